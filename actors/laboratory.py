@@ -7,30 +7,30 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
-from actors.balance.spec import SerialBalanceSpec
-from actors.bench.opening import MakeDevice, OpenBench, needs_person, open_bench
-from actors.device import Device, LocalDevice, RayDevice
-from actors.operator import Operator
-from actors.optimizer.actor import DeviceOptimizer, Proposer
-from actors.protocols import (
+from actors.balance.balance_settings import SerialBalanceSpec
+from actors.bench.bench_factory import MakeDevice, OpenBench, needs_person, open_bench
+from actors.interfaces import (
     Bench,
     BenchLostError,
     Laboratory,
     LaboratoryError,
     Notice,
+    Operator,
     Optimizer,
     SimulatorPool,
 )
-from actors.ray_watch import watch_ray
-from actors.simulation.in_process import InProcessSimulatorPool
-from actors.simulation.job_runner import Simulator, pour_simulator
-from actors.simulation.pool import RaySimulatorPool
-from actors.simulation.processes import ProcessSimulatorPool
-from actors.spec import LaboratorySpec, simulator_count
-from sim_engine.extras import EXTRAS, PACKAGES, installed
+from actors.laboratory_settings import LaboratorySpec, simulator_count
+from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
+from actors.runtime.ray_runtime import watch_ray
+from actors.runtime.remote_object import Device, LocalDevice, RayDevice
+from actors.simulators.local_worker import InProcessSimulatorPool
+from actors.simulators.pool import RaySimulatorPool
+from actors.simulators.process_worker import ProcessSimulatorPool
+from actors.simulators.simulation_task import Simulator, pour_simulator
+from sim_engine.resources import EXTRAS, PACKAGES, installed
 
 if TYPE_CHECKING:
-    from actors.cluster.joined import JoinedCluster
+    from actors.runtime.ray_cluster import JoinedCluster
 
 
 def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = False) -> None:
@@ -57,7 +57,7 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = Fa
             "'decant[lab]', or run with --in-process, one simulation after the other"
         )
     if spec.ray is not None and not spec.in_process:
-        from actors.cluster.probe import check_cluster
+        from actors.runtime.cluster_check import check_cluster
 
         check_cluster(spec.ray, need_bench=need_bench)
 
@@ -105,7 +105,7 @@ def open_laboratory(
             private Ray would be. Where a bench is needed, or a cluster named, it is as ever.
         make: makes simulators, where they run.
         operator: who answers questions, where a person does.
-        kept: simulators that outlive the laboratory, in place of its own (`actors.warm`). Not on a cluster, whose
+        kept: simulators that outlive the laboratory, in place of its own (`actors.simulators.warm_pool`). Not on a cluster, whose
             members come and go.
         optimizer: likewise, in place of one of its own: it keeps no state that matters.
 
@@ -288,7 +288,7 @@ class RayLaboratory(_OpenLaboratory):
     _watching: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> RayLaboratory:
-        from actors.ray_runtime import keep_signals, start_ray
+        from actors.runtime.ray_runtime import keep_signals, start_ray
 
         starting = asyncio.ensure_future(asyncio.to_thread(start_ray, self._spec))
         try:
@@ -302,7 +302,7 @@ class RayLaboratory(_OpenLaboratory):
         keep_signals()
         try:
             if self._spec.ray is not None:
-                from actors.cluster.joined import JoinedCluster
+                from actors.runtime.ray_cluster import JoinedCluster
 
                 self._cluster = JoinedCluster(self._spec.ray, self._tell, self._lose_bench, self._lose_all)
                 await self._cluster.open(need_bench=self._needs_bench)
@@ -329,7 +329,7 @@ class RayLaboratory(_OpenLaboratory):
         await self._open_bench(partial(RayDevice, node=node), self._liquid)
 
     def _open_pool(self) -> RaySimulatorPool:
-        from actors.cluster.versions import versions
+        from actors.runtime.cluster_nodes import versions
 
         def tell(text: str) -> None:
             self._tell(Notice("warning", text))
@@ -383,6 +383,6 @@ class RayLaboratory(_OpenLaboratory):
             await self._stop_ray()
 
     async def _stop_ray(self) -> None:
-        from actors.ray_runtime import stop_ray
+        from actors.runtime.ray_runtime import stop_ray
 
         await asyncio.to_thread(stop_ray)

@@ -31,22 +31,21 @@ from machine import describe, pin, say, show
 from players import play, simulated
 from scipy.special import ndtr
 
-from orchestrator.plan import CalibrationPlan, DeploymentPlan
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated
-from orchestrator.stages import POURS, known_simulations
-from orchestrator.strategies.calibration.active import ActivePours
-from orchestrator.strategies.calibration.c4 import C4Settings, ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.design import DesignedPours
-from orchestrator.strategies.calibration.prior import actions_of_prior
+from orchestrator.runs.stages import POURS, known_simulations
+from orchestrator.strategies.calibration.action_prior import actions_of_prior
+from orchestrator.strategies.calibration.active_design import ActivePours
+from orchestrator.strategies.calibration.continuous_calibration import C4Settings, ContinuousBayesianCalibration
+from orchestrator.strategies.calibration.pour_design import DesignedPours
+from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan
 from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.strategy import Strategy
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.losses import Loss
-from sim_engine.outcome import PourMeasurement
-from sim_engine.space import Axis, Space
-from sim_engine.task import Scene
-from sim_engine.vessel.spec import cylinder
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.outcome import Loss, PourMeasurement
+from sim_engine.scene import Scene
+from sim_engine.search_space import Axis, Space
+from sim_engine.vessel.shapes import cylinder
 
 SPEED, OFFSET = Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0.09, 0.15)
 HEIGHT = Axis("height", 0.05, 0.11)

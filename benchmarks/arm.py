@@ -20,20 +20,19 @@ from typing import Any
 import numpy as np
 from machine import describe, say, show
 
-from actors.arm.errors import ArmStoppedError
-from actors.arm.geometry import ArmLimits, Cell, Pose
-from actors.arm.joint_path import PourPath
-from actors.arm.path.plan import plan_path
-from actors.arm.spec import UrArmSpec
-from actors.arm.ur.driver import UrArm
-from actors.arm.ur.script import STOP_DECELERATION
-from actors.virtual_ur import VirtualController
+from actors.arm.arm_interface import ArmLimits, ArmStoppedError, Pose, RobotCell
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planned_pour import PourPath
+from actors.arm.planning.pour_planner import plan_path
+from actors.arm.ur.ur_driver import UrArm
+from actors.arm.ur.urscript_writer import STOP_DECELERATION
+from actors.emulators.ur_controller import VirtualController
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid
+from sim_engine.liquids import Liquid
 from sim_engine.motion import plan_motion
-from sim_engine.task import Scene
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import cylinder
+from sim_engine.scene import Scene
+from sim_engine.vessel.shapes import cylinder
+from sim_engine.vessel.vessel import build_vessel
 
 ADDRESS = "127.9.8.7"
 CYCLES = {"ur10e": 500.0, "ur10": 125.0}
@@ -45,7 +44,7 @@ RECEIVER = build_vessel(cylinder("receiver", inner_radius=0.045, inner_height=0.
 SPEC = UrArmSpec(
     model="ur10e",
     limits=ArmLimits((0.2, -0.7, 0.0), (1.1, 0.5, 1.0), joint_speed=170 * DEG, tilt_speed=155 * DEG, clearance=3e-3),
-    cell=Cell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
+    cell=RobotCell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
     home=(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
     tool=Pose(z=0.17),
     grip=Pose(y=-0.06, rx=-90 * DEG),

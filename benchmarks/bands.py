@@ -24,18 +24,17 @@ from typing import Any
 from calibration_power import CAMPAIGN, Answers, Kept, dealt, play, recorded, without
 from machine import describe, run_self, say, show
 
-from orchestrator.config.load import load_campaign
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.fingerprint import fingerprint
-from orchestrator.plan import CampaignPlan
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.requests import Simulate, Simulated
-from orchestrator.scoring import rank_correlation
-from orchestrator.stages import CALIBRATION, calibrated_theta, calibration_stages, stage_seed
-from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour
-from orchestrator.strategies.calibration.scorecard import CALIBRATED, shift_left_over
-from sim_engine.bands import Band, band, resolution_shift
-from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import normalised_spillage
+from orchestrator.results.prediction_scores import rank_correlation
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.runs.stages import CALIBRATION, calibrated_theta, calibration_stages, stage_seed
+from orchestrator.strategies.calibration.calibration_scores import CALIBRATED, Evaluation, ScoredPour, shift_left_over
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import normalised_spillage
+from sim_engine.prediction_band import PredictionInterval, band, resolution_shift
 
 ROWS = ("seeds and θ", "with resolution", "with what was left over")
 
@@ -88,7 +87,7 @@ def _row(answers: Answers, one: ScoredPour, thetas: Sequence[SimulationParameter
     return {"split": one.pour.split, "measured": one.pour.spillage, "simulated": values}
 
 
-def bands_of(row: dict[str, Any], particles: int, left: float | None) -> dict[str, Band]:
+def bands_of(row: dict[str, Any], particles: int, left: float | None) -> dict[str, PredictionInterval]:
     """A pour's band with one cause more each time."""
     values = row["simulated"]
     # As many particles as leave nothing of their own error.

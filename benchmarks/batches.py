@@ -19,9 +19,9 @@ from machine import describe, pin, say, show
 from standard_pour import check_particles, short_task, standard_task
 
 from sim_engine.action import DEG
-from sim_engine.backend import BACKENDS, BackendError, require_backend
-from sim_engine.pour import PourSimulator
-from sim_engine.task import PourTask
+from sim_engine.resources import BACKENDS, BackendError, require_backend
+from sim_engine.scene import PourTask
+from sim_engine.simulator import PourSimulator
 
 SCENES = {"cpu": (1, 2, 4, 8, 16), "cuda": (1, 4, 16, 64, 256, 1024)}
 

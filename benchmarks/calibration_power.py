@@ -35,14 +35,13 @@ from typing import Any, cast
 from machine import ROOT, describe, run_self, say, show
 from standard_pour import check_particles
 
-from orchestrator.codec import digest
-from orchestrator.config.load import load_campaign
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.fingerprint import fingerprint
-from orchestrator.flights import Flight, free_slots, next_to_tell
-from orchestrator.plan import CalibrationPlan, CampaignPlan, MeasuredPour, RecordedPour
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.journal.codec import digest
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Suggest, Suggested
-from orchestrator.stages import (
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.runs.stage_scheduler import PendingRequest, free_slots, next_to_tell
+from orchestrator.runs.stages import (
     CALIBRATION,
     calibrated_theta,
     calibration_stages,
@@ -51,16 +50,21 @@ from orchestrator.stages import (
     scenes_of,
     stage_seed,
 )
-from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
-from orchestrator.strategies.calibration.contexts import Contexts
-from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour
-from orchestrator.strategies.calibration.scorecard import DRAWS
-from orchestrator.strategies.protocol import Strategy
-from sim_engine.cache import cache_directory
+from orchestrator.strategies.calibration.calibration_scores import (
+    DRAWS,
+    Evaluation,
+    ScoredPour,
+    mean_predictor_discrepancy,
+    regression_discrepancy,
+)
+from orchestrator.strategies.calibration.pour_contexts import Contexts
+from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, MeasuredPour, RecordedPour
+from orchestrator.strategies.strategy import Strategy
 from sim_engine.errors import InvalidSceneError
-from sim_engine.liquid import SimulationParameters
-from sim_engine.space import Axis, Space
-from sim_engine.task import PourTask
+from sim_engine.liquids import SimulationParameters
+from sim_engine.resources import cache_directory
+from sim_engine.scene import PourTask
+from sim_engine.search_space import Axis, Space
 
 CAMPAIGN = ROOT / "configs" / "campaigns" / "recorded.yaml"
 STEPS = (("viscosity",), ("cohesion",), ("friction",), ("wall_distance", "lip_drop"), ("eddies",))
@@ -121,16 +125,16 @@ def without(plan: CalibrationPlan, fold: Sequence[int]) -> CalibrationPlan:
 
 def play(strategy: Strategy, answer: Callable[[Request], Outcome], slots: int, label: str) -> None:
     """Ask, answer and tell until the strategy has finished, in the order in which a run of the campaign does."""
-    flights: dict[int, Flight] = {}
+    flights: dict[int, PendingRequest] = {}
     asked, begun, told = 0, time.monotonic(), 0
     while not strategy.finished:
         for request in strategy.ask(free_slots(list(flights.values()), slots)):
-            flights[asked] = Flight(asked, request)
+            flights[asked] = PendingRequest(asked, request)
             asked += 1
         for flight in flights.values():
             if flight.outcome is None:
                 flight.outcome = answer(flight.request)
-        flight = cast("Flight", next_to_tell(list(flights.values()), "logical"))
+        flight = cast("PendingRequest", next_to_tell(list(flights.values()), "logical"))
         assert flight.outcome is not None
         del flights[flight.id]
         strategy.tell(flight.request, flight.outcome)
@@ -145,14 +149,14 @@ class Answers:
     """Answers questions and simulates pours in this process."""
 
     def __init__(self, plan: CampaignPlan) -> None:
-        from sim_engine.pour import PourSimulator
+        from sim_engine.simulator import PourSimulator
 
         self._simulator = PourSimulator()
         self._scenes = scenes_of(plan)
 
     def __call__(self, request: Request) -> Outcome:
         """What a laboratory would say."""
-        from actors.optimizer.core.propose import propose
+        from actors.optimizer.suggest import propose
 
         if isinstance(request, Suggest):
             return Suggested(propose(request.problem))

@@ -40,17 +40,16 @@ from calibration_power import CAMPAIGN, SPLITS, Answers, Kept, known_values, pla
 from machine import describe, run_self, say, show
 from optimisers import interval
 
-from orchestrator.config.load import load_campaign
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.fingerprint import fingerprint
-from orchestrator.plan import CalibrationPlan, CampaignPlan
-from orchestrator.results import learnt_by
-from orchestrator.stages import CALIBRATION, calibrated_theta, calibration_stages, stage_seed
-from orchestrator.strategies.calibration.base import Calibrated
-from orchestrator.strategies.calibration.evaluation import Evaluation, random_parameters
-from orchestrator.strategies.calibration.settings import DesignSettings
-from orchestrator.strategies.doors import calibrations
-from sim_engine.liquid import SimulationParameters
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.journal.stage_results import result_of
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.runs.stages import CALIBRATION, calibrated_theta, calibration_stages, stage_seed
+from orchestrator.strategies.calibration.calibration_base import Calibrated, DesignSettings
+from orchestrator.strategies.calibration.calibration_scores import Evaluation, random_parameters
+from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan
+from orchestrator.strategies.strategy_registry import calibrations
+from sim_engine.liquids import SimulationParameters
 
 PAPER = ("C1=2800", "C2=504", "C3=1652", "C4=108")
 DEFAULTS, UNCALIBRATED, RANDOM = "defaults", "uncalibrated", "random"
@@ -122,7 +121,7 @@ def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
         (stage,) = (stage for stage in calibration_stages(calibration) if stage.name == CALIBRATION)
         strategy = stage.build({}, stage_seed(seed, stage.name))
         play(strategy, answers, plan.parallel_simulations, label)
-        found = learnt_by({CALIBRATION: strategy.result()}, CALIBRATION, Calibrated)
+        found = result_of({CALIBRATION: strategy.result()}, CALIBRATION, Calibrated)
         thetas = {"theta": calibrated_theta({CALIBRATION: found}).theta}
     pours = recorded(calibration)
     unseen = [scored for scored in pours if scored.pour.split != TRAINED_ON]

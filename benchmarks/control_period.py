@@ -26,9 +26,9 @@ from typing import Any
 import psutil
 from machine import describe, say, show
 
-from actors.simulation.actor import NICENESS
-from actors.ur import rtde
-from actors.virtual_ur import VirtualController
+from actors.arm.ur import rtde
+from actors.emulators.ur_controller import VirtualController
+from actors.simulators.ray_worker import NICENESS
 
 ADDRESS = "127.9.8.6"
 PERIOD = 0.002
@@ -46,7 +46,7 @@ SIMULATE = """
 import os, sys
 os.nice(int(sys.argv[1]))
 from standard_pour import standard_task
-from sim_engine.pour import PourSimulator
+from sim_engine.simulator import PourSimulator
 simulator = PourSimulator()
 while True:
     simulator.simulate(standard_task(2000, 0))

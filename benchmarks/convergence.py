@@ -18,9 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from sim_engine.fill import spacing
-from sim_engine.liquid import SimulationParameters
-from sim_engine.pour import PourSimulator
+from sim_engine.liquids import SimulationParameters
+from sim_engine.simulator import PourSimulator, spacing
 from sim_engine.validation.convergence import POURS, spillage
 
 VOLUME = 200e-6

@@ -21,7 +21,7 @@ from typing import Any
 from machine import describe, pin, say, show
 from standard_pour import check_particles
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 
 SOURCE = Path(__file__).with_name("core_limit.c")
 MACHINES = {"x86_64": ("x86-64-v3", "native"), "AMD64": ("x86-64-v3", "native")}

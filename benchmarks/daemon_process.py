@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from orchestrator.daemon.client import Client
+from orchestrator.daemon.daemon_client import Client
 
 PATIENCE = 120.0
 """Longest time that anything is waited for [s]."""
@@ -50,7 +50,7 @@ def serving(folder: Path, *options: str, environment: Mapping[str, str] | None =
         environment: beside this process's own.
     """
     with (folder / "log").open("a") as log:
-        command = [sys.executable, "-c", "from orchestrator.cli import main; main()", "serve", *options]
+        command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "serve", *options]
         process = started(
             [*command, "--state", str(folder / "state"), "--port", "0"],
             stdout=log, stderr=log, start_new_session=True, env={**os.environ, **(environment or {})},

@@ -27,9 +27,9 @@ from daemon_page import keep
 from daemon_process import await_, end_in_order, serving, started
 from ruamel.yaml import YAML
 
-from orchestrator.config.load import load_campaign
-from orchestrator.daemon.client import Client
-from orchestrator.daemon.packing import Files, pack
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.daemon.daemon_client import Client
+from orchestrator.daemon.submission_bundle import Files, pack
 
 ROOT = Path(__file__).parents[1]
 READERS = 200

@@ -34,25 +34,23 @@ from optimiser_problems import BY_NAME, Floats, Instance, Problem
 from players import AXES, SCENE, interval, simulated, unit
 from skipping_clock import SkippingLoop, run
 
-from actors.optimizer.core.problem import Suggestion, SuggestProblem
-from actors.optimizer.core.propose import propose
-from actors.protocols import ProgressCallback
-from actors.spec import LaboratorySpec
-from orchestrator.campaign import run_campaign
-from orchestrator.events import DecisionMade, Event
-from orchestrator.occupancy import RESTS, Occupancy
-from orchestrator.plan import CampaignPlan, DeploymentPlan, OutputPlan
+from actors.interfaces import ProgressCallback
+from actors.laboratory_settings import LaboratorySpec
+from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.suggest import propose
+from orchestrator.results.pool_occupancy import RESTS, Occupancy
+from orchestrator.runs.events import DecisionMade, Event
+from orchestrator.runs.run_engine import run_campaign
+from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan, OutputPlan
 from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3_settings import D3Settings
-from orchestrator.strategies.deployment.learnt import Deployed
-from orchestrator.strategies.deployment.prices import PricesSettings
-from orchestrator.strategies.deployment.trust import TrustSettings
-from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import Loss
-from sim_engine.outcome import PourMeasurement
-from sim_engine.simulated import SimulatedPour
-from sim_engine.space import Space
-from sim_engine.task import PourTask, Scene
+from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.deployment_result import Deployed
+from orchestrator.strategies.deployment.model_check import TrustSettings
+from orchestrator.strategies.deployment.time_costs import PricesSettings
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import Loss, PourMeasurement, SimulatedPour
+from sim_engine.scene import PourTask, Scene
+from sim_engine.search_space import Space
 
 AFTER = (1, 3, 5, 10, 15)
 SIMULATORS: dict[str, Callable[[Instance, Floats, Floats], float]] = {

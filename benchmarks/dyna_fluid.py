@@ -25,24 +25,23 @@ from dyna import AFTER, Bench, rounded
 from machine import describe, pin, say, show
 from skipping_clock import run
 
-from actors.bench.hidden import hidden_spill
-from actors.protocols import InvalidActionError, ProgressCallback
-from orchestrator.campaign import run_campaign
-from orchestrator.config.study.sections import load_study
-from orchestrator.occupancy import Occupancy
-from orchestrator.plan import DeploymentPlan, OutputPlan
+from actors.bench.ground_truth import hidden_spill
+from actors.interfaces import InvalidActionError, ProgressCallback
+from orchestrator.results.pool_occupancy import Occupancy
+from orchestrator.runs.run_engine import run_campaign
+from orchestrator.strategies.campaign_plan import DeploymentPlan, OutputPlan
 from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3_settings import D3Settings
-from orchestrator.strategies.deployment.learnt import Deployed
-from orchestrator.strategies.deployment.prices import PricesSettings
-from orchestrator.strategies.deployment.trust import Compared
-from orchestrator.study.plan import StudyPlan
+from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.deployment_result import Deployed
+from orchestrator.strategies.deployment.model_check import Compared
+from orchestrator.strategies.deployment.time_costs import PricesSettings
+from orchestrator.study.study_file import load_study
+from orchestrator.study.study_plan import StudyPlan
 from sim_engine.errors import InvalidSceneError
-from sim_engine.liquid import SimulationParameters
-from sim_engine.outcome import PourMeasurement
-from sim_engine.pour import PourSimulator
-from sim_engine.simulated import SimulatedPour
-from sim_engine.task import PourTask, Scene
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import PourMeasurement, SimulatedPour
+from sim_engine.scene import PourTask, Scene
+from sim_engine.simulator import PourSimulator
 
 ROOT = Path(__file__).resolve().parents[1]
 Row = dict[str, Any]

@@ -23,7 +23,7 @@ from typing import Any
 
 from machine import ROOT, describe, say, show
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 
 LIMIT = 0.2
 """Largest error of a time that is told, as a share of the whole run."""
@@ -75,7 +75,7 @@ def run(bench: str, seed: int) -> dict[str, Any]:
     Raises:
         SystemExit: it did not come to its end.
     """
-    program = "from orchestrator.cli import main; main()"
+    program = "from orchestrator.cli.app import main; main()"
     configs = ROOT / "configs"
     lines: list[tuple[float, str]] = []
     with tempfile.TemporaryDirectory(prefix="decant-eta-") as folder:

@@ -20,9 +20,9 @@ import numpy as np
 from machine import describe, pin, say, show
 from optimiser_problems import BY_NAME, Floats, Instance
 
-from actors.optimizer.core.problem import Data, Point, SuggestProblem
-from actors.optimizer.core.propose import propose
-from sim_engine.space import Axis, Space
+from actors.optimizer.questions import Data, Point, SuggestProblem
+from actors.optimizer.suggest import propose
+from sim_engine.search_space import Axis, Space
 
 SPACE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
 SCATTER = 0.02

@@ -23,12 +23,12 @@ from typing import Any
 from daemon_page import keep
 from daemon_process import end_in_order, started
 
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 
 ROOT = Path(__file__).parents[1]
 
-WITH = "from orchestrator.cli import main; main()"
-WITHOUT = f"from orchestrator.ahead import Ahead; Ahead.foresee = lambda self, request: None; {WITH}"
+WITH = "from orchestrator.cli.app import main; main()"
+WITHOUT = f"from orchestrator.runs.speculation import Ahead; Ahead.foresee = lambda self, request: None; {WITH}"
 
 
 def run_once(campaign: str, program: str) -> dict[str, Any]:

@@ -31,19 +31,18 @@ from typing import Any
 import numpy as np
 import psutil
 
-from actors.child_process import child_environment
-from actors.optimizer.core.problem import Data, SuggestProblem
-from actors.optimizer.core.propose import propose
-from actors.protocols import PourProgress
-from orchestrator.config.load import load_campaign
-from orchestrator.events import Event, PourProgressed, RequestFinished, RequestStarted
-from orchestrator.monitor.live import LiveView
-from orchestrator.monitor.monitor import RerunMonitor
-from orchestrator.monitor.server import environment, rerun_program
-from orchestrator.plan import CampaignPlan
+from actors.interfaces import PourProgress
+from actors.optimizer.questions import Data, SuggestProblem
+from actors.optimizer.suggest import propose
+from actors.runtime.child_process import child_environment
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.live_view.live_server import LiveView
+from orchestrator.live_view.rerun_subscriber import RerunMonitor
+from orchestrator.live_view.viewer_server import environment, rerun_program
 from orchestrator.requests import Pour, Simulate, Simulated, Suggest, Suggested
-from sim_engine.outcome import PourOutcome
-from sim_engine.simulated import RecordedFrames
+from orchestrator.runs.events import Event, PourProgressed, RequestFinished, RequestStarted
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.outcome import PourOutcome, RecordedFrames
 
 ROOT = Path(__file__).parents[1]
 

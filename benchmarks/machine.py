@@ -15,15 +15,15 @@ from typing import Any
 
 import psutil
 
-from actors.child_process import child_environment
-from sim_engine.cache import ENVIRONMENT_VARIABLE
+from actors.runtime.child_process import child_environment
+from sim_engine.resources import ENVIRONMENT_VARIABLE
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
 def describe() -> dict[str, Any]:
     """Machine, software and moment: without them a figure means nothing."""
-    from sim_engine.validation.sources import solver_fingerprint
+    from sim_engine.solver_fingerprint import solver_fingerprint
 
     return {
         "processor": _processor(),

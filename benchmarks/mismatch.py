@@ -34,15 +34,15 @@ import numpy as np
 from mismatch_worlds import LEVELS, SIMULATED_SCATTER, Valley
 from players import SCENE, Numbers, interval, play
 
-from orchestrator.plan import DeploymentPlan
-from orchestrator.stages import DEPLOYMENT, with_bench
-from orchestrator.strategies.deployment.base import Deployment
+from orchestrator.runs.stages import DEPLOYMENT, with_bench
+from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3_settings import D3Settings
-from orchestrator.strategies.deployment.trust import TrustSettings
-from orchestrator.strategies.learnt import Learnt
-from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import Loss
+from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.deployment_base import Deployment
+from orchestrator.strategies.deployment.model_check import TrustSettings
+from orchestrator.strategies.stage_result import StageResult
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import Loss
 
 ARMS: dict[str, Callable[[int, int], Any]] = {
     "D2": lambda pours, _: D2Settings(pours=pours),
@@ -84,7 +84,7 @@ def campaign(arm: str, level: str, seed: int, pours: int, simulations: int) -> d
 
 def receivers(level: str, bench: int, carried: bool, pours: int, simulations: int) -> list[dict[str, float]]:
     """Three receivers one after the other on one bench: what each loses, with what was learnt before or without."""
-    results: dict[str, Learnt] = {}
+    results: dict[str, StageResult] = {}
     found = []
     for number in range(3):
         valley = Valley(level, 4 * bench + number, bench)

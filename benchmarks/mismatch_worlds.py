@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sim_engine.action import DEG
-from sim_engine.space import Axis, Space
+from sim_engine.search_space import Axis, Space
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 

@@ -33,11 +33,11 @@ from machine import describe, pin, say, show, single_threaded
 from optimiser_problems import BY_NAME, PROBLEMS, Instance
 from optimiser_rivals import RIVALS, luckiest, play
 
-from actors.child_process import child_environment
-from actors.optimizer.core.problem import Data, MeanName, NoiseName, SuggestProblem
-from actors.optimizer.core.propose import propose
-from sim_engine.cache import cache_directory
-from sim_engine.space import Axis, Space
+from actors.optimizer.questions import Data, MeanName, NoiseName, SuggestProblem
+from actors.optimizer.suggest import propose
+from actors.runtime.child_process import child_environment
+from sim_engine.resources import cache_directory
+from sim_engine.search_space import Axis, Space
 
 REQUIREMENTS = ("scikit-optimize==0.10.2", "bayesian-optimization==3.4.0", "torch==2.13.0", "botorch==0.18.0")
 RIVALS_FILE = Path(__file__).with_name("optimiser_rivals.py")

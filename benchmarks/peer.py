@@ -31,10 +31,10 @@ from standard_pour import (
     vessels,
 )
 
-from actors.child_process import child_environment
-from sim_engine.cache import cache_directory
-from sim_engine.contact import rotations
-from sim_engine.fill import fill
+from actors.runtime.child_process import child_environment
+from sim_engine.collision import rotations
+from sim_engine.resources import cache_directory
+from sim_engine.simulator import fill
 
 NAME, VERSION = "SPlisHSPlasH", "2.19.0"
 REQUIREMENTS = (f"pysplishsplash=={VERSION}", "numpy")

@@ -35,7 +35,7 @@ def plan(configs: Path, receiver: str, environment: dict[str, str]) -> dict[str,
     Raises:
         SystemExit: it failed.
     """
-    command = [sys.executable, "-c", "from orchestrator.cli import main; main()", "plan", "--json"]
+    command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "plan", "--json"]
     command += [
         str(configs / "campaigns" / "quickstart.yaml"),
         "--receiver",

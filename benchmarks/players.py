@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from optimiser_problems import Floats
 
-from actors.optimizer.core.propose import propose
+from actors.optimizer.suggest import propose
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
-from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.strategy import Strategy
 from sim_engine.action import DEG
-from sim_engine.liquid import Liquid
+from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement, PourOutcome
-from sim_engine.space import Axis, Space
-from sim_engine.task import Scene
-from sim_engine.vessel.spec import cylinder
+from sim_engine.scene import Scene
+from sim_engine.search_space import Axis, Space
+from sim_engine.vessel.shapes import cylinder
 
 AXES = (
     Axis("angular_velocity", 15 * DEG, 120 * DEG),

@@ -29,11 +29,10 @@ from machine import describe, run_self, say, show, single_threaded
 from standard_pour import check_particles, short_task, standard_task
 
 from actors.laboratory import RayLaboratory
-from actors.simulation.pool import RaySimulatorPool
-from actors.spec import LaboratorySpec
-from sim_engine.outcome import PourOutcome
-from sim_engine.simulated import SimulatedPour
-from sim_engine.task import PourTask
+from actors.laboratory_settings import LaboratorySpec
+from actors.simulators.pool import RaySimulatorPool
+from sim_engine.outcome import PourOutcome, SimulatedPour
+from sim_engine.scene import PourTask
 
 TINY = 200
 """Particles of a pour that is nearly nothing."""
@@ -114,7 +113,7 @@ class Plain:
 
 def plain_worker() -> None:
     """What runs in a plain process: orders come line by line, CPU seconds go back."""
-    from sim_engine.pour import PourSimulator
+    from sim_engine.simulator import PourSimulator
 
     simulator = PourSimulator()
     simulator.simulate(short_task(TINY))

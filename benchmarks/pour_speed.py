@@ -32,8 +32,8 @@ from standard_pour import (
     standard_action,
 )
 
-from sim_engine.liquid import SimulationParameters
-from sim_engine.pour import PourSimulator
+from sim_engine.liquids import SimulationParameters
+from sim_engine.simulator import PourSimulator
 
 __all__ = ["SCENE", "main", "standard_action"]
 

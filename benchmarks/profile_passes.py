@@ -29,7 +29,7 @@ import numpy as np
 from machine import describe, pin, run_self, say, show
 from standard_pour import check_particles, measure, short_task
 
-from sim_engine.cache import ENVIRONMENT_VARIABLE
+from sim_engine.resources import ENVIRONMENT_VARIABLE
 
 PASSES = {
     "sim_engine.fluid.step.Stepper.step": "the rest of a step",
@@ -193,7 +193,7 @@ def profile(particles: int, plain_cpu_s: float) -> dict[str, Any]:
         particles: N.
         plain_cpu_s: what the same pour takes without.
     """
-    from sim_engine.pour import PourSimulator
+    from sim_engine.simulator import PourSimulator
 
     clock = Clock()
     clock.wrap_all()

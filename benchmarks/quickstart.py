@@ -34,14 +34,13 @@ from typing import Any
 from machine import ROOT, run_self, say
 from players import interval
 
-from actors.optimizer.core.mismatch import Mismatch
-from actors.simulation.in_process import InProcessSimulatorPool
-from actors.simulation.job_runner import Simulator, pour_simulator
-from orchestrator.codec import digest, from_json, to_json
+from actors.optimizer.questions import ModelDiscrepancy
+from actors.simulators.local_worker import InProcessSimulatorPool
+from actors.simulators.simulation_task import Simulator, pour_simulator
+from orchestrator.journal.codec import digest, from_json, to_json
 from orchestrator.strategies.deployment import d3
-from sim_engine.outcome import PourOutcome
-from sim_engine.simulated import SimulatedPour
-from sim_engine.task import PourTask
+from sim_engine.outcome import PourOutcome, SimulatedPour
+from sim_engine.scene import PourTask
 
 GOOD, BAD = 0.01, 0.10
 PAGE = ROOT / "docs" / "optimiser.md"
@@ -50,8 +49,8 @@ CAMPAIGN = ROOT / "configs" / "campaigns" / "quickstart.yaml"
 
 
 def _with_lookahead() -> None:
-    def mismatch(*args: Any, **changes: Any) -> Mismatch:
-        return Mismatch(*args, **{**changes, "looks_ahead": True})
+    def mismatch(*args: Any, **changes: Any) -> ModelDiscrepancy:
+        return ModelDiscrepancy(*args, **{**changes, "looks_ahead": True})
 
     vars(d3).update(Mismatch=mismatch)
 
@@ -89,10 +88,10 @@ def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
     """One campaign: every pour with what was expected of it, what it recommends, and why it ended."""
     from actors.laboratory import open_laboratory
     from decant.campaigns import build_campaign, load_campaign
-    from orchestrator.campaign import run_campaign
-    from orchestrator.report.results import deployments_of
-    from orchestrator.runs import create_run
-    from sim_engine.validation.sources import solver_fingerprint
+    from orchestrator.results.stage_views import deployments_of
+    from orchestrator.runs.run_engine import run_campaign
+    from orchestrator.runs.run_folder import create_run
+    from sim_engine.solver_fingerprint import solver_fingerprint
 
     ARMS[arm]()
     shipped = load_campaign(CAMPAIGN, laboratory)

@@ -22,20 +22,19 @@ import numpy as np
 from machine import describe, pin, say, show
 from numpy.typing import NDArray
 
-from actors.optimizer.core.propose import propose
-from orchestrator.config.load import load_campaign, load_vessel
-from orchestrator.config.pose import PoseNoiseSection
-from orchestrator.plan import DeploymentPlan
+from actors.optimizer.suggest import propose
+from orchestrator.config.file_loading import load_campaign, load_vessel
+from orchestrator.config.pose_errors import PoseNoiseSection
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
-from orchestrator.strategies.deployment.costs import Costing
-from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
-from orchestrator.strategies.deployment.d1_risk import RobustPlanning
-from orchestrator.strategies.deployment.learnt import Recommended
-from orchestrator.strategies.deployment.risk import RiskSettings
+from orchestrator.strategies.campaign_plan import DeploymentPlan
+from orchestrator.strategies.deployment.costing import Costing
+from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning, RobustPlanning
+from orchestrator.strategies.deployment.deployment_result import Recommended
+from orchestrator.strategies.deployment.disturbances import RiskSettings
 from sim_engine.action import DEG, described
-from sim_engine.liquid import SimulationParameters
-from sim_engine.pour import InvalidSceneError, PourSimulator
-from sim_engine.task import PoseError, PourTask, Scene
+from sim_engine.liquids import SimulationParameters
+from sim_engine.scene import PoseError, PourTask, Scene
+from sim_engine.simulator import InvalidSceneError, PourSimulator
 
 Floats = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ Toy losses, cheap and known exactly, at the same number of simulations:
 
     python benchmarks/risk_measures.py [--seeds 5] [--simulations 48] [--toys cup cliff valleys] [--json]
 
-`joint` is `orchestrator.strategies.deployment.d1_risk`; `raw` forms the mean or CVaR of the m1 losses of each action,
+`joint` is `orchestrator.strategies.deployment.d1`; `raw` forms the mean or CVaR of the m1 losses of each action,
 under the same m1 draws for all of them, and regresses that over actions; `plain` is D1, which knows of no errors.
 Regret: the true measure of the recommended action, less the least there is.
 """
@@ -22,23 +22,21 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 from scipy.stats import qmc
 
-from actors.optimizer.core.problem import Data, SuggestProblem
-from actors.optimizer.core.propose import propose
-from actors.optimizer.core.risk import conditional_value_at_risk, tail_weights
-from orchestrator.config.pose import PoseNoiseSection
-from orchestrator.plan import DeploymentPlan
+from actors.optimizer.questions import Data, SuggestProblem
+from actors.optimizer.risk_measures import conditional_value_at_risk, tail_weights
+from actors.optimizer.suggest import propose
+from orchestrator.config.pose_errors import PoseNoiseSection
 from orchestrator.requests import Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
-from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
-from orchestrator.strategies.deployment.d1_risk import RobustPlanning
-from orchestrator.strategies.deployment.learnt import Recommended
-from orchestrator.strategies.deployment.risk import RiskSettings
+from orchestrator.strategies.campaign_plan import DeploymentPlan
+from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning, RobustPlanning
+from orchestrator.strategies.deployment.deployment_result import Recommended
+from orchestrator.strategies.deployment.disturbances import RiskSettings
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.losses import Loss
-from sim_engine.outcome import PourOutcome
-from sim_engine.space import Axis, Space
-from sim_engine.task import PoseError, Scene
-from sim_engine.vessel.spec import cylinder
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.outcome import Loss, PourOutcome
+from sim_engine.scene import PoseError, Scene
+from sim_engine.search_space import Axis, Space
+from sim_engine.vessel.shapes import cylinder
 
 Floats = NDArray[np.float64]
 

@@ -20,9 +20,8 @@ import psutil
 from machine import describe, pin, run_self, say, show
 from standard_pour import FEWEST, check_particles, measure, short_task, standard_task
 
-from sim_engine.course import SLICE
 from sim_engine.errors import SimulationCancelled
-from sim_engine.pour import SETTLING, PourSimulator
+from sim_engine.simulator import SETTLING, SLICE, PourSimulator
 
 PARTICLES = (1_000, 2_000, 5_000, 10_000, 20_000)
 MEMORY = (1_000, 2_000, 5_000, 10_000, 20_000, 50_000)

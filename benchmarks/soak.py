@@ -34,11 +34,11 @@ from daemon_page import keep
 from daemon_process import end_in_order, serving
 from ruamel.yaml import YAML
 
-from orchestrator.config.load import load_campaign
-from orchestrator.daemon.client import Client, DaemonError
-from orchestrator.daemon.packing import Files, pack
-from orchestrator.journal import JOURNAL_NAME
-from orchestrator.report import style
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.daemon.daemon_client import Client, DaemonError
+from orchestrator.daemon.submission_bundle import Files, pack
+from orchestrator.journal.journal import JOURNAL_NAME
+from orchestrator.results import figure_style as style
 
 ROOT = Path(__file__).parents[1]
 
@@ -207,7 +207,7 @@ def _name(process: psutil.Process) -> str:
     for part, name in (
         ("virtual_ur", "controller"),
         ("ur.worker", "worker of the arm"),
-        ("orchestrator.monitor", "recording"),
+        ("orchestrator.live_view", "recording"),
     ):
         if part in line:
             return name

@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_engine.action import DEG, Action
-from sim_engine.fill import spacing
-from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.motion import PourMotion, plan_motion
 from sim_engine.outcome import PourOutcome
-from sim_engine.pour import PourSimulator
-from sim_engine.task import PourTask, Scene
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import cylinder
-from sim_engine.vessel.vessel import Vessel
+from sim_engine.scene import PourTask, Scene
+from sim_engine.simulator import PourSimulator, spacing
+from sim_engine.vessel.shapes import cylinder
+from sim_engine.vessel.vessel import Vessel, build_vessel
 
 Floats = NDArray[np.float64]
 
@@ -163,7 +161,7 @@ def in_frame(points: Floats, time_: float) -> Floats:
         points: (N, 3).
         time_: [s].
     """
-    from sim_engine.contact import rotations
+    from sim_engine.collision import rotations
 
     poses = motion().sample(np.array([time_]))
     (rotation,) = rotations(poses)
@@ -181,7 +179,7 @@ def density_inside(points: Floats, time_: float, particles: int) -> float:
     Returns:
         Mean volume that a particle stands for over that of its Voronoi cell; nan if nobody is that far inside.
     """
-    from sim_engine.validation.at_rest import INNER, mean_density
+    from sim_engine.validation.hydrostatic_cases import INNER, mean_density
 
     d = particle_spacing(particles)
     local = in_frame(points, time_)

@@ -37,7 +37,7 @@ def answer(particles: int, begun: float) -> dict[str, Any]:
     from standard_pour import standard_task
 
     from sim_engine.fluid.engine import engine
-    from sim_engine.pour import PourSimulator
+    from sim_engine.simulator import PourSimulator
 
     marks.append(time.monotonic())
     engine()

@@ -16,13 +16,12 @@ from pathlib import Path
 
 from machine import ROOT
 
-from orchestrator.commands.study import read_study
-from orchestrator.strategies.calibration.scorecard import UNCALIBRATED
+from orchestrator.cli.study_command import read_study
+from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED
 from orchestrator.study.cells import cells_of
-from orchestrator.study.folder import finished_results
-from orchestrator.study.report.effects import tests_of
-from orchestrator.study.report.gather import LEVEL, RANDOM, Gathered, Key, gather, mean, running_least
-from orchestrator.study.report.intervals import Estimate, estimate
+from orchestrator.study.report.cell_results import LEVEL, RANDOM, Gathered, Key, gather, mean, running_least
+from orchestrator.study.report.statistics import Estimate, estimate, tests_of
+from orchestrator.study.study_folder import finished_results
 
 PAGE = ROOT / "docs" / "results.md"
 BEGIN, END = "<!-- measured: hidden benches -->\n", "<!-- end of measured -->"

@@ -22,14 +22,13 @@ from machine import describe, pin, say, show
 from optimiser_problems import BY_NAME, Floats, Instance
 from players import AXES, SCENE, Numbers, play
 
-from orchestrator.plan import DeploymentPlan
+from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.d2 import D2Settings, RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.d3_settings import D3Settings
-from orchestrator.strategies.deployment.trust import Compared, TrustSettings
-from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import Loss
-from sim_engine.space import Space
+from orchestrator.strategies.deployment.d3 import D3Settings, Hybrid
+from orchestrator.strategies.deployment.model_check import Compared, TrustSettings
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import Loss
+from sim_engine.search_space import Space
 
 SPACE = Space(AXES[:2])
 SIMULATORS: dict[str, Callable[[Instance, Floats, Floats], float]] = {

@@ -32,7 +32,7 @@ def cost(file: Path, environment: dict[str, str]) -> float:
         SystemExit: the file was refused.
     """
     before = os.times()
-    command = [sys.executable, "-c", "from orchestrator.cli import main; main()", "validate", str(file)]
+    command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "validate", str(file)]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     after = os.times()
     if done.returncode != 0:

@@ -13,15 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from orchestrator.commands.vessel import Sources, vessel
-from orchestrator.config.load import load_vessel
+from orchestrator.cli.vessel_measurement import Sources, vessel
+from orchestrator.config.file_loading import load_vessel
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.pour import PourSimulator
-from sim_engine.task import PourTask, Scene
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import VesselSpec
-from sim_engine.vessel.vessel import Vessel
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.scene import PourTask, Scene
+from sim_engine.simulator import PourSimulator
+from sim_engine.vessel.shapes import VesselSpec
+from sim_engine.vessel.vessel import Vessel, build_vessel
 from tests.measured import FOCAL, Bench
 
 PAGE = Path("docs/vessels.md")

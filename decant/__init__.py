@@ -10,23 +10,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from actors.protocols import LaboratoryError
+    from actors.interfaces import LaboratoryError
     from decant.campaigns import build_campaign, load_campaign, load_vessel, shipped, starting_set
-    from decant.catalogue import find_pours, find_runs
-    from decant.driving import calibrate, plan, run
-    from decant.runs import Run, open_run, publish
-    from decant.simulating import Simulation, simulate
-    from orchestrator import events
-    from orchestrator.config.campaign.assignments import AssignmentError
-    from orchestrator.config.yaml.errors import ConfigError
-    from orchestrator.errors import RunError
-    from orchestrator.events import Event
-    from orchestrator.plan import CampaignPlan
-    from orchestrator.publish import Published
+    from decant.catalogue_tables import find_pours, find_runs
+    from decant.run_results import Run, open_run, publish
+    from decant.running import calibrate, plan, run
+    from decant.simulation import Simulation, simulate
+    from orchestrator.config.action_assignments import AssignmentError
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.results.publishing import Published
+    from orchestrator.run_errors import RunError
+    from orchestrator.runs import events
+    from orchestrator.runs.events import Event
+    from orchestrator.strategies.campaign_plan import CampaignPlan
     from sim_engine.errors import DecantError, InvalidArgumentError
-    from sim_engine.extras import MissingExtraError
-    from sim_engine.liquid import SimulationParameters
-    from sim_engine.vessel.spec import VesselSpec
+    from sim_engine.liquids import SimulationParameters
+    from sim_engine.resources import MissingExtraError
+    from sim_engine.vessel.shapes import VesselSpec
 
 __all__ = [
     "AssignmentError",
@@ -61,21 +61,21 @@ __all__ = [
 
 _HOMES = {
     "decant.campaigns": ("build_campaign", "load_campaign", "load_vessel", "shipped", "starting_set"),
-    "decant.catalogue": ("find_pours", "find_runs"),
-    "decant.driving": ("calibrate", "plan", "run"),
-    "decant.runs": ("Run", "open_run", "publish"),
-    "decant.simulating": ("Simulation", "simulate"),
-    "actors.protocols": ("LaboratoryError",),
-    "orchestrator.config.campaign.assignments": ("AssignmentError",),
-    "orchestrator.config.yaml.errors": ("ConfigError",),
-    "orchestrator.errors": ("RunError",),
-    "orchestrator.events": ("Event",),
-    "orchestrator.plan": ("CampaignPlan",),
-    "orchestrator.publish": ("Published",),
+    "decant.catalogue_tables": ("find_pours", "find_runs"),
+    "decant.running": ("calibrate", "plan", "run"),
+    "decant.run_results": ("Run", "open_run", "publish"),
+    "decant.simulation": ("Simulation", "simulate"),
+    "actors.interfaces": ("LaboratoryError",),
+    "orchestrator.config.action_assignments": ("AssignmentError",),
+    "orchestrator.config.yaml.yaml_errors": ("ConfigError",),
+    "orchestrator.run_errors": ("RunError",),
+    "orchestrator.runs.events": ("Event",),
+    "orchestrator.strategies.campaign_plan": ("CampaignPlan",),
+    "orchestrator.results.publishing": ("Published",),
     "sim_engine.errors": ("DecantError", "InvalidArgumentError"),
-    "sim_engine.extras": ("MissingExtraError",),
-    "sim_engine.liquid": ("SimulationParameters",),
-    "sim_engine.vessel.spec": ("VesselSpec",),
+    "sim_engine.resources": ("MissingExtraError",),
+    "sim_engine.liquids": ("SimulationParameters",),
+    "sim_engine.vessel.shapes": ("VesselSpec",),
 }
 """Module → the names that it gives."""
 
@@ -87,7 +87,7 @@ if not TYPE_CHECKING:  # else a type checker would take a misspelt name for Any
     def __getattr__(name: str) -> Any:
         """Import a name when it is asked for (PEP 562)."""
         if name == "events":
-            return import_module("orchestrator.events")
+            return import_module("orchestrator.runs.events")
         if name not in _HOME_OF:
             raise AttributeError(f"module 'decant' has no attribute '{name}'; it has {', '.join(__all__)}")
         return getattr(import_module(_HOME_OF[name]), name)

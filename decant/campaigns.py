@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from orchestrator.config.load import campaign_from, load_campaign, load_vessel
-from orchestrator.config.yaml.source import Document
-from orchestrator.plan import CampaignPlan
+from orchestrator.config.file_loading import campaign_from, load_campaign, load_vessel
+from orchestrator.config.yaml.yaml_source import Document
 from orchestrator.shipped import shipped, starting_set
+from orchestrator.strategies.campaign_plan import CampaignPlan
 
 __all__ = ["build_campaign", "load_campaign", "load_vessel", "shipped", "starting_set"]
 

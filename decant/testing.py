@@ -14,8 +14,8 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from actors.contracts.arm import ArmBench, ArmContract
-    from actors.contracts.balance import BalanceBench, BalanceContract
+    from actors.contract_tests.arm_contract import ArmBench, ArmContract
+    from actors.contract_tests.balance_contract import BalanceBench, BalanceContract
     from orchestrator.strategy_harness import (
         ACTIONS,
         CALIBRATION_ACTIONS,
@@ -49,10 +49,10 @@ __all__ = [
 ]
 
 _CONTRACTS = {
-    "ArmBench": "actors.contracts.arm",
-    "ArmContract": "actors.contracts.arm",
-    "BalanceBench": "actors.contracts.balance",
-    "BalanceContract": "actors.contracts.balance",
+    "ArmBench": "actors.contract_tests.arm_contract",
+    "ArmContract": "actors.contract_tests.arm_contract",
+    "BalanceBench": "actors.contract_tests.balance_contract",
+    "BalanceContract": "actors.contract_tests.balance_contract",
 }
 
 

@@ -23,7 +23,7 @@ from typing import Any
 import httpx
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 
 FOLDER = Path(__file__).parent / "images" / "daemon"
 SIZES = {"phone": (390, 844), "tablet": (1024, 768), "desk": (1440, 1080)}

@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from orchestrator.report import style
-from orchestrator.report.section import fill_section, place, section
+from orchestrator.results import figure_style as style
+from orchestrator.results.pour_figures import fill_section, place, section
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid
+from sim_engine.liquids import Liquid
 from sim_engine.motion import plan_motion
-from sim_engine.task import Scene
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import cylinder
+from sim_engine.scene import Scene
+from sim_engine.vessel.shapes import cylinder
+from sim_engine.vessel.vessel import build_vessel
 
 MM = 1e-3
 TILT = 55 * DEG

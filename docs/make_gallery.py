@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 
 import decant
-from orchestrator.config.load import load_vessel
-from orchestrator.report import style
-from orchestrator.report.scene import simulation_png
-from orchestrator.report.section import fill_section, section
-from sim_engine.vessel.build import build_vessel
+from orchestrator.config.file_loading import load_vessel
+from orchestrator.results import figure_style as style
+from orchestrator.results.pour_figures import fill_section, section, simulation_png
+from sim_engine.vessel.vessel import build_vessel
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES, VESSELS = ROOT / "docs" / "images", ROOT / "configs" / "vessels"

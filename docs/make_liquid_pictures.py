@@ -10,17 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from orchestrator.config.load import load_vessel
+from orchestrator.config.file_loading import load_vessel
 from sim_engine.action import DEG, Action
-from sim_engine.lip import flow_course, weber
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.liquids import look_up
+from sim_engine.lip_flow import flow_course, weber
+from sim_engine.liquids import Liquid, SimulationParameters, look_up
+from sim_engine.model_validity import DRIBBLING_WEBER
 from sim_engine.motion import plan_motion
-from sim_engine.pour import PourSimulator
-from sim_engine.regimes import DRIBBLING_WEBER
-from sim_engine.task import PourTask, Scene
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import cylinder
+from sim_engine.scene import PourTask, Scene
+from sim_engine.simulator import PourSimulator
+from sim_engine.vessel.shapes import cylinder
+from sim_engine.vessel.vessel import build_vessel
 
 IMAGES = Path(__file__).resolve().parent / "images"
 TIMES = (1.5, 2.0, 3.0)
@@ -135,7 +134,7 @@ def main() -> None:
 
 def _walls(panel, pose, radius: float, height: float) -> None:  # type: ignore[no-untyped-def]
     """The section of a straight cup of 4 mm walls in the plane y = 0, in millimetres."""
-    from sim_engine.contact import rotations
+    from sim_engine.collision import rotations
 
     r, h = radius, height + 4.0
     outline = np.array([[-r, h], [-r, 4], [r, 4], [r, h], [r + 4, h], [r + 4, 0], [-r - 4, 0], [-r - 4, h], [-r, h]])

@@ -19,9 +19,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from actors.child_process import child_environment
-from orchestrator.journal import JOURNAL_NAME, JournalError, JournalReader, Kind
-from orchestrator.monitor.live import LiveView
+from actors.runtime.child_process import child_environment
+from orchestrator.journal.journal import JOURNAL_NAME, JournalError, JournalReader, Kind
+from orchestrator.live_view.live_server import LiveView
 
 ROOT = Path(__file__).parents[1]
 
@@ -81,7 +81,7 @@ def during_a_run(chromium: str, to: Path) -> Path:
 @contextlib.contextmanager
 def running(campaign: Path) -> Iterator[tuple[subprocess.Popen[str], str, Path]]:
     """`decant run --live`, with the address and the run's folder that it prints."""
-    command = [sys.executable, "-c", "from orchestrator.cli import main; main()", "run", str(campaign), "--live"]
+    command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "run", str(campaign), "--live"]
     process = subprocess.Popen(
         command,
         cwd=campaign.parents[2],

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from actors.child_process import child_environment
-from orchestrator.journal import JOURNAL_NAME, JournalReader
-from orchestrator.report import style
-from orchestrator.report.results import deployments_of
-from orchestrator.results import decode_results
-from orchestrator.strategies.deployment.learnt import Deployed
+from actors.runtime.child_process import child_environment
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.stage_results import decode_results
+from orchestrator.results import figure_style as style
+from orchestrator.results.stage_views import deployments_of
+from orchestrator.strategies.deployment.deployment_result import Deployed
 
 ROOT = Path(__file__).resolve().parent.parent
 CAMPAIGN = ROOT / "configs" / "campaigns" / "quickstart.yaml"

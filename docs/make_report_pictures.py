@@ -15,8 +15,8 @@ from typing import Any
 
 from PIL import Image
 
-from orchestrator.report.run_page import REPORT_NAME
-from orchestrator.study.report.page import PAGE, REPORT
+from orchestrator.results.html_report import REPORT_NAME
+from orchestrator.study.report.study_page import PAGE, REPORT
 
 DOCS = Path(__file__).parent
 

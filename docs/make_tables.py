@@ -18,32 +18,39 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from orchestrator.catalogue.columns import TABLES as CATALOGUE
-from orchestrator.config import pose, vessel
-from orchestrator.config.campaign import sections as campaign
-from orchestrator.config.campaign.records import MASS_COLUMNS, SPLITS, column_name
-from orchestrator.config.campaign.scenes import DEFAULTS, NEEDED
-from orchestrator.config.laboratory import arm_sections, cell, cluster, operator
-from orchestrator.config.laboratory import sections as laboratory
-from orchestrator.config.laboratory.arms import ARMS
-from orchestrator.config.study import sections as study
-from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Choice, Section
-from orchestrator.config.yaml.validate import sections_in
-from orchestrator.daemon import settings as daemon
-from orchestrator.daemon.notify import NotifySection
-from orchestrator.report.physics import kept_records
+from orchestrator.catalogue.catalogue_index import TABLES as CATALOGUE
+from orchestrator.config import arm_file as arm_sections
+from orchestrator.config import arm_file as cell
+from orchestrator.config import campaign_file as campaign
+from orchestrator.config import laboratory_file as cluster
+from orchestrator.config import laboratory_file as laboratory
+from orchestrator.config import laboratory_file as operator
+from orchestrator.config import pose_errors as pose
+from orchestrator.config import vessel_file as vessel
+from orchestrator.config.arm_file import ARMS
+from orchestrator.config.scene_builder import DEFAULTS, NEEDED
+from orchestrator.config.weighed_pours import MASS_COLUMNS, SPLITS, column_name
+from orchestrator.config.yaml.section_validation import sections_in
+from orchestrator.daemon import daemon_settings as daemon
+from orchestrator.daemon.notifications import NotifySection
+from orchestrator.results.solver_report import kept_records
 from orchestrator.states import State
-from orchestrator.strategies.deployment.adaptive import IgnoranceSettings, RiskLimitSettings, StopSettings
+from orchestrator.strategies.deployment.disturbances import RiskSettings
+from orchestrator.strategies.deployment.model_check import TrustSettings
+from orchestrator.strategies.deployment.model_monitoring import (
+    DiscrepancyPolicySettings,
+    RiskLimitSettings,
+    StopSettings,
+)
 from orchestrator.strategies.deployment.objectives import Objective
-from orchestrator.strategies.deployment.prices import PricesSettings
-from orchestrator.strategies.deployment.risk import RiskSettings
-from orchestrator.strategies.deployment.trust import TrustSettings
-from orchestrator.strategies.deployment.window import WindowSettings
-from orchestrator.strategies.doors import OBJECTIVES, STRATEGIES
+from orchestrator.strategies.deployment.safe_window import WindowSettings
+from orchestrator.strategies.deployment.time_costs import PricesSettings
+from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES
+from orchestrator.study import study_file as study
 from sim_engine.action import ACTION_DIMENSIONS
-from sim_engine.liquid import SimulationParameters
-from sim_engine.liquids import KNOWN, ROOM
+from sim_engine.liquids import KNOWN, ROOM, SimulationParameters
+from sim_engine.settings.model import Choice, Section
+from sim_engine.settings.quantity import Quantity
 from sim_engine.validation import sensitivity
 
 FOLDER = Path(__file__).parent
@@ -60,7 +67,7 @@ SECTIONS: dict[str, type[Section]] = {
     "risk": RiskSettings,
     "window": WindowSettings,
     "prices": PricesSettings,
-    "ignorance": IgnoranceSettings,
+    "ignorance": DiscrepancyPolicySettings,
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
     "data": campaign.DataSection,
@@ -395,7 +402,7 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
 
 
 def _shown(value: float, quantity: Quantity) -> str:
-    from orchestrator.config.yaml.quantities import format_quantity
+    from sim_engine.settings.quantity import format_quantity
 
     return format_quantity(float(value), quantity.unit, quantity.display).split(" ", 1)[0]
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import Literal
 
-from actors.optimizer.core.problem import Suggestion, SuggestProblem
+from actors.optimizer.questions import Suggestion, SuggestProblem
 from sim_engine.action import Action
-from sim_engine.bands import LEVEL
-from sim_engine.liquid import SimulationParameters
+from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
-from sim_engine.task import PoseError
+from sim_engine.prediction_band import LEVEL
+from sim_engine.scene import PoseError
 
 _NORMAL = NormalDist()
 
@@ -25,7 +25,7 @@ class Prediction:
         mean: expected loss.
         deviation: standard deviation of that expectation: how well it is known.
         scatter: standard deviation of a single pour around it (in simulation: of a single seed); None if unknown.
-        band: the shortest interval that a single pour lies in with a probability of `sim_engine.bands.LEVEL`; None if
+        band: the shortest interval that a single pour lies in with a probability of `sim_engine.prediction_band.LEVEL`; None if
             unknown.
     """
 
@@ -132,7 +132,7 @@ class Suggested:
 
 @dataclass(frozen=True)
 class Answered:
-    """Outcome of an `Ask`: one of its options."""
+    """Outcome of an `AskOperator`: one of its options."""
 
     answer: str
 
@@ -176,4 +176,4 @@ class Decision:
 
 
 Order = Literal["logical", "completion"]
-"""The order in which outcomes are told; see `orchestrator.scheduler`."""
+"""The order in which outcomes are told; see `orchestrator.runs.stage_scheduler`."""

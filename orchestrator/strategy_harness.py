@@ -8,7 +8,7 @@
 
 `StrategyHarness` answers every request at once: simulations and pours with functions of the action, questions to the
 optimiser with the optimiser itself. `check_strategy` is to a strategy what `ArmContract` is to an arm. There are no
-processes, clocks or files here: those belong to `orchestrator.scheduler`. Every failure is an AssertionError.
+processes, clocks or files here: those belong to `orchestrator.runs.stage_scheduler`. Every failure is an AssertionError.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from typing import Literal
 
 import numpy as np
 
-from actors.optimizer.core.propose import propose
-from orchestrator.errors import LearningError, RunError
+from actors.optimizer.suggest import propose
+from orchestrator.journal.stage_results import decode_result, encode_result
 from orchestrator.requests import (
     Ask,
     Failed,
@@ -36,14 +36,14 @@ from orchestrator.requests import (
     Suggest,
     Suggested,
 )
-from orchestrator.results import decode_result, encode_result
-from orchestrator.strategies.protocol import Strategy
+from orchestrator.run_errors import LearningError, RunError
+from orchestrator.strategies.strategy import Strategy
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
-from sim_engine.space import Axis, Space
-from sim_engine.task import PoseError, Scene
-from sim_engine.vessel.spec import cylinder
+from sim_engine.scene import PoseError, Scene
+from sim_engine.search_space import Axis, Space
+from sim_engine.vessel.shapes import cylinder
 
 SpillModel = Callable[[Action, SimulationParameters, np.random.Generator], float]
 """Share of the poured liquid that is spilled, 0 … 1. ValueError: the action is invalid; NaN: the trial fails."""

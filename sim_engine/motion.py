@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sim_engine.action import Action
 from sim_engine.hydrostatics import predicted_end_of_flow
-from sim_engine.task import Scene
+from sim_engine.scene import Scene
 from sim_engine.vessel.vessel import Vessel
 
 FloatArray = NDArray[np.float64]

@@ -1,10 +1,21 @@
-"""What came of a pour, simulated or weighed: plain values."""
+"""What came of a pour, simulated or weighed: plain values.
+
+A simulated pour: what came of it, and its particles at some times where those were asked for.
+
+What is minimised, written down once.
+
+Calibration compares the normalised spillage r = spilled / poured, which is undefined below 5 % poured.
+Deployment minimises, by default, (spilled + w·retained) / loaded, so that not pouring is not a solution.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 
 class ParticleState(IntEnum):
@@ -130,3 +141,86 @@ class PourMeasurement:
     def fractions(self) -> Fractions:
         """Poured, spilled, retained as fractions of the load."""
         return Fractions(1.0 - self.retained / self.loaded, self.spilled / self.loaded, self.retained / self.loaded)
+
+
+@dataclass(frozen=True)
+class RecordedFrames:
+    """Particles at some times.
+
+    Attributes:
+        times: (F,) [s].
+        positions: F arrays (N, 3) float32, world [m].
+        states: F arrays (N,) uint8, `sim_engine.outcome.ParticleState`.
+        pourer_poses: (F, 7): x y z qw qx qy qz of the pourer.
+    """
+
+    times: NDArray[np.float64]
+    positions: list[NDArray[np.float32]]
+    states: list[NDArray[np.uint8]]
+    pourer_poses: NDArray[np.float64]
+
+    def copied(self) -> RecordedFrames:
+        """The same in memory of its own."""
+        positions, states = [np.array(p) for p in self.positions], [np.array(s) for s in self.states]
+        return RecordedFrames(np.array(self.times), positions, states, np.array(self.pourer_poses))
+
+
+@dataclass(frozen=True)
+class SimulatedPour:
+    """A simulated pour; `frames` only if the task asked for any."""
+
+    outcome: PourOutcome
+    frames: RecordedFrames | None = None
+
+    def copied(self) -> SimulatedPour:
+        """The same in memory of its own: arrays from a shared store would hold that for as long as they live."""
+        return self if self.frames is None else SimulatedPour(self.outcome, self.frames.copied())
+
+
+MINIMUM_POURED = 0.05
+"""Smallest poured fraction at which r = spilled / poured is defined."""
+
+LossName = Literal["spilled_and_retained", "normalised", "grams", "particles"]
+
+
+def normalised_spillage(fractions: Fractions) -> float | None:
+    """The paper's c = C / k: spilled over poured; None (undefined) below `MINIMUM_POURED`.
+
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.1.
+    """
+    if fractions.poured < MINIMUM_POURED:
+        return None
+    return fractions.spilled / fractions.poured
+
+
+@dataclass(frozen=True)
+class Loss:
+    """A deployment loss.
+
+    Attributes:
+        name: `spilled_and_retained` is Decant's default, (spilled + w·retained) / loaded. The paper's own:
+            `normalised` (spilled / poured), `grams` (spilled mass), `particles` (number spilled).
+        retained_weight: w of the default loss.
+    """
+
+    name: LossName = "spilled_and_retained"
+    retained_weight: float = 1.0
+
+    def __call__(self, fractions: Fractions, *, loaded_mass: float, particles: int) -> float | None:
+        """Loss of a pour, to be minimised; None where it is undefined.
+
+        Args:
+            fractions: what came of the pour.
+            loaded_mass: [kg], for `grams`.
+            particles: number of particles that a simulation of it has (for a real pour: that the simulator would
+                have), for `particles`.
+        """
+        match self.name:
+            case "spilled_and_retained":
+                return fractions.spilled + self.retained_weight * fractions.retained
+            case "normalised":
+                return normalised_spillage(fractions)
+            case "grams":
+                return fractions.spilled * loaded_mass * 1e3
+            case "particles":
+                return fractions.spilled * particles

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.state_directory import VARIABLE
+from orchestrator.catalogue.run_registry import VARIABLE
 from tests.depth import load_profile
 
 load_profile()

@@ -1,6 +1,6 @@
 """A Ray cluster of several nodes on this machine, started as people start one, whose nodes can be killed.
 
-Its processes carry the mark by which `actors.ray_warden` finds them: a warden ends them when the test's process is
+Its processes carry the mark by which `actors.runtime.ray_cleanup` finds them: a warden ends them when the test's process is
 gone, however it went.
 """
 
@@ -18,8 +18,8 @@ from pathlib import Path
 
 import psutil
 
-from actors.child_process import child_environment
-from actors.ray_warden import MARK, cluster_processes, end_cluster
+from actors.runtime.child_process import child_environment
+from actors.runtime.ray_cleanup import MARK, cluster_processes, end_cluster
 from tests.patience import PATIENCE
 
 NOT_OURS = ("ray::IDLE", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
@@ -44,7 +44,7 @@ class LocalCluster:
             self.address = f"127.0.0.2:{free.getsockname()[1]}"
         self._raylets: list[psutil.Process] = []
         self._warden = subprocess.Popen(
-            [sys.executable, "-m", "actors.ray_warden", str(self.folder)],
+            [sys.executable, "-m", "actors.runtime.ray_cleanup", str(self.folder)],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
 from scipy.ndimage import gaussian_filter
 
-from sim_engine.vessel.build import build_vessel
 from sim_engine.vessel.profile import outer_profile
-from sim_engine.vessel.sources.evidence import held_when_tilted
-from sim_engine.vessel.sources.outline import volume_below
-from sim_engine.vessel.spec import ProfileShape, VesselSpec
+from sim_engine.vessel.shapes import ProfileShape, VesselSpec
+from sim_engine.vessel.vessel import build_vessel
+from sim_engine.vessel_acquisition.measurements import held_when_tilted
+from sim_engine.vessel_acquisition.outline_fit import volume_below
 
 Floats = NDArray[np.float64]
 

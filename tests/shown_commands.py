@@ -92,8 +92,8 @@ def write_scratch(folder: Path) -> str:
 
     Laboratories wait for nothing and need no Ray; liquids are coarse; there are few pours and few simulations.
     """
-    from orchestrator.config.load import load_campaign
-    from orchestrator.publish import publish
+    from orchestrator.config.file_loading import load_campaign
+    from orchestrator.results.publishing import publish
 
     shutil.copytree(ROOT / "configs", folder / "configs")
     _change(folder / "configs/laboratories/twin.yaml", _small_laboratory)
@@ -113,8 +113,8 @@ def write_scratch(folder: Path) -> str:
 
 async def _played(plan: Any, directory: Path, pours: int | None) -> Any:
     """The campaign in a world whose spillage is a formula; paused after so many pours."""
-    from actors.optimizer.actor import Proposer
-    from orchestrator.campaign import run_campaign
+    from actors.optimizer.optimizer_actor import Proposer
+    from orchestrator.runs.run_engine import run_campaign
     from tests.orchestrator.toy import ToyBench, ToyLaboratory
 
     class Optimizer:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.child_process import child_environment
-from sim_engine.fill import fill
+from actors.runtime.child_process import child_environment
+from sim_engine.simulator import fill
 
 ROOT = Path(__file__).parent.parent
 BENCHMARKS = ROOT / "benchmarks"

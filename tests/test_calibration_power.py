@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from orchestrator.config.load import load_campaign
-from orchestrator.plan import CalibrationPlan
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.strategies.campaign_plan import CalibrationPlan
 from sim_engine.action import DEG
-from sim_engine.liquid import SimulationParameters
+from sim_engine.liquids import SimulationParameters
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from actors.optimizer.core.propose import propose
-from orchestrator.config.load import load_campaign
-from orchestrator.plan import CampaignPlan
+from actors.optimizer.suggest import propose
+from orchestrator.config.file_loading import load_campaign
 from orchestrator.requests import Outcome, Request, Simulate, Simulated, Suggest, Suggested
+from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategy_harness import outcome_of
 from sim_engine.action import Action
 

@@ -13,18 +13,18 @@ from types import ModuleType
 import pytest
 import typer.main
 
-from actors.child_process import child_environment
-from orchestrator.cli import app
-from orchestrator.commands import common
-from orchestrator.config.load import load_campaign, load_vessel
-from orchestrator.journal import Kind
-from orchestrator.unknown import OperatorNeededError
-from sim_engine import regimes
+from actors.runtime.child_process import child_environment
+from orchestrator.cli import foreground_run as common
+from orchestrator.cli.app import app
+from orchestrator.config.file_loading import load_campaign, load_vessel
+from orchestrator.journal.journal import Kind
+from orchestrator.runs.unknown_pours import OperatorNeededError
+from sim_engine import model_validity as regimes
 from sim_engine.action import DEG, Action
-from sim_engine.lip import EDGE
-from sim_engine.liquid import Liquid
-from sim_engine.task import Scene
-from sim_engine.vessel.build import build_vessel
+from sim_engine.lip_flow import EDGE
+from sim_engine.liquids import Liquid
+from sim_engine.scene import Scene
+from sim_engine.vessel.vessel import build_vessel
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "configs").rglob("*.md")])
@@ -173,7 +173,7 @@ def test_numbers_of_a_pour_on_the_page_are_those_of_the_code() -> None:
     beaker, tumbler = (load_vessel(ROOT / "configs" / "vessels" / f"{name}.yaml") for name in ("beaker", "tumbler"))
     scene = Scene("page", beaker, tumbler, Liquid(mass=0.1996))
 
-    def told(speed: float, tilt: float) -> regimes.Regimes:
+    def told(speed: float, tilt: float) -> regimes.ModelValidity:
         action = Action(angular_velocity=speed * DEG, max_angle=tilt * DEG, x_offset=0.1, height=0.1)
         return regimes.regimes(scene, action, build_vessel(beaker), build_vessel(tumbler), spacing=1e-3)
 

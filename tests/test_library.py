@@ -159,13 +159,13 @@ def test_a_program_of_a_user_passes_a_strict_type_check_and_misspelt_names_do_no
 
 
 def test_every_public_error_is_a_decant_error_and_what_it_was_before() -> None:
-    from orchestrator.codec import CodecError
-    from orchestrator.jobs import JobError
-    from orchestrator.journal_file import JournalError
-    from sim_engine.backend import BackendError
-    from sim_engine.doors import DoorError
+    from orchestrator.journal.codec import CodecError
+    from orchestrator.journal.journal_file import JournalError
+    from orchestrator.runs.run_tasks import RunTaskError
     from sim_engine.errors import InvalidSceneError
-    from sim_engine.vessel.errors import VesselError
+    from sim_engine.resources import BackendError
+    from sim_engine.settings.plugin_registry import PluginError
+    from sim_engine.vessel.shapes import VesselError
 
     before: dict[type[Exception], type[Exception]] = {
         decant.AssignmentError: ValueError,
@@ -176,9 +176,9 @@ def test_every_public_error_is_a_decant_error_and_what_it_was_before() -> None:
         decant.RunError: Exception,
         BackendError: RuntimeError,
         CodecError: ValueError,
-        DoorError: LookupError,
+        PluginError: LookupError,
         InvalidSceneError: ValueError,
-        JobError: ValueError,
+        RunTaskError: ValueError,
         JournalError: decant.RunError,
         VesselError: ValueError,
     }
@@ -251,7 +251,7 @@ def fake_simulators(monkeypatch: pytest.MonkeyPatch) -> None:
     from actors.laboratory import open_laboratory
     from tests.actors.conftest import make_fake
 
-    monkeypatch.setattr("decant.driving.open_laboratory", partial(open_laboratory, make=make_fake()))
+    monkeypatch.setattr("decant.running.open_laboratory", partial(open_laboratory, make=make_fake()))
 
 
 def test_draws_of_theta_that_no_calibration_makes_are_refused_before_a_run_begins(tmp_path: Path) -> None:

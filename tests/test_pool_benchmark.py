@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 from tests.patience import PATIENCE
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "pool_speed.py"

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from orchestrator.strategy_harness import SCENE
-from sim_engine.liquid import SimulationParameters
-from sim_engine.task import PourTask
+from sim_engine.liquids import SimulationParameters
+from sim_engine.scene import PourTask
 from tests.actors.conftest import make_fake
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from actors.child_process import run
+from actors.runtime.child_process import run
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parents[1]

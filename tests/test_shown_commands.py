@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from orchestrator.cli import app
-from orchestrator.commands import speaking
+from orchestrator.cli import console as speaking
+from orchestrator.cli.app import app
 from tests.shown_commands import PAGES, REASONS, ROOT, TESTED, Block, arguments_of, blocks_of, write_scratch
 
 QUICKSTART = ROOT / "configs" / "campaigns" / "quickstart.yaml"
@@ -113,7 +113,7 @@ def test_a_long_command_does_what_the_page_says(command: str, scratch: tuple[Pat
 
 def decant(arguments: list[str], folder: Path) -> Any:
     """The program, as from a terminal that nobody types in."""
-    program = [sys.executable, "-c", "from orchestrator.cli import main; main()", *arguments]
+    program = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", *arguments]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run(
         program, cwd=folder, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=800

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 from orchestrator.shipped import STARTING_SET
-from sim_engine.extras import EXTRAS
+from sim_engine.resources import EXTRAS
 
 ROOT = Path(__file__).parents[1]
 
@@ -34,9 +34,9 @@ importlib.util.find_spec = lambda name, package=None: None if name in {sorted(EX
 
 HARNESS = """
 from decant.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
-from orchestrator.plan import DeploymentPlan
+from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.d2 import D2Settings
-from sim_engine.losses import Loss
+from sim_engine.outcome import Loss
 
 def spill(action, theta, rng):
     return abs(action.x_offset - 0.12)
@@ -52,7 +52,7 @@ print(len(StrategyHarness(spill).run(make()).pours), "pours")
 
 CONTRACT = """
 import pytest
-from actors.arm.numbers import NumbersArm, NumbersSpec
+from actors.arm.simulated_arm import NumbersArm, NumbersSpec
 from decant.testing import ACTIONS, SCENE, ArmBench, ArmContract
 
 class TestMyArm(ArmContract):
@@ -77,7 +77,7 @@ def run(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 def command(*arguments: str) -> str:
-    return f"{BLOCKED}\nfrom orchestrator.cli import main\nsys.argv = {['decant', *arguments]!r}\nmain()"
+    return f"{BLOCKED}\nfrom orchestrator.cli.app import main\nsys.argv = {['decant', *arguments]!r}\nmain()"
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +174,7 @@ def test_without_extras_one_simulates_and_plans(tmp_path: Path) -> None:
 
 
 def test_without_extras_a_table_says_what_to_install(tmp_path: Path) -> None:
-    code = f"{BLOCKED}\nfrom decant.runs import _frame\n_frame(iter([]))"
+    code = f"{BLOCKED}\nfrom decant.run_results import _frame\n_frame(iter([]))"
     done = run(code, tmp_path)
     assert "pip install 'decant[tables]'" in done.stderr
 

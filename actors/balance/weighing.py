@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
 
-from actors.balance.actor import DeviceBalance
-from actors.balance.errors import (
+from actors.balance.balance_device import DeviceBalance
+from actors.balance.balance_interface import (
     BalanceError,
     CommandError,
     NotStableError,
@@ -13,11 +13,17 @@ from actors.balance.errors import (
     ReferenceLostError,
     UnitError,
 )
-from actors.balance.masses import Weighed, loaded_mass, measurement, weighing_uncertainty
-from actors.balance.placement import Step, weighings
-from actors.balance.spec import BalanceSpec
-from actors.balance.typed import typed_weight
-from actors.operator import Question
+from actors.balance.balance_settings import BalanceSpec
+from actors.balance.readings import typed_weight
+from actors.balance.weighing_plan import (
+    PourMasses,
+    WeighingStep,
+    loaded_mass,
+    measurement,
+    weighing_uncertainty,
+    weighings,
+)
+from actors.interfaces import OperatorQuestion
 from sim_engine.outcome import PourMeasurement
 
 MENDABLE = (NotStableError, OutOfRangeError, CommandError, UnitError)
@@ -26,7 +32,7 @@ MENDABLE = (NotStableError, OutOfRangeError, CommandError, UnitError)
 AGAIN = "The balance can't be used as it is. Mend it, and leave what is on it. Is it mended, to be tried again?"
 
 
-Ask = Callable[[Question], Awaitable[str]]
+AskOperator = Callable[[OperatorQuestion], Awaitable[str]]
 """Asks a person and awaits the answer; raises `LaboratoryError` where none comes, or the pour is given up."""
 
 
@@ -46,24 +52,24 @@ class Weighings:
         self,
         spec: BalanceSpec,
         balance: DeviceBalance | None,
-        ask: Ask,
-        known: Mapping[str, Weighed] | None = None,
-        weighed: Callable[[str, Weighed], None] = lambda key, weight: None,
+        ask: AskOperator,
+        known: Mapping[str, PourMasses] | None = None,
+        weighed: Callable[[str, PourMasses], None] = lambda key, weight: None,
         nominal: float | None = None,
     ) -> None:
         self._spec, self._balance, self._ask, self._tell, self._nominal = spec, balance, ask, weighed, nominal
         self._known = dict(known or {})
         self._steps = weighings(spec.placement, known=self._known, pourer_elsewhere=spec.pourer_elsewhere)
-        self._weighed: dict[str, Weighed] = {}
+        self._weighed: dict[str, PourMasses] = {}
 
     @property
-    def lasting(self) -> dict[str, Weighed]:
+    def lasting(self) -> dict[str, PourMasses]:
         """Weighings that hold for later pours with the same vessels."""
         once = {step.key: self._weighed[step.key] for step in self._steps if self._lasts(step)}
         return self._known | once
 
     @property
-    def weighed(self) -> dict[str, Weighed]:
+    def weighed(self) -> dict[str, PourMasses]:
         """All weighings so far, those of earlier pours that still hold included."""
         return self._known | self._weighed
 
@@ -111,17 +117,17 @@ class Weighings:
     def _pour(self) -> int:
         return next(i for i, step in enumerate(self._steps) if step.do == "pour")
 
-    def _lasts(self, step: Step) -> bool:
+    def _lasts(self, step: WeighingStep) -> bool:
         return step.when == "once" and step.key in self._weighed
 
-    async def _do(self, step: Step) -> None:
+    async def _do(self, step: WeighingStep) -> None:
         """One step; asked for where hands are needed, and again until it is done."""
         problem, typed = "", step.by == "operator"
         while True:
             answer = ""
             if step.hands or problem:
                 answer = await self._ask(
-                    Question(step.put, "weight" if typed else "done", problem, about=step.key or step.about)
+                    OperatorQuestion(step.put, "weight" if typed else "done", problem, about=step.key or step.about)
                 )
             try:
                 if typed:
@@ -136,12 +142,12 @@ class Weighings:
             except ReferenceLostError:
                 raise  # asked already
             except BalanceError as error:
-                question = Question(AGAIN, "yes or no", str(error), about="balance")
+                question = OperatorQuestion(AGAIN, "yes or no", str(error), about="balance")
                 if self._balance is None or not _is_yes(await self._ask(question)):
                     raise
                 problem = ""
 
-    def _misfilled(self, step: Step) -> str:
+    def _misfilled(self, step: WeighingStep) -> str:
         """What is wrong with the load that was just weighed; '' if nothing is."""
         if step.key != "pourer_full" or self._nominal is None:
             return ""
@@ -151,15 +157,15 @@ class Weighings:
         allowed = f"{1e3 * self._nominal:g} ± {1e3 * self._spec.load_tolerance:g} g"
         return f"{1e3 * loaded:.2f} g are in the pourer, but {allowed} are asked for; fill anew"
 
-    def _note(self, key: str, weighed: Weighed) -> None:
+    def _note(self, key: str, weighed: PourMasses) -> None:
         self._weighed[key] = weighed
         self._tell(key, weighed)
 
-    def _typed(self, answer: str) -> Weighed:
+    def _typed(self, answer: str) -> PourMasses:
         typed = typed_weight(answer)
-        return Weighed(typed.mass, weighing_uncertainty(typed.step, self._repeatability, tared=False))
+        return PourMasses(typed.mass, weighing_uncertainty(typed.step, self._repeatability, tared=False))
 
-    async def _read(self, step: Step) -> None:
+    async def _read(self, step: WeighingStep) -> None:
         """Tare or weigh on the balance here."""
         if self._balance is None:
             raise BalanceError(f"'{step.put}' needs a balance, and none is connected")
@@ -169,7 +175,7 @@ class Weighings:
         try:
             weight = await self._balance.weigh()
         except ReferenceLostError as error:
-            question = Question(
+            question = OperatorQuestion(
                 "Did the balance stay switched on, and does it still show this weight?",
                 "yes or no",
                 str(error),
@@ -180,7 +186,7 @@ class Weighings:
                 raise
             await self._balance.keep_reference()
             weight = await self._balance.weigh()
-        self._note(step.key, Weighed(weight.mass, weighing_uncertainty(weight.step, self._repeatability)))
+        self._note(step.key, PourMasses(weight.mass, weighing_uncertainty(weight.step, self._repeatability)))
 
     @property
     def _repeatability(self) -> float:

@@ -3,6 +3,8 @@
 Nothing of it is known to those who learn but what the balance shows. What the arm executed counts, and neither what was
 planned nor what the driver believes: a motion that was broken off leaves liquid in the pourer, or lets it run on while
 the pourer stands tilted. Where part of a motion is not known, nobody says what became of the liquid.
+
+Which part of what an arm did is the pour, and what a pourer did that sits askew in the fingers.
 """
 
 from __future__ import annotations
@@ -15,21 +17,83 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from actors.arm.protocol import Executed, PlannedPour
-from actors.arm.spec import UrArmSpec
-from actors.bench.device_stand_ins import DeviceStandIns
-from actors.bench.executed import executed_pour, slipped
-from actors.bench.hidden import draw_pose_error, hidden_pour, spill_of, stream
-from actors.bench.spec import VirtualBenchSpec
-from actors.bench.stand_ins import History
+from actors.arm.arm_interface import Executed, PlannedPour
+from actors.arm.arm_settings import UrArmSpec
+from actors.bench.device_emulators import DeviceEmulators, History
+from actors.bench.ground_truth import draw_pose_error, hidden_pour, spill_of, stream
 from actors.bench.virtual_operator import Hands
-from actors.protocols import LaboratoryError, SimulatorPool
+from actors.interfaces import LaboratoryError, SimulatorPool
+from actors.laboratory_settings import VirtualBenchSpec
 from sim_engine.action import Action
-from sim_engine.liquid import SimulationParameters
-from sim_engine.sampled_motion import SampledMotion
-from sim_engine.simulated import RecordedFrames
-from sim_engine.task import PoseError, PourTask, Scene
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import RecordedFrames
+from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
+
+FloatArray = NDArray[np.float64]
+
+AT_START = 2e-3
+"""How near the pour's first pose the arm stands when it begins [rad]."""
+
+AT_REST = 1e-6
+"""Joints that change by less from sample to sample stand still [rad]."""
+
+LONGEST_REST = 6.0
+"""Rest in the middle of a motion is simulated for so long [s]: what runs out meanwhile has run out by then."""
+
+
+def slipped(motion: SampledMotion, grip_tilt: float) -> SampledMotion:
+    """The motion of a pourer that sits in the fingers turned by so much [rad] about the y axis of its underside."""
+    c, s = math.cos(0.5 * grip_tilt), math.sin(0.5 * grip_tilt)
+    w, x, y, z = (motion.poses[:, k] for k in range(3, 7))
+    turned = np.stack([c * w - s * y, c * x - s * z, c * y + s * w, c * z + s * x], axis=-1)
+    return SampledMotion(motion.times, np.concatenate([motion.poses[:, :3], turned], axis=-1))
+
+
+def executed_pour(times: FloatArray, joints: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """The part of a history that is the pour: from the first movement away from its first pose to the last movement.
+
+    The clock plays no part in where it begins or ends, and long rests are shortened, so that the same motion is cut the
+    same however long anybody took over it.
+
+    Args:
+        times: shape (T,), increasing [s].
+        joints: shape (T, 6) [rad].
+        start: the pour's first joints, shape (6,) [rad].
+
+    Returns:
+        Times from 0, and joints; None if nothing moved after the arm had stood there.
+    """
+    away = np.max(np.abs(joints - start), axis=1) >= AT_START
+    moves = np.max(np.abs(np.diff(joints, axis=0)), axis=1) > AT_REST
+    rests = np.flatnonzero(~away[:-1] & ~moves)
+    if len(rests) == 0:
+        return None
+    first = int(rests[0])
+    left = np.flatnonzero(away[first:])
+    if len(left) == 0:
+        return None
+    begin = first + int(left[0])
+    while begin > first and moves[begin - 1]:
+        begin -= 1
+    end = begin + int(np.flatnonzero(moves[begin:])[-1]) + 1
+    return _without_long_rests(np.diff(times[begin : end + 1]), moves[begin:end], joints[begin : end + 1])
+
+
+def _without_long_rests(
+    gaps: FloatArray, moved: NDArray[np.bool_], joints: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Times from 0; of a rest only its beginning is kept."""
+    kept, now, rest = [(0.0, 0)], 0.0, 0.0
+    for i, (gap, moves) in enumerate(zip(gaps, moved, strict=True), start=1):
+        allowed = float(gap) if moves else min(float(gap), LONGEST_REST - rest)
+        rest = 0.0 if moves else rest + allowed
+        if allowed > 0.0:
+            now += allowed
+            kept.append((now, i))
+    return np.array([t for t, _ in kept]), joints[[i for _, i in kept]]
+
 
 T = TypeVar("T")
 
@@ -71,7 +135,7 @@ class PourAsk:
             self.show(frames)
 
 
-class Nature:
+class GroundTruth:
     """What happens around arm and balance during a pour. On hardware nobody here has to do anything about it.
 
     Args:
@@ -122,7 +186,7 @@ class Nature:
         """The pour is over, however."""
 
 
-class VirtualBench(Nature):
+class VirtualBench(GroundTruth):
     """A bench without hardware, whose liquid follows what the arm read back.
 
     Args:
@@ -137,7 +201,7 @@ class VirtualBench(Nature):
         self,
         spec: VirtualBenchSpec,
         time_scale: float,
-        stand_ins: DeviceStandIns,
+        stand_ins: DeviceEmulators,
         hands: Hands,
         simulators: SimulatorPool,
     ) -> None:
@@ -148,7 +212,7 @@ class VirtualBench(Nature):
         self._landed = False
 
     async def prepare(self, pour: PourAsk) -> None:
-        """See `Nature.prepare`."""
+        """See `GroundTruth.prepare`."""
         self._pour = pour
         self._hands.prepare(pour.scene.liquid.mass, stream(pour.seed, "arm"))
         await self.stand_ins.prepare(stream(pour.seed, "balance"))
@@ -156,12 +220,12 @@ class VirtualBench(Nature):
 
     @contextlib.asynccontextmanager
     async def followed(self) -> AsyncIterator[None]:
-        """See `Nature.followed`."""
+        """See `GroundTruth.followed`."""
         self._landed = False
         yield
 
     async def lands(self, executed: Executed | None, broken: Exception | None) -> None:
-        """See `Nature.lands`: the liquid follows, once, and the balance carries what became of it.
+        """See `GroundTruth.lands`: the liquid follows, once, and the balance carries what became of it.
 
         Raises:
             LaboratoryError: with the errors of this pour's placement the vessels would touch, the liquid could not be
@@ -211,7 +275,7 @@ class FollowedBench(VirtualBench):
         self,
         spec: VirtualBenchSpec,
         arm: UrArmSpec,
-        stand_ins: DeviceStandIns,
+        stand_ins: DeviceEmulators,
         hands: Hands,
         simulators: SimulatorPool,
     ) -> None:
@@ -225,7 +289,7 @@ class FollowedBench(VirtualBench):
 
     @contextlib.asynccontextmanager
     async def followed(self) -> AsyncIterator[None]:
-        """See `Nature.followed`: what the arm does is noted again and again, however long anybody needs."""
+        """See `GroundTruth.followed`: what the arm does is noted again and again, however long anybody needs."""
         self._times, self._joints, self._landed, self._gap = [], [], False, ""
         self._earlier, self._since = 0.0, (await self.stand_ins.history(math.inf)).now
         following = asyncio.create_task(self._follow())
@@ -275,7 +339,7 @@ class FollowedBench(VirtualBench):
 
     def _motion(self, executed: Executed | None, grip_tilt: float) -> SampledMotion | None:
         """What the pourer truly did, from the pour's first pose on; None if it never left it."""
-        from actors.arm.path.transforms import pourer_motion
+        from actors.arm.planning.frames import pourer_motion
 
         if self._gap:
             raise LaboratoryError(

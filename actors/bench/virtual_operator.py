@@ -1,17 +1,103 @@
-"""The person at a virtual bench: does what questions ask, takes a person's time for it, and answers."""
+"""The person at a virtual bench: does what questions ask, takes a person's time for it, and answers.
+
+What stands where on a virtual bench, and what is in it: what its balance carries follows from that. Pure.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import math
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from actors.bench.things import Things
-from actors.operator import Operator, Question
-from actors.protocols import LaboratoryError
+from actors.balance.weighing_plan import Placement
+from actors.interfaces import LaboratoryError, Operator, OperatorQuestion
+
+POURER, RECEIVER, TRAY = 0.312, 0.186, 0.428
+"""Dry masses [kg]: of glass beakers and a steel tray, so that nothing cancels by chance."""
+
+
+@dataclass
+class BenchContents:
+    """Pourer, receiver and tray around a balance.
+
+    Attributes:
+        placement: where the balance stands.
+        on_balance: what of 'pourer', 'receiver', 'tray' stands on it.
+        in_pourer, in_receiver, on_tray: liquid [kg].
+    """
+
+    placement: Placement
+    on_balance: set[str] = field(default_factory=set)
+    in_pourer: float = 0.0
+    in_receiver: float = 0.0
+    on_tray: float = 0.0
+
+    def mass(self, name: str) -> float:
+        """Mass of a thing with what is in it [kg]."""
+        dry = {"dry pourer": POURER, "pourer": POURER, "receiver": RECEIVER, "tray": TRAY}[name]
+        return dry + {"pourer": self.in_pourer, "receiver": self.in_receiver, "tray": self.on_tray}.get(name, 0.0)
+
+    @property
+    def carried(self) -> float:
+        """By the balance [kg]."""
+        return sum(self.mass(name) for name in self.on_balance)
+
+    def receive(self, spilled: float, retained: float) -> None:
+        """A pour is over, or was broken off.
+
+        Args:
+            spilled: beside the receiver [kg].
+            retained: still in the pourer [kg].
+        """
+        self.in_receiver += self.in_pourer - spilled - retained
+        self.on_tray += spilled
+        self.in_pourer = retained
+
+    def do(self, about: str, fill: float) -> None:
+        """What a question of a pour's weighings asks for; anything else changes nothing.
+
+        Args:
+            about: of the question, see `actors.balance.weighing_plan`.
+            fill: what the pourer is filled with, if it is to be filled [kg].
+        """
+        under = {"tray"} if self.placement in (Placement.TRAY, Placement.EVERYTHING) else set()
+        alone = self.placement in (Placement.TRAY, Placement.TARED)
+        match about:
+            case "tray_wiped":
+                self.on_tray, self.on_balance = 0.0, under
+            case "dry_pourer" | "dry_pourer_after":
+                self.on_balance = {"dry pourer"}
+            case "cleared" | "cleared_after":
+                self.on_balance = set()
+            case "pourer_empty":
+                self.in_pourer, self.on_balance = 0.0, under | {"pourer"}
+            case "pourer_full":
+                self.in_pourer, self.on_balance = fill, under | {"pourer"}
+            case "receiver_empty":
+                self.in_receiver, self.on_balance = 0.0, under | {"receiver"}
+            case "set_up":
+                self.in_receiver, self.on_tray = 0.0, 0.0
+                self.on_balance = {"tray"} if alone else under | {"receiver"}
+            case "tray_before":
+                self.in_receiver, self.on_tray = 0.0, 0.0
+            case "receiver_gone":
+                self.on_balance = under
+            case "pourer_after":
+                self.on_balance = under | {"pourer"}
+
+    def typed(self, about: str, step: float) -> str:
+        """What somebody reads off another scale and types.
+
+        Args:
+            about: a weighing's key.
+            step: of that scale [kg].
+        """
+        mass = self.mass(about.partition("_")[0])
+        return f"{1e3 * round(mass / step) * step:.1f} g"
+
 
 SCATTER = 1e-3
 """Standard deviation of a filling by hand [kg]."""
@@ -51,7 +137,7 @@ class Hands:
         put: changes what is on the balance; None where there is none.
     """
 
-    def __init__(self, things: Things, put: Put | None) -> None:
+    def __init__(self, things: BenchContents, put: Put | None) -> None:
         self.things, self._put = things, put
         self._rng = np.random.default_rng(0)
         self._load = 0.0
@@ -65,7 +151,7 @@ class Hands:
         """
         self._load, self._rng = load, np.random.default_rng(seed)
 
-    async def do(self, question: Question) -> None:
+    async def do(self, question: OperatorQuestion) -> None:
         """What a question asks for."""
         self.things.do(question.about, self._load + float(self._rng.normal(0.0, SCATTER)))
         if self._put is not None and question.wants == "done":
@@ -73,7 +159,7 @@ class Hands:
 
 
 class VirtualOperator:
-    """See `actors.operator.Operator`. Mends what it is told of, but not for ever: see `PERSISTENCE`.
+    """See `actors.interfaces.Operator`. Mends what it is told of, but not for ever: see `PERSISTENCE`.
 
     Args:
         hands: that it works with.
@@ -85,7 +171,7 @@ class VirtualOperator:
         self._late: dict[str, float] = {}
         self._answers: dict[str, list[str]] = {}
         self._again = 0
-        self.heard: list[Question] = []
+        self.heard: list[OperatorQuestion] = []
         self.announced: list[tuple[str, float]] = []
 
     def script(self, answers: Mapping[str, Sequence[str]], late: Mapping[str, float]) -> None:
@@ -98,7 +184,7 @@ class VirtualOperator:
         self._answers = {about: list(given) for about, given in answers.items()}
         self._late = dict(late)
 
-    async def ask(self, question: Question) -> str:
+    async def ask(self, question: OperatorQuestion) -> str:
         """See `Operator.ask`."""
         self.heard.append(question)
         about = question.about
@@ -139,7 +225,7 @@ class PlayedOperator:
     def __init__(self, person: Operator, hands: Hands) -> None:
         self._person, self._hands = person, hands
 
-    async def ask(self, question: Question) -> str:
+    async def ask(self, question: OperatorQuestion) -> str:
         """See `Operator.ask`."""
         if question.wants == "weight":  # there is no scale to look at
             await self._hands.do(question)

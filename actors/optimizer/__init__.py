@@ -1,1 +1,1 @@
-"""The optimiser: its pure core, and the actor around it."""
+"""The Bayesian optimiser: linear algebra, and one actor around it."""

@@ -9,9 +9,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.catalogue.columns import TABLES, Column
-from orchestrator.pour_rows import Row
-from sim_engine.extras import require
+from orchestrator.catalogue.catalogue_index import TABLES, Column
+from orchestrator.journal.run_record import Row
+from sim_engine.resources import require
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -15,19 +15,18 @@ import time
 from dataclasses import replace
 from typing import Any
 
-from actors.protocols import LaboratoryError
-from actors.warm import WarmSimulators
-from orchestrator.daemon.feed import Feed
-from orchestrator.daemon.lane import Lane
-from orchestrator.daemon.notify import Counts
-from orchestrator.daemon.people import Asking
-from orchestrator.daemon.reading import Pours
-from orchestrator.daemon.running import Common, Running
-from orchestrator.daemon.settings import DESK, Rig, Settings
-from orchestrator.daemon.store import AT_REST, ENDED, STOPPED, WITHDRAWN, Item, Store, Wish
-from orchestrator.errors import RunError
-from orchestrator.monitor.live import LiveView
-from orchestrator.state_directory import make_state_directory
+from actors.interfaces import LaboratoryError
+from actors.simulators.warm_pool import WarmSimulators
+from orchestrator.catalogue.run_registry import make_state_directory
+from orchestrator.daemon.daemon_settings import DESK, DaemonSettings, Rig
+from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, WITHDRAWN, DesiredState, QueueItem, Store
+from orchestrator.daemon.event_feed import Feed
+from orchestrator.daemon.notifications import Counts
+from orchestrator.daemon.remote_operator import Asking
+from orchestrator.daemon.rig_worker import Common, Lane, Running
+from orchestrator.daemon.run_readout import Pours
+from orchestrator.live_view.live_server import LiveView
+from orchestrator.run_errors import RunError
 
 LEAVING = 10.0
 """Time that campaigns have to come to rest where Ray has died [s]; then those that don't pour are given up."""
@@ -42,7 +41,7 @@ def _emergency_of(rig: str) -> str:
     return f"{EMERGENCY} {rig}"
 
 
-class RefusedError(RunError):
+class RequestRefusedError(RunError):
     """What was asked for can't be done now; the text says why."""
 
 
@@ -54,7 +53,7 @@ class Supervisor:
         live: view that runs are shown in, open already.
     """
 
-    def __init__(self, settings: Settings, live: LiveView | None = None) -> None:
+    def __init__(self, settings: DaemonSettings, live: LiveView | None = None) -> None:
         make_state_directory(settings.state)
         settings.runs.mkdir(parents=True, exist_ok=True)
         settings.snapshots.mkdir(parents=True, exist_ok=True)
@@ -162,7 +161,7 @@ class Supervisor:
             if not any(item.id.endswith(key) for item in self.store.items()):
                 return key
 
-    def submit(self, item: Item) -> Item:
+    def submit(self, item: QueueItem) -> QueueItem:
         """Queue a campaign whose snapshot has been checked.
 
         Raises:
@@ -178,16 +177,18 @@ class Supervisor:
     def refuse_new_work(self, rig: str = "") -> None:
         """Raises RefusedError where nothing new is taken, by the daemon or by one rig."""
         if self.emergency is not None:
-            raise RefusedError("the emergency stop is latched; nothing is taken before somebody has cleared it")
+            raise RequestRefusedError("the emergency stop is latched; nothing is taken before somebody has cleared it")
         if rig in self.emergencies:
-            raise RefusedError(
+            raise RequestRefusedError(
                 f"the emergency stop of rig {rig} is latched; it takes nothing before somebody has cleared it"
             )
         if self.stopping:
             again = "ray" in self.problems
-            raise RefusedError("the daemon is just beginning anew; try again" if again else "the daemon is ending")
+            raise RequestRefusedError(
+                "the daemon is just beginning anew; try again" if again else "the daemon is ending"
+            )
 
-    def item(self, key: str) -> Item:
+    def item(self, key: str) -> QueueItem:
         """A campaign by its id, or by the beginning of one. Raises KeyError."""
         found = self.store.item(key)
         if found is None and len(key) >= 3:
@@ -197,7 +198,7 @@ class Supervisor:
             raise KeyError(key)
         return found
 
-    def move(self, key: str, by: str, *, before: str | None = None, priority: int | None = None) -> Item:
+    def move(self, key: str, by: str, *, before: str | None = None, priority: int | None = None) -> QueueItem:
         """Give a queued campaign another place: in front of another one, at the head (''), or by its priority.
 
         Raises:
@@ -206,14 +207,14 @@ class Supervisor:
         """
         item = self.item(key)
         if item.state != "queued":
-            raise RefusedError(f"{item.id} is {item.state}; only a queued campaign has a place in the queue")
+            raise RequestRefusedError(f"{item.id} is {item.state}; only a queued campaign has a place in the queue")
         if priority is not None:
             self.store.change(item.id, priority=priority)
         if before is not None:
             queue = [one for one in self.store.items(["queued"]) if one.id != item.id]
             at = 0 if before == "" else next((i for i, one in enumerate(queue) if one.id == self.item(before).id), None)
             if at is None:
-                raise RefusedError(f"{before} is not in the queue")
+                raise RequestRefusedError(f"{before} is not in the queue")
             level = queue[at].priority if queue else item.priority
             behind = queue[at].rank if queue else 1.0
             ahead = queue[at - 1].rank if at > 0 and queue[at - 1].priority == level else behind - 2.0
@@ -251,45 +252,47 @@ class Supervisor:
 
     # ---- one campaign
 
-    def pause(self, key: str, by: str) -> Item:
+    def pause(self, key: str, by: str) -> QueueItem:
         """At the next checkpoint."""
-        return self._end(key, by, Wish.PAUSE)
+        return self._end(key, by, DesiredState.PAUSE)
 
-    def stop(self, key: str, by: str) -> Item:
+    def stop(self, key: str, by: str) -> QueueItem:
         """Finish the pour, publish what there is, and leave it at that."""
-        return self._end(key, by, Wish.STOP)
+        return self._end(key, by, DesiredState.STOP)
 
-    def _end(self, key: str, by: str, wish: Wish) -> Item:
+    def _end(self, key: str, by: str, wish: DesiredState) -> QueueItem:
         item = self.item(key)
         running = self._running(item)
         if running is None and item.state in ENDED:
-            raise RefusedError(f"{item.id} is {item.state} already")
+            raise RequestRefusedError(f"{item.id} is {item.state} already")
         if running is not None:
             running.pause()
         self.store.change(item.id, wish=str(wish))
         self.note(by, str(wish), item.id)
         if running is None:
             if item.state == "queued":
-                self.store.change(item.id, state=WITHDRAWN if wish is Wish.STOP else "paused", reason=f"by {by}")
-            elif wish is Wish.STOP:
+                self.store.change(
+                    item.id, state=WITHDRAWN if wish is DesiredState.STOP else "paused", reason=f"by {by}"
+                )
+            elif wish is DesiredState.STOP:
                 self.store.change(item.id, state=STOPPED, ended=time.time(), reason=f"by {by}")
         self.wake()
         return self.item(item.id)
 
-    async def abort(self, key: str, by: str) -> Item:
+    async def abort(self, key: str, by: str) -> QueueItem:
         """Stop the motion; see `Running.abort`."""
         item = self.item(key)
         running = self._running(item)
         if running is None:
-            raise RefusedError(f"{item.id} is {item.state}: nothing of it moves")
+            raise RequestRefusedError(f"{item.id} is {item.state}: nothing of it moves")
         stopping = asyncio.create_task(running.abort())
         await asyncio.sleep(0)
-        self.store.change(item.id, wish=str(Wish.ABORT))
+        self.store.change(item.id, wish=str(DesiredState.ABORT))
         self.note(by, "abort", item.id)
         await stopping
         return self.item(item.id)
 
-    def resume(self, key: str, by: str) -> Item:
+    def resume(self, key: str, by: str) -> QueueItem:
         """Go on with a campaign that rests.
 
         Raises:
@@ -298,21 +301,21 @@ class Supervisor:
         item = self.item(key)
         self.refuse_new_work(item.rig)
         if item.state in (STOPPED, WITHDRAWN) and item.run is None:
-            self.store.change(item.id, state="queued", wish=str(Wish.RUN), reason="")
+            self.store.change(item.id, state="queued", wish=str(DesiredState.RUN), reason="")
         elif self._running(item) is not None or item.state in ("queued", "finished"):
-            raise RefusedError(f"{item.id} is {item.state}; only what rests can be resumed")
+            raise RequestRefusedError(f"{item.id} is {item.state}; only what rests can be resumed")
         else:
             state = "queued" if item.run is None else "paused" if item.state == STOPPED else item.state
-            self.store.change(item.id, state=state, wish=str(Wish.RUN), ended=None)
+            self.store.change(item.id, state=state, wish=str(DesiredState.RUN), ended=None)
         self.note(by, "resume", item.id)
         self.wake()
         return self.item(item.id)
 
-    def _running(self, item: Item) -> Running | None:
+    def _running(self, item: QueueItem) -> Running | None:
         lane = self.lanes.get(item.rig)
         return lane.running if lane is not None and lane.running is not None and lane.holds(item.id) else None
 
-    def progress(self, item: Item) -> dict[str, Any] | None:
+    def progress(self, item: QueueItem) -> dict[str, Any] | None:
         """Where a running campaign stands."""
         running = self._running(item)
         return None if running is None or running.watching is None else running.watching.progress()
@@ -339,7 +342,7 @@ class Supervisor:
             self.store.set_flag(flag, {"by": by, "time": time.time(), "reason": reason})
             for lane in lanes:
                 if lane.running is not None:
-                    self.store.change(lane.running.item.id, wish=str(Wish.ABORT))
+                    self.store.change(lane.running.item.id, wish=str(DesiredState.ABORT))
             where = f"rig {rig}" if rig else ""
             self.note(by, "emergency stop", detail=": ".join(filter(None, (where, reason))))
         await asyncio.gather(*stops, return_exceptions=True)

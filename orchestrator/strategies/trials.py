@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 
-from actors.optimizer.core.problem import Data, Point
+from actors.optimizer.questions import Data, Point
 from orchestrator.requests import Simulate
 
 

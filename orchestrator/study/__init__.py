@@ -1,1 +1,1 @@
-"""A study: many small campaigns from one file, and what they show together."""
+"""Comparisons of strategies over many runs."""

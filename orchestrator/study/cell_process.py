@@ -17,19 +17,18 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from actors.protocols import Laboratory, LaboratoryError
-from actors.simulation.in_process import InProcessSimulatorPool
-from actors.spec import LaboratorySpec
-from orchestrator.campaign import run_campaign
-from orchestrator.errors import RunError
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.journal_check import has_begun
-from orchestrator.stages import CALIBRATION
-from orchestrator.study.campaigns import campaign_of
-from orchestrator.study.cells import Cell, cells_of
-from orchestrator.study.code import code_now
-from orchestrator.study.folder import CellResult, read_result, run_folder, write_result
-from orchestrator.study.plan import StudyPlan
+from actors.interfaces import Laboratory, LaboratoryError
+from actors.laboratory_settings import LaboratorySpec
+from actors.simulators.local_worker import InProcessSimulatorPool
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.journal_check import has_begun
+from orchestrator.run_errors import RunError
+from orchestrator.runs.run_engine import run_campaign
+from orchestrator.runs.stages import CALIBRATION
+from orchestrator.study.cells import StudyCell, cells_of
+from orchestrator.study.study_campaigns import campaign_of
+from orchestrator.study.study_folder import CellResult, code_now, read_result, run_folder, write_result
+from orchestrator.study.study_plan import StudyPlan
 
 Make = Callable[[LaboratorySpec, bool], Laboratory]
 """Makes the laboratory of a cell, with a bench or without."""
@@ -49,7 +48,7 @@ def in_this_process(simulators: InProcessSimulatorPool) -> Make:
     return make
 
 
-def run_cell(study: StudyPlan, cell: Cell, folder: Path, make: Make) -> CellResult:
+def run_cell(study: StudyPlan, cell: StudyCell, folder: Path, make: Make) -> CellResult:
     """Run a cell, or go on with it, and keep what came of it.
 
     Raises:
@@ -118,7 +117,7 @@ def work(path: Path, make: Make | None = None) -> None:
         path: of the study.
         make: makes laboratories; by default in this process, around one simulator.
     """
-    from orchestrator.config.study.sections import load_study
+    from orchestrator.study.study_file import load_study
 
     # Libraries print to stdout, which is for answers alone: from here on they print to the log.
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")

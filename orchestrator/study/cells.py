@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from orchestrator.stages import stage_seed
-from orchestrator.study.plan import StudyPlan
+from orchestrator.runs.stages import stage_seed
+from orchestrator.study.study_plan import StudyPlan
 
 Kind = Literal["grid", "pours", "calibration", "uncalibrated", "deployment", "final"]
 
@@ -25,7 +25,7 @@ PARTICLE_SECONDS = 0.0007
 
 
 @dataclass(frozen=True)
-class Cell:
+class StudyCell:
     """One small campaign.
 
     Attributes:
@@ -56,10 +56,10 @@ class Cell:
     again: int = 0
 
 
-def cells_of(study: StudyPlan) -> tuple[Cell, ...]:
+def cells_of(study: StudyPlan) -> tuple[StudyCell, ...]:
     """All cells, each after those that it needs; repetition by repetition, so that an unfinished study is balanced."""
     train = study.pour_count - study.holdout
-    cells: list[Cell] = []
+    cells: list[StudyCell] = []
 
     def add(kind: Kind, simulations: int, pours: int, *needs: str, **place: str | int) -> str:
         parts = [str(place[key]) for key in ("level", "arm", "receiver") if place.get(key)]
@@ -69,7 +69,7 @@ def cells_of(study: StudyPlan) -> tuple[Cell, ...]:
         shared = [str(place[key]) for key in ("level", "receiver") if place.get(key)]
         family = "calibration" if kind == "uncalibrated" else kind
         seed = stage_seed(study.seed, _name(family, *shared, numbers=numbers))
-        cells.append(Cell(name, kind, needs, simulations, pours, seed, **place))  # type: ignore[arg-type]
+        cells.append(StudyCell(name, kind, needs, simulations, pours, seed, **place))  # type: ignore[arg-type]
         return name
 
     if any(arm.plan.strategy == "C1" for arm in study.calibrations):
@@ -106,7 +106,7 @@ def _name(*parts: str, numbers: Sequence[int]) -> str:
     return ".".join([*parts, *(f"{number:02d}" for number in numbers)])
 
 
-def estimated_seconds(study: StudyPlan, cell: Cell) -> float:
+def estimated_seconds(study: StudyPlan, cell: StudyCell) -> float:
     """CPU seconds that a cell may take, from how many particles are simulated [s]. Rough: within a factor of two."""
     axes = {axis.name: axis for arm in study.calibrations for axis in arm.plan.parameters.axes}
     usual = float(study.base.parameters.particles)

@@ -13,15 +13,14 @@ once for each place of its particles: what measures densities keeps the slope fo
 pairs read and add to stands in fours, which the processor moves at a time: displacements take a third of the time then.
 
 Source: Macklin & Müller 2013 (position based fluids); Macklin, Müller & Chentanez 2016 (accumulated multipliers); wall
-integral: after Bender et al. 2019 (volume maps), see `sim_engine/vessel/corners.py`.
+integral: after Bender et al. 2019 (volume maps), see `sim_engine/vessel/wall_correction.py`.
 """
 
 import taichi as ti
 
-from sim_engine.fluid.kernels import SIGMA, slope, wall_density, wall_slope, weight
+from sim_engine.fluid.kernels import SIGMA, slope, square, wall_density, wall_slope, weight
 from sim_engine.fluid.neighbours import measure_pairs
 from sim_engine.fluid.state import SUPPORT, VESSELS
-from sim_engine.fluid.vectors import square
 
 PACKING = 1.012
 """Kernel sum of bulk liquid of spacing d over its continuum value, measured on a cup at rest: with it the density there

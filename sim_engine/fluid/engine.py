@@ -8,12 +8,11 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim_engine.backend import BackendError, require_backend
-from sim_engine.cache import cache_directory
-from sim_engine.contact import rotations
-from sim_engine.fluid.quick import imports, look_up_quickly, uncollected
-from sim_engine.fluid.setup import POSE_STEP, SceneSetup, pose_at
+from sim_engine.collision import rotations
+from sim_engine.fluid.scene_setup import POSE_STEP, SceneSetup, pose_at
+from sim_engine.fluid.taichi_startup import imports, look_up_quickly, uncollected
 from sim_engine.outcome import ParticleState
+from sim_engine.resources import BackendError, cache_directory, require_backend
 
 with imports():
     import taichi as ti

@@ -4,6 +4,9 @@ Wendland C2 in three dimensions with support h: W(q) = σ (1 − q)⁴ (1 + 4q),
 square root per pair, its gradient is finite at r = 0, and it does not pair particles up.
 
 Source: Wendland 1995; Dehnen & Aly 2012 (no pairing instability). Wall integrals: ours, by integration.
+
+Products of vectors in space, written out: Taichi's own ones, for any shape, make kernels a third larger, and their
+compiling and looking up that much slower.
 """
 
 import math
@@ -100,3 +103,45 @@ HALF_ATTRACTION = 64.0 * math.pi / 504.0
 """∫ attraction · cos over a half-space, in units of h³."""
 BULK_BOND = 64.0 * 4.0 * math.pi / 3.0 / 840.0
 """∫ bond over all space, in units of h³."""
+
+
+@ti.func
+def dot(a, b):
+    """a · b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@ti.func
+def square(a):
+    """|a|²."""
+    return a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
+
+
+@ti.func
+def length(a):
+    """|a|."""
+    return ti.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+
+
+@ti.func
+def turned(m, a):
+    """m a, of a rotation matrix."""
+    return ti.Vector(
+        [
+            m[0, 0] * a[0] + m[0, 1] * a[1] + m[0, 2] * a[2],
+            m[1, 0] * a[0] + m[1, 1] * a[1] + m[1, 2] * a[2],
+            m[2, 0] * a[0] + m[2, 1] * a[1] + m[2, 2] * a[2],
+        ]
+    )
+
+
+@ti.func
+def turned_back(m, a):
+    """mᵀ a, of a rotation matrix."""
+    return ti.Vector(
+        [
+            m[0, 0] * a[0] + m[1, 0] * a[1] + m[2, 0] * a[2],
+            m[0, 1] * a[0] + m[1, 1] * a[1] + m[2, 1] * a[2],
+            m[0, 2] * a[0] + m[1, 2] * a[1] + m[2, 2] * a[2],
+        ]
+    )

@@ -10,15 +10,22 @@ Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 import taichi as ti
 
 from sim_engine.fluid.density import displace, measure, measure_first, multiply, multiply_first
+from sim_engine.fluid.kernels import dot, length, square, turned, turned_back
 from sim_engine.fluid.neighbours import rebuild
-from sim_engine.fluid.newtonian import STIFFEST, flow
-from sim_engine.fluid.packing import yield_to_shear
-from sim_engine.fluid.rims import lower_rims
 from sim_engine.fluid.state import VESSELS, FluidState
 from sim_engine.fluid.tension import pull
-from sim_engine.fluid.vectors import dot, length, square, turned, turned_back
-from sim_engine.fluid.viscosity import relax
-from sim_engine.fluid.walls import FAR, STRETCH, crossed, distance_and_gradient, in_cavity, swept, to_vessel, to_world
+from sim_engine.fluid.viscosity import STIFFEST, flow, relax, yield_to_shear
+from sim_engine.fluid.walls import (
+    FAR,
+    STRETCH,
+    crossed,
+    distance_and_gradient,
+    in_cavity,
+    lower_rims,
+    swept,
+    to_vessel,
+    to_world,
+)
 from sim_engine.outcome import ParticleState
 
 CFL = 1.5

@@ -6,7 +6,7 @@ RANGE = 3.0
 """Over spacing d."""
 SURFACE = 0.66
 """Energy of what a spacing's square of a surface has by the sums of `tension`: scales cohesion to its tension. From
-the frequency of drops (`sim_engine.validation.droplet`)."""
+the frequency of drops (`sim_engine.validation.capillarity`)."""
 CAPILLARY = 0.56
 """Cohesion acts at intervals of at most that part of the capillary time; at 0.9 of it drops heat up."""
 LONGEST_WAIT = 0.01

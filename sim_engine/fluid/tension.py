@@ -22,19 +22,20 @@ Source: ours; total variation as interfacial energy: Modica 1987; forces as exac
 
 import taichi as ti
 
-from sim_engine.fluid.columns import in_eights, take_seats
 from sim_engine.fluid.kernels import (
     BULK_BOND,
     HALF_ATTRACTION,
     attraction,
     attraction_turn,
     bond,
+    dot,
+    length,
     wall_attraction,
     wall_bond,
 )
+from sim_engine.fluid.neighbours import in_eights, take_seats
 from sim_engine.fluid.state import STRETCHES, VESSELS
 from sim_engine.fluid.strength import RANGE
-from sim_engine.fluid.vectors import dot, length
 
 ALONE = 3.0
 """Weight of the bonds that are missing. At 1 drops lose their density, at 2 and range 2.8 oscillations decay faster."""

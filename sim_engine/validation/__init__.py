@@ -1,1 +1,1 @@
-"""Physical cases that the solver is held against: setup, measured quantities, reference, criterion; one a module."""
+"""Physical test cases of the solver."""

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.pour import PourSimulator
-from sim_engine.task import PourTask, Scene
-from sim_engine.validation.result import Figure, Measurement, Series, at_most, reported
-from sim_engine.vessel.spec import ProfileShape, VesselSpec, cylinder
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.scene import PourTask, Scene
+from sim_engine.simulator import PourSimulator
+from sim_engine.validation.case_result import Figure, Measurement, Series, at_most, reported
+from sim_engine.vessel.shapes import ProfileShape, VesselSpec, cylinder
 
 LIP_RADIUS = 0.04
 POURER = cylinder("beaker", inner_radius=LIP_RADIUS, inner_height=0.10)
@@ -39,7 +39,7 @@ HEIGHTS = {"tumbler": 0.09, "narrow": 0.11, "cone": 0.06, "bowl": 0.06}
 
 
 @dataclass(frozen=True)
-class Pour:
+class ConvergencePour:
     """One of the pours.
 
     Attributes:
@@ -79,32 +79,34 @@ class Pour:
 
 
 FOUND = (
-    Pour(TUMBLER, 30, 44, 110),
-    Pour(TUMBLER, 100, 44),
-    Pour(NARROW, 40, 75),
-    Pour(NARROW, 90, 70),
-    Pour(NARROW, 60, 55),
-    Pour(CONE, 30, 90),
-    Pour(CONE, 80, 95),
+    ConvergencePour(TUMBLER, 30, 44, 110),
+    ConvergencePour(TUMBLER, 100, 44),
+    ConvergencePour(NARROW, 40, 75),
+    ConvergencePour(NARROW, 90, 70),
+    ConvergencePour(NARROW, 60, 55),
+    ConvergencePour(CONE, 30, 90),
+    ConvergencePour(CONE, 80, 95),
 )
 CHOSEN = (
-    Pour(TUMBLER, 20, 60),
-    Pour(TUMBLER, 60, 70),
-    Pour(TUMBLER, 15, 48),
-    Pour(TUMBLER, 45, 60, 95),
-    Pour(BOWL, 40, 95),
-    Pour(BOWL, 110, 85),
-    Pour(BOWL, 25, 65),
-    Pour(CONE, 50, 80),
-    Pour(CONE, 110, 60),
-    Pour(NARROW, 25, 45),
-    Pour(NARROW, 75, 60, 100),
-    Pour(NARROW, 115, 45),
+    ConvergencePour(TUMBLER, 20, 60),
+    ConvergencePour(TUMBLER, 60, 70),
+    ConvergencePour(TUMBLER, 15, 48),
+    ConvergencePour(TUMBLER, 45, 60, 95),
+    ConvergencePour(BOWL, 40, 95),
+    ConvergencePour(BOWL, 110, 85),
+    ConvergencePour(BOWL, 25, 65),
+    ConvergencePour(CONE, 50, 80),
+    ConvergencePour(CONE, 110, 60),
+    ConvergencePour(NARROW, 25, 45),
+    ConvergencePour(NARROW, 75, 60, 100),
+    ConvergencePour(NARROW, 115, 45),
 )
 POURS = FOUND + CHOSEN
 
 
-def spillage(simulator: PourSimulator, pour: Pour, parameters: SimulationParameters, seed: int) -> tuple[float, float]:
+def spillage(
+    simulator: PourSimulator, pour: ConvergencePour, parameters: SimulationParameters, seed: int
+) -> tuple[float, float]:
     """Spilled over poured of one pour, and the CPU seconds that it took."""
     outcome = simulator.simulate(pour.task(parameters, seed)).outcome
     if outcome.invalid is not None:
@@ -144,7 +146,7 @@ QUICK = (FOUND[1], FOUND[4], FOUND[5])
 
 def convergence(
     simulator: PourSimulator,
-    chosen: tuple[Pour, ...],
+    chosen: tuple[ConvergencePour, ...],
     numbers: tuple[int, ...],
     seeds: int,
     parameters: SimulationParameters,

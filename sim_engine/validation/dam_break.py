@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_engine.hydrostatics import GRAVITY
-from sim_engine.liquid import SimulationParameters
-from sim_engine.validation.result import Figure, Measurement, Series, at_most, reported, within
-from sim_engine.validation.stage import run
-from sim_engine.validation.tanks import block, box
+from sim_engine.liquids import SimulationParameters
+from sim_engine.validation.case_result import Figure, Measurement, Series, at_most, reported, within
+from sim_engine.validation.container_runs import block, box, run
 
 Floats = NDArray[np.float64]
 

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid, ParameterInfo, SimulationParameters
-from sim_engine.losses import normalised_spillage
-from sim_engine.pour import PourSimulator
-from sim_engine.task import PourTask, Scene
-from sim_engine.validation.result import Figure, Measurement, Series, reported
-from sim_engine.vessel.spec import cylinder
+from sim_engine.liquids import Liquid, ParameterInfo, SimulationParameters
+from sim_engine.outcome import normalised_spillage
+from sim_engine.scene import PourTask, Scene
+from sim_engine.simulator import PourSimulator
+from sim_engine.validation.case_result import Figure, Measurement, Series, reported
+from sim_engine.vessel.shapes import cylinder
 
 Floats = NDArray[np.float64]
 
@@ -282,7 +282,7 @@ def _measurements(found: list[Sensitivity], extent: Extent) -> list[Measurement]
 
 
 @dataclass(frozen=True)
-class Effect:
+class ParameterEffect:
     """One line of a page: what a parameter does to a pour.
 
     Attributes:
@@ -299,13 +299,13 @@ class Effect:
     error: str
 
 
-def effects(records: Sequence[Mapping[str, Any]]) -> list[Effect]:
+def effects(records: Sequence[Mapping[str, Any]]) -> list[ParameterEffect]:
     """What parameters do, from the measurements as a page keeps them (`Measurement.as_json`)."""
     found = []
     for record in records:
         match = _CHANGE.fullmatch(str(record["name"]))
         if match is not None and record["value"] is not None:
-            found.append(Effect(**match.groupdict(), change=float(record["value"])))
+            found.append(ParameterEffect(**match.groupdict(), change=float(record["value"])))
     return found
 
 

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 from scipy.special import jv, jvp
 
-from sim_engine.fill import fill, spacing
 from sim_engine.hydrostatics import GRAVITY
-from sim_engine.liquid import SimulationParameters
-from sim_engine.validation.at_rest import CUP, HEIGHT, RADIUS, VOLUME
-from sim_engine.validation.result import Figure, Measurement, Series, reported, within
-from sim_engine.validation.stage import Container, run, still_pose
-from sim_engine.vessel.build import build_vessel
+from sim_engine.liquids import SimulationParameters
+from sim_engine.simulator import fill, spacing
+from sim_engine.validation.case_result import Figure, Measurement, Series, reported, within
+from sim_engine.validation.container_runs import Container, run, still_pose
+from sim_engine.validation.hydrostatic_cases import CUP, HEIGHT, RADIUS, VOLUME
+from sim_engine.vessel.vessel import build_vessel
 
 Floats = NDArray[np.float64]
 
@@ -93,7 +93,7 @@ def sloshing(particles: int, parameters: SimulationParameters) -> tuple[list[Mea
         parameters: θ; its number of particles is replaced.
     """
     from sim_engine.fluid.engine import engine
-    from sim_engine.fluid.setup import POSE_STEP
+    from sim_engine.fluid.scene_setup import POSE_STEP
 
     vessel = build_vessel(CUP)
     start = fill(vessel, VOLUME, particles, 1, parameters.wall_distance).astype(float)

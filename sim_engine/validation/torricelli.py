@@ -11,11 +11,10 @@ import math
 import numpy as np
 
 from sim_engine.hydrostatics import GRAVITY
-from sim_engine.liquid import SimulationParameters
-from sim_engine.validation.at_rest import HEIGHT, RADIUS, VOLUME
-from sim_engine.validation.result import Figure, Measurement, Series, within
-from sim_engine.validation.stage import run
-from sim_engine.validation.tanks import block, holed_cup
+from sim_engine.liquids import SimulationParameters
+from sim_engine.validation.case_result import Figure, Measurement, Series, within
+from sim_engine.validation.container_runs import block, holed_cup, run
+from sim_engine.validation.hydrostatic_cases import HEIGHT, RADIUS, VOLUME
 
 HOLE = 0.010
 FLOOR = 0.003

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_engine.vessel.errors import VesselError
-from sim_engine.vessel.sdf import MARGIN
+from sim_engine.vessel.distance_grid import MARGIN
+from sim_engine.vessel.shapes import VesselError
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

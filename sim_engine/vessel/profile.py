@@ -12,8 +12,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_engine.vessel.errors import VesselError
-from sim_engine.vessel.spec import ProfileShape
+from sim_engine.vessel.shapes import ProfileShape, VesselError
 
 Floats = NDArray[np.float64]
 

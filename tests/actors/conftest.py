@@ -12,15 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.bench.spec import VirtualBenchSpec
-from actors.spec import LaboratorySpec
+from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
 from sim_engine.action import DEG, Action
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.outcome import PourOutcome
-from sim_engine.simulated import RecordedFrames, SimulatedPour
-from sim_engine.task import PoseError, PourTask, Scene
-from sim_engine.vessel.spec import cylinder
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.outcome import PourOutcome, RecordedFrames, SimulatedPour
+from sim_engine.scene import PoseError, PourTask, Scene
+from sim_engine.vessel.shapes import cylinder
 
 
 class FakeSimulator:
@@ -139,7 +137,7 @@ def bench_spec() -> VirtualBenchSpec:
 @pytest.fixture(scope="session")
 def ray_running() -> Iterator[None]:
     """Ray, started once; laboratories of tests join it."""
-    from actors.ray_runtime import start_ray, stop_ray
+    from actors.runtime.ray_runtime import start_ray, stop_ray
 
     start_ray(LaboratorySpec("tests", simulators=4))
     import ray

@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.arm.actor import DeviceArm
-from actors.arm.errors import ArmLostError, ArmNotReleasedError, ArmStoppedError
-from actors.arm.look import ArmLook, SafetyRecord
-from actors.arm.motion_path import MotionPath
-from actors.arm.numbers import POSITION_NOISE, Grip, NumbersArm, NumbersSpec
-from actors.bench.planning import plan_pour
-from actors.contracts.arm import ArmBench, ArmContract
-from actors.device import LocalDevice, RayDevice
+from actors.arm.arm_device import DeviceArm
+from actors.arm.arm_interface import ArmLostError, ArmNotReleasedError, ArmStoppedError
+from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
+from actors.arm.planned_pour import MotionPath
+from actors.arm.simulated_arm import POSITION_NOISE, Grip, NumbersSpec, SimulatedArm
+from actors.bench.pour_feasibility import plan_pour
+from actors.contract_tests.arm_contract import ArmBench, ArmContract
+from actors.runtime.remote_object import LocalDevice, RayDevice
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def motion(path):
 
 
 def released(scale=0.0):
-    arm = NumbersArm(NumbersSpec(scale))
+    arm = SimulatedArm(NumbersSpec(scale))
     arm.release()
     return arm
 
@@ -82,8 +82,8 @@ def test_motion_takes_its_duration_over_the_time_scale(path, motion, scale):
 def make_arm(request):
     if request.param == "process":
         request.getfixturevalue("ray_running")
-        return lambda spec: DeviceArm(RayDevice("arm", NumbersArm, spec), spec)
-    return lambda spec: DeviceArm(LocalDevice("arm", lambda: NumbersArm(spec)), spec)
+        return lambda spec: DeviceArm(RayDevice("arm", SimulatedArm, spec), spec)
+    return lambda spec: DeviceArm(LocalDevice("arm", lambda: SimulatedArm(spec)), spec)
 
 
 @pytest.mark.realtime
@@ -135,7 +135,7 @@ def test_progress_follows_the_tilt_through_the_phases(make_arm, path, motion):
         assert state.tilt == pytest.approx(float(motion.tilt(np.array([state.time]))[0]), abs=1e-6)
 
 
-class Unreachable(NumbersArm):
+class Unreachable(SimulatedArm):
     def connect(self):
         raise ArmLostError("nobody answers at 192.168.0.10")
 
@@ -155,7 +155,7 @@ def test_any_arm_can_be_looked_at_and_one_that_does_not_answer_says_so():
 
 @pytest.mark.realtime
 def test_safety_settings_that_nobody_has_accepted_fail_on_hardware():
-    look = ArmLook(checksum="AB", serial="7", model="arm")
+    look = ArmDiagnostics(checksum="AB", serial="7", model="arm")
     record = SafetyRecord("AB", "7", "arm", "1", "2026-01-01", "Ada")
     states = [look.checks(r, accept="accept it", virtual=False)[-1].state for r in (None, record)]
     assert states == ["fail", "ok"]
@@ -167,6 +167,6 @@ def test_safety_settings_that_nobody_has_accepted_fail_on_hardware():
 class TestArmOfNumbers(ArmContract):
     @pytest.fixture
     def bench(self, path):
-        arm = NumbersArm(NumbersSpec(2.0))
+        arm = SimulatedArm(NumbersSpec(2.0))
         yield ArmBench(arm, path, 2.0, jog=("z", 0.005, 0.02), disturb=lambda: arm.grip(Grip(speed_factor=0.7)))
         arm.close()

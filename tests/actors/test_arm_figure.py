@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from actors.arm.spec import UrArmSpec
-from orchestrator.config.load import load_laboratory
+from actors.arm.arm_settings import UrArmSpec
+from orchestrator.config.file_loading import load_laboratory
 
 FILE = Path(__file__).parents[2] / "configs" / "laboratories" / "virtual.yaml"
 

@@ -16,15 +16,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from actors.balance.virtual_serial.handle import VirtualSerialBalance
-from actors.child_process import (
-    ChildProcess,
-    ConnectedProcess,
-    child_environment,
-    run,
-    run_async,
-)
-from actors.protocols import LaboratoryError
+from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
+from actors.interfaces import LaboratoryError
+from actors.runtime.child_process import ChildProcess, ConnectedProcess, child_environment, run, run_async
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parents[2]
@@ -193,7 +187,7 @@ def test_a_program_is_run_from_an_event_loop() -> None:
 def test_children_end_with_a_parent_that_is_killed(waits: str, options: str) -> None:
     parent = ChildProcess(
         python(
-            "import sys\nfrom actors.child_process import ChildProcess\n"
+            "import sys\nfrom actors.runtime.child_process import ChildProcess\n"
             f"child = ChildProcess([sys.executable, '-c', {waits!r}], {options}output=False)\n"
             "print(child.pid, flush=True)\nsys.stdin.read()"
         ),
@@ -208,7 +202,7 @@ def test_children_end_with_a_parent_that_is_killed(waits: str, options: str) -> 
 
 
 def test_a_connected_process_ends_with_its_connection() -> None:
-    child = ConnectedProcess("actors.simulation.processes")
+    child = ConnectedProcess("actors.simulators.process_worker")
     assert child.alive
     child.connection.close()
     child.close(PATIENCE)
@@ -263,13 +257,13 @@ def test_one_module_of_the_product_starts_programs() -> None:
                 found.append(f"{at}: from subprocess import")
             elif isinstance(node, ast.Attribute) and node.attr in STARTING.get(name_of(node.value), ()):
                 found.append(f"{at}: {name_of(node)}")
-    assert not found, "\n".join(["start programs with actors.child_process:", *found])
+    assert not found, "\n".join(["start programs with actors.runtime.child_process:", *found])
 
 
 AT_THE_START = {
-    "orchestrator/state_directory.py",  # `--state`, before anything is started
-    "orchestrator/daemon/renewal.py",  # what the previous program left, before anything is started
-    "actors/ray_settings.py",  # read by Ray's library in this process; it has no other way
+    "orchestrator/catalogue/run_registry.py",  # `--state`, before anything is started
+    "orchestrator/daemon/restart.py",  # what the previous program left, before anything is started
+    "actors/runtime/private_ray.py",  # read by Ray's library in this process; it has no other way
 }
 """Files that change this process's environment outside of an import."""
 
@@ -314,4 +308,4 @@ def test_tests_and_scripts_give_every_child_an_environment() -> None:
                 continue
             if not any(word.arg in ("env", None) for word in node.keywords):
                 found.append(f"{path.relative_to(ROOT)}:{node.lineno}")
-    assert not found, "\n".join(["add env=child_environment() (actors.child_process):", *found])
+    assert not found, "\n".join(["add env=child_environment() (actors.runtime.child_process):", *found])

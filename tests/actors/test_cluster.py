@@ -26,10 +26,10 @@ PROGRAM = """
 import asyncio, json, sys
 from pathlib import Path
 from actors.laboratory import open_laboratory
-from actors.spec import LaboratorySpec, RaySpec
+from actors.laboratory_settings import LaboratorySpec, RaySpec
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import SimulationParameters
-from sim_engine.task import PourTask
+from sim_engine.liquids import SimulationParameters
+from sim_engine.scene import PourTask
 from tests.actors import conftest
 
 def say(*words):
@@ -68,7 +68,7 @@ def decant(folder: Path, address: str, environment: dict[str, str]) -> subproces
     """`decant run` of a small campaign on a cluster."""
     path = write_campaign(folder, CAMPAIGN.replace("  simulators: 2\n", f"  ray: {{address: '{address}'}}\n"))
     return subprocess.run(
-        [sys.executable, "-c", "from orchestrator.cli import main; main()", "run", str(path)],
+        [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "run", str(path)],
         cwd=folder,
         env={**environment, "PYTHONPATH": str(ROOT)},
         capture_output=True,

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from actors import device
-from actors.device import DeviceLostError, LocalDevice, RayDevice
+from actors.runtime import remote_object as device
+from actors.runtime.remote_object import DeviceLostError, LocalDevice, RayDevice
 
 
 class Stuck:

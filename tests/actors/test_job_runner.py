@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from actors.simulation.job_runner import JobCancelledError, JobRunner
+from actors.simulators.simulation_task import JobCancelledError, JobRunner
 
 
 def never() -> bool:

@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.device import DeviceLostError
+from actors.interfaces import LaboratoryError
 from actors.laboratory import check_laboratory, open_laboratory
-from actors.optimizer.core.problem import Data, SuggestProblem
-from actors.protocols import LaboratoryError
-from actors.spec import LaboratorySpec
-from orchestrator.config.load import load_laboratory
-from sim_engine.liquid import SimulationParameters
-from sim_engine.space import Axis, Space
-from sim_engine.task import PourTask
+from actors.laboratory_settings import LaboratorySpec
+from actors.optimizer.questions import Data, SuggestProblem
+from actors.runtime.remote_object import DeviceLostError
+from orchestrator.config.file_loading import load_laboratory
+from sim_engine.liquids import SimulationParameters
+from sim_engine.scene import PourTask
+from sim_engine.search_space import Axis, Space
 
 PROBLEM = SuggestProblem(
     space=Space((Axis("x_offset", 0.08, 0.15), Axis("angular_velocity", 0.3, 2.0))),

@@ -9,12 +9,12 @@ import sys
 
 import pytest
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 
 PROGRAM = """
 import json
 import psutil
-from actors.memory import give_back
+from actors.simulators.simulation_task import give_back
 
 def resident():
     return psutil.Process().memory_info().rss

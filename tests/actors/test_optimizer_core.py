@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.optimizer.core.problem import Data, SuggestProblem
-from actors.optimizer.core.propose import propose
-from sim_engine.space import Axis, Space
+from actors.optimizer.questions import Data, SuggestProblem
+from actors.optimizer.suggest import propose
+from sim_engine.search_space import Axis, Space
 from tests.depth import examples
 
 PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))

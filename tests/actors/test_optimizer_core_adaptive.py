@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.optimizer.core.asked import Asked
-from actors.optimizer.core.lookahead import foreseen
-from actors.optimizer.core.mismatch import Displacement, Limit, Mismatch, Play
-from actors.optimizer.core.models import fit
-from actors.optimizer.core.problem import Data, SuggestProblem
-from actors.optimizer.core.propose import propose
-from actors.optimizer.core.shortest import shortest_bands
-from orchestrator.codec import canonical, from_json, to_json
-from sim_engine.space import Axis, Space
+from actors.optimizer.gaussian_process import highest_density_intervals
+from actors.optimizer.knowledge_gradient import foreseen
+from actors.optimizer.question_arrays import Asked
+from actors.optimizer.questions import BenchOffset, Data, Limit, ModelDiscrepancy, Play, SuggestProblem
+from actors.optimizer.suggest import propose
+from actors.optimizer.surrogate_models import fit
+from orchestrator.journal.codec import canonical, from_json, to_json
+from sim_engine.search_space import Axis, Space
 
 PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
 PLAY = (Play(shift=0.14), Play(factor=0.05, origin=0.2))
@@ -50,7 +49,7 @@ def asked(simulator, poured, mean="adaptive", **changes):
         data_of(poured, cup(poured)) if len(poured) else Data(),
         mean=mean,
         simulated=data_of(simulated, simulator(simulated)),
-        mismatch=Mismatch(PLAY, left=10) if mean == "adaptive" else None,
+        mismatch=ModelDiscrepancy(PLAY, left=10) if mean == "adaptive" else None,
     )
     return replace(problem, **changes)
 
@@ -90,7 +89,7 @@ def test_after_a_pour_that_lost_all_in_place_of_little_the_next_goes_where_the_s
     question = asked(lambda x: 1.0 - 0.8 * cup(x), [], acquisition="least_loss", count=1)
     first = propose(question).points[0]
     assert cup(first)[0] > 0.9
-    second = propose(replace(question, data=data_of([first], cup(first)), mismatch=Mismatch(PLAY, left=9)))
+    second = propose(replace(question, data=data_of([first], cup(first)), mismatch=ModelDiscrepancy(PLAY, left=9)))
     assert cup(second.points[0])[0] < 0.1
     assert second.mismatch.ignorance > 0.5
 
@@ -140,7 +139,7 @@ def test_a_band_is_the_shortest_interval_that_holds_nine_pours_in_ten(middle):
     rng = np.random.default_rng(0)
     chosen = (rng.random(100_000) < 0.3).astype(int)
     drawn = np.clip(middle + deviations[chosen, 0] * rng.standard_normal(100_000), 0.0, 1.0)
-    low, high = shortest_bands(weights, means, deviations, 0.9)[0]
+    low, high = highest_density_intervals(weights, means, deviations, 0.9)[0]
     assert np.mean((drawn >= low) & (drawn <= high)) == pytest.approx(0.9, abs=0.01)
     equal = np.quantile(drawn, [0.05, 0.95])
     assert high - low < (0.85 if middle != 0.4 else 1.005) * (equal[1] - equal[0])
@@ -190,7 +189,7 @@ def test_simulations_beside_a_pour_are_made_around_what_is_in_doubt():
 def test_what_was_learnt_with_one_receiver_makes_the_first_prediction_for_the_next_better():
     learnt = propose(asked(displaced, POURED, count=0)).mismatch.drawn
     assert len(learnt) == 64
-    assert isinstance(learnt[0], Displacement)
+    assert isinstance(learnt[0], BenchOffset)
     fresh = asked(displaced, [], count=0, predict_at=ASK)
     told = replace(fresh, mismatch=replace(fresh.mismatch, drawn=learnt))
     assert error(propose(told)) < 0.9 * error(propose(fresh))
@@ -230,8 +229,8 @@ def test_a_cost_in_another_unit_is_the_same_question():
     ("changes", "text"),
     [
         ({"mismatch": None}, "needs a mismatch"),
-        ({"mismatch": Mismatch(PLAY[:1])}, "axes"),
-        ({"mean": "scaled", "mismatch": Mismatch(PLAY)}, "no other mean"),
+        ({"mismatch": ModelDiscrepancy(PLAY[:1])}, "axes"),
+        ({"mean": "scaled", "mismatch": ModelDiscrepancy(PLAY)}, "no other mean"),
     ],
 )
 def test_a_question_that_makes_no_sense_is_refused(changes, text):

@@ -6,11 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.optimizer.core.problem import Data, Effort, Suggestion, SuggestProblem
-from actors.optimizer.core.propose import propose
-from actors.optimizer.core.surrogate import Search, constant_mean_process, joint_process, simulated_mean_process
-from orchestrator.codec import from_json, to_json
-from sim_engine.space import Axis, Space
+from actors.optimizer.gaussian_process import (
+    HyperparameterSearch,
+    constant_mean_process,
+    joint_process,
+    simulated_mean_process,
+)
+from actors.optimizer.questions import Data, SearchEffort, Suggestion, SuggestProblem
+from actors.optimizer.suggest import propose
+from orchestrator.journal.codec import from_json, to_json
+from sim_engine.search_space import Axis, Space
 
 PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
 INFORMED = ("simulated", "pooled", "scaled")
@@ -58,7 +63,7 @@ def test_a_simulation_removes_as_much_doubt_as_was_foretold(mean):
     place = np.array([[0.4, 0.55]])
 
     def fitted(points, costs, thetas=(None, None)):
-        searches = [Search() if theta is None else Search(theta, 0) for theta in thetas]
+        searches = [HyperparameterSearch() if theta is None else HyperparameterSearch(theta, 0) for theta in thetas]
         if mean != "simulated":
             return joint_process(points, costs, real, cup(real), scaled=mean == "scaled", search=searches[0])
         prior = constant_mean_process(points, costs, search=searches[0])
@@ -108,13 +113,13 @@ def test_knowledge_is_about_simulations():
 
 @pytest.mark.parametrize("mean", INFORMED)
 def test_a_fit_that_goes_on_from_the_last_one_finds_the_same_model_for_less(mean):
-    question = asked(mean, simulations=40, pours=5, count=0, predict_at=((0.3, 0.5), (0.9, 0.1)), effort=Effort())
+    question = asked(mean, simulations=40, pours=5, count=0, predict_at=((0.3, 0.5), (0.9, 0.1)), effort=SearchEffort())
     fresh = propose(question)
-    kept = propose(replace(question, effort=Effort(fresh.fitted, 0)))
+    kept = propose(replace(question, effort=SearchEffort(fresh.fitted, 0)))
     assert kept.fitted == fresh.fitted
     assert kept.predictions == pytest.approx(fresh.predictions, abs=1e-9)
     far = tuple(tuple(value + 0.3 for value in theta) for theta in fresh.fitted)
-    steps = [propose(replace(question, effort=Effort(far, iterations))) for iterations in (0, 4, 30)]
+    steps = [propose(replace(question, effort=SearchEffort(far, iterations))) for iterations in (0, 4, 30)]
     errors = [np.abs(np.subtract(step.predictions, fresh.predictions)).max() for step in steps]
     assert errors[2] < 0.02
     assert errors[2] < errors[0]
@@ -123,9 +128,9 @@ def test_a_fit_that_goes_on_from_the_last_one_finds_the_same_model_for_less(mean
 
 def test_a_start_of_another_model_is_refused():
     with pytest.raises(ValueError, match="a start of 2 hyperparameters for a model of 9"):
-        propose(asked(effort=Effort(((0.0, 0.0),), 4)))
+        propose(asked(effort=SearchEffort(((0.0, 0.0),), 4)))
     with pytest.raises(ValueError, match="must be finite"):
-        propose(asked(effort=Effort(((math.nan,),), 4)))
+        propose(asked(effort=SearchEffort(((math.nan,),), 4)))
 
 
 def test_pours_are_held_against_what_simulations_promise_everywhere_not_only_where_they_are_dense():
@@ -139,7 +144,7 @@ def test_pours_are_held_against_what_simulations_promise_everywhere_not_only_whe
         mean="scaled",
         simulated=data_of(dense, np.maximum(cup(dense), 0.0)),
         acquisition="lcb",
-        effort=Effort(),
+        effort=SearchEffort(),
     )
     (point,) = propose(question).points  # the third: every third fills space where simulation's promise is not kept
     assert math.dist(point, (0.35, 0.6)) < 0.35

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
 
-from actors.optimizer.core import fitting
-from actors.optimizer.core.covariance import Covariance, HyperPrior
-from actors.optimizer.core.problem import Data, Linear, SuggestProblem
-from actors.optimizer.core.propose import propose
-from orchestrator.codec import canonical, from_json, to_json
-from sim_engine.space import Axis, Space
+from actors.optimizer import gaussian_process as fitting
+from actors.optimizer.covariance import Covariance, HyperPrior
+from actors.optimizer.questions import Data, Linear, SuggestProblem
+from actors.optimizer.suggest import propose
+from orchestrator.journal.codec import canonical, from_json, to_json
+from sim_engine.search_space import Axis, Space
 
 PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
 ASK = tuple((x, y) for x in (0.15, 0.4, 0.65, 0.9) for y in (0.1, 0.35, 0.6, 0.85))

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from actors.optimizer.core.problem import Data, Effort, Linear, SuggestProblem
-from actors.optimizer.core.propose import propose
-from sim_engine.space import Axis, Space
+from actors.optimizer.questions import Data, Linear, SearchEffort, SuggestProblem
+from actors.optimizer.suggest import propose
+from sim_engine.search_space import Axis, Space
 from tests.depth import examples
 
 MEANS = ("constant", "zero", "simulated", "pooled", "scaled")
@@ -61,7 +61,7 @@ def questions(draw):
         simulated=data(8),
         acquisition=draw(st.sampled_from(acquisitions)),
         pouring=tuple(draw(st.lists(point, max_size=2))),
-        effort=draw(st.sampled_from([None, Effort()])),
+        effort=draw(st.sampled_from([None, SearchEffort()])),
         infeasible=tuple(draw(st.lists(point, max_size=3))),
         failed=tuple(draw(st.lists(point, max_size=3))),
         constraints=constraints,

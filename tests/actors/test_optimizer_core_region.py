@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from actors.optimizer.core.problem import Data, Linear, SuggestProblem
-from actors.optimizer.core.propose import propose
-from sim_engine.space import Axis, Space
+from actors.optimizer.questions import Data, Linear, SuggestProblem
+from actors.optimizer.suggest import propose
+from sim_engine.search_space import Axis, Space
 
 PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
 MIXED = Space((Axis("n", 1, 4, integer=True), Axis("k", 1e-3, 1.0, "log"), Axis("m", 10, 2000, "log", integer=True)))

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.optimizer.core.problem import Data, Disturbance, Risk, SuggestProblem
-from actors.optimizer.core.propose import propose
-from actors.optimizer.core.risk import RiskProcess, conditional_value_at_risk
-from actors.optimizer.core.surrogate import constant_mean_process
-from sim_engine.space import Axis, Space
+from actors.optimizer.gaussian_process import constant_mean_process
+from actors.optimizer.questions import Data, Disturbance, Risk, SuggestProblem
+from actors.optimizer.risk_measures import RiskProcess, conditional_value_at_risk
+from actors.optimizer.suggest import propose
+from sim_engine.search_space import Axis, Space
 
 LOSSES = st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=30)
 LEVELS = st.floats(0.0, 0.99)

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.protocols import SimulationError
-from actors.simulation.parcel import Packer, unpack
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import MeshShape, VesselSpec
+from actors.interfaces import SimulationError
+from actors.simulators.task_transfer import Packer, unpack
+from sim_engine.vessel.shapes import MeshShape, VesselSpec
+from sim_engine.vessel.vessel import build_vessel
 
 MUG = Path(__file__).parents[2] / "configs" / "vessels" / "meshes" / "mug.stl"
 

@@ -15,10 +15,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from actors import ray_private, ray_runtime
-from actors.child_process import ChildProcess, child_environment
-from actors.protocols import LaboratoryError
-from actors.spec import LaboratorySpec
+from actors.interfaces import LaboratoryError
+from actors.laboratory_settings import LaboratorySpec
+from actors.runtime import private_ray as ray_private
+from actors.runtime import ray_runtime
+from actors.runtime.child_process import ChildProcess, child_environment
 from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.ray
@@ -26,8 +27,8 @@ pytestmark = pytest.mark.ray
 PROGRAM = """
 import asyncio, json, os, signal, sys, time
 import psutil
-from actors.ray_runtime import keep_signals, ray_folder, start_ray, stop_ray
-from actors.spec import LaboratorySpec
+from actors.runtime.ray_runtime import keep_signals, ray_folder, start_ray, stop_ray
+from actors.laboratory_settings import LaboratorySpec
 
 class Spinner:
     def pid(self): return os.getpid()
@@ -197,8 +198,7 @@ def test_logs_of_workers_that_are_gone_are_removed_and_those_of_living_ones_kept
 
 
 def test_a_class_is_made_one_of_actors_once_however_many_there_are(ray_running) -> None:
-    from actors.device import RayDevice
-    from actors.ray_class import actor_class
+    from actors.runtime.remote_object import RayDevice, actor_class
 
     before = actor_class.cache_info().currsize
     devices = [RayDevice(str(number), Counter) for number in range(3)]
@@ -211,7 +211,7 @@ def test_a_class_is_made_one_of_actors_once_however_many_there_are(ray_running) 
 def test_a_process_that_hangs_is_given_up_long_before_the_deadline(
     ray_running: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from actors import device
+    from actors.runtime import remote_object as device
 
     monkeypatch.setattr(device, "LOOK_INTERVAL", 0.2)
     monkeypatch.setattr(device, "LOOK_DEADLINE", 1.0)

@@ -20,12 +20,12 @@ ROOT = Path(__file__).parents[2]
 PROGRAM = """
 import asyncio, json, sys
 from actors.laboratory import open_laboratory
-from actors.optimizer.core.problem import Data, SuggestProblem
-from actors.spec import LaboratorySpec
-from actors.warm import WarmSimulators
-from sim_engine.liquid import SimulationParameters
-from sim_engine.space import Axis, Space
-from sim_engine.task import PourTask
+from actors.optimizer.questions import Data, SuggestProblem
+from actors.laboratory_settings import LaboratorySpec
+from actors.simulators.warm_pool import WarmSimulators
+from sim_engine.liquids import SimulationParameters
+from sim_engine.search_space import Axis, Space
+from sim_engine.scene import PourTask
 from tests.actors.conftest import make_scene
 from sim_engine.action import Action
 from tests.reliability.formula import Formula

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from actors.simulation.shared import AHEAD, FairPool
+from actors.simulators.shared_pool import AHEAD, FairPool
 
 
 class Pool:

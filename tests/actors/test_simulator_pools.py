@@ -14,14 +14,14 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.arm.numbers import NumbersArm, NumbersSpec
-from actors.cluster.versions import versions
-from actors.device import RayDevice
-from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
-from actors.simulation import processes
-from actors.simulation.in_process import InProcessSimulatorPool
-from actors.simulation.pool import RaySimulatorPool
-from actors.simulation.processes import ProcessSimulatorPool
+from actors.arm.simulated_arm import NumbersSpec, SimulatedArm
+from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
+from actors.runtime.cluster_nodes import versions
+from actors.runtime.remote_object import RayDevice
+from actors.simulators import process_worker as processes
+from actors.simulators.local_worker import InProcessSimulatorPool
+from actors.simulators.pool import RaySimulatorPool
+from actors.simulators.process_worker import ProcessSimulatorPool
 from tests.patience import PATIENCE
 
 
@@ -200,7 +200,7 @@ def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, task):
 @pytest.mark.ray
 def test_simulators_step_back_behind_an_arm_s_driver_which_does_not(ray_running, fake, task):
     async def play():
-        arm = RayDevice("arm", NumbersArm, NumbersSpec(0.0))
+        arm = RayDevice("arm", SimulatedArm, NumbersSpec(0.0))
         pool = RaySimulatorPool(2, make=fake())
         try:
             await pool.simulate(task())

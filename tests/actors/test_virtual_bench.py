@@ -12,14 +12,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.bench.hidden import draw_pose_error, spill_of
-from actors.bench.spec import VirtualBenchSpec
+from actors.bench.ground_truth import draw_pose_error, spill_of
+from actors.interfaces import InvalidActionError, NotPouredError, PourFailedError, UnknownPourError
 from actors.laboratory import open_laboratory
-from actors.protocols import InvalidActionError, NotPouredError, PourFailedError, UnknownPourError
-from actors.spec import LaboratorySpec
+from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
 from sim_engine.action import DEG
 from sim_engine.outcome import PourOutcome
-from sim_engine.task import PoseError
+from sim_engine.scene import PoseError
 from tests.patience import PATIENCE
 
 

@@ -17,8 +17,8 @@ from typing import Any
 
 import psutil
 
-from orchestrator.journal import JOURNAL_NAME, Entry, JournalReader, Kind
-from orchestrator.journal_file import JournalError
+from orchestrator.journal.journal import JOURNAL_NAME, Entry, JournalReader, Kind
+from orchestrator.journal.journal_file import JournalError
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parents[2]
@@ -46,7 +46,7 @@ class Workplace:
     def start(self, *arguments: str) -> subprocess.Popen[str]:
         """`decant ARGUMENTS` as from another terminal."""
         return subprocess.Popen(
-            [sys.executable, "-c", "from orchestrator.cli import main; main()", *arguments],
+            [sys.executable, "-c", "from orchestrator.cli.app import main; main()", *arguments],
             cwd=self.folder,
             env={**os.environ, **self.environment, "PYTHONPATH": str(ROOT), "TMPDIR": str(self.temporary)},
             stdin=subprocess.DEVNULL,

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import uvicorn
 
-from orchestrator.daemon.api import serve_app
-from orchestrator.daemon.auth import Role, Tokens, token_of
-from orchestrator.daemon.client import Client
-from orchestrator.daemon.settings import Settings
+from orchestrator.daemon.access_control import Role, Tokens, token_of
+from orchestrator.daemon.daemon_client import Client
+from orchestrator.daemon.daemon_settings import DaemonSettings
+from orchestrator.daemon.http_api import serve_app
 from orchestrator.daemon.supervisor import Supervisor
 from tests.patience import PATIENCE
 
@@ -22,7 +22,7 @@ class Real:
     """A daemon in a thread, with a socket that anybody on this machine can reach."""
 
     def __init__(self, state: Path) -> None:
-        self.settings = Settings(state, in_process=True, keep_free=0, quick_start=False)
+        self.settings = DaemonSettings(state, in_process=True, keep_free=0, quick_start=False)
         state.mkdir(exist_ok=True)
         self.tokens = Tokens(self.settings.tokens)
         self.socket = socket.socket()

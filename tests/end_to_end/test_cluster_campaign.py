@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from orchestrator.journal import Entry, Kind
+from orchestrator.journal.journal import Entry, Kind
 from tests.end_to_end import small
 from tests.end_to_end.command import (
     PATIENCE,
@@ -186,9 +186,9 @@ def test_a_program_that_loses_its_own_node_ends_with_a_word_whether_ray_lets_it_
 
 CHECK = """
 import sys
-from actors.cluster.probe import check_cluster
-from actors.protocols import LaboratoryError
-from actors.spec import RaySpec
+from actors.runtime.cluster_check import check_cluster
+from actors.interfaces import LaboratoryError
+from actors.laboratory_settings import RaySpec
 try:
     check_cluster(RaySpec(sys.argv[1]), need_bench=False)
 except LaboratoryError as error:
@@ -223,11 +223,11 @@ MUG_POURS = """
 import asyncio, sys
 from pathlib import Path
 from actors.laboratory import open_laboratory
-from actors.spec import LaboratorySpec, RaySpec
+from actors.laboratory_settings import LaboratorySpec, RaySpec
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.task import PourTask, Scene
-from sim_engine.vessel.spec import MeshShape, VesselSpec, cylinder
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.scene import PourTask, Scene
+from sim_engine.vessel.shapes import MeshShape, VesselSpec, cylinder
 
 address, mesh = sys.argv[1], Path("mug.stl").absolute()
 mug = VesselSpec(name="mug", shape=MeshShape(path=mesh, unit="mm"))

@@ -16,8 +16,8 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from orchestrator.daemon.api import create_app
-from orchestrator.daemon.auth import Role
+from orchestrator.daemon.access_control import Role
+from orchestrator.daemon.http_api import create_app
 from tests.depth import examples
 from tests.end_to_end.daemon_thread import Real
 

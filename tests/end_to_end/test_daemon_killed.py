@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 
-from orchestrator.codec import decode_outcome
-from orchestrator.daemon.auth import Role, token_of
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.daemon.access_control import Role, token_of
+from orchestrator.journal.codec import decode_outcome
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Poured
 from tests.end_to_end.command import ROOT, pour_under_way, started_after_they_were_finished
 from tests.end_to_end.small import CAMPAIGN, write_campaign
@@ -60,7 +60,14 @@ class Laboratory:
 
     def _decant(self, *arguments: str, stdout: Any = subprocess.PIPE) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [sys.executable, "-c", "from orchestrator.cli import main; main()", *arguments, "--state", str(self.state)],
+            [
+                sys.executable,
+                "-c",
+                "from orchestrator.cli.app import main; main()",
+                *arguments,
+                "--state",
+                str(self.state),
+            ],
             cwd=self.folder,
             env={**os.environ, "PYTHONPATH": str(ROOT), **self.environment},
             stdin=subprocess.DEVNULL,

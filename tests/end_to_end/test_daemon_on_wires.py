@@ -14,12 +14,12 @@ from typing import Any
 
 import pytest
 
-from actors.balance.virtual_serial.handle import VirtualSerialBalance
-from actors.virtual_ur.launcher import VirtualController
-from orchestrator.daemon.auth import Role, token_of
-from orchestrator.daemon.client import Client, DaemonError
-from orchestrator.journal import Kind
-from orchestrator.safety import SafetyRecord, write_record
+from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
+from actors.emulators.ur_controller.controller_process import VirtualController
+from orchestrator.daemon.access_control import Role, token_of
+from orchestrator.daemon.daemon_client import Client, DaemonError
+from orchestrator.journal.journal import Kind
+from orchestrator.runs.safety_approval import SafetyRecord, write_record
 from tests.end_to_end.command import pour_under_way
 from tests.end_to_end.test_daemon_killed import Laboratory, opened
 from tests.orchestrator import hardware

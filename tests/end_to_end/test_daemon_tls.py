@@ -9,7 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 from tests.end_to_end.test_daemon_killed import opened
 from tests.patience import PATIENCE
 

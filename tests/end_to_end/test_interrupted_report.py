@@ -6,7 +6,7 @@ import json
 import signal
 from pathlib import Path
 
-from orchestrator.journal import Entry, Kind
+from orchestrator.journal.journal import Entry, Kind
 from orchestrator.states import State
 from tests.end_to_end import small
 from tests.end_to_end.command import Workplace

@@ -17,12 +17,12 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from orchestrator.cli import app
-from orchestrator.config.load import load_campaign
-from orchestrator.journal import JOURNAL_NAME, Entry, Kind
-from orchestrator.journal_check import JournalDamagedError
-from orchestrator.pour_ledger import LEDGER_NAME, read_ledger
-from orchestrator.runs import find_run
+from orchestrator.cli.app import app
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.journal.journal import JOURNAL_NAME, Entry, Kind
+from orchestrator.journal.journal_check import JournalDamagedError
+from orchestrator.journal.pour_ledger import LEDGER_NAME, read_ledger
+from orchestrator.runs.run_folder import find_run
 from tests.end_to_end import small
 from tests.end_to_end.command import Workplace, ended, started_after_they_were_finished
 from tests.patience import PATIENCE

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.campaign.check import check_campaign
-from orchestrator.config.load import load_campaign
-from orchestrator.plan import CampaignPlan
-from orchestrator.stages import stages_of
-from orchestrator.strategies.deployment.d3_settings import D3Settings
-from sim_engine.task import PoseError
+from orchestrator.config.campaign_checks import check_campaign
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.runs.stages import stages_of
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.deployment.d3 import D3Settings
+from sim_engine.scene import PoseError
 
 CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"
 

@@ -12,7 +12,7 @@ from typing import Any
 import psutil
 import pytest
 
-from orchestrator.journal import Entry, Kind
+from orchestrator.journal.journal import Entry, Kind
 from tests.depth import THOROUGH
 from tests.end_to_end import small
 from tests.end_to_end.command import (

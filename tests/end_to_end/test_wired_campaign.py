@@ -11,8 +11,8 @@ import psutil
 import pytest
 from ruamel.yaml import YAML
 
-from actors.arm.joint_path import unpack
-from orchestrator.journal import Entry, Kind
+from actors.arm.planned_pour import unpack
+from orchestrator.journal.journal import Entry, Kind
 from tests.end_to_end import small
 from tests.end_to_end.command import Workplace, finished_in, pour_under_way, started_after_they_were_finished
 
@@ -63,7 +63,9 @@ def far_ends(place: Workplace) -> list[psutil.Process]:
     for process in psutil.process_iter():
         try:
             ours = process.environ().get("TMPDIR") == str(place.temporary)
-            if ours and any(name in process.cmdline() for name in ("actors.virtual_ur", "actors.arm.ur.worker")):
+            if ours and any(
+                name in process.cmdline() for name in ("actors.emulators.ur_controller", "actors.arm.ur.rtde_worker")
+            ):
                 found.append(process)
         except (psutil.Error, OSError):
             continue

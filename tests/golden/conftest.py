@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.state_directory import VARIABLE
+from orchestrator.catalogue.run_registry import VARIABLE
 from tests.golden.golden import Golden
 
 REGENERATE = "--regenerate"

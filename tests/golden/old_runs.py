@@ -98,8 +98,8 @@ CAMPAIGNS = {"learnt": (LEARNT, "run"), "weighed": (WEIGHED, "calibrate"), "unkn
 
 PROGRAM = """
 import os, signal, sys
-from orchestrator.cli import main
-from orchestrator.journal import Journal
+from orchestrator.cli.app import main
+from orchestrator.journal.journal import Journal
 
 pours, written = int(sys.argv.pop(1)), 0
 write = Journal.append_all

@@ -16,17 +16,17 @@ from typing import Any
 
 import pytest
 
-from orchestrator.codec import encode_request, to_json
-from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
-from orchestrator.config.study.sections import load_study
-from orchestrator.fingerprint import deciding, fingerprint
-from orchestrator.plan import CampaignPlan
+from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
+from orchestrator.journal.codec import encode_request, to_json
 from orchestrator.requests import Ask, Failed, Pour, Request, Simulate, Slots, Suggest
-from orchestrator.stages import prediction_stages, stage_seed, stages_of
-from orchestrator.strategies.learnt import Learnt
-from orchestrator.strategies.protocol import Strategy
+from orchestrator.runs.fingerprint import deciding, fingerprint
+from orchestrator.runs.stages import prediction_stages, stage_seed, stages_of
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.stage_result import StageResult
+from orchestrator.strategies.strategy import Strategy
 from orchestrator.study.cells import cells_of
-from orchestrator.study.plan import study_fingerprint
+from orchestrator.study.study_file import load_study
+from orchestrator.study.study_plan import study_fingerprint
 from tests.golden.golden import DATA, ROOT, Changes, Golden, columns, compact, normalised
 from tests.golden.world import outcome_of
 
@@ -47,7 +47,7 @@ def played(plan: CampaignPlan) -> Iterator[dict[str, Any]]:
     """A campaign's stages from the first to the last: requests, outcomes, decisions, results, one after the other."""
     stages = [*stages_of(plan), *([] if plan.deployment is None else prediction_stages(
         plan, plan.deployment, PREDICTION_SEEDS))]  # fmt: skip
-    results: dict[str, Learnt] = {}
+    results: dict[str, StageResult] = {}
     for stage in stages:
         seed = stage_seed(plan.seed, stage.name)
         yield {"stage": stage.name, "seed": seed, "order": stage.order, "pours": stage.pours}

@@ -19,8 +19,8 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from orchestrator.cli import app
-from orchestrator.state_directory import VARIABLE
+from orchestrator.catalogue.run_registry import VARIABLE
+from orchestrator.cli.app import app
 from tests.golden.golden import DATA, ROOT, Golden, normalised
 
 INPUTS = DATA / "bad_input"

@@ -9,9 +9,9 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from orchestrator.cli import app
-from orchestrator.config.schema import SCHEMAS, schema_text
-from orchestrator.daemon.api import openapi_text
+from orchestrator.cli.app import app
+from orchestrator.config.json_schema import SCHEMAS, schema_text
+from orchestrator.daemon.http_api import openapi_text
 from tests.golden.golden import ROOT, Golden, differing, normalised
 
 PUBLISHED = {

@@ -20,27 +20,30 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.optimizer.core.mismatch import Displacement, Limit, Mismatch, Play
-from actors.optimizer.core.problem import (
+from actors.optimizer.questions import (
+    BenchOffset,
     Data,
     DesignQuestion,
     Disturbance,
-    Effort,
+    Limit,
     Linear,
+    ModelDiscrepancy,
+    Play,
     PosteriorQuestion,
     Risk,
+    SearchEffort,
     Suggestion,
     SuggestProblem,
 )
-from actors.optimizer.core.propose import propose
-from orchestrator.codec import to_json
+from actors.optimizer.suggest import propose
+from orchestrator.journal.codec import to_json
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.pour import PourSimulator
-from sim_engine.space import Axis, Space
-from sim_engine.spread import spreads
-from sim_engine.task import PourTask, Scene
-from sim_engine.vessel.spec import cylinder
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.prediction_band import spreads
+from sim_engine.scene import PourTask, Scene
+from sim_engine.search_space import Axis, Space
+from sim_engine.simulator import PourSimulator
+from sim_engine.vessel.shapes import cylinder
 from tests.golden.golden import DATA, RTOL, Golden, compact
 
 ELSEWHERE = 1e-4
@@ -114,7 +117,7 @@ PLAIN = SuggestProblem(PLANE, POURED, seed=11, predict_at=ASKED)
 INFORMED = replace(PLAIN, simulated=SIMULATED)
 
 ADAPTIVE = replace(
-    INFORMED, mean="adaptive", mismatch=Mismatch((Play(shift=0.14), Play(factor=0.05, origin=0.2)), left=4)
+    INFORMED, mean="adaptive", mismatch=ModelDiscrepancy((Play(shift=0.14), Play(factor=0.05, origin=0.2)), left=4)
 )
 
 CONTEXT = SuggestProblem(THETA, differences(18, 3), seed=12, context=points(6, 4))
@@ -129,8 +132,8 @@ PROBLEMS: dict[str, SuggestProblem] = {
     "lcb, pooled mean, widened": replace(INFORMED, mean="pooled", widening=2.0),
     "lcb, scaled mean": replace(INFORMED, mean="scaled"),
     "lcb, varying noise": replace(PLAIN, data=data(20, 8), noise="varying"),
-    "posterior minimum": replace(PLAIN, acquisition="posterior_minimum", count=2, effort=Effort()),
-    "a fit that goes on": replace(PLAIN, effort=Effort(((-1.0, -0.5, -0.5, -3.0),), 3)),
+    "posterior minimum": replace(PLAIN, acquisition="posterior_minimum", count=2, effort=SearchEffort()),
+    "a fit that goes on": replace(PLAIN, effort=SearchEffort(((-1.0, -0.5, -0.5, -3.0),), 3)),
     "refusals and failures": replace(PLAIN, infeasible=points(3, 9), refused=points(2, 10), failed=POURED.points[:1]),
     "a constraint": replace(PLAIN, constraints=(Linear((("x_offset", 1.0), ("angular_velocity", 0.05)), 0.17),)),
     "knowledge, simulated mean": replace(INFORMED, mean="simulated", acquisition="knowledge", count=2),
@@ -140,7 +143,7 @@ PROBLEMS: dict[str, SuggestProblem] = {
     "least loss within a limit": replace(
         ADAPTIVE,
         acquisition="least_loss",
-        mismatch=replace(ADAPTIVE.mismatch, limit=Limit(0.2, 0.1), drawn=(Displacement((1.0, 1.0), (0.05, 0.0)),)),  # type: ignore[type-var]
+        mismatch=replace(ADAPTIVE.mismatch, limit=Limit(0.2, 0.1), drawn=(BenchOffset((1.0, 1.0), (0.05, 0.0)),)),  # type: ignore[type-var]
     ),
     "what adaptive pours taught": replace(ADAPTIVE, count=0),
     "context": CONTEXT,

@@ -23,22 +23,22 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 import decant
-from orchestrator.campaign import run_campaign
-from orchestrator.cli import app
-from orchestrator.codec import encode_request
-from orchestrator.config.load import load_campaign
-from orchestrator.daemon.encode import PASSING as PASSED_BY
-from orchestrator.daemon.encode import event_json
-from orchestrator.events import Event, PourProgressed, StrategyProgressed
-from orchestrator.journal import JOURNAL_NAME, JournalReader
-from orchestrator.progress import ProgressDisplay
-from orchestrator.publish import publish
-from orchestrator.replay import ToldStep, read_history
-from orchestrator.report.table import summary_table
+from orchestrator.cli.app import app
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.daemon.event_feed import PASSING as PASSED_BY
+from orchestrator.daemon.event_feed import event_json
+from orchestrator.journal.codec import encode_request
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.run_record import read_result
+from orchestrator.progress.console_progress import ProgressDisplay
 from orchestrator.requests import Request
-from orchestrator.run_result import read_result
-from orchestrator.stages import stages_of
-from orchestrator.strategies.learnt import Learnt
+from orchestrator.results.console_view import summary_table
+from orchestrator.results.publishing import publish
+from orchestrator.runs.events import Event, PourProgressed, StrategyProgressed
+from orchestrator.runs.replay import ToldStep, read_history
+from orchestrator.runs.run_engine import run_campaign
+from orchestrator.runs.stages import stages_of
+from orchestrator.strategies.stage_result import StageResult
 from tests.golden import old_runs
 from tests.golden.golden import ROOT, Golden, agree, compact, line, normalised
 from tests.golden.world import FormulaLaboratory
@@ -233,7 +233,7 @@ def test_old_run_is_replayed(name: str, runs: Path) -> None:
     plan = load_campaign(folder / "resolved.json")
     asked = 0
     with JournalReader(folder / JOURNAL_NAME) as journal:
-        results: dict[str, Learnt] = {}
+        results: dict[str, StageResult] = {}
         for stage in stages_of(plan):
             history = read_history(journal, stage.name)
             if history.seed is None:

@@ -7,9 +7,16 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from actors.optimizer.core.mismatch import Displacement, MismatchFound
-from actors.optimizer.core.problem import Posterior, RiskAnswer, Suggestion, SuggestProblem, SurrogateMap
-from actors.protocols import PourProgress, ProgressCallback
+from actors.interfaces import PourProgress, ProgressCallback
+from actors.optimizer.questions import (
+    BenchOffset,
+    DiscrepancyFound,
+    Posterior,
+    RiskAnswer,
+    Suggestion,
+    SuggestProblem,
+    SurrogateMap,
+)
 from orchestrator.requests import (
     Answered,
     Ask,
@@ -24,10 +31,9 @@ from orchestrator.requests import (
     Suggested,
 )
 from sim_engine.action import Action
-from sim_engine.liquid import SimulationParameters
-from sim_engine.outcome import PourMeasurement, PourOutcome
-from sim_engine.simulated import SimulatedPour
-from sim_engine.task import PourTask, Scene
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import PourMeasurement, PourOutcome, SimulatedPour
+from sim_engine.scene import PourTask, Scene
 
 LOAD = 0.2
 """Of a weighed pour [kg]."""
@@ -164,14 +170,14 @@ def _risk(problem: SuggestProblem) -> RiskAnswer | None:
     return RiskAnswer(expected, (0.01,) * asked, worst)
 
 
-def _mismatch(problem: SuggestProblem, dimension: int) -> MismatchFound:
+def _mismatch(problem: SuggestProblem, dimension: int) -> DiscrepancyFound:
     assert problem.mismatch is not None
     limited = problem.mismatch.limit is not None
     drawn = (
-        Displacement((1.0,) * dimension, (0.05,) * dimension),
-        Displacement((0.98,) * dimension, (0.0,) * dimension),
+        BenchOffset((1.0,) * dimension, (0.05,) * dimension),
+        BenchOffset((0.98,) * dimension, (0.0,) * dimension),
     )
-    return MismatchFound(
+    return DiscrepancyFound(
         ignorance=0.05,
         shifts=(0.05,) * dimension,
         deviations=(0.02,) * dimension,

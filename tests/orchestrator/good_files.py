@@ -8,13 +8,13 @@ from textwrap import dedent
 
 import pytest
 
-from orchestrator.config.load import load_campaign
-from orchestrator.config.yaml.dump import as_file
-from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.references import References
-from orchestrator.config.yaml.sections import Section
-from orchestrator.config.yaml.source import Document, Place, Report
-from orchestrator.config.yaml.validate import validate
+from orchestrator.config.yaml.section_validation import validate
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.config.yaml.yaml_source import Document, Place, Report
+from orchestrator.config.yaml.yaml_writer import as_file
+from sim_engine.settings.model import Section
 
 CAMPAIGN = """\
 name: test

@@ -6,7 +6,7 @@ import socket
 import time
 from pathlib import Path
 
-from actors.virtual_ur.launcher import VirtualController
+from actors.emulators.ur_controller.controller_process import VirtualController
 
 HOME = (-14.0, -91.0, -115.0, -154.0, -104.0, 0.0)
 """[deg]"""

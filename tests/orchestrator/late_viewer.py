@@ -9,8 +9,8 @@ import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from actors.child_process import child_environment
-from orchestrator.monitor.server import environment, rerun_program
+from actors.runtime.child_process import child_environment
+from orchestrator.live_view.viewer_server import environment, rerun_program
 from tests.orchestrator.recorded import Contents
 from tests.patience import PATIENCE
 

@@ -8,19 +8,19 @@ from typing import Any, Literal
 
 import numpy as np
 
-from orchestrator.config.pose import PoseNoiseSection
-from orchestrator.plan import CalibrationPlan, DeploymentPlan
-from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta
-from orchestrator.strategies.calibration.posterior import PosteriorFound, RemainingDiscrepancy
-from orchestrator.strategies.deployment.risk import RiskSettings
-from orchestrator.strategies.deployment.window import WindowSettings
-from orchestrator.strategies.doors import STRATEGIES
+from orchestrator.config.pose_errors import PoseNoiseSection
+from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
+from orchestrator.strategies.calibration.posterior_summary import PosteriorFound, RemainingDiscrepancy
+from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan
+from orchestrator.strategies.deployment.disturbances import RiskSettings
+from orchestrator.strategies.deployment.safe_window import WindowSettings
+from orchestrator.strategies.strategy_registry import STRATEGIES
 from orchestrator.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE
 from sim_engine.action import Action
-from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import Loss
-from sim_engine.space import Space
-from sim_engine.task import PoseError
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import Loss
+from sim_engine.scene import PoseError
+from sim_engine.search_space import Space
 
 CALM: dict[str, dict[str, Any]] = {"D3": {"model": "residual", "trust": "always", "per_pour": 0}}
 """What tests have otherwise than campaigns, unless they say it."""

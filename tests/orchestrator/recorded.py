@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from orchestrator.monitor.server import run_rerun
+from orchestrator.live_view.viewer_server import run_rerun
 
 
 class Contents:

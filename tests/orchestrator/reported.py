@@ -12,13 +12,13 @@ from matplotlib.collections import PathCollection
 from matplotlib.text import Text
 from rich.console import Console
 
-from orchestrator.plan import MeasuredPour
-from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour, random_parameters
+from orchestrator.strategies.calibration.calibration_scores import Evaluation, ScoredPour, random_parameters
+from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.strategies.campaign_plan import MeasuredPour
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.learnt import Learnt
+from orchestrator.strategies.stage_result import StageResult
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import SimulationParameters
+from sim_engine.liquids import SimulationParameters
 from tests.orchestrator import watched
 
 
@@ -28,7 +28,7 @@ def spilled(action: Action, parameters: SimulationParameters) -> float:
     return min(0.02 + 0.3 * miss + 2.0 * abs(parameters.cohesion - 0.02), 0.9)
 
 
-def played_results() -> dict[str, Learnt]:
+def played_results() -> dict[str, StageResult]:
     """Results of the real strategies, in a world whose spillage is a formula."""
     plan = watched.campaign(pours=4)
     assert plan.calibration is not None

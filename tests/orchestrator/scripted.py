@@ -6,12 +6,12 @@ import asyncio
 from pathlib import Path
 from typing import Any, Literal
 
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Outcome, Pour, Request, Simulate, Slots
-from orchestrator.stages import StageDefinition
+from orchestrator.runs.stages import StageDefinition
 from orchestrator.states import State, check_transition
-from orchestrator.strategies.learnt import Learnt
-from orchestrator.strategies.progress import Progress
+from orchestrator.strategies.stage_result import StageResult
+from orchestrator.strategies.strategy import Progress
 from tests.orchestrator.toy import SCENE, SPACE, THETA, ToyLaboratory, run_toy
 
 
@@ -31,7 +31,7 @@ def one_stage(strategy: Any, order: Any = "logical") -> tuple[StageDefinition, .
     return (StageDefinition("only", lambda results, seed: strategy, order=order, pours=True),)
 
 
-class Scripted(Learnt):
+class Scripted(StageResult):
     """What a script was told."""
 
     kind: Literal["scripted"] = "scripted"

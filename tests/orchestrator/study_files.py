@@ -8,8 +8,8 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from orchestrator.config.study.sections import load_study
-from orchestrator.study.plan import StudyPlan
+from orchestrator.study.study_file import load_study
+from orchestrator.study.study_plan import StudyPlan
 
 ROOT = Path(__file__).parents[2]
 STUDIES = ROOT / "configs" / "studies"

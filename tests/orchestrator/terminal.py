@@ -26,7 +26,7 @@ class Terminal:
 
     def __init__(self, *arguments: str, cwd: str | None = None) -> None:
         self._keys, theirs = pty.openpty()
-        code = "import sys; sys.argv[0] = 'decant'; from orchestrator.cli import main; main()"
+        code = "import sys; sys.argv[0] = 'decant'; from orchestrator.cli.app import main; main()"
         self.process = subprocess.Popen(
             [sys.executable, "-c", code, *arguments],
             stdin=theirs,

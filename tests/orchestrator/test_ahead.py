@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from orchestrator.ahead import Ahead
-from orchestrator.events import Event, RequestFinished, StageClosed
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Failed, Outcome, Pour, Simulate
-from orchestrator.stages import CALIBRATION, EVALUATION, POURS
-from sim_engine.task import PourTask
+from orchestrator.runs.events import Event, RequestFinished, StageClosed
+from orchestrator.runs.speculation import SpeculativeExecution
+from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
+from sim_engine.scene import PourTask
 from tests.orchestrator.scripted import simulate
 from tests.orchestrator.test_stages import Optimizer, campaign
 from tests.orchestrator.toy import ToyBench, ToyLaboratory, ToySimulators, logical_record, run_toy
@@ -96,7 +96,7 @@ def test_what_was_foreseen_makes_room_for_what_is_asked_for() -> None:
                 raise
             raise AssertionError
 
-        ahead = Ahead(work, width=2)
+        ahead = SpeculativeExecution(work, width=2)
         for seed in (1, 2, 3):
             ahead.foresee(simulate(seed))
         await asyncio.sleep(0)
@@ -124,7 +124,7 @@ def test_one_that_is_being_made_is_waited_for_and_not_made_twice() -> None:
             await asyncio.sleep(0.01)
             return Failed("invalid_action", "cups touch")
 
-        ahead = Ahead(work, width=1)
+        ahead = SpeculativeExecution(work, width=1)
         ahead.foresee(simulate(1))
         assert ahead.knows(simulate(1))
         assert await ahead.take(simulate(1)) == Failed("invalid_action", "cups touch")
@@ -142,7 +142,7 @@ def test_bad_luck_is_not_kept(outcome: Outcome | Exception) -> None:
                 raise outcome
             return outcome
 
-        ahead = Ahead(work, width=1)
+        ahead = SpeculativeExecution(work, width=1)
         ahead.foresee(simulate(1))
         await asyncio.sleep(0.01)
         assert not ahead.knows(simulate(1))

@@ -19,14 +19,13 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from orchestrator.catalogue import registry
-from orchestrator.catalogue.columns import POURS, RUNS
-from orchestrator.catalogue.index import INDEX_NAME, Catalogue
-from orchestrator.catalogue.search import Search, find_pours, find_runs, moment
-from orchestrator.cli import app
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.runs import create_run
-from orchestrator.state_directory import VARIABLE, state_directory
+from orchestrator.catalogue import run_registry as registry
+from orchestrator.catalogue.catalogue_index import INDEX_NAME, POURS, RUNS, Catalogue
+from orchestrator.catalogue.queries import CatalogueQuery, find_pours, find_runs, moment
+from orchestrator.catalogue.run_registry import VARIABLE, state_directory
+from orchestrator.cli.app import app
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.runs.run_folder import create_run
 from tests.orchestrator.killed import die_at, run
 from tests.orchestrator.toy import ToyLaboratory, ToySimulators, toy_plan
 
@@ -68,7 +67,7 @@ def killed(tmp_path: Path, at: Kind) -> Path:
 def asked(table: str = "run", **conditions: Any) -> list[dict[str, Any]]:
     with Catalogue() as catalogue:
         catalogue.refresh()
-        return (find_runs if table == "run" else find_pours)(catalogue, Search(**conditions))
+        return (find_runs if table == "run" else find_pours)(catalogue, CatalogueQuery(**conditions))
 
 
 def invoke(command: str) -> Any:

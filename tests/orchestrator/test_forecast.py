@@ -8,14 +8,19 @@ from itertools import pairwise
 
 import pytest
 
-from actors.bench.spec import VirtualBenchSpec
-from actors.spec import LaboratorySpec
-from orchestrator.events import Event, RequestFinished, RequestStarted, StageClosed, StageOpened, StrategyProgressed
-from orchestrator.forecast import PRICE, Forecast, Work
+from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
+from orchestrator.progress.time_estimate import PRICE, Forecast, WorkEstimate, pour_time, work_of
 from orchestrator.requests import Failed, Pour, Simulate, Simulated
-from orchestrator.strategies.progress import Progress
-from orchestrator.work import pour_time, work_of
-from sim_engine.liquid import SimulationParameters
+from orchestrator.runs.events import (
+    Event,
+    RequestFinished,
+    RequestStarted,
+    StageClosed,
+    StageOpened,
+    StrategyProgressed,
+)
+from orchestrator.strategies.strategy import Progress
+from sim_engine.liquids import SimulationParameters
 from tests.orchestrator import watched
 from tests.orchestrator.toy import SCENE, SPACE, toy_plan
 
@@ -30,10 +35,10 @@ EVALUATION = tuple(0.68 for _ in range(25))
 PRIOR = tuple(0.74 for _ in range(16))
 CYCLES = (5.7, 6.6, 6.9, 5.2, 6.8, 5.7)
 WORK = {
-    "pours": Work(pours=10, pour_time=8.5),
-    "calibration": Work(24, particles=900.0),
-    "evaluation": Work(25),
-    "deployment": Work(40, 6, beside=4, pour_time=8.5),
+    "pours": WorkEstimate(pours=10, pour_time=8.5),
+    "calibration": WorkEstimate(24, particles=900.0),
+    "evaluation": WorkEstimate(25),
+    "deployment": WorkEstimate(40, 6, beside=4, pour_time=8.5),
 }
 
 
@@ -101,7 +106,7 @@ def test_the_end_that_is_foretold_comes_true_within_a_fifth_from_the_beginning_o
 def test_first_pours_that_start_a_bench_and_what_is_made_beside_them_say_nothing_of_the_next_ones() -> None:
     """Seen: 171 s were told after the second pour where 88 were left, 119 a moment before."""
     timeline, forecast = Timeline(), Forecast(slots=2, particles=1000.0)
-    forecast.begin(2, {"pours": Work(pours=10, pour_time=8.5)})
+    forecast.begin(2, {"pours": WorkEstimate(pours=10, pour_time=8.5)})
     lefts = []
     for event in timeline.stage("pours", pours=(33.6, 22.7, 6.5, 4.3, *(4.0,) * 6)):
         forecast(event)
@@ -114,7 +119,7 @@ def test_first_pours_that_start_a_bench_and_what_is_made_beside_them_say_nothing
 def test_simulations_made_while_the_arm_pours_are_not_waited_for(made: bool, last: bool) -> None:
     """Unless they weren't: then the forecast is right again once that is seen."""
     forecast, timeline = Forecast(slots=2, particles=0.6 * 2 / PRICE), Timeline()
-    forecast.begin(2, {"pours": Work(pours=4, pour_time=8.0), "evaluation": Work(35, ahead=25)})
+    forecast.begin(2, {"pours": WorkEstimate(pours=4, pour_time=8.0), "evaluation": WorkEstimate(35, ahead=25)})
     assert forecast.left(timeline.now) == pytest.approx(4 * 8.2 + 10 * 0.6)
     answered = (*(0.6 for _ in range(10)), *((0.0 if made else 0.6) for _ in range(25)))
     for event in timeline.stage("pours", pours=(8.0,) * 4):
@@ -140,11 +145,11 @@ def test_the_time_left_falls_while_a_pour_or_a_simulation_takes_its_time() -> No
 
 def test_simulations_beside_a_pour_cost_time_only_where_they_outlast_it() -> None:
     one = Forecast(slots=1, particles=1000.0)
-    one.begin(1, {"deployment": Work(0, 10, beside=0, pour_time=90.0)})
+    one.begin(1, {"deployment": WorkEstimate(0, 10, beside=0, pour_time=90.0)})
     few = Forecast(slots=1, particles=1000.0)
-    few.begin(1, {"deployment": Work(200, 10, beside=20, pour_time=90.0)})
+    few.begin(1, {"deployment": WorkEstimate(200, 10, beside=20, pour_time=90.0)})
     many = Forecast(slots=1, particles=1000.0)
-    many.begin(1, {"deployment": Work(2000, 10, beside=200, pour_time=90.0)})
+    many.begin(1, {"deployment": WorkEstimate(2000, 10, beside=200, pour_time=90.0)})
     assert few.left(0.0) == one.left(0.0) == pytest.approx(902.0)
     assert (many.left(0.0) or 0.0) > 1.5 * 902.0
 
@@ -160,8 +165,8 @@ def test_what_an_earlier_run_has_done_is_not_left_any_more() -> None:
 def test_a_person_s_pour_takes_the_time_that_was_set_for_it_and_a_fast_bench_a_part_of_it() -> None:
     plan = toy_plan(watched.Path("x"))
     assert work_of(plan, ["deployment:cup", "no stage of it"]) == {
-        "deployment:cup": Work(37 + 2 * 3, 3, 2, pour_time=0.0),
-        "no stage of it": Work(),
+        "deployment:cup": WorkEstimate(37 + 2 * 3, 3, 2, pour_time=0.0),
+        "no stage of it": WorkEstimate(),
     }
     campaign = watched.campaign()
     assert campaign.deployment is not None

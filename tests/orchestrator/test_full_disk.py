@@ -10,18 +10,18 @@ from typing import Any
 
 import pytest
 
-from actors.child_process import child_environment
-from actors.protocols import Notice, ProgressCallback
-from orchestrator.commands.campaigns import run_directory
-from orchestrator.commands.common import BAD_INPUT, RefusalError
-from orchestrator.events import Event, LogLine
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.journal_file import JournalError
-from orchestrator.plan import OutputPlan
+from actors.interfaces import Notice, ProgressCallback
+from actors.runtime.child_process import child_environment
+from orchestrator.cli.campaign_commands import run_directory
+from orchestrator.cli.foreground_run import BAD_INPUT, RefusalError
+from orchestrator.journal.disk_reserve import MB, RESERVE, TO_BEGIN, NoSpaceError, Reserve
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.journal_file import JournalError
 from orchestrator.requests import Poured
-from orchestrator.reserve import MB, RESERVE, TO_BEGIN, NoSpaceError, Reserve
+from orchestrator.runs.events import Event, LogLine
+from orchestrator.strategies.campaign_plan import OutputPlan
 from sim_engine.outcome import PourMeasurement
-from sim_engine.task import Scene
+from sim_engine.scene import Scene
 from tests.orchestrator.scripted import Script, one_stage, pour, run, states
 from tests.orchestrator.toy import ToyBench, ToyLaboratory, toy_plan
 

@@ -15,14 +15,14 @@ from pathlib import Path
 
 import pytest
 
-from actors.child_process import child_environment
-from orchestrator.daemon.store import Store, StoreError
-from orchestrator.journal import JOURNAL_NAME, Draft, Journal, JournalReader, Kind
-from orchestrator.journal_check import JournalDamagedError, check_journal
-from orchestrator.journal_file import FORMAT, Header, JournalError, JournalLockedError
-from orchestrator.pour_ledger import BEGUN, LEDGER_NAME, read_ledger
+from actors.runtime.child_process import child_environment
+from orchestrator.daemon.daemon_store import Store, StoreError
+from orchestrator.journal.journal import JOURNAL_NAME, Draft, Journal, JournalReader, Kind
+from orchestrator.journal.journal_check import JournalDamagedError, check_journal
+from orchestrator.journal.journal_file import FORMAT, Header, JournalError, JournalLockedError
+from orchestrator.journal.pour_ledger import BEGUN, LEDGER_NAME, read_ledger
 from orchestrator.states import State
-from orchestrator.study.folder import StudyError, opened
+from orchestrator.study.study_folder import StudyError, opened
 from tests.orchestrator.study_files import small
 
 HEADER = Header("toy", {"seed": 7, "deployment": {"pours": 3}})
@@ -105,8 +105,8 @@ def test_pours_are_flushed_to_the_disk_and_simulations_need_not_be(path: Path) -
 def test_everything_acknowledged_survives_the_death_of_the_writer(path: Path) -> None:
     code = f"""
         from pathlib import Path
-        from orchestrator.journal import Journal, Kind
-        from orchestrator.journal_file import Header
+        from orchestrator.journal.journal import Journal, Kind
+        from orchestrator.journal.journal_file import Header
         journal = Journal.create(Path({str(path)!r}), Header("toy", {HEADER.fingerprint!r}))
         for number in range(10**6):
             journal.append(Kind.NOTE, {{"number": number}})
@@ -131,8 +131,8 @@ def test_everything_acknowledged_survives_the_death_of_the_writer(path: Path) ->
 def test_a_second_process_is_refused_and_told_who_is_first(path: Path) -> None:
     code = f"""
         from pathlib import Path
-        from orchestrator.journal import Journal
-        from orchestrator.journal_file import Header
+        from orchestrator.journal.journal import Journal
+        from orchestrator.journal.journal_file import Header
         journal = Journal.create(Path({str(path)!r}), Header("toy", {HEADER.fingerprint!r}))
         print("open", flush=True)
         input()
@@ -250,8 +250,8 @@ def poured(path: Path, *, until: str) -> None:
         import os, signal
         from pathlib import Path
         from orchestrator import journal as module
-        from orchestrator.journal import Journal, Kind
-        from orchestrator.journal_file import Header
+        from orchestrator.journal.journal import Journal, Kind
+        from orchestrator.journal.journal_file import Header
         from tests.orchestrator.test_journal import pour
         journal = Journal.create(Path({str(path)!r}), Header("toy", {HEADER.fingerprint!r}))
         pour(journal, 1)

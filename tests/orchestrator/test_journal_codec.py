@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem, SurrogateMap
-from orchestrator.codec import (
+from actors.optimizer.questions import Data, Suggestion, SuggestProblem, SurrogateMap
+from orchestrator.journal.codec import (
     CodecError,
     canonical,
     decode_outcome,
@@ -23,9 +23,9 @@ from orchestrator.codec import (
 )
 from orchestrator.requests import Failed, Pour, Poured, Prediction, Simulate, Simulated, Suggest, Suggested
 from sim_engine.action import ACTION_DIMENSIONS, Action
-from sim_engine.liquid import SimulationParameters
+from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
-from sim_engine.space import Axis, Space
+from sim_engine.search_space import Axis, Space
 from tests.depth import examples
 
 # Numbers below 2e-308 are not numbers of a laboratory, and a process in which Taichi has run takes them for 0.

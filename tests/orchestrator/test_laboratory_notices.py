@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from actors.protocols import BenchLostError, LaboratoryError, Notice
-from orchestrator.events import LogLine
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.lanes import LaneError
+from actors.interfaces import BenchLostError, LaboratoryError, Notice
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.runs.events import LogLine
+from orchestrator.runs.request_executor import RequestExecutorError
 from tests.orchestrator.scripted import Script, one_stage, pour, run, simulate, states
 from tests.orchestrator.toy import ToyBench, ToyLaboratory, ToySimulators
 
@@ -24,7 +24,9 @@ def kinds(directory, *wanted: Kind) -> list[str]:
 def test_a_bench_lost_during_a_pour_leaves_the_pour_unknown_and_pours_nothing_more(tmp_path):
     bench = ToyBench(fails=lambda seed: LOST)
     script = Script(pour(1), pour(2))
-    with pytest.raises(LaneError, match=r"bench-pc .* what was poured is unknown: see to the bench, then resume"):
+    with pytest.raises(
+        RequestExecutorError, match=r"bench-pc .* what was poured is unknown: see to the bench, then resume"
+    ):
         run(tmp_path, ToyLaboratory(bench=bench), stages=one_stage(script))
     assert kinds(tmp_path, Kind.POUR_STARTED, Kind.POUR_FINISHED) == [Kind.POUR_STARTED]
     assert states(tmp_path)[-1] == "unknown"

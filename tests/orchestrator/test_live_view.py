@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.commands.live import live_view, parsed
-from orchestrator.commands.speaking import RefusalError
-from orchestrator.events import LogLine
-from orchestrator.monitor.beside import put_beside
-from orchestrator.monitor.live import LiveError, LiveView, answers
-from orchestrator.monitor.monitor import RerunMonitor
-from orchestrator.monitor.outlet import SENDING
-from orchestrator.monitor.server import run_rerun
+from orchestrator.cli.console import RefusalError
+from orchestrator.cli.live_option import live_view, parsed
+from orchestrator.live_view.blueprints import put_beside
+from orchestrator.live_view.live_server import LiveError, LiveView, answers
+from orchestrator.live_view.recording_sink import SENDING
+from orchestrator.live_view.rerun_subscriber import RerunMonitor
+from orchestrator.live_view.viewer_server import run_rerun
+from orchestrator.runs.events import LogLine
 from tests.orchestrator import watched
 from tests.orchestrator.late_viewer import seen, viewer
 from tests.orchestrator.recorded import Contents, tabs_as_they_came

@@ -11,23 +11,22 @@ import numpy as np
 import pytest
 from matplotlib.collections import PathCollection, QuadMesh
 
-from actors.child_process import child_environment
-from actors.optimizer.core.problem import Data, SuggestProblem
-from actors.optimizer.core.propose import propose
-from actors.optimizer.core.slices import slices
-from actors.protocols import PourProgress
-from orchestrator.config.load import load_campaign
-from orchestrator.events import LogLine, PourProgressed, RequestFinished, RequestStarted
-from orchestrator.monitor.monitor import RerunMonitor
-from orchestrator.monitor.pictures import slices_picture, surrogate_picture
-from orchestrator.monitor.recording import CampaignRecording
-from orchestrator.monitor.simulation import simulation_rrd
-from orchestrator.monitor.worker import QueueThread
-from orchestrator.report.units import DISCREPANCY
+from actors.interfaces import PourProgress
+from actors.optimizer.questions import Data, SuggestProblem
+from actors.optimizer.suggest import propose, slices
+from actors.runtime.child_process import child_environment
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.live_view.map_images import slices_picture, surrogate_picture
+from orchestrator.live_view.queue_thread import QueueThread
+from orchestrator.live_view.rerun_subscriber import RerunMonitor
+from orchestrator.live_view.run_recording import CampaignRecording
+from orchestrator.live_view.simulation_view import simulation_rrd
 from orchestrator.requests import Pour, Simulate, Simulated, Suggest, Suggested
-from sim_engine.liquid import SimulationParameters
-from sim_engine.simulated import RecordedFrames, SimulatedPour
-from sim_engine.space import Axis, Space
+from orchestrator.results.loss_units import DISCREPANCY
+from orchestrator.runs.events import LogLine, PourProgressed, RequestFinished, RequestStarted
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import RecordedFrames, SimulatedPour
+from sim_engine.search_space import Axis, Space
 from tests.orchestrator import watched
 from tests.orchestrator.recorded import Contents
 from tests.patience import PATIENCE

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from actors.protocols import NotPouredError, UnknownPourError
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.lanes import PourNotMadeError, PourUnknownError
+from actors.interfaces import NotPouredError, UnknownPourError
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Poured
-from orchestrator.unknown import OperatorNeededError
+from orchestrator.runs.request_executor import PourNotMadeError, PourUnknownError
+from orchestrator.runs.unknown_pours import OperatorNeededError
 from tests.orchestrator.scripted import Script, one_stage, pour, run, states
 from tests.orchestrator.toy import ToyBench, ToyLaboratory, toy_plan
 

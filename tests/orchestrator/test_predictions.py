@@ -12,27 +12,26 @@ from typing import Any
 
 import pytest
 
-from actors.optimizer.core.problem import Suggestion, SuggestProblem
-from actors.optimizer.core.propose import propose
-from orchestrator.config.load import load_campaign
-from orchestrator.jobs import planned
-from orchestrator.lanes import Deadlines, Lanes
-from orchestrator.report.summarise import summarise
-from orchestrator.report.table import summary_table
-from orchestrator.report.units import loss_unit
+from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.suggest import propose
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.progress.progress_state import ProgressState
 from orchestrator.requests import Failed, Outcome, Pour, Prediction, Request, Simulate, Slots
-from orchestrator.stages import deployment_stages, prediction_stages
-from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.results.console_view import summary_table
+from orchestrator.results.loss_units import loss_unit
+from orchestrator.results.summarise import summarise
+from orchestrator.runs.request_executor import Deadlines, RequestExecutor
+from orchestrator.runs.run_tasks import planned
+from orchestrator.runs.stages import deployment_stages, prediction_stages
+from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.progress import Progress
-from orchestrator.strategies.protocol import Strategy
-from orchestrator.strategies.repeats import RepeatedSimulation
+from orchestrator.strategies.repeated_simulation import RepeatedSimulation
+from orchestrator.strategies.strategy import Progress, Strategy
 from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
-from orchestrator.tally import Tally
-from sim_engine.bands import resolution_shift
-from sim_engine.losses import Loss
-from sim_engine.vessel.spec import VesselSpec
+from sim_engine.outcome import Loss
+from sim_engine.prediction_band import resolution_shift
+from sim_engine.vessel.shapes import VesselSpec
 from tests.orchestrator import watched
 from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.reported import changed, shown
@@ -91,7 +90,7 @@ def test_a_prediction_simulates_a_measured_vessel_with_another_shape_each_time()
     laboratory = ToyLaboratory()
 
     async def run() -> None:
-        lanes = Lanes(laboratory, {scene.name: scene}, Deadlines(), 0.0)
+        lanes = RequestExecutor(laboratory, {scene.name: scene}, Deadlines(), 0.0)
         for request in (*requests, replace(requests[0], purpose="plan", drawn_shapes=False)):
             await lanes.simulate(request, record=False, started=lambda: None)
 
@@ -241,7 +240,7 @@ def test_the_line_of_a_pour_says_both() -> None:
     assert loss_unit(Loss()).prediction(replace(predicted, scatter=None)) == "0.80 ± 0.90 %"
     assert loss_unit(Loss()).prediction(replace(predicted, band=(0.0, 0.021))) == "0.80 ± 0.90 %, a pour: 0.00 … 2.10 %"
     plan = watched.campaign()
-    tally = Tally(plan)
+    tally = ProgressState(plan)
     for event in watched.events(plan):
         request = getattr(event, "request", None)
         known = isinstance(request, Pour)

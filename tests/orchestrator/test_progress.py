@@ -9,7 +9,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from orchestrator.events import (
+from orchestrator.progress.console_progress import ProgressDisplay
+from orchestrator.progress.progress_state import ProgressState
+from orchestrator.requests import Failed, Pour, Poured, Simulate
+from orchestrator.runs.events import (
     CampaignClosed,
     CampaignOpened,
     LogLine,
@@ -20,10 +23,7 @@ from orchestrator.events import (
     StageOpened,
     StrategyProgressed,
 )
-from orchestrator.progress import ProgressDisplay
-from orchestrator.requests import Failed, Pour, Poured, Simulate
-from orchestrator.strategies.progress import Progress
-from orchestrator.tally import Tally
+from orchestrator.strategies.strategy import Progress
 from sim_engine.outcome import PourMeasurement
 from tests.orchestrator import watched
 
@@ -157,7 +157,7 @@ def test_pours_and_simulations_are_told_apart_with_the_time_left_in_all() -> Non
 
 def test_best_so_far_is_kept_per_receiver_and_ignores_calibration_pours() -> None:
     plan = watched.campaign()
-    tally = Tally(plan)
+    tally = ProgressState(plan)
     told = list(watched.events(plan))
     for event in told:
         tally(event)
@@ -174,7 +174,7 @@ def test_best_so_far_is_kept_per_receiver_and_ignores_calibration_pours() -> Non
 def test_confirming_pours_are_counted_apart_and_are_no_best_so_far() -> None:
     plan = watched.campaign()
     assert plan.deployment is not None
-    tally = Tally(replace(plan, deployment=replace(plan.deployment, confirm=5)))
+    tally = ProgressState(replace(plan, deployment=replace(plan.deployment, confirm=5)))
     for event in watched.events(plan):
         if isinstance(event, (RequestStarted, RequestFinished)) and isinstance(event.request, Pour):
             tally(replace(event, request=replace(event.request, purpose="confirm")))
@@ -184,7 +184,7 @@ def test_confirming_pours_are_counted_apart_and_are_no_best_so_far() -> None:
 
 def test_failed_pours_and_simulations_are_shown_as_such() -> None:
     plan = watched.campaign()
-    tally = Tally(plan)
+    tally = ProgressState(plan)
     tally(CampaignOpened(name="x", run_directory=watched.Path("x"), stages=("s",), mode="virtual", simulators=2))
     simulation: Any = next(
         e for e in watched.events(plan) if isinstance(e, RequestFinished) and isinstance(e.request, Simulate)

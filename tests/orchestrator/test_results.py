@@ -11,12 +11,12 @@ from typing import Any, Literal
 
 import pytest
 
-from orchestrator.errors import RunError
-from orchestrator.publish import publish
-from orchestrator.results import decode_result, encode_result, learnt_by
-from orchestrator.strategies.calibration.base import Calibrated
-from orchestrator.strategies.deployment.learnt import Deployed
-from orchestrator.strategies.learnt import Learnt
+from orchestrator.journal.stage_results import decode_result, encode_result, result_of
+from orchestrator.results.publishing import publish
+from orchestrator.run_errors import RunError
+from orchestrator.strategies.calibration.calibration_base import Calibrated
+from orchestrator.strategies.deployment.deployment_result import Deployed
+from orchestrator.strategies.stage_result import StageResult
 from tests.orchestrator import watched
 from tests.orchestrator.reported import changed
 from tests.orchestrator.toy import run_toy
@@ -46,21 +46,21 @@ def test_a_kind_that_nobody_knows_is_said_with_those_that_are_known() -> None:
 def test_two_kinds_of_one_name_and_a_result_without_one_are_refused() -> None:
     with pytest.raises(TypeError, match="Calibrated has the kind 'calibration' already"):
 
-        class Impostor(Learnt):
+        class Impostor(StageResult):
             kind: Literal["calibration"] = "calibration"
 
     with pytest.raises(TypeError, match="has to declare its kind"):
 
-        class Nameless(Learnt):
+        class Nameless(StageResult):
             pass
 
 
 def test_a_stage_that_learnt_something_else_is_named(results: dict[str, Any]) -> None:
-    assert learnt_by(results, "narrow cup", Deployed) is results["narrow cup"]
+    assert result_of(results, "narrow cup", Deployed) is results["narrow cup"]
     with pytest.raises(RunError, match=r"stage narrow cup should have learnt a Calibrated, but .* 'deployment'"):
-        learnt_by(results, "narrow cup", Calibrated)
+        result_of(results, "narrow cup", Calibrated)
     with pytest.raises(RunError, match="stage pours should have learnt a Calibrated, but there is nothing"):
-        learnt_by(results, "pours", Calibrated)
+        result_of(results, "pours", Calibrated)
 
 
 def test_publishing_closes_the_recording_and_can_be_done_again(tmp_path: Path, results: dict[str, Any]) -> None:
@@ -87,12 +87,14 @@ def test_publishing_closes_the_recording_and_can_be_done_again(tmp_path: Path, r
 
 
 def test_kinds_of_installed_strategies_are_in_the_schema_and_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    from orchestrator import results as module
-    from orchestrator.report.summary import summary_schema
+    from orchestrator.journal import stage_results as module
+    from orchestrator.results.run_summary import summary_schema
     from tests.orchestrator.scripted import Scripted
 
     assert Scripted not in module.kinds()
     settings = type("Settings", (), {"__module__": Scripted.__module__})
-    monkeypatch.setattr("orchestrator.strategies.doors.STRATEGIES", SimpleNamespace(all={"scripted": settings}))
+    monkeypatch.setattr(
+        "orchestrator.strategies.strategy_registry.STRATEGIES", SimpleNamespace(all={"scripted": settings})
+    )
     assert Scripted in module.kinds()
     assert "Scripted" in summary_schema()["$defs"]

@@ -16,12 +16,12 @@ from typing import Any
 
 import pytest
 
-from actors.spec import LaboratorySpec
-from orchestrator.events import Event, RequestFinished, StageClosed
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.journal_file import JournalError, JournalLockedError
-from orchestrator.replay import ReplayError
-from orchestrator.stages import StageDefinition
+from actors.laboratory_settings import LaboratorySpec
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.journal_file import JournalError, JournalLockedError
+from orchestrator.runs.events import Event, RequestFinished, StageClosed
+from orchestrator.runs.replay import ReplayError
+from orchestrator.runs.stages import StageDefinition
 from tests.depth import THOROUGH
 from tests.orchestrator import toy
 from tests.orchestrator.killed import SMALL, finished_times, killed_at, killed_when_last, run

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.runs import RunNotFoundError, create_run, find_run
+from orchestrator.runs.run_folder import RunNotFoundError, create_run, find_run
 from tests.orchestrator.killed import SMALL, die_at, run
 from tests.orchestrator.toy import run_toy, toy_plan
 

@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from actors.device import DeviceLostError
-from actors.optimizer import actor as optimizer
-from actors.protocols import InvalidActionError, LaboratoryError, SimulationError
-from orchestrator.events import Event, LogLine, PourProgressed, RequestFinished
-from orchestrator.lanes import Deadlines, LaneError, PourUnknownError
+from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
+from actors.optimizer import optimizer_actor as optimizer
+from actors.runtime.remote_object import DeviceLostError
 from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Slots
-from orchestrator.scheduler import StrategyError
-from sim_engine.task import PourTask
+from orchestrator.runs.events import Event, LogLine, PourProgressed, RequestFinished
+from orchestrator.runs.request_executor import Deadlines, PourUnknownError, RequestExecutorError
+from orchestrator.runs.stage_scheduler import StrategyError
+from sim_engine.scene import PourTask
 from tests.orchestrator.scripted import Script, one_stage, pour, run, simulate, states
 from tests.orchestrator.toy import (
     ToyBench,
@@ -202,7 +202,9 @@ def test_one_question_is_asked_as_often_as_the_error_says(tmp_path: Path) -> Non
     # The run asked twice and the optimiser thrice each time: six deaths, told as two.
     device, events = Dying(), list[Event]()
     laboratory = ToyLaboratory(optimizer=optimizer.DeviceOptimizer(device))  # type: ignore[arg-type]
-    with pytest.raises(LaneError, match=r"asked the same question 3 times and failed each time \(DeviceLostError"):
+    with pytest.raises(
+        RequestExecutorError, match=r"asked the same question 3 times and failed each time \(DeviceLostError"
+    ):
         run(tmp_path / "run", laboratory, watchers=[events.append])
     assert (device.calls, device.revived) == (3, 3)
     told = [event.text for event in events if isinstance(event, LogLine) and "asked again" in event.text]
@@ -211,7 +213,7 @@ def test_one_question_is_asked_as_often_as_the_error_says(tmp_path: Path) -> Non
 
 def test_an_optimiser_that_keeps_dying_fails_the_run_which_can_be_resumed(tmp_path: Path) -> None:
     run(tmp_path / "undisturbed")
-    with pytest.raises(LaneError, match=r"3 times and failed each time \(ConnectionError: actor died\)"):
+    with pytest.raises(RequestExecutorError, match=r"3 times and failed each time \(ConnectionError: actor died\)"):
         run(tmp_path / "run", ToyLaboratory(optimizer=ToyOptimizer(fails=failing(3))))
     assert states(tmp_path / "run")[-1] == "failed"
     run(tmp_path / "run", resume=True)
@@ -266,14 +268,14 @@ def test_a_strategy_that_asks_for_more_than_there_is_gets_nothing_started(
 
 
 def test_an_unknown_scene_is_named(tmp_path: Path) -> None:
-    with pytest.raises(LaneError, match="scene 'mug', but the plan has cup"):
+    with pytest.raises(RequestExecutorError, match="scene 'mug', but the plan has cup"):
         run(tmp_path / "run", stages=one_stage(Script(pour(scene="mug"))))
 
 
 def test_a_campaign_that_pours_needs_a_bench_and_the_one_it_was_planned_for(tmp_path: Path) -> None:
-    with pytest.raises(LaneError, match="has no bench"):
+    with pytest.raises(RequestExecutorError, match="has no bench"):
         run(tmp_path / "none", ToyLaboratory(bench=None))
-    with pytest.raises(LaneError, match="plan is for a virtual bench, but the laboratory's is hardware"):
+    with pytest.raises(RequestExecutorError, match="plan is for a virtual bench, but the laboratory's is hardware"):
         run(tmp_path / "other", ToyLaboratory(bench=ToyBench(mode="hardware")))
 
 

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.report.scored import draw_scored, write_scored
-from orchestrator.scoring import ScoredRow, rank_correlation, score, scores
+from orchestrator.results.prediction_figures import draw_scored, write_scored
+from orchestrator.results.prediction_scores import ScoredRow, rank_correlation, score, scores
 from sim_engine.action import DEG, Action
-from sim_engine.bands import band
-from sim_engine.spread import Spread
+from sim_engine.prediction_band import SampleStatistics, band
 from tests.orchestrator.reported import is_picture
 
 ACTION = Action(angular_velocity=40 * DEG, x_offset=0.09, height=0.06)
@@ -19,7 +18,7 @@ ACTION = Action(angular_velocity=40 * DEG, x_offset=0.09, height=0.06)
 
 def row(line: int, measured: float | None, predicted: list[float], split: str = "test") -> ScoredRow:
     found = band(predicted, 1_000) if predicted else None
-    return ScoredRow(line, split, ACTION, measured, Spread.of(predicted), found, lost=0)
+    return ScoredRow(line, split, ACTION, measured, SampleStatistics.of(predicted), found, lost=0)
 
 
 ROWS = [

@@ -11,29 +11,34 @@ from typing import Any
 
 import pytest
 
-from actors.optimizer.core.problem import Suggestion, SuggestProblem
-from actors.optimizer.core.propose import propose
-from decant.runs import open_run
-from orchestrator.codec import canonical
-from orchestrator.commands.arming import pour_count
-from orchestrator.config.load import predicts_with_posterior
-from orchestrator.errors import RunError
-from orchestrator.events import Event, RequestFinished
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.plan import CalibrationPlan, CampaignPlan, RecordedPour, RecordSet
-from orchestrator.publish import publish
-from orchestrator.report.summarise import summarise
-from orchestrator.report.table import summary_table
+from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.suggest import propose
+from decant.run_results import open_run
+from orchestrator.cli.motion_approval import pour_count
+from orchestrator.config.file_loading import predicts_with_posterior
+from orchestrator.journal.codec import canonical
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.progress.time_estimate import work_of
 from orchestrator.requests import Pour, Simulate
-from orchestrator.stages import deployed_theta, scenes_of, stages_of
+from orchestrator.results.console_view import summary_table
+from orchestrator.results.publishing import publish
+from orchestrator.results.summarise import summarise
+from orchestrator.run_errors import RunError
+from orchestrator.runs.events import Event, RequestFinished
+from orchestrator.runs.stages import deployed_theta, scenes_of, stages_of
+from orchestrator.strategies.campaign_plan import (
+    CalibrationPlan,
+    CampaignPlan,
+    DeploymentSettings,
+    RecordedPour,
+    RecordSet,
+)
 from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3_settings import D3Settings
-from orchestrator.strategies.settings import DeploymentSettings
-from orchestrator.work import work_of
-from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import Loss
-from sim_engine.space import Axis, Space
-from sim_engine.vessel.spec import cylinder
+from orchestrator.strategies.deployment.d3 import D3Settings
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import Loss
+from sim_engine.search_space import Axis, Space
+from sim_engine.vessel.shapes import cylinder
 from tests.orchestrator import plans
 from tests.orchestrator.reported import changed, shown
 from tests.orchestrator.toy import SCENE, SPACE, ToyLaboratory, logical_record, run_toy, toy_plan

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.errors import RunError
-from orchestrator.stages import stage_seed
+from orchestrator.run_errors import RunError
+from orchestrator.runs.stages import stage_seed
 from orchestrator.states import RESTING, TRANSITIONS, State, TransitionError, check_transition
 from tests.orchestrator.scripted import run, states
 from tests.orchestrator.toy import ToyLaboratory, toy_stages

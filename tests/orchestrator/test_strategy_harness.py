@@ -10,8 +10,8 @@ import pytest
 
 from orchestrator.requests import Ask, Outcome, Pour, Request, Simulate, Slots
 from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.learnt import Learnt
-from orchestrator.strategies.progress import Progress
+from orchestrator.strategies.stage_result import StageResult
+from orchestrator.strategies.strategy import Progress
 from orchestrator.strategy_harness import (
     ACTIONS,
     SCENE,
@@ -26,7 +26,7 @@ from tests.orchestrator.toys import narrow_cup
 CENTRE = SCENE.action(ACTIONS.decode([0.5, 0.5]))
 
 
-class Nothing(Learnt):
+class Nothing(StageResult):
     """A result without content."""
 
     kind: Literal["harness-nothing"] = "harness-nothing"
@@ -144,7 +144,7 @@ class ReportsNumbers(Simulates):
         return 0.25
 
 
-class Unnamed(Learnt):
+class Unnamed(StageResult):
     """A result whose kind is replaced after its declaration, so that no journal can be read back."""
 
     kind: str = "harness-unnamed"

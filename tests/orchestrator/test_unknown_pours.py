@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from actors.spec import LaboratorySpec
-from orchestrator.codec import decode_outcome, encode_outcome
-from orchestrator.errors import RunError
-from orchestrator.events import Event, RequestFinished
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from actors.laboratory_settings import LaboratorySpec
+from orchestrator.journal.codec import decode_outcome, encode_outcome
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Failed, Poured
-from orchestrator.unknown import LOST, REPEAT, WEIGHED, OperatorNeededError, parse_answer
+from orchestrator.run_errors import RunError
+from orchestrator.runs.events import Event, RequestFinished
+from orchestrator.runs.unknown_pours import LOST, REPEAT, WEIGHED, OperatorNeededError, parse_answer
 from tests.orchestrator import toy
 from tests.orchestrator.killed import SMALL, killed_when_last, run
 from tests.orchestrator.toy import ToyLaboratory, answering, logical_record, run_toy, toy_plan

@@ -6,7 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from orchestrator.events import (
+from orchestrator.requests import Pour, Simulate
+from orchestrator.runs.events import (
     CampaignClosed,
     DecisionMade,
     Event,
@@ -15,10 +16,9 @@ from orchestrator.events import (
     RequestStarted,
     StageClosed,
 )
-from orchestrator.flights import is_recorded
-from orchestrator.requests import Pour, Simulate
-from sim_engine.simulated import RecordedFrames
-from sim_engine.task import PourTask
+from orchestrator.runs.stage_scheduler import is_recorded
+from sim_engine.outcome import RecordedFrames
+from sim_engine.scene import PourTask
 from tests.orchestrator.scripted import run
 from tests.orchestrator.toy import ToyLaboratory, logical_record, toy_plan
 

@@ -16,12 +16,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
-from actors.protocols import PourProgress, ProgressCallback
-from actors.spec import LaboratorySpec
-from orchestrator.campaign import run_campaign
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.plan import CampaignPlan, OutputPlan
+from actors.interfaces import PourProgress, ProgressCallback
+from actors.laboratory_settings import LaboratorySpec
+from actors.optimizer.questions import Data, Suggestion, SuggestProblem
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.run_record import CampaignResult
+from orchestrator.journal.stage_results import Results, result_of
 from orchestrator.requests import (
     Decision,
     Failed,
@@ -35,19 +35,17 @@ from orchestrator.requests import (
     Suggest,
     Suggested,
 )
-from orchestrator.results import Results, learnt_by
-from orchestrator.run_result import CampaignResult
-from orchestrator.stages import StageDefinition
-from orchestrator.strategies.learnt import Learnt
-from orchestrator.strategies.progress import Progress
+from orchestrator.runs.run_engine import run_campaign
+from orchestrator.runs.stages import StageDefinition
+from orchestrator.strategies.campaign_plan import CampaignPlan, OutputPlan
+from orchestrator.strategies.stage_result import StageResult
+from orchestrator.strategies.strategy import Progress
 from sim_engine.action import DEG
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.losses import Loss
-from sim_engine.outcome import PourMeasurement, PourOutcome
-from sim_engine.simulated import SimulatedPour
-from sim_engine.space import Axis, Space
-from sim_engine.task import PourTask, Scene
-from sim_engine.vessel.spec import cylinder
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.outcome import Loss, PourMeasurement, PourOutcome, SimulatedPour
+from sim_engine.scene import PourTask, Scene
+from sim_engine.search_space import Axis, Space
+from sim_engine.vessel.shapes import cylinder
 from tests.orchestrator import plans
 
 SPACE = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0.08, 0.15)))
@@ -201,7 +199,7 @@ def slow_laboratory(longest: float, rng: random.Random | None = None) -> ToyLabo
     )
 
 
-class Toyed(Learnt):
+class Toyed(StageResult):
     """What the toy strategy learnt."""
 
     kind: Literal["toy"] = "toy"
@@ -289,7 +287,7 @@ def toy_stages(**numbers: int) -> tuple[StageDefinition, ...]:
     """Two stages; the second one's seed depends on the first one's result."""
 
     def second(results: Results, seed: int) -> ToyStrategy:
-        return ToyStrategy(seed + int(1e6 * learnt_by(results, "first", Toyed).spillages[-1]), **numbers)
+        return ToyStrategy(seed + int(1e6 * result_of(results, "first", Toyed).spillages[-1]), **numbers)
 
     return (
         StageDefinition("first", lambda results, seed: ToyStrategy(seed, **numbers), pours=True),

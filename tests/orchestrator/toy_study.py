@@ -14,18 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from actors.optimizer.core.propose import propose
-from actors.spec import LaboratorySpec
-from orchestrator.config.study.sections import load_study
+from actors.laboratory_settings import LaboratorySpec
+from actors.optimizer.suggest import propose
 from orchestrator.study.cell_process import work
-from orchestrator.study.folder import opened
-from orchestrator.study.plan import StudyPlan
-from orchestrator.study.runner import Status, run_cells
+from orchestrator.study.study_file import load_study
+from orchestrator.study.study_folder import opened
+from orchestrator.study.study_plan import StudyPlan
+from orchestrator.study.study_runner import CellStatus, run_cells
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import SimulationParameters
-from sim_engine.outcome import PourMeasurement, PourOutcome
-from sim_engine.simulated import SimulatedPour
-from sim_engine.task import PourTask, Scene
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import PourMeasurement, PourOutcome, SimulatedPour
+from sim_engine.scene import PourTask, Scene
 
 ROOT = Path(__file__).parents[2]
 PAUSE = "TOY_PAUSE"
@@ -86,7 +85,7 @@ def toy_command(study: StudyPlan) -> list[str]:
     return [sys.executable, str(Path(__file__)), str(study.source), "cells"]
 
 
-def run_toy_study(study: StudyPlan, **arguments: Any) -> Status:
+def run_toy_study(study: StudyPlan, **arguments: Any) -> CellStatus:
     """As the command does."""
     with opened(study) as folder:
         return run_cells(study, folder, jobs=2, command=toy_command, **arguments)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import SimulationParameters
+from sim_engine.liquids import SimulationParameters
 
 
 def calibration_spill(action: Action, theta: SimulationParameters, rng: np.random.Generator) -> float:

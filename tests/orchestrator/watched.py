@@ -10,24 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem, SurrogateMap
-from actors.optimizer.core.propose import propose
-from actors.protocols import PourProgress
-from actors.spec import LaboratorySpec
-from orchestrator.events import (
-    CampaignClosed,
-    CampaignOpened,
-    DecisionMade,
-    Event,
-    LogLine,
-    PourProgressed,
-    RequestFinished,
-    RequestStarted,
-    StageClosed,
-    StageOpened,
-    StrategyProgressed,
-)
-from orchestrator.plan import CampaignPlan, OutputPlan
+from actors.interfaces import PourProgress
+from actors.laboratory_settings import LaboratorySpec
+from actors.optimizer.questions import Data, Suggestion, SuggestProblem, SurrogateMap
+from actors.optimizer.suggest import propose
 from orchestrator.requests import (
     Decision,
     Failed,
@@ -42,17 +28,28 @@ from orchestrator.requests import (
     Suggest,
     Suggested,
 )
-from orchestrator.strategies.progress import Progress
-from orchestrator.strategies.protocol import Strategy
-from orchestrator.strategies.repeats import Foreseen
+from orchestrator.runs.events import (
+    CampaignClosed,
+    CampaignOpened,
+    DecisionMade,
+    Event,
+    LogLine,
+    PourProgressed,
+    RequestFinished,
+    RequestStarted,
+    StageClosed,
+    StageOpened,
+    StrategyProgressed,
+)
+from orchestrator.strategies.campaign_plan import CampaignPlan, OutputPlan
+from orchestrator.strategies.repeated_simulation import Foreseen
+from orchestrator.strategies.strategy import Progress, Strategy
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.losses import Loss
-from sim_engine.outcome import PourMeasurement, PourOutcome
-from sim_engine.simulated import RecordedFrames, SimulatedPour
-from sim_engine.space import Axis, Space
-from sim_engine.task import PourTask, Scene
-from sim_engine.vessel.spec import cylinder
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.outcome import Loss, PourMeasurement, PourOutcome, RecordedFrames, SimulatedPour
+from sim_engine.scene import PourTask, Scene
+from sim_engine.search_space import Axis, Space
+from sim_engine.vessel.shapes import cylinder
 from tests.orchestrator import plans
 
 BEAKER = cylinder("beaker", inner_radius=0.035, inner_height=0.09)

@@ -8,11 +8,11 @@ from decimal import Decimal
 
 import pytest
 
-from actors.balance.reading import LineError, Reading, Status
-from actors.balance.virtual_balance import Load
+from actors.balance.readings import LineError, Reading, ReadingStatus
+from actors.balance.simulated_balance import Load
 from decant.testing import BalanceBench, BalanceContract
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import VesselSpec
+from sim_engine.vessel.shapes import VesselSpec
+from sim_engine.vessel.vessel import build_vessel
 from tests.plugins.decant_example.balance import SpringBalance, SpringSpec
 from tests.plugins.decant_example.dialect import PLAIN
 from tests.plugins.decant_example.vessel import Cone
@@ -36,9 +36,13 @@ class TestSpring(BalanceContract):
 
 @pytest.mark.parametrize(
     ("line", "status", "mass"),
-    [(b"12.3 g", Status.STABLE, 0.0123), (b"-0.5 g!", Status.UNSTABLE, -0.0005), (b"1.2 kg", Status.STABLE, 1.2)],
+    [
+        (b"12.3 g", ReadingStatus.STABLE, 0.0123),
+        (b"-0.5 g!", ReadingStatus.UNSTABLE, -0.0005),
+        (b"1.2 kg", ReadingStatus.STABLE, 1.2),
+    ],
 )
-def test_lines_of_the_dialect_are_read_and_written(line: bytes, status: Status, mass: float) -> None:
+def test_lines_of_the_dialect_are_read_and_written(line: bytes, status: ReadingStatus, mass: float) -> None:
     reading = PLAIN.decode(line)
     assert isinstance(reading, Reading)
     assert (reading.status, reading.mass()) == (status, pytest.approx(mass))
@@ -50,8 +54,8 @@ def test_half_a_line_is_no_weight(line: bytes) -> None:
     with pytest.raises(LineError):
         PLAIN.decode(line)
     with pytest.raises(ValueError, match="no words"):
-        PLAIN.encode(Reading(Status.OVER, None))
-    assert PLAIN.encode(Reading(Status.STABLE, Decimal("1.0"), "g")) == b"1.0 g\r\n"
+        PLAIN.encode(Reading(ReadingStatus.OVER, None))
+    assert PLAIN.encode(Reading(ReadingStatus.STABLE, Decimal("1.0"), "g")) == b"1.0 g\r\n"
 
 
 def test_a_cone_holds_what_a_cone_holds() -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 from tests.end_to_end import small
 
 ROOT = Path(__file__).parents[2]
@@ -52,7 +52,7 @@ def command(*folders: Path) -> Decant:
     def run(*words: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
         path = os.pathsep.join([*map(str, folders), str(ROOT), os.environ.get("PYTHONPATH", "")])
         return subprocess.run(
-            [sys.executable, "-c", "from orchestrator.cli import main; main()", *words],
+            [sys.executable, "-c", "from orchestrator.cli.app import main; main()", *words],
             env={**os.environ, "PYTHONPATH": path},
             cwd=cwd,
             capture_output=True,
@@ -218,8 +218,8 @@ def test_the_doctor_asks_a_balance_and_an_arm_from_outside(site: Path, broken: P
 
 DIALECT = """
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.spec import SerialBalanceSpec
-from actors.balance.virtual_serial.handle import VirtualSerialBalance
+from actors.balance.balance_settings import SerialBalanceSpec
+from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 
 far = VirtualSerialBalance.start("plain", baud=0, time_scale=20.0)
 balance = SerialBalance(SerialBalanceSpec(far.port, time_scale=20.0))
@@ -259,11 +259,11 @@ def test_the_tables_of_the_pages_know_what_is_installed(site: Path) -> None:
 
 UNFINISHED = """
 from typing import Literal
-from orchestrator.config.laboratory.arms import ArmSettings
-from orchestrator.config.laboratory.balance import BalanceDeviceSection
-from orchestrator.strategies.calibration.settings import DesignSettings
+from orchestrator.config.arm_file import ArmSettings
+from orchestrator.config.balance_file import BalanceDeviceSection
+from orchestrator.strategies.calibration.calibration_base import DesignSettings
 from orchestrator.strategies.deployment.objectives import Objective
-from sim_engine.vessel.spec import Shape
+from sim_engine.vessel.shapes import Shape
 
 class Arm(ArmSettings):
     kind: Literal["arm"] = "arm"

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from decant.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
-from orchestrator.plan import DeploymentPlan
+from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.objectives import Objectives, Spillage
-from sim_engine.losses import Loss
+from sim_engine.outcome import Loss
 from tests.orchestrator.toys import narrow_cup
 from tests.plugins.decant_example.objective import Gentle
 from tests.plugins.decant_example.strategy import Hypercube, HypercubeSettings
@@ -64,11 +64,11 @@ import json, sys
 from pathlib import Path
 sys.path.insert(0, "docs")
 import make_tables
-from orchestrator.config.load import load_campaign
-from orchestrator.config.schema import campaign_schema
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.fingerprint import fingerprint
-from orchestrator.stages import stages_of
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.json_schema import campaign_schema
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.runs.stages import stages_of
 
 folder = Path(sys.argv[1])
 plan = load_campaign(folder / "good.yaml")
@@ -186,11 +186,11 @@ def test_what_is_wrong_is_said_as_of_ours(known: dict[str, Any], case: str, mess
 STUDY = """
 import json, sys
 from pathlib import Path
-from orchestrator.study.report.page import write_report
+from orchestrator.study.report.study_page import write_report
 from tests.orchestrator.study_files import read, written
 from tests.orchestrator.toy_study import run_toy_study
-from orchestrator.config.study.sections import load_study
-from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.study.study_file import load_study
+from orchestrator.config.yaml.yaml_errors import ConfigError
 
 folder = Path(sys.argv[1])
 data = read("quick")

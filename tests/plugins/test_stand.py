@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from actors.arm.errors import ArmLostError, ArmStoppedError
-from actors.arm.motion_path import ExecutedMotion, MotionPath
-from actors.protocols import InvalidActionError
+from actors.arm.arm_interface import ArmLostError, ArmStoppedError
+from actors.arm.planned_pour import ExecutedMotion, MotionPath
+from actors.interfaces import InvalidActionError
 from decant.testing import ArmBench, ArmContract
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid
-from sim_engine.task import Scene
-from sim_engine.vessel.spec import cylinder
+from sim_engine.liquids import Liquid
+from sim_engine.scene import Scene
+from sim_engine.vessel.shapes import cylinder
 from tests.plugins.decant_example.arm import Drive, Stand, StandSpec, poses_of
 
 SCENE = Scene(

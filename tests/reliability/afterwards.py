@@ -6,7 +6,7 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
-from orchestrator.journal import JOURNAL_NAME, Entry, JournalReader, Kind
+from orchestrator.journal.journal import JOURNAL_NAME, Entry, JournalReader, Kind
 from orchestrator.states import State
 from tests.end_to_end.command import timeless
 

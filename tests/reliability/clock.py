@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 
 SOURCE = Path(__file__).with_name("clock.c")
 

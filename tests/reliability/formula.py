@@ -13,9 +13,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from sim_engine.outcome import PourOutcome
-from sim_engine.simulated import SimulatedPour
-from sim_engine.task import PourTask
+from sim_engine.outcome import PourOutcome, SimulatedPour
+from sim_engine.scene import PourTask
 
 LOG = "DECANT_TEST_POURED"
 """Variable that names the file in which pours of the bench's liquid are written down."""
@@ -28,7 +27,7 @@ WHOLE = 0.97
 
 
 class Formula:
-    """See `actors.simulation.job_runner.Simulator`."""
+    """See `actors.simulators.simulation_task.Simulator`."""
 
     def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
         """A spillage by action, θ and seed, in thousandths."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.laboratory import RayLaboratory
-from actors.spec import LaboratorySpec
+from actors.laboratory_settings import LaboratorySpec
 from tests.orchestrator.toy import ToyLaboratory
 from tests.reliability import strikes
 from tests.reliability.case import CUT, FULL, KILLED, STOPPED, Case, every, first_of_kind

@@ -25,7 +25,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 from tests.reliability.case import FAULTS, NO_MEANING, TARGETS, Case
 from tests.reliability.rig import Rig
 from tests.reliability.strikes import can_mount

@@ -12,10 +12,10 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-from actors.device import DeviceLostError, RayDevice
-from actors.optimizer.actor import DeviceOptimizer, Proposer
-from actors.simulation.pool import RaySimulatorPool
-from actors.spec import LaboratorySpec
+from actors.laboratory_settings import LaboratorySpec
+from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
+from actors.runtime.remote_object import DeviceLostError, RayDevice
+from actors.simulators.pool import RaySimulatorPool
 from tests.orchestrator.toy import ToyLaboratory
 from tests.reliability import strikes
 from tests.reliability.case import CUT, KILLED, STOPPED, Case, Outcome, every, first_and_last, first_of_kind
@@ -33,7 +33,7 @@ class PooledRig(Rig):
     """Of the processes that are struck."""
 
     def __init__(self, folder: Path) -> None:
-        from actors.ray_runtime import start_ray
+        from actors.runtime.ray_runtime import start_ray
 
         os.environ[WORK] = "0.02"
         start_ray(LaboratorySpec("matrix", simulators=SIMULATORS))
@@ -43,7 +43,7 @@ class PooledRig(Rig):
         super().__init__(folder)
 
     def close(self) -> None:
-        from actors.ray_runtime import stop_ray
+        from actors.runtime.ray_runtime import stop_ray
 
         self._loop.run_until_complete(self._pool.close())
         self._loop.run_until_complete(self._device.close())

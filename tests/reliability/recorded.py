@@ -8,16 +8,16 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
-from orchestrator.events import Watcher
-from orchestrator.monitor.live import LiveView
-from orchestrator.monitor.monitor import RerunMonitor
-from orchestrator.plan import CampaignPlan
+from orchestrator.live_view.live_server import LiveView
+from orchestrator.live_view.rerun_subscriber import RerunMonitor
+from orchestrator.runs.events import Watcher
+from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.reliability import clock, strikes
 from tests.reliability.case import AHEAD, BACK, CUT, FULL, KILLED, STOPPED, Case, every, first_of_kind
 from tests.reliability.program import ProgramRig
 from tests.reliability.rig import Life
 
-WRITER = "orchestrator.monitor.writer"
+WRITER = "orchestrator.live_view.recording_writer"
 
 
 class RecordingRig(ProgramRig):

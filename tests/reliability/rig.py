@@ -24,12 +24,12 @@ from typing import Any, NoReturn
 
 import psutil
 
-from orchestrator.campaign import run_campaign
-from orchestrator.config.load import load_campaign
-from orchestrator.events import Event, PourProgressed, Watcher
-from orchestrator.journal import Journal, Kind
-from orchestrator.plan import CampaignPlan
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.journal.journal import Journal, Kind
+from orchestrator.runs.events import Event, PourProgressed, Watcher
+from orchestrator.runs.run_engine import run_campaign
 from orchestrator.states import State
+from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.end_to_end.small import CAMPAIGN, write_campaign
 from tests.orchestrator.toy import ToyLaboratory
 from tests.reliability import strikes

@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from actors.bench.pouring_bench import PouringBench
-from actors.warm import WarmSimulators
-from orchestrator.config.load import load_campaign
-from orchestrator.daemon.client import Client, DaemonError
-from orchestrator.daemon.packing import pack
-from orchestrator.daemon.server import serve
-from orchestrator.daemon.settings import load_settings
+from actors.bench.bench_factory import PouringBench
+from actors.simulators.warm_pool import WarmSimulators
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.daemon.daemon_client import Client, DaemonError
+from orchestrator.daemon.daemon_settings import load_settings
+from orchestrator.daemon.server_process import serve
+from orchestrator.daemon.submission_bundle import pack
 from tests.end_to_end.small import CAMPAIGN, write_campaign
 from tests.reliability import strikes
 from tests.reliability.case import (

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import psutil
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 
 DISK_MB = 60
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 from tests.reliability import strikes
 from tests.reliability.case import (
     BACK,

@@ -14,9 +14,9 @@ from typing import Any
 
 from actors.bench import virtual_operator
 from actors.bench.virtual_operator import VirtualOperator
+from actors.interfaces import OperatorQuestion, OperatorSpec
 from actors.laboratory import InProcessLaboratory
-from actors.operator import OperatorSpec, Question
-from orchestrator.journal import Kind
+from orchestrator.journal.journal import Kind
 from tests.actors.bench.conftest import wired_spec
 from tests.end_to_end.test_wired_campaign import write_wired
 from tests.reliability import strikes
@@ -110,7 +110,7 @@ def attend(laboratory: InProcessLaboratory, life: Life) -> None:
     operator, stand_ins = opened.operator, opened.stand_ins
     ask = operator.ask
 
-    async def attended(question: Question) -> str:
+    async def attended(question: OperatorQuestion) -> str:
         if question.problem or question.about not in ROUTINE:
             life.note("heard", question.about)
         if question.problem:
@@ -128,17 +128,17 @@ async def mend(stand_ins: Any) -> None:
 
 
 class WorkerRig(WiredRig):
-    target, process = "worker", "actors.arm.ur.worker"
+    target, process = "worker", "actors.arm.ur.rtde_worker"
 
 
 class ControllerRig(WiredRig):
-    target, process = "controller", "actors.virtual_ur"
+    target, process = "controller", "actors.emulators.ur_controller"
 
 
 class BalanceRig(WiredRig):
     """Its line is a pseudo-terminal, not a socket: cut is unplugged."""
 
-    target, process = "balance", "actors.balance.virtual_serial"
+    target, process = "balance", "actors.emulators.serial_balance"
 
     def strike(self, fault: str, life: Life) -> None:
         if fault != CUT:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from sim_engine.pour import PourSimulator
+from sim_engine.simulator import PourSimulator
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
-from sim_engine.bands import band, left_over, resolution_shift
+from sim_engine.prediction_band import band, left_over, resolution_shift
 from sim_engine.validation.convergence import LIMITS
 
 PHI = NormalDist()

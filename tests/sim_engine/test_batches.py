@@ -9,14 +9,14 @@ import sys
 import numpy as np
 import pytest
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 from sim_engine.action import DEG, Action
-from sim_engine.backend import BackendError, cuda_devices, require_backend
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.pour import PourSimulator
-from sim_engine.task import PourTask, Scene
-from sim_engine.vessel.spec import cylinder
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.resources import BackendError, cuda_devices, require_backend
+from sim_engine.scene import PourTask, Scene
+from sim_engine.simulator import PourSimulator
+from sim_engine.vessel.shapes import cylinder
 from tests.patience import PATIENCE
 
 SCENE = Scene(
@@ -139,7 +139,7 @@ def test_recorded_frames_show_the_liquid_from_the_start_of_a_slow_pour(simulator
 
 def test_engine_ends_cleanly_without_having_simulated() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", "from sim_engine.pour import PourSimulator; PourSimulator().close()"],
+        [sys.executable, "-c", "from sim_engine.simulator import PourSimulator; PourSimulator().close()"],
         capture_output=True,
         text=True,
         timeout=PATIENCE,

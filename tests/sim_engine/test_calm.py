@@ -10,18 +10,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import sim_engine.pour as pour_module
+from sim_engine import simulator as pour_module
 from sim_engine.action import DEG, Action
-from sim_engine.calm import CALM, FREEBOARD, STEP, calm_until, liquid_velocity, wave_height
-from sim_engine.course import SLICE, Course
 from sim_engine.hydrostatics import level
-from sim_engine.liquid import Liquid, SimulationParameters
+from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.motion import plan_motion
-from sim_engine.pour import PourSimulator
-from sim_engine.sampled_motion import SampledMotion
-from sim_engine.task import PourTask, Scene
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import cylinder
+from sim_engine.scene import PourTask, SampledMotion, Scene
+from sim_engine.simulator import (
+    CALM,
+    FREEBOARD,
+    SLICE,
+    STEP,
+    PourSimulator,
+    TimeLoop,
+    calm_until,
+    liquid_velocity,
+    wave_height,
+)
+from sim_engine.vessel.shapes import cylinder
+from sim_engine.vessel.vessel import build_vessel
 from tests.depth import examples
 
 SCENE = Scene(
@@ -56,9 +63,9 @@ def test_a_simulation_begins_between_two_slices() -> None:
     task = PourTask(SCENE, action(20.0), SimulationParameters(), seed=0)
     start = calm_until(motion, POURER, VOLUME)
     assert start > 0.0
-    assert Course(task, motion, start, 0).clock == pytest.approx(start)
+    assert TimeLoop(task, motion, start, 0).clock == pytest.approx(start)
     with pytest.raises(ValueError, match="multiple of"):
-        Course(task, motion, start + 0.5 * SLICE, 0)
+        TimeLoop(task, motion, start + 0.5 * SLICE, 0)
 
 
 @settings(max_examples=examples(25), deadline=None)

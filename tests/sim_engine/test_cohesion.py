@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from sim_engine.fluid.engine import engine
 from sim_engine.fluid.kernels import BULK_BOND, HALF_ATTRACTION
-from sim_engine.fluid.setup import SceneSetup, SolidWalls
+from sim_engine.fluid.scene_setup import SceneSetup, SolidWalls
 from sim_engine.fluid.strength import RANGE, cohesion_acceleration
 from sim_engine.fluid.tension import ALONE, BLUNT, BONDED, CALM
 from sim_engine.fluid.walls import FAR
-from sim_engine.liquid import SimulationParameters
-from sim_engine.validation.stage import DENSITY, FAR_AWAY, NO_RIM, NOTHING, still_pose
+from sim_engine.liquids import SimulationParameters
+from sim_engine.validation.container_runs import DENSITY, FAR_AWAY, NO_RIM, NOTHING, still_pose
 
 Floats = NDArray[np.float64]
 

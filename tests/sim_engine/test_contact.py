@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sim_engine.action import DEG, Action
-from sim_engine.contact import (
+from sim_engine.collision import (
     WAY,
     clearance,
     contact_during,
@@ -22,13 +22,12 @@ from sim_engine.contact import (
     rotations,
     way_of,
 )
-from sim_engine.liquid import Liquid
+from sim_engine.liquids import Liquid
 from sim_engine.motion import Motion, PourMotion, plan_motion
-from sim_engine.pour import InvalidSceneError, check_motion
-from sim_engine.sampled_motion import SampledMotion
-from sim_engine.task import Pivot, PoseError, Scene
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import cylinder
+from sim_engine.scene import Pivot, PoseError, SampledMotion, Scene
+from sim_engine.simulator import InvalidSceneError, check_motion
+from sim_engine.vessel.shapes import cylinder
+from sim_engine.vessel.vessel import build_vessel
 from tests.depth import examples
 
 A = build_vessel(cylinder("a", inner_radius=0.04, inner_height=0.1, wall=0.002, floor=0.002))

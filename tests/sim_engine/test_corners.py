@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_engine.validation.tanks import box, holed_cup
-from sim_engine.vessel import corners
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.corners import equivalent_distance, half_space, inside_mask
-from sim_engine.vessel.spec import cylinder
+from sim_engine.validation.container_runs import box, holed_cup
+from sim_engine.vessel import wall_correction as corners
+from sim_engine.vessel.shapes import cylinder
+from sim_engine.vessel.vessel import build_vessel
+from sim_engine.vessel.wall_correction import equivalent_distance, half_space, inside_mask
 
 CUP = build_vessel(cylinder("cup", inner_radius=0.04, inner_height=0.1))
 MASK = inside_mask(CUP.grid)

@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from sim_engine import cache
+from sim_engine import resources as cache
 from sim_engine.hydrostatics import retained_volume
 from sim_engine.vessel import mesh as mesh_module
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.errors import VesselError
 from sim_engine.vessel.mesh_distance import closest_points
-from sim_engine.vessel.spec import MeshShape, ProfileShape, VesselSpec
-from sim_engine.vessel.vessel import Vessel
+from sim_engine.vessel.shapes import MeshShape, ProfileShape, VesselError, VesselSpec
+from sim_engine.vessel.vessel import Vessel, build_vessel
 
 MUG = Path(__file__).parents[2] / "configs" / "vessels" / "meshes" / "mug.stl"
 Make = Callable[..., Vessel]

@@ -8,12 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid
+from sim_engine.liquids import Liquid
 from sim_engine.motion import PourMotion, plan_motion
-from sim_engine.sampled_motion import SampledMotion
-from sim_engine.task import Pivot, Scene
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import cylinder
+from sim_engine.scene import Pivot, SampledMotion, Scene
+from sim_engine.vessel.shapes import cylinder
+from sim_engine.vessel.vessel import build_vessel
 from tests.depth import examples
 
 CUP = cylinder("cup", inner_radius=0.04, inner_height=0.10)

@@ -8,11 +8,13 @@ from dataclasses import replace
 import pytest
 
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import THIN, Liquid, SimulationParameters
-from sim_engine.pour import PourSimulator
-from sim_engine.task import PourTask, Scene
-from sim_engine.validation import films, thick, wetting
-from sim_engine.vessel.spec import cylinder
+from sim_engine.liquids import THIN, Liquid, SimulationParameters
+from sim_engine.scene import PourTask, Scene
+from sim_engine.simulator import PourSimulator
+from sim_engine.validation import capillarity as wetting
+from sim_engine.validation import viscous_flows as films
+from sim_engine.validation import viscous_flows as thick
+from sim_engine.vessel.shapes import cylinder
 
 PLAIN = SimulationParameters(cohesion=0.0, viscosity=0.0)
 SCENE = Scene(

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from sim_engine.action import DEG
-from sim_engine.liquid import SimulationParameters
+from sim_engine.liquids import SimulationParameters
 from sim_engine.motion import PourMotion
-from sim_engine.pour import InvalidSceneError, PourSimulator
-from sim_engine.sampled_motion import SampledMotion
-from sim_engine.task import PoseError, PourTask
+from sim_engine.scene import PoseError, PourTask, SampledMotion
+from sim_engine.simulator import InvalidSceneError, PourSimulator
 from tests.sim_engine.test_pour import task
 
 OFF = {"receiver_x": 0.004, "receiver_y": -0.002, "receiver_z": 0.003, "tilt_zero": 1.0 * DEG, "speed_factor": 1.04}

@@ -10,13 +10,12 @@ import pytest
 
 from sim_engine.action import DEG, Action
 from sim_engine.hydrostatics import retained_volume, tilting_cup_outflow
-from sim_engine.liquid import Liquid, SimulationParameters
-from sim_engine.pour import InvalidSceneError, PourSimulator, SimulationCancelled
-from sim_engine.sampled_motion import SampledMotion
-from sim_engine.simulated import SimulatedPour
-from sim_engine.task import PoseError, PourTask, Scene
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import VesselSpec, cylinder
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.outcome import SimulatedPour
+from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
+from sim_engine.simulator import InvalidSceneError, PourSimulator, SimulationCancelled
+from sim_engine.vessel.shapes import VesselSpec, cylinder
+from sim_engine.vessel.vessel import build_vessel
 
 CUP = cylinder("cup", inner_radius=0.04, inner_height=0.10)
 GLASS = cylinder("glass", inner_radius=0.045, inner_height=0.09)

@@ -10,26 +10,16 @@ import textwrap
 import pytest
 import taichi as ti
 
-from sim_engine.fluid import (
-    columns,
-    density,
-    engine,
-    kernels,
-    neighbours,
-    newtonian,
-    packing,
-    quick,
-    rims,
-    state,
-    step,
-    table,
-    tension,
-    vectors,
-    viscosity,
-    walls,
-)
+from sim_engine.fluid import density, engine, kernels, neighbours, state, step, tension, viscosity, walls
+from sim_engine.fluid import kernels as vectors
+from sim_engine.fluid import neighbours as columns
+from sim_engine.fluid import state as table
+from sim_engine.fluid import taichi_startup as quick
+from sim_engine.fluid import viscosity as newtonian
+from sim_engine.fluid import viscosity as packing
+from sim_engine.fluid import walls as rims
 from sim_engine.fluid.engine import FluidEngine
-from sim_engine.pour import PourSimulator
+from sim_engine.simulator import PourSimulator
 
 MODULES = columns, density, engine, kernels, neighbours, newtonian, packing, rims, state, step, table, tension, vectors
 FUNCTIONS = [

@@ -10,17 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_engine import lip
+from sim_engine import lip_flow as lip
 from sim_engine.action import DEG, Action
 from sim_engine.hydrostatics import GRAVITY
-from sim_engine.lip import FlowNumbers, bond, capillary_length
-from sim_engine.liquid import Liquid
+from sim_engine.lip_flow import FlowNumbers, bond, capillary_length
+from sim_engine.liquids import Liquid
+from sim_engine.model_validity import DRIBBLING_WEBER, VISCOUS_REYNOLDS, WETTING_BOND, ModelValidity, regimes
 from sim_engine.motion import plan_motion
-from sim_engine.regimes import DRIBBLING_WEBER, VISCOUS_REYNOLDS, WETTING_BOND, Regimes, regimes
-from sim_engine.sampled_motion import SampledMotion
-from sim_engine.task import Pivot, Scene
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import ProfileShape, VesselSpec, cylinder
+from sim_engine.scene import Pivot, SampledMotion, Scene
+from sim_engine.vessel.shapes import ProfileShape, VesselSpec, cylinder
+from sim_engine.vessel.vessel import build_vessel
 from tests.depth import examples
 
 CUP = cylinder("cup", inner_radius=0.04, inner_height=0.1)
@@ -40,17 +39,17 @@ def necked(radius: float) -> VesselSpec:
     return VesselSpec(name="bottle", shape=ProfileShape(inner=inner, wall=0.002, floor=0.002))
 
 
-def planned(scene: Scene = SCENE, action: Action = STANDARD, spacing: float = FINE) -> Regimes:
+def planned(scene: Scene = SCENE, action: Action = STANDARD, spacing: float = FINE) -> ModelValidity:
     return regimes(scene, action, build_vessel(scene.pourer), build_vessel(scene.receiver), spacing=spacing)
 
 
-def of_liquid(action: Action = STANDARD, **changes: float) -> Regimes:
+def of_liquid(action: Action = STANDARD, **changes: float) -> ModelValidity:
     """The standard pour, or another one, of 200 mL of another liquid."""
     liquid = WATER.model_copy(update=changes)
     return planned(replace(SCENE, liquid=liquid.model_copy(update={"mass": WATER.volume * liquid.density})), action)
 
 
-def kinds(found: Regimes) -> set[str]:
+def kinds(found: ModelValidity) -> set[str]:
     return {one.kind for one in found.not_covered}
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sim_engine.liquid import SimulationParameters
-from sim_engine.pour import PourSimulator
-from sim_engine.validation.convergence import CHOSEN, FOUND, Pour, spillage
+from sim_engine.liquids import SimulationParameters
+from sim_engine.simulator import PourSimulator
+from sim_engine.validation.convergence import CHOSEN, FOUND, ConvergencePour, spillage
 
 HIDDEN = 0.12
 """Friction of the liquid that is calibrated on."""
@@ -28,7 +28,9 @@ def test_without_a_viscosity_of_eddies_coarse_particles_scatter_their_stream(sim
     assert without > with_theirs + 0.02
 
 
-def spilled(simulator: PourSimulator, pours: tuple[Pour, ...], particles: int, friction: float) -> NDArray[np.float64]:
+def spilled(
+    simulator: PourSimulator, pours: tuple[ConvergencePour, ...], particles: int, friction: float
+) -> NDArray[np.float64]:
     theta = SimulationParameters(particles=particles, cohesion=0.0, viscosity=1.0, friction=friction)
     return np.array([spillage(simulator, pour, theta, seed=1)[0] for pour in pours])
 

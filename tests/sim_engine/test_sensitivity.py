@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_engine.liquid import SimulationParameters
+from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourOutcome
-from sim_engine.pour import PourSimulator
-from sim_engine.task import PourTask
-from sim_engine.validation import suite
+from sim_engine.scene import PourTask
+from sim_engine.simulator import PourSimulator
+from sim_engine.validation import cases as suite
 from sim_engine.validation.sensitivity import (
     PARTICLES,
     POURS,
-    Effect,
     Extent,
+    ParameterEffect,
     Sensitivity,
     analyse,
     effects,
@@ -145,7 +145,7 @@ def test_other_lines_of_a_page_are_no_effects() -> None:
     rows = [{"name": "height", "value": 1.0}, {"name": "… mean slope, per 1 (± 0.1)", "value": 2.0}]
     assert effects(rows) == []
     line = {"name": "friction 0 … 1, fast pour: spillage rises; change (± 0.02)", "value": 0.15}
-    assert effects([line]) == [Effect("friction", "fast", "0 … 1", "spillage rises", 0.15, "0.02")]
+    assert effects([line]) == [ParameterEffect("friction", "fast", "0 … 1", "spillage rises", 0.15, "0.02")]
 
 
 def test_walls_that_rub_spill_more_in_a_real_pour(simulator: PourSimulator) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sim_engine.validation.sources import ROOT, solver_fingerprint
+from sim_engine.solver_fingerprint import ROOT, solver_fingerprint
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from sim_engine.outcome import PourOutcome
-from sim_engine.spread import FRACTIONS, Spread, spreads
+from sim_engine.prediction_band import FRACTIONS, SampleStatistics, spreads
 
 SPILLED = (0.02, 0.05, 0.11)
 
@@ -38,4 +38,4 @@ def test_invalid_outcomes_and_undefined_spillages_are_left_out() -> None:
     assert found["spilled"].count == 2
     assert (found["spillage"].count, found["spillage"].mean) == (1, pytest.approx(0.02 / 0.8))
     assert spreads([leaked]) == {}
-    assert Spread.of([]) is None
+    assert SampleStatistics.of([]) is None

@@ -8,24 +8,19 @@ import numpy as np
 import pytest
 
 from sim_engine.fluid.engine import engine
-from sim_engine.liquid import SimulationParameters
-from sim_engine.pour import PourSimulator
-from sim_engine.validation import (
-    at_rest,
-    convergence,
-    dam_break,
-    droplet,
-    landing,
-    pours,
-    sloshing,
-    stage,
-    suite,
-    tanks,
-    tilting,
-    torricelli,
-    walls,
-)
-from sim_engine.validation.result import Measurement, at_least, at_most, reported, within
+from sim_engine.liquids import SimulationParameters
+from sim_engine.simulator import PourSimulator
+from sim_engine.validation import capillarity as droplet
+from sim_engine.validation import cases as suite
+from sim_engine.validation import container_runs as stage
+from sim_engine.validation import container_runs as tanks
+from sim_engine.validation import convergence, dam_break, sloshing, torricelli
+from sim_engine.validation import hydrostatic_cases as at_rest
+from sim_engine.validation import hydrostatic_cases as tilting
+from sim_engine.validation import jet_landing as landing
+from sim_engine.validation import wall_tightness as walls
+from sim_engine.validation import whole_pours as pours
+from sim_engine.validation.case_result import Measurement, at_least, at_most, reported, within
 
 STICKY = SimulationParameters(cohesion=0.0, viscosity=1.0, friction=1.0)
 
@@ -267,10 +262,10 @@ def test_every_pour_has_a_limit() -> None:
 
 
 def test_a_fault_of_the_solver_is_a_criterion_that_is_not_met(simulator: PourSimulator) -> None:
-    def work(_: PourSimulator, __: suite.Effort) -> tuple[list[Measurement], None]:
+    def work(_: PourSimulator, __: suite.CaseEffort) -> tuple[list[Measurement], None]:
         raise ArithmeticError("at 0.1 s: diverged")
 
-    result = suite.Case("bad", "Bad", "", work).run(simulator, suite.Effort())
+    result = suite.Case("bad", "Bad", "", work).run(simulator, suite.CaseEffort())
     assert not result.passed
     assert "diverged" in result.measurements[0].name
 
@@ -302,7 +297,7 @@ is a test of its own."""
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [case.name for case in suite.CASES if case.name not in TOO_LONG])
 def test_full_case(simulator: PourSimulator, name: str) -> None:
-    result = suite.case(name).run(simulator, suite.Effort(full=True))
+    result = suite.case(name).run(simulator, suite.CaseEffort(full=True))
     failed = failures(list(result.measurements))
     if name in NOT_MET:
         assert failed != [], f"{name} now meets all its criteria: take it off the list and write the page again"

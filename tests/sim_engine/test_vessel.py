@@ -9,11 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.errors import VesselError
-from sim_engine.vessel.sdf import MARGIN, MAXIMUM_NODES
-from sim_engine.vessel.spec import ProfileShape, VesselSpec, cylinder
-from sim_engine.vessel.vessel import Vessel, check_holds
+from sim_engine.vessel.distance_grid import MARGIN, MAXIMUM_NODES
+from sim_engine.vessel.shapes import ProfileShape, VesselError, VesselSpec, cylinder
+from sim_engine.vessel.vessel import Vessel, build_vessel, check_holds
 from tests.depth import examples
 
 BEAKER = build_vessel(cylinder("beaker", inner_radius=0.04, inner_height=0.1))

@@ -3,20 +3,22 @@
 Of the library only what reads and what writes input registers is used. Its control interface uploads a program of its
 own when it is made, reconnects by itself and uploads again, ends the program each time and sometimes its process: that
 can't be had in a cell where nothing may run without consent.
+
+Whether the client library is there that a UR arm is reached by.
 """
 
 from __future__ import annotations
 
 import contextlib
 import faulthandler
+import importlib.util
 import socket
 import threading
 import time
 from collections.abc import Iterator
 from typing import Any
 
-from actors.arm.ur.client import client_missing
-from actors.arm.ur.messages import (
+from actors.arm.ur.worker_messages import (
     CLOCK,
     GO,
     HEARTBEAT,
@@ -27,6 +29,17 @@ from actors.arm.ur.messages import (
     DataPackage,
     TroubleError,
 )
+
+
+def client_missing() -> str | None:
+    """Why no arm can be reached from here at all: the client library isn't installed; None if it is."""
+    if importlib.util.find_spec("rtde_receive") is not None:
+        return None
+    return (
+        "the arm needs the package ur-rtde, which is not installed: pip install 'decant[lab]' (it has no wheel for "
+        "Python 3.13 yet)"
+    )
+
 
 PORTS = {30004: "RTDE", 29999: "dashboard", 30001: "primary interface"}
 PROBE_TIME = 2.0

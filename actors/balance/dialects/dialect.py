@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 
-from actors.balance.reading import Reading, Reply
-from actors.balance.virtual_serial.voice import PlainVoice, Voice
+from actors.balance.dialects.protocol_encoder import PlainEncoder, ProtocolEncoder
+from actors.balance.readings import Reading, Reply
 
 NUMBER = re.compile(r"[+-]?[0-9]{1,10}(?:\.[0-9]{1,9})?")
 """A weight in digits; no exponents, no commas, and a digit on both sides of the point."""
@@ -104,10 +104,10 @@ class Dialect(ABC):
         """
         return 0
 
-    def voices(self) -> Mapping[str, Callable[[], Voice]]:
+    def voices(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
         """Its side at the far end of the line, for virtual balances: by the dialect's name, and by others for what else
         such balances may be set to."""
-        return {self.name: lambda: PlainVoice(self, self.query, self.tare, self.zero)}
+        return {self.name: lambda: PlainEncoder(self, self.query, self.tare, self.zero)}
 
 
 def text_of(line: bytes) -> str | None:

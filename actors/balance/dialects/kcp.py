@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from actors.balance.dialects import status_lines
-from actors.balance.virtual_serial.voice import Voice
+from actors.balance.dialects.protocol_encoder import ProtocolEncoder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,9 +25,9 @@ class Kcp(status_lines.StatusLines):
         """See `Dialect.likeness`."""
         return 3 if status_lines.is_kern(said) else 1  # whose pace suits both, where nothing else is known
 
-    def voices(self) -> Mapping[str, Callable[[], Voice]]:
+    def voices(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
         """See `Dialect.voices`."""
-        return {self.name: lambda: status_lines.StatusLineVoice(self, '"01" "1.1.2" "1.1.2"', "KERN VIRTUAL 6200-2")}
+        return {self.name: lambda: status_lines.StatusLineEncoder(self, '"01" "1.1.2" "1.1.2"', "KERN VIRTUAL 6200-2")}
 
 
 KCP = Kcp()

@@ -20,8 +20,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from actors.balance.dialects.dialect import Dialect, LineSettings, number_in, text_of
-from actors.balance.reading import LineError, Reading, Reply, Status
-from actors.balance.virtual_serial.voice import END, Display, Said, Voice, Waiting, silently, weight_line
+from actors.balance.dialects.protocol_encoder import (
+    END,
+    EncoderDisplay,
+    PendingReply,
+    ProtocolEncoder,
+    Said,
+    silently,
+    weight_line,
+)
+from actors.balance.readings import LineError, Reading, ReadingStatus, Reply
 
 STABLE_WIDTHS = (16, 17)
 """Characters of a stable line without CR LF."""
@@ -57,9 +65,9 @@ class KernSwt(Dialect):
         if text is None:
             raise LineError("not printable ASCII")
         if text.strip() == "Error" and len(text) in FAULT_WIDTHS:
-            return Reading(Status.ERROR)
+            return Reading(ReadingStatus.ERROR)
         if text.strip() == "=Overload=":
-            return Reading(Status.OVER)
+            return Reading(ReadingStatus.OVER)
         match = _LINE.fullmatch(text)
         value = number_in(match["sign"].strip() + match["value"]) if match is not None else None
         if match is None or value is None:
@@ -67,29 +75,29 @@ class KernSwt(Dialect):
         widths = STABLE_WIDTHS if match["unit"] else UNSTABLE_WIDTHS
         if len(text) not in widths:
             raise LineError(f"{len(text)} characters; a weight has {' or '.join(map(str, widths))}")
-        return Reading(Status.STABLE if match["unit"] else Status.UNSTABLE, value, match["unit"])
+        return Reading(ReadingStatus.STABLE if match["unit"] else ReadingStatus.UNSTABLE, value, match["unit"])
 
     def encode(self, reading: Reading) -> bytes:
         """See `Dialect.encode`."""
-        if reading.status in (Status.STABLE, Status.UNSTABLE) and reading.value is not None:
+        if reading.status in (ReadingStatus.STABLE, ReadingStatus.UNSTABLE) and reading.value is not None:
             sign = "-" if reading.value < 0 else " "
             head = f" {sign}{abs(reading.value)!s:>10} "
-            stable = reading.status is Status.STABLE
+            stable = reading.status is ReadingStatus.STABLE
             text = head + (f"{reading.unit:<3}" if stable else "" if self.short else "   ")
-        elif reading.status is Status.OVER:
+        elif reading.status is ReadingStatus.OVER:
             text = "=Overload=".rjust(16)
-        elif reading.status is Status.ERROR:
+        elif reading.status is ReadingStatus.ERROR:
             text = "Error".rjust(12 if self.short else 16)
         else:
             raise ValueError(f"no line of this dialect says '{reading.status}'")
         return text.encode("ascii") + END
 
-    def voices(self) -> Mapping[str, Callable[[], Voice]]:
+    def voices(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
         """See `Dialect.voices`."""
-        return {self.name: KernSwtVoice, f"{self.name}-short": lambda: KernSwtVoice(short=True)}
+        return {self.name: KernSwtEncoder, f"{self.name}-short": lambda: KernSwtEncoder(short=True)}
 
 
-class KernSwtVoice:
+class KernSwtEncoder:
     """Older Kern balances.
 
     Args:
@@ -100,18 +108,18 @@ class KernSwtVoice:
         self.dialect = KernSwt(short=short)
 
     def commands(self, heard: bytearray) -> list[bytes]:
-        """See `Voice.commands`."""
+        """See `ProtocolEncoder.commands`."""
         letters = [bytes([byte]) for byte in heard if byte in b"swt"]
         heard.clear()
         return letters
 
-    def answer(self, command: bytes, display: Display) -> Said:
-        """See `Voice.answer`."""
+    def answer(self, command: bytes, display: EncoderDisplay) -> Said:
+        """See `ProtocolEncoder.answer`."""
         if command == b"w":
             return weight_line(self.dialect, display.reading())
         if command == b"s":
-            return Waiting(lambda: weight_line(self.dialect, display.reading()))
-        return Waiting(lambda: silently(display.tare)) if command == b"t" else b""
+            return PendingReply(lambda: weight_line(self.dialect, display.reading()))
+        return PendingReply(lambda: silently(display.tare)) if command == b"t" else b""
 
 
 KERN_SWT = KernSwt()

@@ -16,19 +16,18 @@ from dataclasses import dataclass, replace
 from decimal import Decimal
 
 from actors.balance.dialects import status_lines
-from actors.balance.reading import Reading, Status
-from actors.balance.units import KILOGRAMS
-from actors.balance.virtual_serial.voice import (
+from actors.balance.dialects.protocol_encoder import (
     Cancel,
-    Display,
+    EncoderDisplay,
     Lines,
+    PendingReply,
+    ProtocolEncoder,
     Repeat,
     Said,
-    Voice,
-    Waiting,
     line_of,
     weight_line,
 )
+from actors.balance.readings import KILOGRAMS, Reading, ReadingStatus
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +42,7 @@ class MtSics(status_lines.StatusLines):
         """See `Dialect.likeness`."""
         return 2 if status_lines.levels_of_sics(said) else 0
 
-    def voices(self) -> Mapping[str, Callable[[], Voice]]:
+    def voices(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
         """See `Dialect.voices`."""
         return {self.name: lambda: MtSicsVoice(self, '"01" "2.30" "2.22"', "VIRTUAL")}
 
@@ -58,11 +57,11 @@ LONGEST_WAIT = 65_535
 """What SC, TC and ZC may be told to wait [ms]."""
 
 
-class MtSicsVoice(status_lines.StatusLineVoice):
+class MtSicsVoice(status_lines.StatusLineEncoder):
     """What MT-SICS has and KCP has not: units, commands with a time limit, repeated output of the display's unit."""
 
     LEVELS: Mapping[str, int] = {
-        **status_lines.StatusLineVoice.LEVELS,
+        **status_lines.StatusLineEncoder.LEVELS,
         **dict.fromkeys(("C", "SC", "SIRU", "SNR", "SRU", "TC", "ZC"), 1),
         "M21": 2,
     }
@@ -72,8 +71,8 @@ class MtSicsVoice(status_lines.StatusLineVoice):
         self._model = model
         self._units: dict[int, str] = {}
 
-    def answer_bare(self, word: str, display: Display) -> Said:
-        """See `StatusLineVoice.answer_bare`."""
+    def answer_bare(self, word: str, display: EncoderDisplay) -> Said:
+        """See `StatusLineEncoder.answer_bare`."""
         match word:
             case "C":
                 return Cancel(line_of("C B") + line_of("C A"))
@@ -91,8 +90,8 @@ class MtSicsVoice(status_lines.StatusLineVoice):
                 return line_of(f"M21 B {HOST} {host}") + line_of(f"M21 A {DISPLAY} {shown_}")
         return super().answer_bare(word, display)
 
-    def answer_with(self, word: str, parameters: str, display: Display) -> Said:
-        """See `StatusLineVoice.answer_with`."""
+    def answer_with(self, word: str, parameters: str, display: EncoderDisplay) -> Said:
+        """See `StatusLineEncoder.answer_with`."""
         match word:
             case "SC" | "TC" | "ZC":
                 return self._limited(word, parameters, display)
@@ -108,15 +107,15 @@ class MtSicsVoice(status_lines.StatusLineVoice):
         return super().answer_with(word, parameters, display)
 
     def line(self, reading: Reading) -> bytes:
-        """See `StatusLineVoice.line`."""
+        """See `StatusLineEncoder.line`."""
         return weight_line(self.dialect, self._in_unit(reading, HOST))
 
-    def tared(self, display: Display) -> str:
-        """See `StatusLineVoice.tared`."""
-        tare = self._in_unit(Reading(Status.STABLE, display.scale.tared, display.scale.settings.unit), HOST)
+    def tared(self, display: EncoderDisplay) -> str:
+        """See `StatusLineEncoder.tared`."""
+        tare = self._in_unit(Reading(ReadingStatus.STABLE, display.scale.tared, display.scale.settings.unit), HOST)
         return f"{tare.value!s:>10} {tare.unit}"
 
-    def _limited(self, word: str, parameters: str, display: Display) -> Said:
+    def _limited(self, word: str, parameters: str, display: EncoderDisplay) -> Said:
         """Wait for rest for a time, then do it all the same."""
         if not parameters.isdecimal() or int(parameters) > LONGEST_WAIT:
             return line_of(f"{word} L")
@@ -124,9 +123,9 @@ class MtSicsVoice(status_lines.StatusLineVoice):
         def act() -> bytes:
             return self.weight(display) if word == "SC" else self.act(word, display)
 
-        return Waiting(act, act, int(parameters) / 1000.0)
+        return PendingReply(act, act, int(parameters) / 1000.0)
 
-    def _number(self, kind: int, display: Display) -> str:
+    def _number(self, kind: int, display: EncoderDisplay) -> str:
         unit = self._units.get(kind, display.scale.settings.unit)
         return next((number for number, name in UNITS.items() if name == unit), "0")
 

@@ -21,14 +21,23 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from actors.balance.dialects.dialect import Dialect, LineSettings, number_in, text_of
-from actors.balance.reading import LineError, Reading, Reply, Status
-from actors.balance.virtual_serial.voice import END, Display, Said, Voice, Waiting, line_of, silently, weight_line
+from actors.balance.dialects.protocol_encoder import (
+    END,
+    EncoderDisplay,
+    PendingReply,
+    ProtocolEncoder,
+    Said,
+    line_of,
+    silently,
+    weight_line,
+)
+from actors.balance.readings import LineError, Reading, ReadingStatus, Reply
 
 SHORT, LONG = 14, 20
 """Widths of the two layouts without CR LF."""
 
-_WORDS = {"High": Status.OVER, "H": Status.OVER, "Low": Status.UNDER, "L": Status.UNDER, "--": Status.BUSY,
-          "Cal.Int.": Status.BUSY, "Cal.Ext.": Status.BUSY, "C": Status.BUSY}  # fmt: skip
+_WORDS = {"High": ReadingStatus.OVER, "H": ReadingStatus.OVER, "Low": ReadingStatus.UNDER, "L": ReadingStatus.UNDER, "--": ReadingStatus.BUSY,
+          "Cal.Int.": ReadingStatus.BUSY, "Cal.Ext.": ReadingStatus.BUSY, "C": ReadingStatus.BUSY}  # fmt: skip
 _FAULT = re.compile(r"(?:Err|ERR) *(?P<number>[0-9]{1,4})|(?P<word>(?:APP|DIS|PRT)\.ER)")
 _BRACKETS = re.compile(r"\[([0-9]+)\]")
 
@@ -69,34 +78,34 @@ class Sbi(Dialect):
         if word in _WORDS:
             return Reading(_WORDS[word], detail=word if word.startswith("C") else "")
         if (fault := _FAULT.fullmatch(word)) is not None:
-            return Reading(Status.ERROR, detail=f"error {fault['number'] or fault['word']}")
+            return Reading(ReadingStatus.ERROR, detail=f"error {fault['number'] or fault['word']}")
         return _weight(text)
 
     def encode(self, reading: Reading) -> bytes:
         """See `Dialect.encode`."""
         status = reading.status
-        if status in (Status.STABLE, Status.UNSTABLE) and reading.value is not None:
+        if status in (ReadingStatus.STABLE, ReadingStatus.UNSTABLE) and reading.value is not None:
             sign = "-" if reading.value < 0 else "+"
-            unit = reading.unit if status is Status.STABLE else ""
+            unit = reading.unit if status is ReadingStatus.STABLE else ""
             text, label = f"{sign}{abs(reading.value)!s:>9} {unit:<3}", "N"
         elif status in _SAID:
             text, label = _SAID[status].ljust(8).rjust(SHORT), "Stat"
-        elif status is Status.ERROR:
+        elif status is ReadingStatus.ERROR:
             text, label = f"   Err {reading.detail.removeprefix('error ') or '54':<7}", "Stat"
         else:
             raise ValueError(f"no line of this dialect says '{status}'")
         return ((f"{label:<6}" if self.identified else "") + text).encode("ascii") + END
 
-    def voices(self) -> Mapping[str, Callable[[], Voice]]:
+    def voices(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
         """See `Dialect.voices`."""
         return {
-            self.name: SbiVoice,
-            f"{self.name}-identified": lambda: SbiVoice(identified=True),
-            f"{self.name}-at-stability": lambda: SbiVoice(at_stability=True),
+            self.name: SbiEncoder,
+            f"{self.name}-identified": lambda: SbiEncoder(identified=True),
+            f"{self.name}-at-stability": lambda: SbiEncoder(at_stability=True),
         }
 
 
-_SAID = {Status.OVER: "High", Status.UNDER: "Low", Status.BUSY: "--"}
+_SAID = {ReadingStatus.OVER: "High", ReadingStatus.UNDER: "Low", ReadingStatus.BUSY: "--"}
 
 
 def _weight(text: str) -> Reading:
@@ -112,10 +121,10 @@ def _weight(text: str) -> Reading:
         raise LineError("not a weight")
     if sign == "-":
         number = -number
-    return Reading(Status.STABLE if name else Status.UNSTABLE, number, name)
+    return Reading(ReadingStatus.STABLE if name else ReadingStatus.UNSTABLE, number, name)
 
 
-class SbiVoice:
+class SbiEncoder:
     """Sartorius SBI.
 
     Args:
@@ -128,24 +137,24 @@ class SbiVoice:
         self._at_stability = at_stability
 
     def commands(self, heard: bytearray) -> list[bytes]:
-        """See `Voice.commands`."""
+        """See `ProtocolEncoder.commands`."""
         found = re.findall(rb"\x1b([A-Z]|[a-z][A-Za-z0-9]*_)", bytes(heard))
         tail = bytes(heard).rpartition(b"\x1b")
         begun = tail[1] and re.fullmatch(rb"(?:[a-z][A-Za-z0-9]*)?", tail[2])
         heard[:] = b"\x1b" + tail[2] if begun else b""
         return found
 
-    def answer(self, command: bytes, display: Display) -> Said:
-        """See `Voice.answer`."""
+    def answer(self, command: bytes, display: EncoderDisplay) -> Said:
+        """See `ProtocolEncoder.answer`."""
         if command == b"P" and not self._at_stability:
             return weight_line(self.dialect, display.reading())
         match command:
             case b"P":
-                return Waiting(lambda: weight_line(self.dialect, display.reading()))
+                return PendingReply(lambda: weight_line(self.dialect, display.reading()))
             case b"T" | b"U":
-                return Waiting(lambda: silently(display.tare))
+                return PendingReply(lambda: silently(display.tare))
             case b"V":
-                return Waiting(lambda: silently(display.zero))
+                return PendingReply(lambda: silently(display.zero))
             case b"x1_":
                 return line_of("VIRTUAL-SBI")
         return b""

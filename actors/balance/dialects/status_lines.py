@@ -14,26 +14,40 @@ from dataclasses import dataclass
 from decimal import Decimal
 
 from actors.balance.dialects.dialect import Dialect, number_in, text_of
-from actors.balance.reading import Acknowledgement, Answer, LineError, Reading, Reply, Status
-from actors.balance.units import KILOGRAMS, kilograms
-from actors.balance.virtual_serial.voice import (
+from actors.balance.dialects.protocol_encoder import (
     END,
     Cancel,
-    Display,
+    EncoderDisplay,
     Follow,
     Lines,
+    PendingReply,
     Repeat,
     Said,
-    Waiting,
     line_of,
     weight_line,
 )
+from actors.balance.readings import (
+    KILOGRAMS,
+    Acknowledgement,
+    LineError,
+    Reading,
+    ReadingReply,
+    ReadingStatus,
+    Reply,
+    kilograms,
+)
 
-WEIGHTS = {"S": Status.STABLE, "D": Status.UNSTABLE}
-STATES = {"I": Status.BUSY, "+": Status.OVER, "-": Status.UNDER, "L": Status.ERROR}
-_LETTERS = {Status.STABLE: "S", Status.UNSTABLE: "D", Status.BUSY: "I", Status.OVER: "+", Status.UNDER: "-"}
-ANSWERS = {"A": Answer.DONE, "S": Answer.DONE, "D": Answer.DONE, "I": Answer.BUSY, "+": Answer.OVER,
-           "-": Answer.UNDER, "L": Answer.REFUSED}  # fmt: skip
+WEIGHTS = {"S": ReadingStatus.STABLE, "D": ReadingStatus.UNSTABLE}
+STATES = {"I": ReadingStatus.BUSY, "+": ReadingStatus.OVER, "-": ReadingStatus.UNDER, "L": ReadingStatus.ERROR}
+_LETTERS = {
+    ReadingStatus.STABLE: "S",
+    ReadingStatus.UNSTABLE: "D",
+    ReadingStatus.BUSY: "I",
+    ReadingStatus.OVER: "+",
+    ReadingStatus.UNDER: "-",
+}
+ANSWERS = {"A": ReadingReply.DONE, "S": ReadingReply.DONE, "D": ReadingReply.DONE, "I": ReadingReply.BUSY, "+": ReadingReply.OVER,
+           "-": ReadingReply.UNDER, "L": ReadingReply.REFUSED}  # fmt: skip
 REFUSALS = {
     "ES": "syntax error: it does not know the command",
     "ET": "transmission error: it received damaged characters",
@@ -60,14 +74,14 @@ def decode(line: bytes) -> Reply:
     if not words:
         raise LineError("empty")
     if words[0] in REFUSALS and len(words) == 1:
-        return Acknowledgement("", Answer.REFUSED, REFUSALS[words[0]])
+        return Acknowledgement("", ReadingReply.REFUSED, REFUSALS[words[0]])
     if words[0] == "S":
         return _weight(words)
     if not COMMAND.fullmatch(words[0]) or len(words) < 2 or (words[1] not in ANSWERS and words[1] != "B"):
         raise LineError("neither a weight nor an answer to a command")
     if words[1] in WEIGHTS and len(words) > 2 and (len(words) != 4 or number_in(words[2]) is None):
         raise LineError("the weight is damaged")
-    return Acknowledgement(words[0], ANSWERS.get(words[1], Answer.BUSY), " ".join(words[2:]))
+    return Acknowledgement(words[0], ANSWERS.get(words[1], ReadingReply.BUSY), " ".join(words[2:]))
 
 
 def _weight(words: list[str]) -> Reading:
@@ -75,7 +89,7 @@ def _weight(words: list[str]) -> Reading:
         case ["S", state] if state in STATES:
             return Reading(STATES[state], detail="it can't carry out the question" if state == "L" else "")
         case ["S", "S" | "D", "Error", number]:
-            return Reading(Status.ERROR, detail=f"error {number}")
+            return Reading(ReadingStatus.ERROR, detail=f"error {number}")
         case ["S", state, value, unit] if state in WEIGHTS:
             weight = number_in(value)
             if weight is not None and UNIT.fullmatch(unit):
@@ -93,7 +107,7 @@ def encode(reading: Reading) -> bytes:
         letter = _LETTERS[reading.status]
         weight = f" {reading.value!s:>10} {reading.unit}" if letter in WEIGHTS else ""
         return f"S {letter}{weight}".encode("ascii") + END
-    if reading.status is Status.ERROR:
+    if reading.status is ReadingStatus.ERROR:
         return f"S S Error {reading.detail.removeprefix('error ') or '1b'}".encode("ascii") + END
     raise ValueError(f"no line says '{reading.status}'")
 
@@ -101,7 +115,7 @@ def encode(reading: Reading) -> bytes:
 IDENTITY = ("I1", "I2")
 """Ask for the levels of commands, and for the model."""
 
-_SIGNS = {Status.OVER: "+", Status.UNDER: "-"}
+_SIGNS = {ReadingStatus.OVER: "+", ReadingStatus.UNDER: "-"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +139,7 @@ class StatusLines(Dialect):
         return encode(reading)
 
 
-class StatusLineVoice:
+class StatusLineEncoder:
     """The commands that KCP and MT-SICS share: MT-SICS's levels 0 and 1, as most balances have them.
 
     Args:
@@ -151,13 +165,13 @@ class StatusLineVoice:
         }
 
     def commands(self, heard: bytearray) -> list[bytes]:
-        """See `Voice.commands`."""
+        """See `ProtocolEncoder.commands`."""
         *whole, rest = re.split(rb"\r\n|\n", bytes(heard))
         heard[:] = rest
         return whole
 
-    def answer(self, command: bytes, display: Display) -> Said:
-        """See `Voice.answer`."""
+    def answer(self, command: bytes, display: EncoderDisplay) -> Said:
+        """See `ProtocolEncoder.answer`."""
         word, _, parameters = command.decode("ascii", "replace").partition(" ")
         if not word and not parameters:
             return b""
@@ -167,7 +181,7 @@ class StatusLineVoice:
             return self.answer_with(word, parameters.strip(), display)
         return self.answer_bare(word, display)
 
-    def answer_bare(self, word: str, display: Display) -> Said:
+    def answer_bare(self, word: str, display: EncoderDisplay) -> Said:
         """The answer to a known command without parameters."""
         match word:
             case "I0":
@@ -175,13 +189,13 @@ class StatusLineVoice:
             case "SI":
                 return self.weight(display)
             case "S":
-                return Waiting(lambda: self.weight(display), line_of("S I"))
+                return PendingReply(lambda: self.weight(display), line_of("S I"))
             case "SIR":
                 return Repeat(self.line)
             case "SR":
                 return self.follow(display)
             case "T" | "Z":
-                return Waiting(lambda: self.act(word, display), line_of(f"{word} I"))
+                return PendingReply(lambda: self.act(word, display), line_of(f"{word} I"))
             case "TI" | "ZI":
                 return self.act(word, display)
             case "TA":
@@ -195,7 +209,7 @@ class StatusLineVoice:
                 return Cancel(line_of(f"I4 A {self._identity['I4']}"))
         return line_of(f"{word} A {self._identity[word]}" if word in self._identity else f"{word} L")
 
-    def answer_with(self, word: str, parameters: str, display: Display) -> Said:
+    def answer_with(self, word: str, parameters: str, display: EncoderDisplay) -> Said:
         """The answer to a known command with parameters; 'L' where these are not as they should be."""
         match word:
             case "D" if re.fullmatch(r'"[^"]*"', parameters):
@@ -214,11 +228,11 @@ class StatusLineVoice:
         """The line for a reading."""
         return weight_line(self.dialect, reading)
 
-    def weight(self, display: Display) -> bytes:
+    def weight(self, display: EncoderDisplay) -> bytes:
         """The line for what is shown now."""
         return self.line(display.reading())
 
-    def tared(self, display: Display) -> str:
+    def tared(self, display: EncoderDisplay) -> str:
         """The tare with its unit, as it stands in a line."""
         return f"{display.scale.tared!s:>10} {display.scale.settings.unit}"
 
@@ -228,7 +242,7 @@ class StatusLineVoice:
         number, factor = number_in(value), kilograms(unit.strip())
         return None if number is None or factor is None else float(number) * factor
 
-    def follow(self, display: Display, mass: float | None = None, *, moving: bool = True) -> Follow:
+    def follow(self, display: EncoderDisplay, mass: float | None = None, *, moving: bool = True) -> Follow:
         """Report changes: of a mass [kg], or by default of an eighth of the weight and at least 30 digits."""
         scale = display.scale
         if mass is None:
@@ -236,7 +250,7 @@ class StatusLineVoice:
         step = Decimal(repr(mass)) / Decimal(repr(KILOGRAMS[scale.settings.unit]))
         return Follow(self.line, lambda stood: step, moving)
 
-    def act(self, word: str, display: Display) -> bytes:
+    def act(self, word: str, display: EncoderDisplay) -> bytes:
         """Tare (T …) or zero (Z …) now, and the line that reports it."""
         status = display.tare() if word.startswith("T") else display.zero()
         if status in _SIGNS:

@@ -6,22 +6,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from orchestrator.config.laboratory.sections import LaboratoryFile, resolve_laboratory
-from orchestrator.config.vessel import (
-    MESH_SUFFIXES,
-    LiquidFile,
-    VesselFile,
-    resolve_liquid,
-    resolve_vessel,
-)
-from orchestrator.config.yaml.errors import ConfigError, shown_path
-from orchestrator.config.yaml.files import missing_file, resolved
-from orchestrator.config.yaml.kinds import wrong_kind
-from orchestrator.config.yaml.sections import Section
-from orchestrator.config.yaml.source import Document, Place, Report
-from orchestrator.config.yaml.validate import validate
-from sim_engine.liquid import Liquid
-from sim_engine.vessel.spec import VesselSpec
+from orchestrator.config.laboratory_file import LaboratoryFile, resolve_laboratory
+from orchestrator.config.vessel_file import MESH_SUFFIXES, LiquidFile, VesselFile, resolve_liquid, resolve_vessel
+from orchestrator.config.yaml.file_access import missing_file, resolved
+from orchestrator.config.yaml.section_validation import validate
+from orchestrator.config.yaml.yaml_errors import ConfigError, shown_path
+from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
+from sim_engine.liquids import Liquid
+from sim_engine.settings.model import Section
+from sim_engine.vessel.shapes import VesselSpec
 
 S = TypeVar("S", bound=Section)
 

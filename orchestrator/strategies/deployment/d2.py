@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from actors.optimizer.core.problem import Data, Suggestion, SuggestProblem
-from orchestrator.plan import DeploymentPlan
-from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
-from orchestrator.strategies.deployment.settings import SearchSettings
-from orchestrator.strategies.protocol import Strategy
-from sim_engine.liquid import SimulationParameters
-from sim_engine.task import Scene
+from actors.optimizer.questions import Data, Suggestion, SuggestProblem
+from orchestrator.strategies.campaign_plan import DeploymentPlan
+from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
+from orchestrator.strategies.strategy import Strategy
+from sim_engine.liquids import SimulationParameters
+from sim_engine.scene import Scene
 
 
 class D2Settings(SearchSettings):

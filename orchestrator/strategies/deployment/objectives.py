@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Section
 from sim_engine.action import Action
 from sim_engine.motion import turn
 from sim_engine.outcome import Fractions
-from sim_engine.space import Space
-from sim_engine.task import Scene
+from sim_engine.scene import Scene
+from sim_engine.search_space import Space
+from sim_engine.settings.model import Section
+from sim_engine.settings.quantity import Quantity
 
 if TYPE_CHECKING:
-    from orchestrator.config.yaml.sections import Complaints
+    from sim_engine.settings.model import Problems
 
 Vector = tuple[float, ...]
 """One number for each objective, smaller is better."""
@@ -54,13 +54,13 @@ class Objective(Section):
         """Share of the load that should arrive."""
         return 1.0
 
-    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Complaints) -> None:
+    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
         """Complain of what does not make sense in a scene, or beside the other objectives."""
 
     @classmethod
     def unknown_tag(cls, word: str) -> str:
         """Which plug-in would have it, if it could be loaded."""
-        objectives = resolve_name("orchestrator.strategies.doors:OBJECTIVES")
+        objectives = resolve_name("orchestrator.strategies.strategy_registry:OBJECTIVES")
         return next((str(broken) for broken in objectives.broken if broken.name == word), "")
 
 
@@ -85,7 +85,7 @@ class Retained(Objective):
         """The share that is retained."""
         return fractions.retained
 
-    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Complaints) -> None:
+    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
         """It contradicts a volume to stop at."""
         if "target_volume" in beside:
             text = "wants the pourer to be emptied, and target_volume what is over to stay in it; keep one of them"
@@ -110,7 +110,7 @@ class Time(Objective):
         corners = itertools.product((0.0, 1.0), repeat=actions.dimension)
         return max(duration(scene.action(actions.decode(corner))) for corner in corners) / self.scale
 
-    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Complaints) -> None:
+    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
         """The hold has to last a known time."""
         if "hold_time" not in actions.names and scene.fixed.get("hold_time") is None:
             text = "needs a hold that lasts a known time; search hold_time, or fix it under motion ('hold_time: 1.5 s')"
@@ -147,7 +147,7 @@ class TargetVolume(Objective):
         assert self.volume is not None, "checked"
         return self.volume / scene.liquid.volume
 
-    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Complaints) -> None:
+    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
         """The target is loaded, and an action can stop there."""
         if self.volume is None:
             text = "key 'volume' is missing; add for example 'volume: 150 mL'"

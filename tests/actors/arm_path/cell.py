@@ -11,16 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.geometry import ArmLimits, Cell, Pose
-from actors.arm.path.travel import follow
-from actors.arm.spec import UrArmSpec
-from orchestrator.config.load import load_vessel
+from actors.arm.arm_interface import ArmLimits, Pose, RobotCell
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planning.transfer_motion import follow
+from orchestrator.config.file_loading import load_vessel
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid
+from sim_engine.liquids import Liquid
 from sim_engine.motion import PourMotion, plan_motion
-from sim_engine.task import Pivot, Scene
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.vessel import Vessel
+from sim_engine.scene import Pivot, Scene
+from sim_engine.vessel.vessel import Vessel, build_vessel
 
 FloatArray = NDArray[np.float64]
 
@@ -32,7 +31,7 @@ LIMITS = ArmLimits(
 SPEC = UrArmSpec(
     model="ur10e",
     limits=LIMITS,
-    cell=Cell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
+    cell=RobotCell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
     home=(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
     tool=Pose(z=0.17),
     grip=Pose(y=-0.06, rx=-90 * DEG),

@@ -8,16 +8,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from actors.arm.path.kinematics import (
-    MODELS,
-    beyond_reach,
-    forward,
-    inverse,
-    link_points,
-    posture,
-    singularities,
-)
-from actors.virtual_ur.kinematics import Kinematics
+from actors.arm.planning.kinematics import MODELS, beyond_reach, forward, inverse, link_points, posture, singularities
+from actors.emulators.ur_controller.robot_kinematics import Kinematics
 from tests.depth import examples
 
 from .cell import SPEC, turned

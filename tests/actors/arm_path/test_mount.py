@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.arm.geometry import Cell, Mount
-from actors.arm.path.kinematics import MODELS, inverse, singularities
-from actors.arm.path.limits import check_limits
-from actors.arm.path.plan import plan_path
-from actors.arm.path.transforms import cell_transforms, flange_poses, pourer_motion, pourer_transforms
-from actors.arm.spec import UrArmSpec
-from actors.protocols import InvalidActionError
+from actors.arm.arm_interface import Mount, RobotCell
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planning.frames import cell_transforms, flange_poses, pourer_motion, pourer_transforms
+from actors.arm.planning.kinematics import MODELS, inverse, singularities
+from actors.arm.planning.path_checks import check_limits
+from actors.arm.planning.pour_planner import plan_path
+from actors.interfaces import InvalidActionError
 from sim_engine.action import DEG
 
 from .cell import SPEC, motion, vessel
@@ -26,7 +26,7 @@ def mounted(name: str) -> UrArmSpec:
     """A cell for that mount, with a home that has the pourer upright beside the receiver."""
     limits = replace(SPEC.limits, box_low=(-1.5, -1.5, -1.5), box_high=(1.5, 1.5, 1.5))
     for direction in np.arange(0.0, 360.0, 15.0) * DEG:
-        cell = Cell(receiver=RECEIVERS[name], direction=float(direction), table=-1.5)
+        cell = RobotCell(receiver=RECEIVERS[name], direction=float(direction), table=-1.5)
         spec = replace(SPEC, limits=limits, cell=cell, mount=MOUNTS[name])
         flange = flange_poses(np.array([[-0.2, 0.0, 0.25, 1.0, 0.0, 0.0, 0.0]]), spec)
         found = inverse(flange.rotation, flange.position, MODELS[spec.model])[0]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.arm.path.pace import STEEPEST, followable, pour_times, trapezoid
+from actors.arm.planning.trajectory import STEEPEST, followable, pour_times, trapezoid
 from sim_engine.action import DEG
 from sim_engine.motion import Phase, PourMotion, Segment
 from tests.depth import examples

@@ -11,22 +11,22 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from actors.arm.geometry import Plane
-from actors.arm.joint_path import JointPath, PourPath
-from actors.arm.path.checks import recheck
-from actors.arm.path.kinematics import MODELS, forward
-from actors.arm.path.pace import STEEPEST
-from actors.arm.path.plan import plan_path
-from actors.arm.path.transforms import cell_transforms, pourer_motion, pourer_transforms
-from actors.arm.path.travel import TOOL_ACCELERATION
-from actors.arm.spec import UrArmSpec
-from actors.protocols import InvalidActionError
-from orchestrator.config.load import load_campaign
+from actors.arm.arm_interface import Plane
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planned_pour import JointPath, PourPath
+from actors.arm.planning.frames import cell_transforms, pourer_motion, pourer_transforms
+from actors.arm.planning.kinematics import MODELS, forward
+from actors.arm.planning.path_checks import recheck
+from actors.arm.planning.pour_planner import plan_path
+from actors.arm.planning.trajectory import STEEPEST
+from actors.arm.planning.transfer_motion import TOOL_ACCELERATION
+from actors.interfaces import InvalidActionError
+from orchestrator.config.file_loading import load_campaign
 from sim_engine.action import DEG
-from sim_engine.contact import clearance, first_contact, rotations
+from sim_engine.collision import clearance, first_contact, rotations
 from sim_engine.motion import plan_motion
-from sim_engine.task import Pivot
-from sim_engine.vessel.build import build_vessel
+from sim_engine.scene import Pivot
+from sim_engine.vessel.vessel import build_vessel
 from tests.depth import examples
 
 from .cell import ACTION, CONFIGS, LIMITS, SPEC, limited, motion, turned, vessel, waiting_at

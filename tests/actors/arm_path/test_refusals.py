@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.arm.geometry import Plane, Pose
-from actors.arm.joint_path import JointPath
-from actors.arm.path.checks import recheck
-from actors.arm.path.plan import plan_path
-from actors.arm.spec import UrArmSpec
-from actors.protocols import InvalidActionError
+from actors.arm.arm_interface import Plane, Pose
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planned_pour import JointPath
+from actors.arm.planning.path_checks import recheck
+from actors.arm.planning.pour_planner import plan_path
+from actors.interfaces import InvalidActionError
 from sim_engine.action import DEG, Action
-from sim_engine.task import Pivot
+from sim_engine.scene import Pivot
 
 from .cell import ACTION, LIMITS, SPEC, limited, motion, placed, vessel, waiting_at
 

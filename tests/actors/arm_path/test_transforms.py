@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.arm.geometry import Pose
-from actors.arm.path.kinematics import MODELS, inverse
-from actors.arm.path.plan import plan_path
-from actors.arm.path.transforms import flange_poses, pourer_motion, pourer_transforms, quaternions
+from actors.arm.arm_interface import Pose
+from actors.arm.planning.frames import flange_poses, pourer_motion, pourer_transforms, quaternions
+from actors.arm.planning.kinematics import MODELS, inverse
+from actors.arm.planning.pour_planner import plan_path
 from sim_engine.action import DEG
-from sim_engine.contact import rotations
+from sim_engine.collision import rotations
 from tests.depth import examples
 
 from .cell import SPEC, motion, placed, turned, vessel

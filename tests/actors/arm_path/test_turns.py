@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation, Slerp
 
-from actors.arm.path.solids import hull
-from actors.arm.path.turns import about, between, from_vector, to_quaternions
+from actors.arm.planning.collision_geometry import hull
+from actors.arm.planning.frames import about, between, from_vector, to_quaternions
 from tests.depth import examples
 
 from .cell import vessel

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from actors import contracts
-from actors.arm.joint_path import PourPath
-from actors.arm.ur.driver import UrArm
-from actors.virtual_ur import VirtualController
+from actors.arm.planned_pour import PourPath
+from actors.arm.ur.ur_driver import UrArm
+from actors.emulators.ur_controller import VirtualController
 from tests.patience import PATIENCE
 
 from .pours import HOME, START, pour_path, settings

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from actors.arm.geometry import ArmLimits, Cell, Pose
-from actors.arm.joint_path import JointPath, PourPath
-from actors.arm.protocol import PathReport
-from actors.arm.spec import UrArmSpec
+from actors.arm.arm_interface import ArmLimits, PathReport, Pose, RobotCell
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planned_pour import JointPath, PourPath
 
 HOME = tuple(math.radians(v) for v in (0.0, -90.0, 90.0, -90.0, -90.0, 0.0))
 START = tuple(math.radians(v) for v in (12.0, -85.0, 88.0, -93.0, -90.0, 3.0))
@@ -35,7 +34,7 @@ def settings(address: str = "", **changes: Any) -> UrArmSpec:
     spec = UrArmSpec(
         model="ur10e",
         limits=ArmLimits((-1.5, -1.5, -0.5), (1.5, 1.5, 2.0)),
-        cell=Cell((0.8, 0.0, 0.0)),
+        cell=RobotCell((0.8, 0.0, 0.0)),
         home=HOME,  # type: ignore[arg-type]
         address=address,
         tool=Pose(0.0, 0.0, 0.15),

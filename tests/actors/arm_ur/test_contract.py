@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from actors.arm.errors import ArmLostError
-from actors.arm.joint_path import ExecutedPath, PourPath
-from actors.arm.path.plan import plan_path
-from actors.arm.path.transforms import pourer_motion
-from actors.arm.ur.driver import UrArm
-from actors.contracts.arm import ArmBench, ArmContract
-from actors.virtual_ur import VirtualController
+from actors.arm.arm_interface import ArmLostError
+from actors.arm.planned_pour import ExecutedPath, PourPath
+from actors.arm.planning.frames import pourer_motion
+from actors.arm.planning.pour_planner import plan_path
+from actors.arm.ur.ur_driver import UrArm
+from actors.contract_tests.arm_contract import ArmBench, ArmContract
+from actors.emulators.ur_controller import VirtualController
 from sim_engine.action import DEG
 
 from .conftest import next_address

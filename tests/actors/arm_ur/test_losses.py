@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.arm.errors import ArmError, ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
-from actors.arm.joint_path import JointPath
-from actors.arm.ur.driver import UrArm
-from actors.arm.ur.messages import Settings
-from actors.arm.ur.script import path_program
-from actors.child_process import child_environment
-from actors.protocols import LaboratoryError
+from actors.arm.arm_interface import ArmError, ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
+from actors.arm.planned_pour import JointPath
+from actors.arm.ur.ur_driver import UrArm
+from actors.arm.ur.urscript_writer import path_program
+from actors.arm.ur.worker_messages import MotionSettings
+from actors.interfaces import LaboratoryError
+from actors.runtime.child_process import child_environment
 from tests.patience import PATIENCE
 
 from .conftest import Call, Rig, next_address
@@ -190,7 +190,7 @@ def test_killing_the_driver_s_process_in_mid_pour_stops_the_arm(make_rig: Make, 
     rig = make_rig(LONG_TILT, time_scale=FASTER, connect=False)
     (tmp_path / "pour").write_bytes(pickle.dumps((rig.arm._spec, rig.path)))
     program = (
-        "import pickle, sys; from actors.arm.ur.driver import UrArm\n"
+        "import pickle, sys; from actors.arm.ur.ur_driver import UrArm\n"
         f"spec, path = pickle.load(open({str(tmp_path / 'pour')!r}, 'rb'))\n"
         "arm = UrArm(spec); arm.connect(); arm.release(); arm.move_to_start(path)\n"
         "print(arm._session.pid, flush=True); arm.execute(path)"
@@ -219,7 +219,7 @@ def test_a_driver_that_hangs_in_mid_pour_stops_the_arm(make_rig: Make, tmp_path:
     rig = make_rig(LONG_TILT, time_scale=1.0, connect=False)
     (tmp_path / "pour").write_bytes(pickle.dumps((rig.arm._spec, rig.path)))
     program = (
-        "import pickle, sys; from actors.arm.ur.driver import UrArm\n"
+        "import pickle, sys; from actors.arm.ur.ur_driver import UrArm\n"
         f"spec, path = pickle.load(open({str(tmp_path / 'pour')!r}, 'rb'))\n"
         "arm = UrArm(spec); arm.connect(); arm.release(); arm.move_to_start(path); arm.execute(path)"
     )
@@ -297,10 +297,10 @@ def test_another_robot_than_set_up_is_refused(make_rig: Make) -> None:
 def test_a_controller_that_did_not_take_the_payload_keeps_the_arm_still(
     resting: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def heavier(path: JointPath, asked: Settings, number: int, *, cb3: bool) -> str:
+    def heavier(path: JointPath, asked: MotionSettings, number: int, *, cb3: bool) -> str:
         return path_program(path, replace(asked, payload=3.3), number, cb3=cb3)
 
-    monkeypatch.setattr("actors.arm.ur.driver.path_program", heavier)
+    monkeypatch.setattr("actors.arm.ur.ur_driver.path_program", heavier)
     resting.arm.release()
     with pytest.raises(ArmRefusedError, match=r"were set to .*1\.2.*; the controller has .*3\.3"):
         resting.arm.move_to_start(resting.path)
@@ -357,7 +357,7 @@ def test_without_the_client_library_it_is_said_which_one_is_missing(
 @pytest.mark.realtime
 def test_the_driver_does_not_load_the_client_library() -> None:
     program = (
-        "import sys, actors.arm.ur.driver; "
+        "import sys, actors.arm.ur.ur_driver; "
         "print([m for m in sys.modules if m.startswith('rtde') or m.startswith('dashboard_client')])"
     )
     said = subprocess.run(

@@ -12,19 +12,18 @@ from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from actors.arm.errors import ArmRefusedError
-from actors.arm.joint_path import JointPath
-from actors.arm.ur.jogging import jog_path
-from actors.arm.ur.messages import Settings
-from actors.arm.ur.primary import PrimaryError, split
-from actors.arm.ur.script import path_program, thinned
-from actors.arm.ur.tracking import executed_path
-from actors.arm.ur.ways import leans, rejoin, upright_way, way_home
+from actors.arm.arm_interface import ArmRefusedError
+from actors.arm.planned_pour import JointPath
+from actors.arm.ur.executed_motion import executed_path
+from actors.arm.ur.motion_segments import jog_path, leans, rejoin, upright_way, way_home
+from actors.arm.ur.primary_interface import PrimaryError, split
+from actors.arm.ur.urscript_writer import path_program, thinned
+from actors.arm.ur.worker_messages import MotionSettings
 from tests.depth import examples
 
 from .pours import HOME, START, pour_path, settings, smooth
 
-NO_TOOL = Settings((0.0,) * 6, 0.0, (0.0,) * 3)
+NO_TOOL = MotionSettings((0.0,) * 6, 0.0, (0.0,) * 3)
 POUR = pour_path()
 
 
@@ -150,7 +149,7 @@ def test_missed_packages_show_as_a_gap() -> None:
 
 
 def test_a_step_of_the_tool_is_straight_and_keeps_its_orientation() -> None:
-    from actors.arm.path.transforms import pourer_transforms
+    from actors.arm.planning.frames import pourer_transforms
 
     spec = settings()
     path = jog_path(spec, HOME, "y", 0.04, 0.08)  # type: ignore[arg-type]

@@ -9,28 +9,26 @@ from functools import cache
 import numpy as np
 import pytest
 
-from actors.arm.errors import ArmStoppedError
-from actors.arm.geometry import ArmLimits, Cell, Pose
-from actors.arm.path.plan import plan_path
-from actors.arm.path.transforms import pourer_motion
-from actors.arm.spec import UrArmSpec
-from actors.arm.ur.driver import UrArm
-from actors.arm.ur.ways import leans
-from actors.virtual_ur import VirtualController
+from actors.arm.arm_interface import ArmLimits, ArmStoppedError, Pose, RobotCell
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planning.frames import pourer_motion
+from actors.arm.planning.pour_planner import plan_path
+from actors.arm.ur.motion_segments import leans
+from actors.arm.ur.ur_driver import UrArm
+from actors.emulators.ur_controller import VirtualController
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid
+from sim_engine.liquids import Liquid
 from sim_engine.motion import PourMotion, plan_motion
-from sim_engine.task import Scene
-from sim_engine.vessel.build import build_vessel
-from sim_engine.vessel.spec import cylinder
-from sim_engine.vessel.vessel import Vessel
+from sim_engine.scene import Scene
+from sim_engine.vessel.shapes import cylinder
+from sim_engine.vessel.vessel import Vessel, build_vessel
 
 from .conftest import Call, Rig, next_address
 
 SPEC = UrArmSpec(
     model="ur10e",
     limits=ArmLimits((0.2, -0.7, 0.0), (1.1, 0.5, 1.0), joint_speed=170 * DEG, tilt_speed=155 * DEG, clearance=3e-3),
-    cell=Cell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
+    cell=RobotCell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
     home=(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
     tool=Pose(z=0.17),
     grip=Pose(y=-0.06, rx=-90 * DEG),

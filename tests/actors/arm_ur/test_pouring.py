@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from actors.arm.errors import ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
+from actors.arm.arm_interface import ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
 
 from .conftest import Call, Rig
 from .pours import HOME, START, pour_path

@@ -8,13 +8,12 @@ from typing import Any
 
 import pytest
 
-from actors.balance.doors import dialects
+from actors.balance.balance_settings import SerialBalanceSpec, SettlingRule
+from actors.balance.dialects.dialect_registry import dialects
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.settling import SettlingRule
-from actors.balance.spec import SerialBalanceSpec
-from actors.balance.virtual_serial.faults import Faults
-from actors.balance.virtual_serial.handle import VirtualSerialBalance
-from actors.balance.virtual_serial.scale import ScaleSettings
+from actors.balance.simulated_balance import ScaleSettings
+from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
+from actors.emulators.serial_balance.emulated_balance import BalanceFaults
 
 PACE = 20.0
 """Bench seconds per second in these tests."""
@@ -68,7 +67,7 @@ def virtual(voices: Callable[[str], VirtualSerialBalance]) -> Callable[[str], Vi
     def of(voice: str) -> VirtualSerialBalance:
         balance = voices(voice)
         balance.plug()
-        balance.faults(**asdict(Faults()))
+        balance.faults(**asdict(BalanceFaults()))
         balance.prepare((1,))
         return balance
 

@@ -8,13 +8,12 @@ from typing import Any
 
 import pytest
 
-from actors.balance.errors import BalanceError, NoConnectionError
-from actors.balance.protocol import Weight
+from actors.balance.balance_interface import BalanceError, NoConnectionError, Weight
+from actors.balance.balance_settings import SettlingRule
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.settling import SettlingRule
-from actors.balance.virtual_balance import BalanceSettings, Load, VirtualBalance
-from actors.contracts import balance as contract
-from actors.contracts.balance import BalanceBench, BalanceContract
+from actors.balance.simulated_balance import BalanceSettings, Load, VirtualBalance
+from actors.contract_tests import balance_contract as contract
+from actors.contract_tests.balance_contract import BalanceBench, BalanceContract
 
 from .conftest import spec_for
 

@@ -10,15 +10,14 @@ from dataclasses import asdict
 import pytest
 import serial
 
+from actors.balance.balance_interface import BalanceError, LineSettingsError, UnknownDialectError
+from actors.balance.balance_settings import SerialBalanceSpec, SettlingRule, parse_format
 from actors.balance.dialects.dialect import LineSettings
-from actors.balance.doors import dialects
-from actors.balance.errors import BalanceError, LineSettingsError, UnknownDialectError
+from actors.balance.dialects.dialect_registry import dialects
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.settling import SettlingRule
-from actors.balance.spec import SerialBalanceSpec, parse_format
-from actors.balance.virtual_serial.faults import Faults
-from actors.balance.virtual_serial.handle import VirtualSerialBalance
-from actors.balance.wire import port_advice
+from actors.balance.serial_port import port_advice
+from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
+from actors.emulators.serial_balance.emulated_balance import BalanceFaults
 
 from .conftest import OF_VOICE, PACE
 
@@ -179,4 +178,4 @@ def test_names_that_change_with_the_next_plugging_are_advised_against():
 
 
 def test_faults_are_off_unless_asked_for():
-    assert not any(asdict(Faults()).values())
+    assert not any(asdict(BalanceFaults()).values())

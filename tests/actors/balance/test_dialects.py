@@ -9,38 +9,38 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from actors.balance.dialects.dialect import Dialect
+from actors.balance.dialects.dialect_registry import dialects
 from actors.balance.dialects.kcp import KCP
 from actors.balance.dialects.kern_swt import KERN_SWT, KernSwt
 from actors.balance.dialects.mt_sics import MT_SICS
 from actors.balance.dialects.sbi import SBI, Sbi
-from actors.balance.doors import dialects
-from actors.balance.reading import Acknowledgement, Answer, LineError, Reading, Status
+from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingReply, ReadingStatus
 from tests.depth import examples
 
 SPEAKERS: tuple[Dialect, ...] = (*dialects().values(), KernSwt(short=True), Sbi(identified=True))
 
 TYPED = [
-    (MT_SICS, b"S S       0.00 g", Status.STABLE, "0.00", "g"),
-    (MT_SICS, b"S D      -0.01 g", Status.UNSTABLE, "-0.01", "g"),
-    (KCP, b"S S 100.00 g", Status.STABLE, "100.00", "g"),
-    (KCP, b"S I", Status.BUSY, None, ""),
-    (KCP, b"S +", Status.OVER, None, ""),
-    (KCP, b"S -", Status.UNDER, None, ""),
-    (KERN_SWT, b"M-     12.34 g  ", Status.STABLE, "-12.34", "g"),
-    (KERN_SWT, b"          0.0 g  ", Status.STABLE, "0.0", "g"),  # PCB-BA-e-0712, read as 19 bytes
-    (KERN_SWT, b"       1234.5    ", Status.UNSTABLE, "1234.5", ""),
-    (KERN_SWT, b"          0.0 ", Status.UNSTABLE, "0.0", ""),
-    (KERN_SWT, b"           Error", Status.ERROR, None, ""),
-    (KERN_SWT, b"       Error", Status.ERROR, None, ""),
-    (KERN_SWT, b"=Overload=", Status.OVER, None, ""),
-    (SBI, b"   111.255 g  ", Status.STABLE, "111.255", "g"),  # Quintix manual, p. 87
-    (SBI, b"+  123.5[6]g  ", Status.STABLE, "123.56", "g"),
-    (SBI, b"N     +   123.56 g  ", Status.STABLE, "123.56", "g"),  # Entris II, p. 3
-    (SBI, b"-     0.02    ", Status.UNSTABLE, "-0.02", ""),
-    (SBI, b"      High    ", Status.OVER, None, ""),
-    (SBI, b"      Low     ", Status.UNDER, None, ""),
-    (SBI, b"      --      ", Status.BUSY, None, ""),
-    (SBI, b"Stat     ERR 054    ", Status.ERROR, None, ""),
+    (MT_SICS, b"S S       0.00 g", ReadingStatus.STABLE, "0.00", "g"),
+    (MT_SICS, b"S D      -0.01 g", ReadingStatus.UNSTABLE, "-0.01", "g"),
+    (KCP, b"S S 100.00 g", ReadingStatus.STABLE, "100.00", "g"),
+    (KCP, b"S I", ReadingStatus.BUSY, None, ""),
+    (KCP, b"S +", ReadingStatus.OVER, None, ""),
+    (KCP, b"S -", ReadingStatus.UNDER, None, ""),
+    (KERN_SWT, b"M-     12.34 g  ", ReadingStatus.STABLE, "-12.34", "g"),
+    (KERN_SWT, b"          0.0 g  ", ReadingStatus.STABLE, "0.0", "g"),  # PCB-BA-e-0712, read as 19 bytes
+    (KERN_SWT, b"       1234.5    ", ReadingStatus.UNSTABLE, "1234.5", ""),
+    (KERN_SWT, b"          0.0 ", ReadingStatus.UNSTABLE, "0.0", ""),
+    (KERN_SWT, b"           Error", ReadingStatus.ERROR, None, ""),
+    (KERN_SWT, b"       Error", ReadingStatus.ERROR, None, ""),
+    (KERN_SWT, b"=Overload=", ReadingStatus.OVER, None, ""),
+    (SBI, b"   111.255 g  ", ReadingStatus.STABLE, "111.255", "g"),  # Quintix manual, p. 87
+    (SBI, b"+  123.5[6]g  ", ReadingStatus.STABLE, "123.56", "g"),
+    (SBI, b"N     +   123.56 g  ", ReadingStatus.STABLE, "123.56", "g"),  # Entris II, p. 3
+    (SBI, b"-     0.02    ", ReadingStatus.UNSTABLE, "-0.02", ""),
+    (SBI, b"      High    ", ReadingStatus.OVER, None, ""),
+    (SBI, b"      Low     ", ReadingStatus.UNDER, None, ""),
+    (SBI, b"      --      ", ReadingStatus.BUSY, None, ""),
+    (SBI, b"Stat     ERR 054    ", ReadingStatus.ERROR, None, ""),
 ]
 
 
@@ -55,16 +55,16 @@ def test_lines_from_manuals_are_understood(dialect, line, status, value, unit):
 @pytest.mark.parametrize(
     ("line", "command", "answer"),
     [
-        (b"T S     100.00 g", "T", Answer.DONE),
-        (b"T A", "T", Answer.DONE),
-        (b"T I", "T", Answer.BUSY),
-        (b"T +", "T", Answer.OVER),
-        (b"Z A", "Z", Answer.DONE),
-        (b"Z -", "Z", Answer.UNDER),
-        (b"ZI S", "ZI", Answer.DONE),
-        (b'I4 A "0123456789"', "I4", Answer.DONE),
-        (b"ES", "", Answer.REFUSED),
-        (b"EL", "", Answer.REFUSED),
+        (b"T S     100.00 g", "T", ReadingReply.DONE),
+        (b"T A", "T", ReadingReply.DONE),
+        (b"T I", "T", ReadingReply.BUSY),
+        (b"T +", "T", ReadingReply.OVER),
+        (b"Z A", "Z", ReadingReply.DONE),
+        (b"Z -", "Z", ReadingReply.UNDER),
+        (b"ZI S", "ZI", ReadingReply.DONE),
+        (b'I4 A "0123456789"', "I4", ReadingReply.DONE),
+        (b"ES", "", ReadingReply.REFUSED),
+        (b"EL", "", ReadingReply.REFUSED),
     ],
 )
 def test_answers_to_commands_are_told_from_weights(line, command, answer):
@@ -96,7 +96,9 @@ WEIGHTS = st.decimals(min_value=-99999, max_value=99999, places=2)
 @pytest.mark.parametrize("dialect", SPEAKERS, ids=lambda d: d.name)
 @given(value=WEIGHTS, unit=st.sampled_from(["g", "kg", "mg", "ct", "oz", "lb"]), stable=st.booleans())
 def test_what_a_balance_sends_is_what_is_read(dialect, value, unit, stable):
-    sent = Reading(Status.STABLE if stable else Status.UNSTABLE, abs(value) if value == 0 else value, unit)
+    sent = Reading(
+        ReadingStatus.STABLE if stable else ReadingStatus.UNSTABLE, abs(value) if value == 0 else value, unit
+    )
     line = dialect.encode(sent)
     assert line.endswith(b"\r\n")
     read = dialect.decode(line[:-2])
@@ -106,10 +108,10 @@ def test_what_a_balance_sends_is_what_is_read(dialect, value, unit, stable):
     assert read.unit == ("" if leaves_it_out else unit)
 
 
-@pytest.mark.parametrize("status", [Status.OVER, Status.UNDER, Status.BUSY, Status.ERROR])
+@pytest.mark.parametrize("status", [ReadingStatus.OVER, ReadingStatus.UNDER, ReadingStatus.BUSY, ReadingStatus.ERROR])
 @pytest.mark.parametrize("dialect", SPEAKERS, ids=lambda d: d.name)
 def test_states_without_a_weight_are_read_as_sent_or_can_not_be_said(dialect, status):
-    if dialect.name == "kern-swt" and status in (Status.UNDER, Status.BUSY):
+    if dialect.name == "kern-swt" and status in (ReadingStatus.UNDER, ReadingStatus.BUSY):
         with pytest.raises(ValueError, match=str(status)):
             dialect.encode(Reading(status))
         return
@@ -119,7 +121,7 @@ def test_states_without_a_weight_are_read_as_sent_or_can_not_be_said(dialect, st
 @pytest.mark.parametrize("dialect", SPEAKERS, ids=lambda d: d.name)
 @given(value=WEIGHTS.filter(lambda v: abs(v) >= 100), cut=st.integers(1, 17))
 def test_a_line_that_lost_its_beginning_is_never_a_smaller_weight(dialect, value, cut):
-    line = dialect.encode(Reading(Status.STABLE, value, "g"))[:-2]
+    line = dialect.encode(Reading(ReadingStatus.STABLE, value, "g"))[:-2]
     try:
         reply = dialect.decode(line[cut:])
     except LineError:
@@ -130,9 +132,9 @@ def test_a_line_that_lost_its_beginning_is_never_a_smaller_weight(dialect, value
 @pytest.mark.parametrize("dialect", [KERN_SWT, SBI], ids=lambda d: d.name)
 @given(value=WEIGHTS.filter(lambda v: abs(v) >= 100), lost=st.integers(0, 13))
 def test_a_line_of_fixed_width_that_lost_a_digit_is_no_stable_weight(dialect, value, lost):
-    line = dialect.encode(Reading(Status.STABLE, value, "g"))[:-2]
+    line = dialect.encode(Reading(ReadingStatus.STABLE, value, "g"))[:-2]
     try:
         reply = dialect.decode(line[:lost] + line[lost + 1 :])
     except LineError:
         return
-    assert reply.status is not Status.STABLE
+    assert reply.status is not ReadingStatus.STABLE

@@ -10,26 +10,26 @@ from pathlib import Path
 import pytest
 import serial
 
-from actors.balance.record import main
-from actors.balance.recording import Event, Recording
+from actors.balance.line_recording import LineEvent, LineRecording
+from actors.balance.record_line import main
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.virtual_serial.handle import RecordedBalance
-from actors.child_process import child_environment
+from actors.emulators.serial_balance.balance_process import RecordedBalance
+from actors.runtime.child_process import child_environment
 from tests.patience import PATIENCE
 
 from .conftest import spec_for
 
-KERN_TYPED = Recording(
+KERN_TYPED = LineRecording(
     "typed",
     (
-        Event(0.00, "out", b"w"),
-        Event(0.05, "in", b"        12"),
-        Event(0.07, "in", b".30    \r\n"),
-        Event(0.20, "out", b"w"),
-        Event(0.25, "in", b"        12.34 g  \r\n"),
-        Event(0.40, "out", b"t"),
-        Event(0.60, "out", b"w"),
-        Event(0.65, "in", b"         0.00 g  \r\n"),
+        LineEvent(0.00, "out", b"w"),
+        LineEvent(0.05, "in", b"        12"),
+        LineEvent(0.07, "in", b".30    \r\n"),
+        LineEvent(0.20, "out", b"w"),
+        LineEvent(0.25, "in", b"        12.34 g  \r\n"),
+        LineEvent(0.40, "out", b"t"),
+        LineEvent(0.60, "out", b"w"),
+        LineEvent(0.65, "in", b"         0.00 g  \r\n"),
     ),
     {"balance": "layout of Kern PCB-BA-e-1315, p. 35"},
 )
@@ -37,9 +37,11 @@ KERN_TYPED = Recording(
 
 def test_a_file_holds_every_byte_its_time_and_where_it_comes_from(tmp_path):
     path = tmp_path / "kern.jsonl"
-    recording = Recording("typed", (*KERN_TYPED.events, Event(1.5, "in", bytes(range(256)))), {"remarks": "größer"})
+    recording = LineRecording(
+        "typed", (*KERN_TYPED.events, LineEvent(1.5, "in", bytes(range(256)))), {"remarks": "größer"}
+    )
     recording.save(path)
-    assert Recording.load(path) == recording
+    assert LineRecording.load(path) == recording
     assert '"text": "w"' in path.read_text()
 
 
@@ -59,7 +61,7 @@ def test_what_is_no_recording_is_refused_with_its_line(tmp_path, text):
     path = tmp_path / "file.jsonl"
     path.write_text(text)
     with pytest.raises(ValueError, match=r"file\.jsonl:\d: not a recording of a serial line"):
-        Recording.load(path)
+        LineRecording.load(path)
 
 
 @pytest.mark.realtime
@@ -90,9 +92,9 @@ def test_a_unit_that_lost_a_letter_once_is_no_other_unit(tmp_path):
     events = [
         event
         for i, line in enumerate(lines)
-        for event in (Event(i, "out", b"SI\r\n"), Event(i + 0.01, "in", line + b"\r\n"))
+        for event in (LineEvent(i, "out", b"SI\r\n"), LineEvent(i + 0.01, "in", line + b"\r\n"))
     ]
-    Recording("typed", tuple(events)).save(path)
+    LineRecording("typed", tuple(events)).save(path)
     far = RecordedBalance.start(path, speed=20.0)
     try:
         driver = SerialBalance(spec_for(far, "kcp"))
@@ -105,10 +107,14 @@ def test_a_unit_that_lost_a_letter_once_is_no_other_unit(tmp_path):
 @pytest.mark.realtime
 def test_a_late_answer_to_another_command_is_not_taken_for_the_one_awaited(tmp_path):
     path = tmp_path / "late.jsonl"
-    events = [Event(0.0, "out", b"T\r\n"), Event(0.01, "in", b"Z +\r\n"), Event(0.1, "in", b"T S 350.00 g\r\n")]
+    events = [
+        LineEvent(0.0, "out", b"T\r\n"),
+        LineEvent(0.01, "in", b"Z +\r\n"),
+        LineEvent(0.1, "in", b"T S 350.00 g\r\n"),
+    ]
     for i in range(5):
-        events += [Event(1.0 + i, "out", b"SI\r\n"), Event(1.01 + i, "in", b"S S 0.00 g\r\n")]
-    Recording("typed", tuple(events)).save(path)
+        events += [LineEvent(1.0 + i, "out", b"SI\r\n"), LineEvent(1.01 + i, "in", b"S S 0.00 g\r\n")]
+    LineRecording("typed", tuple(events)).save(path)
     far = RecordedBalance.start(path, speed=20.0)
     try:
         driver = SerialBalance(spec_for(far, "kcp"))
@@ -121,7 +127,9 @@ def test_a_late_answer_to_another_command_is_not_taken_for_the_one_awaited(tmp_p
 @pytest.mark.realtime
 def test_answers_come_in_the_pieces_and_at_the_pace_of_then(tmp_path):
     path = tmp_path / "slow.jsonl"
-    Recording("typed", (Event(0.0, "out", b"w"), Event(0.1, "in", b"12"), Event(0.5, "in", b"34"))).save(path)
+    LineRecording(
+        "typed", (LineEvent(0.0, "out", b"w"), LineEvent(0.1, "in", b"12"), LineEvent(0.5, "in", b"34"))
+    ).save(path)
     far = RecordedBalance.start(path)
     try:
         with serial.Serial(far.port, 9600, timeout=2.0) as port:
@@ -160,7 +168,7 @@ def test_a_session_with_a_balance_is_recorded_and_played_back_to_the_driver(virt
     arguments = f"--port {far.port} --to {path} --dialect mt-sics --baud 9600 --format 8N1 --seconds 1 --source virtual"
     assert main(arguments.split()) == 0
     assert "12.3 g" in capsys.readouterr().err
-    recording = Recording.load(path)
+    recording = LineRecording.load(path)
     assert recording.source == "virtual"
     assert {event.data for event in recording.events if event.direction == "out"} == {b"SI\r\n"}
     player = RecordedBalance.start(path, speed=20.0)
@@ -178,7 +186,7 @@ def test_listening_records_what_comes_unasked(virtual, tmp_path):
     path = tmp_path / "heard.jsonl"
     arguments = f"--port {far.port} --to {path} --dialect kern-swt --baud 9600 --format 8N1 --seconds 0.5 --listen"
     assert main([*arguments.split(), "--source", "virtual"]) == 0
-    events = Recording.load(path).events
+    events = LineRecording.load(path).events
     assert {event.direction for event in events} == {"in"}
     assert b"".join(event.data for event in events).count(b"\n") >= 3
 
@@ -186,7 +194,15 @@ def test_listening_records_what_comes_unasked(virtual, tmp_path):
 @pytest.mark.realtime
 def test_the_recorder_is_a_command_and_says_why_it_can_not(tmp_path):
     ended = subprocess.run(
-        [sys.executable, "-m", "actors.balance.record", "--port", "/dev/no-balance", "--to", str(tmp_path / "x.jsonl")],
+        [
+            sys.executable,
+            "-m",
+            "actors.balance.record_line",
+            "--port",
+            "/dev/no-balance",
+            "--to",
+            str(tmp_path / "x.jsonl"),
+        ],
         capture_output=True,
         text=True,
         timeout=PATIENCE,

@@ -7,10 +7,10 @@ import time
 
 import pytest
 
-from actors.balance.doors import voices
-from actors.balance.errors import BalanceFaultError, CommandError, NotStableError, OutOfRangeError, UnitError
-from actors.balance.settling import SettlingRule
-from actors.balance.virtual_balance import Load
+from actors.balance.balance_interface import BalanceFaultError, CommandError, NotStableError, OutOfRangeError, UnitError
+from actors.balance.balance_settings import SettlingRule
+from actors.balance.dialects.dialect_registry import voices
+from actors.balance.simulated_balance import Load
 
 from .conftest import SOON
 

@@ -9,11 +9,11 @@ import time
 import numpy as np
 import pytest
 
-from actors.balance.actor import DeviceBalance
-from actors.balance.errors import BalanceError, NotStableError, OutOfRangeError
+from actors.balance.balance_device import DeviceBalance
+from actors.balance.balance_interface import BalanceError, NotStableError, OutOfRangeError
+from actors.balance.balance_settings import SettlingRule
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.settling import SettlingRule
-from actors.device import LocalDevice, RayDevice
+from actors.runtime.remote_object import LocalDevice, RayDevice
 from tests.patience import PATIENCE
 
 from .conftest import spec_for

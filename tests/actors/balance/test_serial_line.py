@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from actors.balance.errors import BalanceError, NoConnectionError
-from actors.balance.settling import SettlingRule
+from actors.balance.balance_interface import BalanceError, NoConnectionError
+from actors.balance.balance_settings import SettlingRule
 from tests.patience import PATIENCE
 
 from .conftest import SOON

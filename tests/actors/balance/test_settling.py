@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from actors.balance.settling import Settling, SettlingRule
+from actors.balance.balance_settings import Settling, SettlingRule
 
 RULE = SettlingRule(readings=4, span=0.6, steps=1.0)
 

@@ -6,8 +6,7 @@ from decimal import Decimal
 
 import pytest
 
-from actors.balance.reading import Reading, Status
-from actors.balance.typed import typed_weight
+from actors.balance.readings import Reading, ReadingStatus, typed_weight
 
 
 @pytest.mark.parametrize(
@@ -24,17 +23,17 @@ from actors.balance.typed import typed_weight
     ],
 )
 def test_weights_are_converted_by_the_definitions_of_their_units(value, unit, grams):
-    assert Reading(Status.STABLE, Decimal(value), unit).mass() == pytest.approx(grams / 1e3, rel=1e-12)
+    assert Reading(ReadingStatus.STABLE, Decimal(value), unit).mass() == pytest.approx(grams / 1e3, rel=1e-12)
 
 
 @pytest.mark.parametrize("unit", ["pcs", "%", "tl", "N"])
 def test_what_is_no_mass_is_not_made_one(unit):
-    assert Reading(Status.STABLE, Decimal("12"), unit).mass() is None
+    assert Reading(ReadingStatus.STABLE, Decimal("12"), unit).mass() is None
 
 
 def test_step_of_the_display_is_one_of_the_last_digit_sent():
-    assert Reading(Status.STABLE, Decimal("12.30"), "g").step() == pytest.approx(1e-5)
-    assert Reading(Status.STABLE, Decimal("12"), "kg").step() == pytest.approx(1.0)
+    assert Reading(ReadingStatus.STABLE, Decimal("12.30"), "g").step() == pytest.approx(1e-5)
+    assert Reading(ReadingStatus.STABLE, Decimal("12"), "kg").step() == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(

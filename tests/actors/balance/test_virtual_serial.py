@@ -13,25 +13,24 @@ import psutil
 import pytest
 import serial
 
-from actors.balance.reading import Status
+from actors.balance.readings import ReadingStatus
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.virtual_balance import Load
-from actors.balance.virtual_serial.character import Emulation
-from actors.balance.virtual_serial.handle import VirtualSerialBalance
-from actors.balance.virtual_serial.scale import Scale, ScaleSettings
-from actors.child_process import child_environment
-from actors.protocols import LaboratoryError
+from actors.balance.simulated_balance import EmulatedScale, Load, ScaleSettings
+from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
+from actors.emulators.serial_balance.emulated_balance import Emulation
+from actors.interfaces import LaboratoryError
+from actors.runtime.child_process import child_environment
 from tests.patience import PATIENCE
 
 from .conftest import spec_for
 
 
 def test_a_display_comes_within_a_hundredth_in_the_settling_time_and_then_to_rest():
-    scale = Scale(ScaleSettings(resolution=1e-5, settling_time=1.5))
+    scale = EmulatedScale(ScaleSettings(resolution=1e-5, settling_time=1.5))
     scale.put(Load((0.0,), (1.0,)))
     scale.advance(1.5)
     assert float(scale.reading().value) == pytest.approx(990.0, abs=0.5)
-    assert scale.reading().status is Status.UNSTABLE
+    assert scale.reading().status is ReadingStatus.UNSTABLE
     scale.advance(5.0)
     assert (str(scale.reading().value), scale.stable) == ("1000.00", True)
 
@@ -39,7 +38,7 @@ def test_a_display_comes_within_a_hundredth_in_the_settling_time_and_then_to_res
 def test_a_pour_is_followed_with_the_same_result_in_one_stride_or_many():
     shown = []
     for strides in (1, 7, 1000):
-        scale = Scale(ScaleSettings())
+        scale = EmulatedScale(ScaleSettings())
         scale.put(Load((0.0, 2.0, 4.0), (0.0, 0.05, 0.2)))
         for _ in range(strides):
             scale.advance(20.0 / strides)
@@ -49,7 +48,7 @@ def test_a_pour_is_followed_with_the_same_result_in_one_stride_or_many():
 
 
 def test_weighing_the_same_thing_again_scatters_by_the_noise_and_looking_again_does_not():
-    scale = Scale(ScaleSettings(resolution=1e-5, noise=1e-3, settling_time=0.1))
+    scale = EmulatedScale(ScaleSettings(resolution=1e-5, noise=1e-3, settling_time=0.1))
     seen = []
     for _ in range(400):
         scale.put(Load((0.0,), (0.2,)))
@@ -65,7 +64,7 @@ def test_weighing_the_same_thing_again_scatters_by_the_noise_and_looking_again_d
 
 
 def test_the_zero_drifts_with_bench_time_and_steps_may_be_fives():
-    scale = Scale(ScaleSettings(resolution=5e-4, drift=1e-6))
+    scale = EmulatedScale(ScaleSettings(resolution=5e-4, drift=1e-6))
     scale.advance(2000.0)
     assert str(scale.reading().value) == "2.0"
     scale.put(Load((0.0,), (0.1004,)))
@@ -74,8 +73,8 @@ def test_the_zero_drifts_with_bench_time_and_steps_may_be_fives():
 
 
 def test_over_and_under_range_have_no_weight():
-    scale = Scale(ScaleSettings(capacity=6.2))
-    for mass, status in ((6.3, Status.OVER), (-2.0, Status.UNDER)):
+    scale = EmulatedScale(ScaleSettings(capacity=6.2))
+    for mass, status in ((6.3, ReadingStatus.OVER), (-2.0, ReadingStatus.UNDER)):
         scale.put(Load((0.0,), (mass,)))
         scale.advance(10.0)
         assert scale.reading().status is status
@@ -413,7 +412,7 @@ def test_an_order_that_is_unknown_or_comes_too_late_is_refused():
 def test_it_dies_with_a_parent_that_was_killed():
     code = (
         "import time\n"
-        "from actors.balance.virtual_serial.handle import VirtualSerialBalance\n"
+        "from actors.emulators.serial_balance.balance_process import VirtualSerialBalance\n"
         "print(VirtualSerialBalance.start('kcp').pid, flush=True)\n"
         "time.sleep(60)\n"
     )

@@ -6,16 +6,14 @@ import asyncio
 
 import pytest
 
-from actors.balance.actor import DeviceBalance
-from actors.balance.errors import ReferenceLostError
-from actors.balance.masses import WeighingError
-from actors.balance.placement import Placement
+from actors.balance.balance_device import DeviceBalance
+from actors.balance.balance_interface import ReferenceLostError
+from actors.balance.balance_settings import BalanceSpec
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.spec import BalanceSpec
 from actors.balance.weighing import Weighings
-from actors.device import LocalDevice
-from actors.operator import Question
-from actors.protocols import LaboratoryError
+from actors.balance.weighing_plan import Placement, WeighingError
+from actors.interfaces import LaboratoryError, OperatorQuestion
+from actors.runtime.remote_object import LocalDevice
 
 from .conftest import spec_for
 
@@ -32,7 +30,7 @@ class Operator:
         self.poured = False
         self.base = TRAY if placement in (Placement.TRAY, Placement.EVERYTHING) else 0.0
         self.receiver_on = False
-        self.asked: list[Question] = []
+        self.asked: list[OperatorQuestion] = []
 
     def settle(self, pourer: float = 0.0) -> None:
         spill = SPILLED if self.poured and self.base else 0.0
@@ -40,7 +38,7 @@ class Operator:
         self.far.put(self.base + spill + pourer + (receiver if self.receiver_on else 0.0))
         self.far.advance(5.0)
 
-    async def __call__(self, question: Question) -> str:
+    async def __call__(self, question: OperatorQuestion) -> str:
         self.asked.append(question)
         if len(self.asked) > 30:
             raise LaboratoryError("asked for ever")

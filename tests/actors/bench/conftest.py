@@ -13,24 +13,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.balance.placement import Placement
-from actors.balance.spec import SerialBalanceSpec
-from actors.bench.device_stand_ins import DeviceStandIns
-from actors.bench.pouring_bench import PouringBench
-from actors.bench.things import Things
+from actors.balance.balance_settings import SerialBalanceSpec
+from actors.balance.weighing_plan import Placement
+from actors.bench.bench_factory import PouringBench
+from actors.bench.device_emulators import DeviceEmulators
 from actors.bench.virtual_bench import FollowedBench, VirtualBench
-from actors.bench.virtual_operator import VirtualOperator
+from actors.bench.virtual_operator import BenchContents, VirtualOperator
+from actors.interfaces import Notice, OperatorQuestion, OperatorSpec
 from actors.laboratory import InProcessLaboratory
-from actors.operator import OperatorSpec, Question
-from actors.protocols import Notice
-from actors.spec import LaboratorySpec
-from orchestrator.config.load import load_laboratory
+from actors.laboratory_settings import LaboratorySpec
+from orchestrator.config.file_loading import load_laboratory
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import Liquid
-from sim_engine.outcome import PourOutcome
-from sim_engine.simulated import SimulatedPour
-from sim_engine.task import PourTask, Scene
-from sim_engine.vessel.spec import cylinder
+from sim_engine.liquids import Liquid
+from sim_engine.outcome import PourOutcome, SimulatedPour
+from sim_engine.scene import PourTask, Scene
+from sim_engine.vessel.shapes import cylinder
 from tests.patience import PATIENCE
 
 LABORATORIES = Path(__file__).parents[3] / "configs" / "laboratories"
@@ -96,9 +93,9 @@ class Stage:
 
     laboratory: InProcessLaboratory
     bench: PouringBench = field(init=False)
-    site: DeviceStandIns = field(init=False)
+    site: DeviceEmulators = field(init=False)
     operator: VirtualOperator = field(init=False)
-    things: Things = field(init=False)
+    things: BenchContents = field(init=False)
     notices: list[Notice] = field(default_factory=list)
     before: dict[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
     """Done before the next question about something is answered."""
@@ -121,7 +118,7 @@ class Stage:
         self.things = opened.bench.nature.things
         ask = self.operator.ask
 
-        async def attended(question: Question) -> str:
+        async def attended(question: OperatorQuestion) -> str:
             state = await self._seen()
             if question.hands and (state["runtime_state"] != "STOPPED" or max(map(abs, state["speeds"])) > 1e-3):
                 self.unsafe.append(question.about)

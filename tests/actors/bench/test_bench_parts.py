@@ -8,14 +8,12 @@ import re
 import numpy as np
 import pytest
 
-from actors.arm.joint_path import ExecutedPath, pack, unpack
-from actors.balance.placement import Placement, weighings
-from actors.bench.executed import LONGEST_REST, executed_pour
-from actors.bench.questions import NobodyAnsweredError, Questions
-from actors.bench.things import POURER, RECEIVER, TRAY, Things
-from actors.bench.virtual_operator import Hands, PlayedOperator
-from actors.operator import OperatorSpec, Question
-from actors.protocols import Notice
+from actors.arm.planned_pour import ExecutedPath, pack, unpack
+from actors.balance.weighing_plan import Placement, weighings
+from actors.bench.operator_questions import NoAnswerError, OperatorQuestions
+from actors.bench.virtual_bench import LONGEST_REST, executed_pour
+from actors.bench.virtual_operator import POURER, RECEIVER, TRAY, BenchContents, Hands, PlayedOperator
+from actors.interfaces import Notice, OperatorQuestion, OperatorSpec
 
 STEP = 0.008
 
@@ -89,7 +87,7 @@ class Person:
     def __init__(self, after: float) -> None:
         self.after = after
 
-    async def ask(self, question: Question) -> str:
+    async def ask(self, question: OperatorQuestion) -> str:
         await asyncio.sleep(self.after)
         return "done"
 
@@ -97,14 +95,14 @@ class Person:
         pass
 
 
-def ask(after: float, **spec: float) -> tuple[object, Questions, list[Notice]]:
+def ask(after: float, **spec: float) -> tuple[object, OperatorQuestions, list[Notice]]:
     notices: list[Notice] = []
-    questions = Questions(Person(after), OperatorSpec(**spec), notices.append)
+    questions = OperatorQuestions(Person(after), OperatorSpec(**spec), notices.append)
 
     async def play() -> object:
         try:
-            return await questions.ask(Question("Wipe the tray.", "done", about="tray_wiped"))
-        except NobodyAnsweredError as error:
+            return await questions.ask(OperatorQuestion("Wipe the tray.", "done", about="tray_wiped"))
+        except NoAnswerError as error:
             return error
 
     return asyncio.run(play()), questions, notices
@@ -123,7 +121,7 @@ def test_questions_and_answers_are_written_down_with_their_times():
 
 def test_a_question_that_nobody_answers_is_repeated_and_then_given_up():
     answer, questions, notices = ask(60.0, reminder=0.2, deadline=0.5)
-    assert isinstance(answer, NobodyAnsweredError)
+    assert isinstance(answer, NoAnswerError)
     assert "Wipe the tray." in str(answer)
     assert sum("still waiting" in notice.text for notice in notices) == 2
     assert "no answer" in notices[-1].text
@@ -137,18 +135,18 @@ def test_a_person_can_play_on_a_virtual_bench_and_reads_weights_off_the_question
         put.append(mass)
 
     class Reader(Person):
-        async def ask(self, question: Question) -> str:
+        async def ask(self, question: OperatorQuestion) -> str:
             await super().ask(question)
             return question.text.split("shows ")[1].rstrip(".)") if question.wants == "weight" else "done"
 
-    async def play() -> tuple[Things, str]:
-        things = Things(Placement.TRAY)
+    async def play() -> tuple[BenchContents, str]:
+        things = BenchContents(Placement.TRAY)
         hands = Hands(things, onto)
         hands.prepare(0.2, (1,))
         played = PlayedOperator(Reader(0.0), hands)
-        await played.ask(Question("Wipe the tray.", "done", about="tray_wiped"))
-        await played.ask(Question("Fill the pourer.", "done", about="pourer_full"))
-        return things, await played.ask(Question("Weigh the tray.", "weight", about="tray_before"))
+        await played.ask(OperatorQuestion("Wipe the tray.", "done", about="tray_wiped"))
+        await played.ask(OperatorQuestion("Fill the pourer.", "done", about="pourer_full"))
+        return things, await played.ask(OperatorQuestion("Weigh the tray.", "weight", about="tray_before"))
 
     things, typed = asyncio.run(play())
     assert put == [pytest.approx(TRAY), pytest.approx(TRAY + POURER + 0.2, abs=5e-3)]
@@ -158,7 +156,7 @@ def test_a_person_can_play_on_a_virtual_bench_and_reads_weights_off_the_question
 
 @pytest.mark.parametrize("placement", Placement)
 def test_every_step_of_a_pour_puts_on_the_balance_what_it_says(placement):
-    things, carried = Things(placement), {}
+    things, carried = BenchContents(placement), {}
     for step in weighings(placement):
         if step.do == "pour":
             things.receive(spilled=0.004, retained=0.016)

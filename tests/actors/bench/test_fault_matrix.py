@@ -19,10 +19,9 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.arm.path.transforms import pourer_motion
+from actors.arm.planning.frames import pourer_motion
 from actors.bench.virtual_operator import VirtualOperator
-from actors.operator import OperatorSpec
-from actors.protocols import LaboratoryError, NotPouredError, UnknownPourError
+from actors.interfaces import LaboratoryError, NotPouredError, OperatorSpec, UnknownPourError
 from sim_engine.action import DEG
 from sim_engine.outcome import PourMeasurement
 from tests.patience import PATIENCE
@@ -67,7 +66,7 @@ def balance(what: str, **values: Any) -> Callable[[Stage], Awaitable[Any]]:
 
 
 async def kill_worker(stage: Stage) -> None:
-    workers = [p for p in psutil.Process().children() if "actors.arm.ur.worker" in p.cmdline()]
+    workers = [p for p in psutil.Process().children() if "actors.arm.ur.rtde_worker" in p.cmdline()]
     assert len(workers) == 1
     os.kill(workers[0].pid, signal.SIGKILL)
 

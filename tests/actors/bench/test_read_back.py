@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.arm.numbers import NumbersSpec
-from actors.bench.executed import slipped
-from actors.protocols import UnknownPourError
+from actors.arm.simulated_arm import NumbersSpec
+from actors.bench.virtual_bench import slipped
+from actors.interfaces import UnknownPourError
 from sim_engine.action import DEG
-from sim_engine.sampled_motion import SampledMotion
+from sim_engine.scene import SampledMotion
 
 from .conftest import ACTION, reach, wired_spec
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.child_process import child_environment
+from actors.runtime.child_process import child_environment
 
 PACE = 15.0
 
@@ -18,7 +18,7 @@ PROGRAM = f"""
 import asyncio, runpy, sys
 here = runpy.run_path({str(Path(__file__).with_name("conftest.py"))!r})
 from actors.laboratory import InProcessLaboratory
-from actors.protocols import LaboratoryError
+from actors.interfaces import LaboratoryError
 
 def look(progress):
     if progress.checkpoint == "tilt" and (progress.tilt or 0.0) > 0.1:

@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from actors.arm.joint_path import unpack
-from actors.arm.path.transforms import pourer_motion
-from actors.balance.placement import Placement
-from actors.bench.stand_ins import History
-from actors.operator import OperatorSpec
-from actors.protocols import InvalidActionError, NotPouredError, PourProgress
+from actors.arm.planned_pour import unpack
+from actors.arm.planning.frames import pourer_motion
+from actors.balance.weighing_plan import Placement
+from actors.bench.device_emulators import History
+from actors.interfaces import InvalidActionError, NotPouredError, OperatorSpec, PourProgress
 from sim_engine.outcome import PourMeasurement
 
 from .conftest import ACTION, SCENE, Stage, opened_stage, reach, wired_spec

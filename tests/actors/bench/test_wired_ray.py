@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
+from actors.interfaces import Notice, UnknownPourError
 from actors.laboratory import RayLaboratory
-from actors.protocols import Notice, UnknownPourError
 
 from .conftest import ACTION, SCENE, Trickle, reach, wired_spec
 

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.child_process import child_environment
-from actors.virtual_ur import VirtualController
-from actors.virtual_ur.controller import Controller, RuntimeState
-from actors.virtual_ur.messages import Message
-from actors.virtual_ur.models import UR10E
+from actors.emulators.ur_controller import VirtualController
+from actors.emulators.ur_controller.controlled_models import UR10E
+from actors.emulators.ur_controller.controller import Controller, RuntimeState
+from actors.emulators.ur_controller.servers.primary_messages import ControllerMessage
+from actors.runtime.child_process import child_environment
 
 CLIENTS = Path(__file__).with_name("clients")
 _numbers = itertools.count(2)
@@ -36,7 +36,7 @@ class Bench:
 
     def __init__(self, **options: Any) -> None:
         self.controller = Controller(options.pop("model", UR10E), **options)
-        self.messages: list[Message] = []
+        self.messages: list[ControllerMessage] = []
         self.controller.listeners.append(self.messages.append)
         self.times: list[float] = []
         self.joints: list[Any] = []

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.virtual_ur import VirtualController
-from actors.virtual_ur.kinematics import Kinematics
-from actors.virtual_ur.models import MODELS
-from actors.virtual_ur.poses import compose, pose_of, transform_of
+from actors.emulators.ur_controller import VirtualController
+from actors.emulators.ur_controller.controlled_models import MODELS
+from actors.emulators.ur_controller.poses import compose, pose_of, transform_of
+from actors.emulators.ur_controller.robot_kinematics import Kinematics
 
 from .conftest import next_address, observe
 

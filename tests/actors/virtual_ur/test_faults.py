@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from actors.virtual_ur import VirtualController, VirtualControllerError
+from actors.emulators.ur_controller import VirtualController, VirtualControllerError
 
 from .conftest import Client, observe
 

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from actors.ur.models import RobotModel
-from actors.virtual_ur.kinematics import Kinematics
-from actors.virtual_ur.models import HOME, MODELS, UR10E
-from actors.virtual_ur.poses import (
+from actors.arm.ur.robot_models import RobotModel
+from actors.emulators.ur_controller.controlled_models import HOME, MODELS, UR10E
+from actors.emulators.ur_controller.poses import (
     IDENTITY,
     angle_between,
     compose,
@@ -25,8 +24,9 @@ from actors.virtual_ur.poses import (
     transform_of,
     transpose,
 )
-from actors.virtual_ur.robot import Robot
-from actors.virtual_ur.safety import SafetyConfiguration
+from actors.emulators.ur_controller.robot import Robot
+from actors.emulators.ur_controller.robot_kinematics import Kinematics
+from actors.emulators.ur_controller.safety_system import SafetyConfiguration
 
 angles = st.floats(-math.pi, math.pi)
 joints = st.tuples(angles, angles, angles, angles, angles, angles)

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.virtual_ur.controller import RuntimeState
-from actors.virtual_ur.fields import output_fields
-from actors.virtual_ur.models import HOME
-from actors.virtual_ur.safety import Plane, SafetyConfiguration, SafetyMode
-from actors.virtual_ur.wire.recipes import OutputRecipe
+from actors.emulators.ur_controller.controlled_models import HOME
+from actors.emulators.ur_controller.controller import RuntimeState
+from actors.emulators.ur_controller.rtde_fields import output_fields
+from actors.emulators.ur_controller.safety_system import SafetyConfiguration, SafetyMode, SafetyPlane
+from actors.emulators.ur_controller.servers.rtde_recipes import OutputRecipe
 from tests.depth import examples
 
 from .conftest import Bench
@@ -224,7 +224,7 @@ def test_moving_the_slider_during_a_move_makes_no_jump_in_speed(bench: Bench) ->
 def test_a_safety_plane_ends_the_move_before_it_is_far_beyond(bench: Bench) -> None:
     own = SafetyConfiguration.of(bench.controller.model)
     y = bench.robot.pose[1]
-    wall = Plane((0.0, -1.0, 0.0), -(y + 0.1))  # the tool may go 0.1 m in y
+    wall = SafetyPlane((0.0, -1.0, 0.0), -(y + 0.1))  # the tool may go 0.1 m in y
     bench.controller.configure_safety(SafetyConfiguration(own.joint_ranges, own.joint_speeds, planes=(wall,)))
     target = list(bench.robot.pose)
     target[1] += 0.3

@@ -18,8 +18,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from actors.child_process import child_environment
-from actors.virtual_ur import VirtualController, VirtualControllerError, host
+from actors.emulators.ur_controller import VirtualController, VirtualControllerError
+from actors.emulators.ur_controller import control_clock as host
+from actors.runtime.child_process import child_environment
 from tests.depth import examples
 from tests.patience import PATIENCE
 
@@ -97,7 +98,7 @@ def test_settings_that_make_no_sense_are_told(options: dict[str, object], says: 
 
 PARENT = """
 import os, sys, time
-from actors.virtual_ur import VirtualController
+from actors.emulators.ur_controller import VirtualController
 controller = VirtualController.start(address=sys.argv[1])
 if sys.argv[2] == "fork":
     if os.fork() == 0:  # holds the controller's standard input open
@@ -135,7 +136,7 @@ def test_it_dies_with_a_parent_that_is_killed(how: str) -> None:
 
 HANGING = """
 import asyncio, os, re, sys
-from actors.virtual_ur.host import until_orphaned
+from actors.emulators.ur_controller.control_clock import until_orphaned
 
 async def main():
     asyncio.get_running_loop().call_later(1.0, lambda: re.match("(a+)+$", "a" * 60 + "b"))  # holds the interpreter
@@ -251,7 +252,7 @@ def test_a_program_that_can_not_be_run_is_refused_and_the_next_one_runs(
 
 ASK = """
 import os, subprocess, sys, threading
-from actors.virtual_ur.host import raise_priority
+from actors.emulators.ur_controller.control_clock import raise_priority
 if sys.argv[1] == "unprivileged" and os.geteuid() == 0:
     os.setuid(65534)
 def clock():

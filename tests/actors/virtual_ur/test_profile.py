@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors.virtual_ur.motion.profile import Profile
+from actors.emulators.ur_controller.motion.motion_lines import Profile
 
 lengths = st.floats(1e-4, 10.0)
 speeds = st.floats(0.01, 3.0)

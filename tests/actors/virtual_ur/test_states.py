@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from actors.virtual_ur.controller import RuntimeState
-from actors.virtual_ur.fields import write
-from actors.virtual_ur.models import HOME, UR10
-from actors.virtual_ur.power import BOOT_TIME, BRAKE_TIME, POWER_ON_TIME, RobotMode
-from actors.virtual_ur.safety import SafetyMode
-from actors.virtual_ur.servers.dashboard_server import Dashboard
+from actors.emulators.ur_controller.controlled_models import HOME, UR10
+from actors.emulators.ur_controller.controller import RuntimeState
+from actors.emulators.ur_controller.robot import BOOT_TIME, BRAKE_TIME, POWER_ON_TIME, RobotMode
+from actors.emulators.ur_controller.rtde_fields import write
+from actors.emulators.ur_controller.safety_system import SafetyMode
+from actors.emulators.ur_controller.servers.dashboard_server import DashboardServer
 
 from .conftest import Bench
 
@@ -30,7 +30,7 @@ def moving(bench: Bench) -> Bench:
 
 
 def ask(bench: Bench, line: str) -> str:
-    return Dashboard(bench.controller).answer(line)
+    return DashboardServer(bench.controller).answer(line)
 
 
 def standstill_after(bench: Bench, seconds: float = 5.0) -> float:
@@ -238,10 +238,10 @@ def test_an_impossible_payload_ends_the_program(bench: Bench, mass: str) -> None
 
 
 def test_the_checksum_changes_with_any_limit(bench: Bench) -> None:
-    from actors.virtual_ur.faults import Faults
-    from actors.virtual_ur.host import Host
+    from actors.emulators.ur_controller.control_clock import Host
+    from actors.emulators.ur_controller.fault_injection import ControllerFaults
 
-    faults = Faults(Host(bench.controller, "127.0.0.1"))
+    faults = ControllerFaults(Host(bench.controller, "127.0.0.1"))
     seen = {bench.controller.safety.checksum}
     for limits in (
         {"tool_speed": 1.4},
@@ -278,11 +278,11 @@ def test_the_checksum_changes_with_any_limit(bench: Bench) -> None:
     ],
 )
 def test_a_fault_that_makes_no_sense_is_refused_with_a_word_why(bench: Bench, request_: object) -> None:
-    from actors.virtual_ur.faults import FaultError, Faults
-    from actors.virtual_ur.host import Host
+    from actors.emulators.ur_controller.control_clock import Host
+    from actors.emulators.ur_controller.fault_injection import ControllerFaults, FaultError
 
     with pytest.raises(FaultError, match=r".+"):
-        Faults(Host(bench.controller, "127.0.0.1")).call(request_)
+        ControllerFaults(Host(bench.controller, "127.0.0.1")).call(request_)
     bench.run(f"movej({TARGET})")
     assert bench.robot.mover.q == pytest.approx(TARGET)
 

@@ -11,12 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.virtual_ur.commands.maths import COMMANDS
-from actors.virtual_ur.urscript import program
-from actors.virtual_ur.urscript.errors import ScriptError
-from actors.virtual_ur.urscript.lexer import KEYWORDS, Splitter
-from actors.virtual_ur.urscript.program import Command, Program, Steps, waiting
-from actors.virtual_ur.urscript.translate import translate
+from actors.emulators.ur_controller.commands.math_commands import COMMANDS
+from actors.emulators.ur_controller.urscript import program
+from actors.emulators.ur_controller.urscript.lexer import KEYWORDS, ScriptError, Splitter
+from actors.emulators.ur_controller.urscript.program import Command, Program, Steps, waiting
+from actors.emulators.ur_controller.urscript.translator import translate
 from tests.depth import examples
 
 from .conftest import Bench

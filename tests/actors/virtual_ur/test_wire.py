@@ -11,15 +11,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from actors.ur import rtde
-from actors.virtual_ur.controller import Controller
-from actors.virtual_ur.models import UR10, UR10E
-from actors.virtual_ur.servers.connections import MOST_UNSENT, Connection, Connections
-from actors.virtual_ur.servers.dashboard_server import Dashboard, DashboardConnection
-from actors.virtual_ur.servers.primary_server import PrimaryConnection, PrimaryServer
-from actors.virtual_ur.servers.rtde_server import RtdeConnection, RtdeServer
-from actors.virtual_ur.servers.script_server import ScriptConnection
-from actors.virtual_ur.wire import primary
+from actors.arm.ur import rtde
+from actors.emulators.ur_controller.controlled_models import UR10, UR10E
+from actors.emulators.ur_controller.controller import Controller
+from actors.emulators.ur_controller.servers import primary_messages as primary
+from actors.emulators.ur_controller.servers.connections import MOST_UNSENT, Connection, Connections, ScriptConnection
+from actors.emulators.ur_controller.servers.dashboard_server import DashboardConnection, DashboardServer
+from actors.emulators.ur_controller.servers.primary_server import PrimaryConnection, PrimaryServer
+from actors.emulators.ur_controller.servers.rtde_server import RtdeConnection, RtdeServer
 from tests.depth import examples
 
 
@@ -333,7 +332,7 @@ def _rtde(controller: Controller) -> Connection:
 
 
 def _dashboard(controller: Controller) -> Connection:
-    return DashboardConnection(Connections(controller), Dashboard(controller))
+    return DashboardConnection(Connections(controller), DashboardServer(controller))
 
 
 def _script(controller: Controller) -> Connection:
@@ -515,7 +514,7 @@ def test_a_defect_of_the_translator_is_reported_and_the_controller_goes_on(
     server = Wire(_primary(controller := Controller(UR10E)))
     server.take()
     with monkeypatch.context() as patch:
-        patch.setattr("actors.virtual_ur.controller.translate", broken)
+        patch.setattr("actors.emulators.ur_controller.controller.translate", broken)
         server.say(b"sleep(1)\n")
     assert reported(server) == ["compile error: internal error of the controller: 'a defect'"]
     assert "KeyError" in capsys.readouterr().err
@@ -592,7 +591,7 @@ def test_primary_clients_are_told_what_programs_say_and_why_they_end() -> None:
 def test_a_connection_made_in_local_control_may_only_read_even_after_the_switch_to_remote() -> None:
     controller = Controller(UR10E, remote=False)
     connections = Connections(controller)
-    dashboard = Dashboard(controller)
+    dashboard = DashboardServer(controller)
     old, script = Wire(DashboardConnection(connections, dashboard)), Wire(ScriptConnection(connections))
     port = Wire(PrimaryConnection(PrimaryServer(controller, connections), messages=True, writable=True))
     controller.set_remote(True)

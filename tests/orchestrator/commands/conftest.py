@@ -21,7 +21,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def folder(inputs: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working directory, in which nothing can be started."""
     from actors import laboratory
-    from sim_engine.pour import PourSimulator
+    from sim_engine.simulator import PourSimulator
 
     def started(*args: object, **kwargs: object) -> NoReturn:
         raise AssertionError("something was started")

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from actors.virtual_ur.launcher import VirtualController
-from orchestrator.cli import app
-from orchestrator.commands.arming import Envelope, accepted, campaign_pours, envelope, pour_count
-from orchestrator.config.load import load_campaign
-from orchestrator.safety import SafetyRecord, record_path, write_record
-from orchestrator.stages import stages_of
+from actors.emulators.ur_controller.controller_process import VirtualController
+from orchestrator.cli.app import app
+from orchestrator.cli.motion_approval import Envelope, accepted, campaign_pours, envelope, pour_count
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.runs.safety_approval import SafetyRecord, record_path, write_record
+from orchestrator.runs.stages import stages_of
 from tests.orchestrator import hardware
 from tests.orchestrator.terminal import Terminal
 

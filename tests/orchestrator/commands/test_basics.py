@@ -13,13 +13,13 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from orchestrator.cli import app
-from orchestrator.commands import speaking
-from orchestrator.config.campaign.check import check_campaign
-from orchestrator.config.load import load_campaign
-from orchestrator.config.yaml.errors import Problem
-from orchestrator.events import LogLine
-from orchestrator.progress import ProgressDisplay
+from orchestrator.cli import console as speaking
+from orchestrator.cli.app import app
+from orchestrator.config.campaign_checks import check_campaign
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.yaml.yaml_errors import Problem
+from orchestrator.progress.console_progress import ProgressDisplay
+from orchestrator.runs.events import LogLine
 from tests.end_to_end import small
 from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, VESSEL, report, write, write_good
 
@@ -59,7 +59,8 @@ def campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def begun(monkeypatch: pytest.MonkeyPatch, command: str) -> Any:
     """The plan that a command would begin with."""
-    from orchestrator.commands import campaigns, common
+    from orchestrator.cli import campaign_commands as campaigns
+    from orchestrator.cli import foreground_run as common
 
     plans = []
 

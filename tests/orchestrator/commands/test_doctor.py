@@ -17,17 +17,17 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from actors.arm.errors import ArmRefusedError, NotAcceptedError
-from actors.arm.ur import look
-from actors.arm.ur.accepted import require_accepted
-from actors.arm.ur.survey import read_exchange
-from actors.balance.virtual_serial.handle import VirtualSerialBalance
-from actors.ur.models import MODELS
-from actors.virtual_ur.launcher import VirtualController
-from actors.virtual_ur.safety import SafetyConfiguration
-from orchestrator.cli import app
-from orchestrator.config.load import load_laboratory
-from orchestrator.safety import SafetyRecordError, accepted_checksum, read_record, record_path
+from actors.arm.arm_interface import ArmRefusedError, NotAcceptedError
+from actors.arm.ur import controller_readout as look
+from actors.arm.ur.controller_readout import read_exchange
+from actors.arm.ur.robot_models import MODELS
+from actors.arm.ur.ur_driver import require_accepted
+from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
+from actors.emulators.ur_controller.controller_process import VirtualController
+from actors.emulators.ur_controller.safety_system import SafetyConfiguration
+from orchestrator.cli.app import app
+from orchestrator.config.file_loading import load_laboratory
+from orchestrator.runs.safety_approval import SafetyRecordError, accepted_checksum, read_record, record_path
 from tests.orchestrator import hardware
 
 ADDRESS = "127.81.3.2"
@@ -263,13 +263,13 @@ def test_without_an_extra_doctor_names_package_and_extra_before_it_starts_anythi
 
 WITHOUT = """\
 import importlib.util, sys
-from actors.virtual_ur.launcher import VirtualController
+from actors.emulators.ur_controller.controller_process import VirtualController
 missing, real, started = sys.argv.pop(1), importlib.util.find_spec, []
 importlib.util.find_spec = lambda name, *rest: None if name == missing else real(name, *rest)
 sys.modules[missing] = None
 start = VirtualController.start.__func__
 VirtualController.start = classmethod(lambda cls, *a, **k: (started.append(1), start(cls, *a, **k))[1])
-from orchestrator.cli import main
+from orchestrator.cli.app import main
 try:
     main()
 finally:

@@ -9,10 +9,10 @@ from typing import NoReturn, get_args
 import pytest
 from typer.testing import CliRunner
 
-from orchestrator.cli import app
-from orchestrator.commands.options import Answer
-from orchestrator.strategies.deployment.trust import OPTIONS
-from orchestrator.unknown import LOST, REPEAT
+from orchestrator.cli.app import app
+from orchestrator.cli.command_options import Answer
+from orchestrator.runs.unknown_pours import LOST, REPEAT
+from orchestrator.strategies.deployment.model_check import OPTIONS
 from tests.orchestrator.commands.typed import ROOT, invoke, write_inputs
 
 HELP = {
@@ -66,7 +66,7 @@ def test_a_full_disk_ends_a_run_with_its_name_and_advises_no_resuming_of_what_ha
 
 
 def test_a_campaign_runs_on_another_laboratory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from orchestrator.config.load import load_campaign
+    from orchestrator.config.file_loading import load_campaign
 
     twin = ROOT / "configs" / "laboratories" / "twin.yaml"
     plan = load_campaign(ROOT / "configs" / "campaigns" / "quickstart.yaml", twin)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.commands.interrupted import file_trouble, given_up_pours, interruption
+from orchestrator.cli.foreground_run import file_trouble, given_up_pours, interruption
 from tests.orchestrator.scripted import Script, one_stage, pour, states
 from tests.orchestrator.toy import ToyBench, ToyLaboratory, run_toy, toy_plan
 

@@ -8,14 +8,13 @@ from typing import Any
 
 import pytest
 
-from actors.arm.geometry import Pose
-from actors.arm.protocol import Whereabouts
-from actors.arm.spec import UrArmSpec
-from actors.protocols import LaboratoryError
-from actors.virtual_ur.launcher import VirtualController
-from orchestrator.commands.jog import JogError, Jogging, Step, parse_step, steps_home
-from orchestrator.config.load import load_laboratory
-from orchestrator.safety import SafetyRecord, write_record
+from actors.arm.arm_interface import ArmPose, Pose
+from actors.arm.arm_settings import UrArmSpec
+from actors.emulators.ur_controller.controller_process import VirtualController
+from actors.interfaces import LaboratoryError
+from orchestrator.cli.jogging import JogError, Jogging, JogStep, parse_step, steps_home
+from orchestrator.config.file_loading import load_laboratory
+from orchestrator.runs.safety_approval import SafetyRecord, write_record
 from tests.orchestrator import hardware
 from tests.orchestrator.terminal import Terminal
 
@@ -32,8 +31,8 @@ class Arm:
     def joints(self) -> tuple[float, ...]:
         return tuple(self._joints)
 
-    def where(self) -> Whereabouts:
-        return Whereabouts(Pose(x=0.5), tuple(self._joints), self.home)
+    def where(self) -> ArmPose:
+        return ArmPose(Pose(x=0.5), tuple(self._joints), self.home)
 
     def release(self) -> None:
         self.said.append("release")
@@ -71,14 +70,14 @@ class Session:
 @pytest.mark.parametrize(
     ("typed", "step"),
     [
-        ("j5 +2", Step("joint 5", 2.0, "deg")),
-        ("J1 -0,5", Step("joint 1", -0.5, "deg")),
-        ("z -5", Step("z", -5.0, "mm")),
-        ("rx 3", Step("rx", 3.0, "deg")),
-        ("x50", Step("x", 50.0, "mm")),
+        ("j5 +2", JogStep("joint 5", 2.0, "deg")),
+        ("J1 -0,5", JogStep("joint 1", -0.5, "deg")),
+        ("z -5", JogStep("z", -5.0, "mm")),
+        ("rx 3", JogStep("rx", 3.0, "deg")),
+        ("x50", JogStep("x", 50.0, "mm")),
     ],
 )
-def test_what_is_typed_is_a_step(typed: str, step: Step) -> None:
+def test_what_is_typed_is_a_step(typed: str, step: JogStep) -> None:
     assert parse_step(typed) == step
 
 

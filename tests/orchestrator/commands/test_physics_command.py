@@ -13,12 +13,13 @@ import pytest
 from matplotlib.text import Text
 from typer.testing import CliRunner
 
-from orchestrator.cli import app
-from orchestrator.report import physics as report
-from orchestrator.report import style
-from orchestrator.report.style import INK
-from sim_engine.validation import sources, suite
-from sim_engine.validation.result import CaseResult, Figure, Measurement, Series, reported, within
+from orchestrator.cli.app import app
+from orchestrator.results import figure_style as style
+from orchestrator.results import solver_report as report
+from orchestrator.results.figure_style import INK
+from sim_engine import solver_fingerprint as sources
+from sim_engine.validation import cases as suite
+from sim_engine.validation.case_result import CaseResult, Figure, Measurement, Series, reported, within
 from tests.orchestrator.reported import strays
 
 ROOT = Path(__file__).parents[3]
@@ -107,7 +108,7 @@ def test_cases_are_listed_by_name() -> None:
 def test_a_long_case_tells_how_far_it_is_and_a_case_without_criteria_is_judged_by_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def work(simulator: object, effort: suite.Effort) -> tuple[list[Measurement], None]:
+    def work(simulator: object, effort: suite.CaseEffort) -> tuple[list[Measurement], None]:
         assert effort.progress is not None
         for done in range(4):
             effort.progress(done, 3)
@@ -173,7 +174,7 @@ def test_the_legend_lies_on_no_curve_and_no_number_is_tiny(panels: int, monkeypa
 
 def test_a_figure_is_drawn_again_from_what_is_kept_of_it() -> None:
     case = a_case("good", height(0.0397), figure=FIGURE)
-    record = report.case_record(case, case.run(None, suite.Effort()), None, "solver")  # type: ignore[arg-type]
+    record = report.case_record(case, case.run(None, suite.CaseEffort()), None, "solver")  # type: ignore[arg-type]
     assert report.figure_of(json.loads(json.dumps(record))) == FIGURE
     assert report.figure_of({**record, "figure": None}) is None
 
@@ -201,10 +202,10 @@ def test_references_can_be_told_apart_and_have_their_curve_s_colour(monkeypatch:
 
 
 def test_a_fault_of_the_solver_does_not_pass() -> None:
-    def work(simulator: object, effort: suite.Effort) -> tuple[list[Measurement], None]:
+    def work(simulator: object, effort: suite.CaseEffort) -> tuple[list[Measurement], None]:
         raise ArithmeticError("at 0.1 s: diverged")
 
-    result: CaseResult = suite.Case("x", "X", "", work).run(None, suite.Effort())  # type: ignore[arg-type]
+    result: CaseResult = suite.Case("x", "X", "", work).run(None, suite.CaseEffort())  # type: ignore[arg-type]
     assert not result.passed
 
 

@@ -16,16 +16,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from actors.protocols import UnknownPourError
-from actors.virtual_ur.launcher import VirtualController
-from orchestrator.cli import app
-from orchestrator.journal import JOURNAL_NAME, JournalReader
-from orchestrator.lanes import Deadlines, Lanes
-from orchestrator.plan import CampaignPlan
+from actors.emulators.ur_controller.controller_process import VirtualController
+from actors.interfaces import UnknownPourError
+from orchestrator.cli.app import app
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
 from orchestrator.requests import Pour
-from orchestrator.safety import SafetyRecord, write_record
-from orchestrator.stages import scenes_of
+from orchestrator.runs.request_executor import Deadlines, RequestExecutor
+from orchestrator.runs.safety_approval import SafetyRecord, write_record
+from orchestrator.runs.stages import scenes_of
 from orchestrator.states import State
+from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.action import Action
 from tests.end_to_end import small
 from tests.orchestrator import hardware
@@ -148,7 +148,7 @@ def test_empty_cycle_that_is_not_confirmed_moves_nothing(tmp_path: Path, control
 async def breaks_off(plan: CampaignPlan, laboratory: object, directory: Path, **_: object) -> None:
     (directory / JOURNAL_NAME).touch()
     bench = ToyBench(fails=lambda seed: UnknownPourError("protective stop. All weighings: pourer_full 512.1 g"))
-    lanes = Lanes(ToyLaboratory(bench=bench), scenes_of(plan), Deadlines(), 0.0)
+    lanes = RequestExecutor(ToyLaboratory(bench=bench), scenes_of(plan), Deadlines(), 0.0)
     scene, action = next(iter(scenes_of(plan).values())), Action(angular_velocity=1.0, x_offset=0.07, height=0.06)
     await lanes.pour(Pour(scene.name, action, 1, 1), started=lambda: None, progress=lambda p: None)
 
@@ -166,7 +166,7 @@ async def is_interrupted_twice(plan: CampaignPlan, laboratory: object, directory
 def test_pour_whose_outcome_is_unknown_doesn_t_promise_to_be_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: Callable[..., object], code: int
 ) -> None:
-    monkeypatch.setattr("orchestrator.campaign.run_campaign", ends)
+    monkeypatch.setattr("orchestrator.runs.run_engine.run_campaign", ends)
     result = decant("pour", str(small.write_campaign(tmp_path)), *small.GOOD_ACTION, "--in-process")
     assert result.exit_code == code, result.stderr
     run = next((tmp_path / "runs").iterdir())

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from orchestrator.commands import single
-from sim_engine.spread import spreads
+from orchestrator.cli import pour_prediction as single
+from sim_engine.prediction_band import spreads
 from tests.orchestrator import watched
 from tests.orchestrator.commands.typed import SIMULATE, invoke, process
 

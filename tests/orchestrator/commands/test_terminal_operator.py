@@ -14,17 +14,16 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from actors.bench.questions import Questions
-from actors.bench.words import stopped_question
-from actors.operator import OperatorSpec, Question
-from actors.protocols import LaboratoryError, Notice
-from orchestrator.events import LogLine
-from orchestrator.progress import ProgressDisplay
-from orchestrator.terminal_operator import TerminalOperator
+from actors.bench.consent import stopped_question
+from actors.bench.operator_questions import OperatorQuestions
+from actors.interfaces import LaboratoryError, Notice, OperatorQuestion, OperatorSpec
+from orchestrator.cli.terminal_operator import TerminalOperator
+from orchestrator.progress.console_progress import ProgressDisplay
+from orchestrator.runs.events import LogLine
 from tests.orchestrator import watched
 
-DONE = Question("Put the full pourer into the gripper.", "done")
-WEIGHT = Question("Weigh the pourer on the other balance.", "weight")
+DONE = OperatorQuestion("Put the full pourer into the gripper.", "done")
+WEIGHT = OperatorQuestion("Weigh the pourer on the other balance.", "weight")
 PATIENT = OperatorSpec(reminder=30.0, deadline=60.0)
 
 
@@ -66,7 +65,7 @@ def played(scene: Callable[[], Awaitable[None]]) -> None:
 
 
 def test_what_to_do_what_was_wrong_and_what_is_expected_stand_on_the_screen(keyboard: Keyboard) -> None:
-    question = Question(
+    question = OperatorQuestion(
         DONE.text, "done", problem="the balance reads 3 g less than before", details={"load": "200 g", "pour": 3}
     )
 
@@ -119,7 +118,7 @@ def test_yes_and_no_are_told_apart_from_anything_else(keyboard: Keyboard) -> Non
     async def scene() -> None:
         operator = keyboard.operator()
         for typed, answer in (("maybe\nn\n", "no"), ("YES\n", "yes")):
-            asking = asyncio.create_task(operator.ask(Question("Does it still show this weight?", "yes or no")))
+            asking = asyncio.create_task(operator.ask(OperatorQuestion("Does it still show this weight?", "yes or no")))
             await asyncio.sleep(0.1)
             keyboard.type(typed)
             assert await asking == answer
@@ -162,7 +161,7 @@ def test_announced_movement_is_counted_down_whatever_the_words(keyboard: Keyboar
 def test_numbers_that_belong_to_a_question_are_short(keyboard: Keyboard) -> None:
     async def scene() -> None:
         asking = asyncio.create_task(
-            keyboard.operator().ask(Question("May it?", "yes or no", details={"s": 8.0277592}))
+            keyboard.operator().ask(OperatorQuestion("May it?", "yes or no", details={"s": 8.0277592}))
         )
         await keyboard.shows("s: 8.028\n")
         asking.cancel()
@@ -228,7 +227,7 @@ def test_why_the_arm_was_stopped_stands_on_the_screen_once_and_in_the_recording(
             display(line)
 
     async def scene() -> None:
-        questions = Questions(keyboard.operator(), PATIENT, hear)
+        questions = OperatorQuestions(keyboard.operator(), PATIENT, hear)
         stopped = stopped_question(LaboratoryError(why), why, begun=False)
         asking = asyncio.create_task(questions.ask(stopped))
         await keyboard.shows("> ")

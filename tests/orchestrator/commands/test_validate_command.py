@@ -32,7 +32,7 @@ def test_files_that_are_right_pass(folder: Path) -> None:
 # What a check needs is numpy and pydantic. Each of these takes a third of a second to import, or seconds.
 HEAVY = """
 import sys
-from orchestrator.cli import main
+from orchestrator.cli.app import main
 try:
     main()
 finally:

@@ -11,12 +11,12 @@ import pytest
 import trimesh
 from PIL import ExifTags, Image
 
-from orchestrator.commands.speaking import RefusalError
-from orchestrator.commands.vessel import Sources, vessel
-from orchestrator.commands.vessel_tables import read_photograph
-from orchestrator.config.load import load_vessel
-from sim_engine.vessel.build import build_vessel
+from orchestrator.cli.console import RefusalError
+from orchestrator.cli.vessel_measurement import Sources, vessel
+from orchestrator.cli.vessel_tables import read_photograph
+from orchestrator.config.file_loading import load_vessel
 from sim_engine.vessel.profile import volume
+from sim_engine.vessel.vessel import build_vessel
 from tests.measured import FOCAL, Bench
 
 VESSELS = Path("configs/vessels")

@@ -12,16 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.arm.spec import UrArmSpec
-from actors.spec import LaboratorySpec
-from orchestrator.codec import encode_outcome, encode_request
-from orchestrator.commands.speaking import RefusalError
-from orchestrator.commands.view import _recording_of, _view
-from orchestrator.config.load import load_laboratory
-from orchestrator.journal import JOURNAL_NAME, Header, Journal, Kind
-from orchestrator.monitor.again import NoSuchPourError, find_pour, task_of
-from orchestrator.monitor.beside import put_beside
-from orchestrator.monitor.recording import CampaignRecording
+from actors.arm.arm_settings import UrArmSpec
+from actors.laboratory_settings import LaboratorySpec
+from orchestrator.cli.console import RefusalError
+from orchestrator.cli.view_command import _recording_of, _view
+from orchestrator.config.file_loading import load_laboratory
+from orchestrator.journal.codec import encode_outcome, encode_request
+from orchestrator.journal.journal import JOURNAL_NAME, Header, Journal, Kind
+from orchestrator.live_view.blueprints import put_beside
+from orchestrator.live_view.repeated_pour import NoSuchPourError, find_pour, task_of
+from orchestrator.live_view.run_recording import CampaignRecording
 from orchestrator.requests import Pour, Poured
 from sim_engine.outcome import PourMeasurement
 from tests.orchestrator import watched
@@ -64,7 +64,7 @@ def test_recordings_stand_beside_each_other_under_their_names(recording: Path, t
 
 def test_recording_is_served_without_a_display_until_ctrl_c(recording: Path, tmp_path: Path) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-c", "from orchestrator.cli import main; main()", "view", str(recording)],
+        [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "view", str(recording)],
         stderr=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         text=True,
@@ -85,7 +85,7 @@ def test_recording_is_served_without_a_display_until_ctrl_c(recording: Path, tmp
 
 
 def test_pour_is_simulated_again_as_the_arm_moved_with_the_load_that_was_weighed(tmp_path: Path) -> None:
-    from actors.arm.joint_path import ExecutedPath, pack
+    from actors.arm.planned_pour import ExecutedPath, pack
 
     arm = load_laboratory(ROOT / "configs" / "laboratories" / "virtual.yaml").arm
     assert isinstance(arm, UrArmSpec)

@@ -9,8 +9,10 @@ from functools import partial
 
 import pytest
 
-from orchestrator.commands import single, speaking, waiting
-from orchestrator.commands.waiting import Waiting
+from orchestrator.cli import console as speaking
+from orchestrator.cli import console as waiting
+from orchestrator.cli import pour_prediction as single
+from orchestrator.cli.console import WaitingIndicator
 
 
 class Terminal(io.StringIO):
@@ -21,7 +23,7 @@ class Terminal(io.StringIO):
 def waited(out: io.StringIO, at: list[float]) -> str:
     """What is shown if something is told at these times [s]."""
     now = 0.0
-    with Waiting(out, lambda: now) as doing:
+    with WaitingIndicator(out, lambda: now) as doing:
         for now in at:
             doing(f"at {now:g} s")
     return out.getvalue()
@@ -58,7 +60,7 @@ def test_simulate_says_which_seed_it_is_at_while_it_simulates(
 ) -> None:
     monkeypatch.setattr(waiting, "EVERY", 0.1)
     monkeypatch.setattr(single, "waiting_for", partial(waiting.waiting_for, beat=0.05))
-    assert single._simulated(Slow(), [1, 2]) == [1, 2]  # type: ignore[arg-type, list-item, comparison-overlap]
+    assert single._simulated_pour(Slow(), [1, 2]) == [1, 2]  # type: ignore[arg-type, list-item, comparison-overlap]
     lines = capfd.readouterr().err.splitlines()
     assert lines[0].startswith("simulating seed 1 of 2, 0 s so far; the first pour ever also compiles kernels")
     assert lines[-1].startswith("simulating seed 2 of 2, ")

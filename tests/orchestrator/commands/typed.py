@@ -13,7 +13,7 @@ from typing import Any
 import trimesh
 from typer.testing import CliRunner
 
-from orchestrator.cli import app
+from orchestrator.cli.app import app
 from tests.end_to_end import small
 from tests.patience import PATIENCE
 
@@ -112,7 +112,7 @@ def refused(command: str, folder: Path) -> str:
 
 PROGRAM = """
 import sys
-from orchestrator.cli import main
+from orchestrator.cli.app import main
 try:
     main()
 finally:

@@ -8,15 +8,13 @@ from textwrap import dedent
 
 import pytest
 
-from actors.arm.geometry import Plane, Pose
-from actors.arm.spec import UrArmSpec
-from orchestrator.config.laboratory.arm import resolve_arm
-from orchestrator.config.laboratory.arm_sections import UrArmSection
-from orchestrator.config.laboratory.cell import CellSection
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.config.yaml.sections import Section
-from orchestrator.config.yaml.source import Document, Place, Report
-from orchestrator.config.yaml.validate import validate
+from actors.arm.arm_interface import Plane, Pose
+from actors.arm.arm_settings import UrArmSpec
+from orchestrator.config.arm_file import CellSection, UrArmSection, resolve_arm
+from orchestrator.config.yaml.section_validation import validate
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.config.yaml.yaml_source import Document, Place, Report
+from sim_engine.settings.model import Section
 from tests.orchestrator.good_files import written_out
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from actors.arm.numbers import NumbersSpec
-from actors.arm.spec import UrArmSpec
-from orchestrator.config.laboratory.arms import ARMS
-from orchestrator.config.load import load_laboratory
-from orchestrator.config.yaml.errors import ConfigError
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.simulated_arm import NumbersSpec
+from orchestrator.config.arm_file import ARMS
+from orchestrator.config.file_loading import load_laboratory
+from orchestrator.config.yaml.yaml_errors import ConfigError
 
 SHIPPED = Path("configs/laboratories/virtual.yaml").read_text(encoding="utf-8")
 UNTIL, FROM = SHIPPED.index("arm:"), SHIPPED.index("balance:")

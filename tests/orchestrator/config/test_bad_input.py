@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.load import load_campaign
+from orchestrator.config.file_loading import load_campaign
 from tests.orchestrator.good_files import CAMPAIGN, CSV, DEPLOYED, RECORDED, report, write
 
 

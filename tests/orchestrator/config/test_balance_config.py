@@ -7,19 +7,13 @@ from textwrap import dedent
 
 import pytest
 
-from actors.balance.placement import Placement
-from actors.balance.settling import SettlingRule
-from actors.balance.spec import BalanceSpec, SerialBalanceSpec
-from actors.balance.virtual_serial.scale import ScaleSettings
-from orchestrator.config.laboratory.balance import (
-    SerialSection,
-    SettlingSection,
-    VirtualScaleSection,
-    resolve_balance,
-)
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.config.yaml.source import Document, Place, Report
-from orchestrator.config.yaml.validate import validate
+from actors.balance.balance_settings import BalanceSpec, SerialBalanceSpec, SettlingRule
+from actors.balance.simulated_balance import ScaleSettings
+from actors.balance.weighing_plan import Placement
+from orchestrator.config.balance_file import SerialSection, SettlingSection, VirtualScaleSection, resolve_balance
+from orchestrator.config.yaml.section_validation import validate
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from tests.orchestrator.good_files import written_out
 
 

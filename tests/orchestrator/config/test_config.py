@@ -11,21 +11,21 @@ from pathlib import Path
 
 import pytest
 
-from actors.spec import RaySpec
-from orchestrator.commands.options import call
-from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
-from orchestrator.config.study.sections import load_study
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.daemon.settings import load_settings
-from orchestrator.fingerprint import fingerprint
-from orchestrator.runs import create_run
-from orchestrator.state_directory import state_directory
-from orchestrator.strategies.calibration.c4 import C4Settings
+from actors.laboratory_settings import RaySpec
+from orchestrator.catalogue.run_registry import state_directory
+from orchestrator.cli.command_options import call
+from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.daemon.daemon_settings import load_settings
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.runs.run_folder import create_run
+from orchestrator.strategies.calibration.continuous_calibration import C4Settings
+from orchestrator.strategies.campaign_plan import DeploymentSettings
 from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3_settings import D3Settings
-from orchestrator.strategies.deployment.prices import PricesSettings
-from orchestrator.strategies.settings import DeploymentSettings
+from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.time_costs import PricesSettings
+from orchestrator.study.study_file import load_study
 from sim_engine.action import DEG
 
 CONFIGS = Path(__file__).parents[3] / "configs"

@@ -12,10 +12,10 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from actors.child_process import child_environment
-from orchestrator.config.campaign.check import check_campaign
-from orchestrator.config.load import load_campaign, load_laboratory, load_vessel
-from orchestrator.config.schema import (
+from actors.runtime.child_process import child_environment
+from orchestrator.config.campaign_checks import check_campaign
+from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
+from orchestrator.config.json_schema import (
     campaign_schema,
     laboratory_schema,
     result_schema,
@@ -23,9 +23,9 @@ from orchestrator.config.schema import (
     study_schema,
     vessel_schema,
 )
-from orchestrator.config.yaml.source import Document
+from orchestrator.config.yaml.yaml_source import Document
 from sim_engine.action import DEG, Action
-from sim_engine.vessel.spec import MeshShape
+from sim_engine.vessel.shapes import MeshShape
 from tests.patience import PATIENCE
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -154,7 +154,7 @@ def test_paths_resolve_against_the_file_that_names_them(tmp_path: Path, monkeypa
 
 def test_loading_a_campaign_starts_nothing_heavy() -> None:
     code = (
-        "import sys; from pathlib import Path; from orchestrator.config.load import load_campaign;"
+        "import sys; from pathlib import Path; from orchestrator.config.file_loading import load_campaign;"
         f"load_campaign(Path({str(CONFIGS / 'campaigns' / 'recorded.yaml')!r}));"
         "heavy = ('ray', 'taichi', 'rerun', 'sklearn', 'scipy.stats', 'matplotlib', 'trimesh');"
         "print([m for m in heavy if m in sys.modules])"

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.campaign.assignments import assigned_action, set_action
-from orchestrator.config.load import load_campaign, load_parameters
-from orchestrator.config.yaml.quantities import format_quantity, parse_quantity
+from orchestrator.config.action_assignments import assigned_action, set_action
+from orchestrator.config.file_loading import load_campaign, load_parameters
 from sim_engine.action import DEG
-from sim_engine.liquid import SimulationParameters
+from sim_engine.liquids import SimulationParameters
+from sim_engine.settings.quantity import format_quantity, parse_quantity
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 

@@ -10,24 +10,23 @@ import numpy as np
 import pytest
 import yaml
 
-from actors.optimizer.core.problem import Data, Linear, SuggestProblem
-from actors.optimizer.core.propose import propose
-from orchestrator.config.campaign.check import check_campaign
-from orchestrator.config.campaign.constraints import parse_constraint
-from orchestrator.config.load import load_campaign
-from orchestrator.config.yaml.quantities import QuantityError
-from orchestrator.fingerprint import fingerprint
+from actors.optimizer.questions import Data, Linear, SuggestProblem
+from actors.optimizer.suggest import propose
+from orchestrator.config.action_assignments import parse_constraint
+from orchestrator.config.campaign_checks import check_campaign
+from orchestrator.config.file_loading import load_campaign
 from orchestrator.requests import Pour, Simulate
-from orchestrator.stages import calibration_stages
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.runs.stages import calibration_stages
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.d3_free import FreeHybrid
-from orchestrator.strategies.deployment.prices import PricesSettings
+from orchestrator.strategies.deployment.d3 import FreeHybrid, Hybrid
+from orchestrator.strategies.deployment.time_costs import PricesSettings
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import SimulationParameters
-from sim_engine.space import Axis, Space
+from sim_engine.liquids import SimulationParameters
+from sim_engine.search_space import Axis, Space
+from sim_engine.settings.quantity import QuantityError
 from tests.orchestrator.good_files import DEPLOYED, report, write
 from tests.orchestrator.plans import calibration_plan, deployment_plan
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.load import load_campaign, load_vessel
-from orchestrator.config.yaml.errors import PROBLEMS_SHOWN, ConfigError, Problem
-from orchestrator.config.yaml.files import SIZE_LIMIT
-from orchestrator.config.yaml.source import Document
+from orchestrator.config.file_loading import load_campaign, load_vessel
+from orchestrator.config.yaml.file_access import SIZE_LIMIT
+from orchestrator.config.yaml.yaml_errors import PROBLEMS_SHOWN, ConfigError, Problem
+from orchestrator.config.yaml.yaml_source import Document
 from tests.orchestrator.good_files import CAMPAIGN, CSV, RECORDED, report, write
 
 CPU_SECONDS = 3.0

@@ -17,18 +17,18 @@ import yaml
 from hypothesis import assume, event, given, settings
 from hypothesis import strategies as st
 
-from orchestrator.commands.campaigns import planning_plan
-from orchestrator.config.campaign.sections import CALIBRATIONS, DEPLOYMENTS, CalibrationSection, DeploymentSection
-from orchestrator.config.load import load_campaign
-from orchestrator.config.study.sections import load_study
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Section
-from orchestrator.fingerprint import fingerprint
-from orchestrator.plan import CampaignPlan
-from orchestrator.strategies.deployment.learnt import Deployed
-from orchestrator.study.campaigns import campaign_of
+from orchestrator.cli.campaign_commands import planning_plan
+from orchestrator.config.campaign_file import CALIBRATIONS, DEPLOYMENTS, CalibrationSection, DeploymentSection
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.study.cells import cells_of
+from orchestrator.study.study_campaigns import campaign_of
+from orchestrator.study.study_file import load_study
+from sim_engine.settings.model import Section
+from sim_engine.settings.quantity import Quantity
 from tests.depth import examples
 from tests.orchestrator import plans
 

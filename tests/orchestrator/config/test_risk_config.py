@@ -11,15 +11,15 @@ import jsonschema
 import pytest
 import yaml
 
-from orchestrator.commands import campaigns
-from orchestrator.commands.speaking import RefusalError
-from orchestrator.config.load import load_campaign
-from orchestrator.config.schema import campaign_schema
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.fingerprint import fingerprint
+from orchestrator.cli import campaign_commands as campaigns
+from orchestrator.cli.console import RefusalError
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.json_schema import campaign_schema
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.strategies.deployment.d1 import D1Settings
 from sim_engine.action import DEG
-from sim_engine.task import PoseError
+from sim_engine.scene import PoseError
 from tests.orchestrator import plans
 
 CONFIGS = Path(__file__).parents[3] / "configs"

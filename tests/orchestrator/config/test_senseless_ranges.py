@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.campaign.check import check_campaign
-from orchestrator.config.load import load_campaign
-from orchestrator.config.yaml.errors import Problem
+from orchestrator.config.campaign_checks import check_campaign
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.yaml.yaml_errors import Problem
 from tests.orchestrator.good_files import CAMPAIGN, RECORDED, write
 
 CONFIGS = Path(__file__).parents[3] / "configs"

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from actors.balance.placement import Placement
-from actors.balance.spec import NumbersBalanceSpec
-from actors.spec import LaboratorySpec
-from orchestrator.config.campaign.check import check_campaign
-from orchestrator.config.laboratory.sections import LaboratoryFile
-from orchestrator.config.load import load_campaign, load_laboratory
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.fingerprint import fingerprint
-from orchestrator.plan import CampaignPlan
+from actors.balance.balance_settings import NumbersBalanceSpec
+from actors.balance.weighing_plan import Placement
+from actors.laboratory_settings import LaboratorySpec
+from orchestrator.config.campaign_checks import check_campaign
+from orchestrator.config.file_loading import load_campaign, load_laboratory
+from orchestrator.config.laboratory_file import LaboratoryFile
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.orchestrator.good_files import written_out
 
 CONFIGS = Path(__file__).parents[3] / "configs"

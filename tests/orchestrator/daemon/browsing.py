@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 import pytest
 import uvicorn
 
-from orchestrator.daemon.api import serve_app
-from orchestrator.daemon.auth import Role, Tokens
+from orchestrator.daemon.access_control import Role, Tokens
+from orchestrator.daemon.http_api import serve_app
 from tests.end_to_end.small import write_campaign
 from tests.orchestrator.daemon.served import CAMPAIGN, Make, Served, held, serving
 from tests.patience import PATIENCE

@@ -12,17 +12,16 @@ from typing import Any
 import httpx
 import pytest
 
-from actors.operator import Question
-from actors.protocols import PourProgress, ProgressCallback
-from orchestrator.config.load import load_campaign
-from orchestrator.daemon.api import serve_app
-from orchestrator.daemon.auth import Role, Tokens, token_of
-from orchestrator.daemon.packing import pack
-from orchestrator.daemon.settings import Settings
-from orchestrator.daemon.store import AT_REST
+from actors.interfaces import OperatorQuestion, PourProgress, ProgressCallback
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.daemon.access_control import Role, Tokens, token_of
+from orchestrator.daemon.daemon_settings import DaemonSettings
+from orchestrator.daemon.daemon_store import AT_REST
+from orchestrator.daemon.http_api import serve_app
+from orchestrator.daemon.submission_bundle import pack
 from orchestrator.daemon.supervisor import Supervisor
 from sim_engine.outcome import PourMeasurement
-from sim_engine.task import Scene
+from sim_engine.scene import Scene
 from tests.end_to_end.small import write_campaign
 from tests.orchestrator.toy import ToyBench, ToyLaboratory, ToyOptimizer, ToySimulators
 from tests.patience import PATIENCE
@@ -60,7 +59,7 @@ class HeldBench(ToyBench):
         self.stopped = asyncio.Event()
         self.checkpoint = "tilt"
         self.operator: Any = None
-        self.question: Question | None = None
+        self.question: OperatorQuestion | None = None
         self.answers: list[str] = []
 
     async def pour(
@@ -155,7 +154,7 @@ Make = Callable[[], HeldLaboratory]
 async def serving(folder: Path, make: Make = HeldLaboratory, **settings: Any) -> AsyncIterator[Served]:
     """A daemon with its state below a folder, in which the campaign's files are too."""
     state = folder / "state"
-    chosen = Settings(state, in_process=True, keep_free=0, **settings)
+    chosen = DaemonSettings(state, in_process=True, keep_free=0, **settings)
     state.mkdir(exist_ok=True)
     tokens = Tokens(chosen.tokens)
     made: list[HeldLaboratory] = []
@@ -167,7 +166,7 @@ async def serving(folder: Path, make: Make = HeldLaboratory, **settings: Any) ->
         return laboratory
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orchestrator.daemon.running.open_laboratory", open_laboratory)
+        patch.setattr("orchestrator.daemon.rig_worker.open_laboratory", open_laboratory)
         daemon = Supervisor(chosen)
         known = {role: token_of(chosen.tokens, role) or "" for role in Role}
         ended: list[bool] = []

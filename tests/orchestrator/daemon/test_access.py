@@ -16,11 +16,18 @@ from typing import Any
 
 import pytest
 
-from orchestrator.catalogue.index import Catalogue
-from orchestrator.catalogue.registry import enter
-from orchestrator.daemon.auth import FAILURES, WINDOW, Role, TokenFileError, Tokens, TooManyFailuresError
-from orchestrator.daemon.guard import DRAIN
-from orchestrator.daemon.packing import PackingError, unpack
+from orchestrator.catalogue.catalogue_index import Catalogue
+from orchestrator.catalogue.run_registry import enter
+from orchestrator.daemon.access_control import (
+    DRAIN,
+    FAILURES,
+    WINDOW,
+    Role,
+    TokenFileError,
+    Tokens,
+    TooManyFailuresError,
+)
+from orchestrator.daemon.submission_bundle import SubmissionBundleError, unpack
 from tests.orchestrator.daemon.browsing import on_port
 from tests.orchestrator.daemon.served import Served, held, run, serving
 
@@ -65,7 +72,7 @@ def test_nothing_but_health_is_told_without_a_token_and_viewers_do_nothing(tmp_p
 
 
 def test_every_route_asks_for_a_token(tmp_path: Path) -> None:
-    from orchestrator.daemon.api import create_app
+    from orchestrator.daemon.http_api import create_app
 
     described = create_app().openapi()["paths"]
     open_to_all = {path for path, verbs in described.items() for verb in verbs.values() if "security" not in verb}
@@ -180,7 +187,7 @@ def test_what_is_submitted_neither_looks_elsewhere_nor_blows_up(tmp_path: Path, 
     "name", ["../x", "/etc/x", "a/../../x", "a//b", ".hidden", "campaign.yaml", "a\x00b", "x" * 200, ""]
 )
 def test_files_go_nowhere_but_into_the_snapshot(tmp_path: Path, name: str) -> None:
-    with pytest.raises(PackingError, match="is not a name for one"):
+    with pytest.raises(SubmissionBundleError, match="is not a name for one"):
         unpack("name: x\n", {name: base64.b64encode(b"x").decode()}, tmp_path / "snapshot")
     assert list(tmp_path.iterdir()) == []
 

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from orchestrator.cli import app
-from orchestrator.daemon.auth import Role
-from orchestrator.state_directory import VARIABLE, use_state_directory
+from orchestrator.catalogue.run_registry import VARIABLE, use_state_directory
+from orchestrator.cli.app import app
+from orchestrator.daemon.access_control import Role
 from tests.end_to_end.daemon_thread import Real
 from tests.orchestrator.daemon.served import Served, run, serving
 from tests.orchestrator.test_catalogue import made

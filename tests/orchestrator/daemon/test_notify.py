@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from orchestrator.daemon import notify
-from orchestrator.daemon.notify import QUEUE, Notifier, NotifyError
+from orchestrator.daemon import notifications as notify
+from orchestrator.daemon.notifications import QUEUE, Notifier, NotifyError
 
 GENEROUS = 30.0
 

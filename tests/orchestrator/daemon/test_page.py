@@ -16,12 +16,12 @@ from typing import Any
 import httpx
 import pytest
 
-from actors.operator import Question
-from actors.spec import LaboratorySpec
-from orchestrator.config.load import load_laboratory
-from orchestrator.daemon.auth import Role, token_of
-from orchestrator.daemon.settings import Rig
-from orchestrator.state_directory import VARIABLE
+from actors.interfaces import OperatorQuestion
+from actors.laboratory_settings import LaboratorySpec
+from orchestrator.catalogue.run_registry import VARIABLE
+from orchestrator.config.file_loading import load_laboratory
+from orchestrator.daemon.access_control import Role, token_of
+from orchestrator.daemon.daemon_settings import Rig
 from tests.orchestrator.daemon.browsing import OnPort, browser, on_port
 from tests.orchestrator.daemon.served import HeldBench, HeldLaboratory
 from tests.orchestrator.toy import ToyOptimizer, ToySimulators
@@ -32,7 +32,7 @@ pytest.importorskip("playwright")
 WAIT = 20_000
 """Of the browser for what a test waits for [ms]."""
 
-MAIN = "from orchestrator.cli import main; main()"
+MAIN = "from orchestrator.cli.app import main; main()"
 
 SIZES = {"small phone": (320, 640), "phone": (390, 844), "tablet": (1024, 768), "desk": (1440, 900)}
 
@@ -73,7 +73,7 @@ def asking(**question: Any) -> Any:
 
     def make() -> HeldLaboratory:
         bench = HeldBench()
-        bench.question = Question(**question)
+        bench.question = OperatorQuestion(**question)
         return HeldLaboratory(ToySimulators(), bench, ToyOptimizer())
 
     return make

@@ -7,15 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from actors.operator import Question
-from orchestrator.daemon.auth import Role
+from actors.interfaces import OperatorQuestion
+from orchestrator.daemon.access_control import Role
 from tests.orchestrator.daemon.served import HeldLaboratory, run, serving
 
-REFILL = Question("Refill the beaker to 100 g.", "done", about="refill", details={"load": 100.0})
-WEIGH = Question("Weigh the receiver.", "weight", problem="the balance is silent", about="receiver", hands=False)
+REFILL = OperatorQuestion("Refill the beaker to 100 g.", "done", about="refill", details={"load": 100.0})
+WEIGH = OperatorQuestion(
+    "Weigh the receiver.", "weight", problem="the balance is silent", about="receiver", hands=False
+)
 
 
-def asking(question: Question) -> Callable[[], HeldLaboratory]:
+def asking(question: OperatorQuestion) -> Callable[[], HeldLaboratory]:
     def make() -> HeldLaboratory:
         laboratory = HeldLaboratory()
         laboratory.bench.question, laboratory.bench.checkpoint = question, "operator"

@@ -10,17 +10,17 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from orchestrator.cli import app
-from orchestrator.commands.daemon import submit
-from orchestrator.config.load import load_campaign, load_laboratory
-from orchestrator.daemon.packing import pack
-from orchestrator.daemon.reading import Pours
-from orchestrator.daemon.running import job_of
-from orchestrator.daemon.settings import DESK, Rig, Settings
-from orchestrator.daemon.store import Item
-from orchestrator.daemon.submitting import Submission, SubmissionError, prepare
-from orchestrator.jobs import Job
-from orchestrator.plan import CampaignPlan
+from orchestrator.cli.app import app
+from orchestrator.cli.queue_actions import submit
+from orchestrator.config.file_loading import load_campaign, load_laboratory
+from orchestrator.daemon.daemon_settings import DESK, DaemonSettings, Rig
+from orchestrator.daemon.daemon_store import QueueItem
+from orchestrator.daemon.rig_worker import job_of
+from orchestrator.daemon.run_readout import Pours
+from orchestrator.daemon.submission_bundle import pack
+from orchestrator.daemon.submissions import Submission, SubmissionError, prepare
+from orchestrator.runs.run_tasks import RunTask
+from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.end_to_end.small import NARROW, write_campaign
 from tests.orchestrator.daemon.served import CAMPAIGN, HeldLaboratory, campaign_in, held, run, serving
 
@@ -45,11 +45,11 @@ def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
 ) -> None:
     read: list[str] = []
 
-    def counted(settings: Settings, item: Item, rig: Rig) -> Job:
+    def counted(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunTask:
         read.append(item.id)
         return job_of(settings, item, rig)
 
-    monkeypatch.setattr("orchestrator.daemon.looks.job_of", counted)
+    monkeypatch.setattr("orchestrator.daemon.query_routes.job_of", counted)
 
     async def work() -> None:
         async with serving(tmp_path, held) as served:
@@ -156,8 +156,8 @@ def test_a_campaign_for_no_rig_there_is_is_refused_with_those_there_are(tmp_path
 
     async def work() -> None:
         async with serving(tmp_path, HeldLaboratory) as served:
-            from orchestrator.config.load import load_campaign
-            from orchestrator.daemon.packing import pack
+            from orchestrator.config.file_loading import load_campaign
+            from orchestrator.daemon.submission_bundle import pack
 
             text, files = pack(load_campaign(served.campaign))
             told = await served.post("/campaigns", {"text": text, "files": files, "rig": "lefft"}, status=422)
@@ -180,7 +180,7 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
             sent.update(body)
             return {"id": "x", "rig": "desk", "needs_arming": False}
 
-    monkeypatch.setattr("orchestrator.commands.daemon.talking", lambda at: contextlib.nullcontext(Told()))
+    monkeypatch.setattr("orchestrator.cli.queue_actions.talking", lambda at: contextlib.nullcontext(Told()))
     arguments = ["submit", str(campaign_in(tmp_path)), "--parameters", str(theta), "--receiver", str(bowl)]
     refused = CliRunner().invoke(app, arguments)
     assert refused.exit_code == 2
@@ -217,7 +217,7 @@ def with_risk(folder: Path, **changes: str) -> CampaignPlan:
 
 
 def test_a_campaign_without_the_draws_of_theta_that_it_bears_is_refused_when_it_is_submitted(tmp_path: Path) -> None:
-    settings = Settings(tmp_path / "state", in_process=True)
+    settings = DaemonSettings(tmp_path / "state", in_process=True)
     text, files = pack(with_risk(tmp_path))
     for verb, said in (("run", "this campaign has no calibration"), ("plan", "needs --parameters")):
         with pytest.raises(SubmissionError, match=said):
@@ -242,14 +242,14 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
         yield Client()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orchestrator.commands.daemon.talking", talking)
+        patch.setattr("orchestrator.cli.queue_actions.talking", talking)
         source = with_risk(tmp_path).source
         at: Any = None
         submit(
             source, wanted="plan", rig="", priority=0, laboratory=None, seed=None, parameters=theta, at=at, as_json=True
         )
     (body,) = sent
-    settings = Settings(tmp_path / "state", in_process=True)
+    settings = DaemonSettings(tmp_path / "state", in_process=True)
     submission = Submission(text=body["text"], files=body["files"], verb="plan")
     item = prepare(settings, submission, "00000a", "somebody")
     planned = job_of(settings, item, settings.rig(item.rig)).plan
@@ -262,7 +262,7 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
 def test_warnings_of_the_check_and_a_missing_recording_are_reported_as_the_run_begins(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("orchestrator.monitor.live.installed", lambda module: False)
+    monkeypatch.setattr("orchestrator.live_view.live_server.installed", lambda module: False)
     far = CAMPAIGN.replace("[60 mm, 100 mm]", "[60 mm, 500 mm]").replace("rrd: false", "rrd: true")
 
     async def work() -> None:

@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from actors.warm import WarmSimulators
-from orchestrator.daemon import renewal, supervisor
-from orchestrator.daemon.renewal import MOST, RENEWED, RayWatch, Renewal
+from actors.simulators.warm_pool import WarmSimulators
+from orchestrator.daemon import restart as renewal
+from orchestrator.daemon import supervisor
+from orchestrator.daemon.restart import MOST, RENEWED, DaemonRestart, RayWatch
 from tests.orchestrator.daemon.served import held, run, serving
 
 
@@ -70,7 +71,7 @@ def watched(monkeypatch: pytest.MonkeyPatch, daemon: Daemon, *, rests: bool = Fa
     monkeypatch.setattr(renewal, "POURING", 0.8)
     begun, replaced = time.monotonic(), []
 
-    class Kept(Renewal):
+    class Kept(DaemonRestart):
         def begin_anew(self) -> Any:
             replaced.append(time.monotonic() - begun)
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.daemon import lane
-from orchestrator.daemon.retention import prune_recordings
-from orchestrator.daemon.settings import Settings
+from orchestrator.daemon import rig_worker as lane
+from orchestrator.daemon.daemon_settings import DaemonSettings
+from orchestrator.daemon.run_readout import prune_recordings
 from tests.orchestrator.daemon.served import run, serving
 
 
@@ -38,7 +38,7 @@ def test_without_room_nothing_is_begun_and_it_is_said_until_there_is_room(
     run(work())
 
 
-def recorded(settings: Settings, name: str, age: float) -> Path:
+def recorded(settings: DaemonSettings, name: str, age: float) -> Path:
     path = settings.runs / name / "campaign.rrd"
     path.parent.mkdir(parents=True)
     for one in (path, path.with_name("journal.sqlite")):
@@ -48,7 +48,7 @@ def recorded(settings: Settings, name: str, age: float) -> Path:
 
 
 def test_recordings_are_kept_as_long_as_they_are_to_be_and_journals_always(tmp_path: Path) -> None:
-    settings = Settings(tmp_path, keep_recordings=2, recording_age=100.0)
+    settings = DaemonSettings(tmp_path, keep_recordings=2, recording_age=100.0)
     new, newer, many, old = (recorded(settings, n, a) for n, a in (("a", 10), ("b", 5), ("c", 50), ("d", 200)))
     assert prune_recordings(settings, busy={"d"}, now=1e9) == [many]
     assert prune_recordings(settings, now=1e9) == [old]
@@ -58,7 +58,7 @@ def test_recordings_are_kept_as_long_as_they_are_to_be_and_journals_always(tmp_p
 
 
 def test_all_recordings_are_kept_unless_somebody_says_otherwise(tmp_path: Path) -> None:
-    settings = Settings(tmp_path)
+    settings = DaemonSettings(tmp_path)
     recorded(settings, "a", 1e8)
     assert prune_recordings(settings, now=1e9) == []
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.daemon.settings import Settings, load_settings
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.daemon.daemon_settings import DaemonSettings, load_settings
 
 LABORATORY = "{name: numbers, bench: {liquid: {particles: 400}}}\n"
 
 
-def load(folder: Path, text: str) -> Settings:
+def load(folder: Path, text: str) -> DaemonSettings:
     (folder / "left.yaml").write_text(LABORATORY)
     (folder / "desk.yaml").write_text("{name: thinking}\n")
     path = folder / "decant.yaml"

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from orchestrator.daemon.auth import Role
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.daemon.access_control import Role
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from tests.orchestrator.daemon.served import HeldLaboratory, held, run, serving
 
 
@@ -142,8 +142,8 @@ def test_an_emergency_stop_is_latched_until_somebody_clears_it(tmp_path: Path) -
 
 
 def test_one_emergency_stop_is_for_all_rigs(tmp_path: Path) -> None:
-    from orchestrator.config.load import load_laboratory
-    from orchestrator.daemon.settings import Rig
+    from orchestrator.config.file_loading import load_laboratory
+    from orchestrator.daemon.daemon_settings import Rig
 
     laboratory = tmp_path / "numbers.yaml"
     laboratory.write_text("{name: numbers, bench: {liquid: {particles: 400}, time_scale: 0}}\n")

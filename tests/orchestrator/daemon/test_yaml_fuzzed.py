@@ -12,10 +12,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from orchestrator.config.load import load_campaign
-from orchestrator.daemon.packing import Files, pack
-from orchestrator.daemon.settings import Settings
-from orchestrator.daemon.submitting import Submission, SubmissionError, prepare
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.daemon.daemon_settings import DaemonSettings
+from orchestrator.daemon.submission_bundle import Files, pack
+from orchestrator.daemon.submissions import Submission, SubmissionError, prepare
 from tests.depth import examples
 from tests.end_to_end.small import write_campaign
 
@@ -53,7 +53,7 @@ class Desk:
     """A daemon's door, and what may be submitted at it."""
 
     def __init__(self, folder: Path) -> None:
-        self.settings = Settings(folder / "state", in_process=True)
+        self.settings = DaemonSettings(folder / "state", in_process=True)
         self.settings.snapshots.mkdir(parents=True)
         self.text, self.files = pack(load_campaign(write_campaign(folder)))
         self.before = self.everything(folder)

@@ -10,8 +10,8 @@ import pytest
 from matplotlib.text import Text
 from typer.testing import CliRunner
 
-from orchestrator.cli import app
-from orchestrator.report import style
+from orchestrator.cli.app import app
+from orchestrator.results import figure_style as style
 from tests.orchestrator.reported import strays
 
 QUICKSTART = Path(__file__).parents[3] / "configs" / "campaigns" / "quickstart.yaml"

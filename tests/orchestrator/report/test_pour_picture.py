@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orchestrator.report.scene import _moments, simulation_png
-from orchestrator.report.section import place, section
+from orchestrator.results.pour_figures import _moments, place, section, simulation_png
 from sim_engine.motion import plan_motion
-from sim_engine.simulated import SimulatedPour
-from sim_engine.vessel.build import build_vessel
+from sim_engine.outcome import SimulatedPour
+from sim_engine.vessel.vessel import build_vessel
 from tests.orchestrator import watched
 from tests.orchestrator.reported import is_picture
 

@@ -10,16 +10,22 @@ from typing import Any, NoReturn
 import pytest
 from typer.testing import CliRunner
 
-from orchestrator.cli import app
-from orchestrator.config.load import load_campaign
-from orchestrator.plan import CampaignPlan
-from orchestrator.report.names import receiver_names
-from orchestrator.report.regimes import best_action_warnings, campaign_warnings, lines, numbers_line, regimes_of
-from orchestrator.report.summarise import summarise
-from orchestrator.report.table import summary_table
+from orchestrator.cli.app import app
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.results.console_view import summary_table
+from orchestrator.results.stage_views import receiver_names
+from orchestrator.results.summarise import summarise
+from orchestrator.results.validity_warnings import (
+    best_action_warnings,
+    campaign_warnings,
+    lines,
+    numbers_line,
+    regimes_of,
+)
+from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.action import DEG
-from sim_engine.liquid import SimulationParameters
-from sim_engine.space import Axis, Space
+from sim_engine.liquids import SimulationParameters
+from sim_engine.search_space import Axis, Space
 from tests.end_to_end import small
 from tests.orchestrator import watched
 from tests.orchestrator.reported import changed, shown
@@ -148,8 +154,8 @@ def test_a_campaign_begins_with_what_is_not_simulated_in_it_each_kind_once(verb:
 
 
 def test_a_resumed_run_does_not_say_it_again(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from orchestrator.commands.common import run_in_front_of_people
-    from orchestrator.commands.speaking import RefusalError
+    from orchestrator.cli.console import RefusalError
+    from orchestrator.cli.foreground_run import run_in_front_of_people
 
     plan = load_campaign(folder / "small.yaml")
     for resume, times in ((False, 1), (True, 0)):
@@ -163,7 +169,7 @@ def test_calibrate_is_silent_about_a_deployment_that_it_does_not_make(folder: Pa
 
 
 def test_a_vessel_that_can_t_be_judged_stops_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from orchestrator.report import regimes
+    from orchestrator.results import validity_warnings as regimes
 
     def broken(*args: object) -> NoReturn:
         raise ValueError("the pourer has no lip")

@@ -12,28 +12,28 @@ import pytest
 from matplotlib.collections import PathCollection
 from matplotlib.text import Text
 
-from orchestrator.report import figures as figures_module
-from orchestrator.report import maps as maps_module
-from orchestrator.report.campaign import draw_figures
-from orchestrator.report.figures import DiscrepancyGroup, PourSeries, draw_discrepancy, draw_spillage
-from orchestrator.report.maps import SurrogatePicture, draw_surrogate, draw_trials
-from orchestrator.report.posterior import draw_posterior
-from orchestrator.report.results import (
+from orchestrator.results import spillage_figures as figures_module
+from orchestrator.results import surrogate_figures as maps_module
+from orchestrator.results.campaign_figures import draw_figures
+from orchestrator.results.console_view import summary_table
+from orchestrator.results.figure_style import display_value, display_values, log_ticks
+from orchestrator.results.loss_units import loss_unit
+from orchestrator.results.model_check_figures import draw_trust, trust_title
+from orchestrator.results.posterior_figures import draw_posterior
+from orchestrator.results.spillage_figures import DiscrepancyGroup, PourSeries, draw_discrepancy, draw_spillage
+from orchestrator.results.stage_views import (
     calibration_picture,
     deployment_picture,
     discrepancy_groups,
     evaluation_of,
     pour_series,
 )
-from orchestrator.report.style import display_value, display_values, log_ticks
-from orchestrator.report.summarise import summarise
-from orchestrator.report.table import summary_table
-from orchestrator.report.trust import draw_trust, trust_title
-from orchestrator.report.units import loss_unit
-from orchestrator.strategies.deployment.trust import Compared, Comparison
+from orchestrator.results.summarise import summarise
+from orchestrator.results.surrogate_figures import SurrogatePicture, draw_surrogate, draw_trials
+from orchestrator.strategies.deployment.model_check import Compared, PourComparison
 from sim_engine.action import DEG, Action
-from sim_engine.losses import Loss
-from sim_engine.space import Axis, Space
+from sim_engine.outcome import Loss
+from sim_engine.search_space import Axis, Space
 from tests.orchestrator import watched
 from tests.orchestrator.reported import changed, is_picture, shown, strays
 
@@ -304,7 +304,7 @@ def test_simulations_stand_beside_the_pours_of_a_loss_map(
 
 def compared(rows: list[tuple[float, float, float]], limit: float = 2.5) -> Compared:
     """A trust result of (simulated, deviation, weighed)."""
-    pours = tuple(Comparison(number, *row) for number, row in enumerate(rows, start=1))
+    pours = tuple(PourComparison(number, *row) for number, row in enumerate(rows, start=1))
     mean = sum(max(pour.z, 0.0) for pour in pours) / len(pours)
     return Compared(
         z_scores=tuple(pour.z for pour in pours),

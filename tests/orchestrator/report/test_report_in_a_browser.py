@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from orchestrator.campaign import run_campaign
-from orchestrator.config.load import load_campaign
-from orchestrator.publish import publish
-from orchestrator.runs import create_run
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.results.publishing import publish
+from orchestrator.runs.run_engine import run_campaign
+from orchestrator.runs.run_folder import create_run
 from tests.end_to_end.small import write_campaign
 from tests.orchestrator.daemon.browsing import browser
 from tests.orchestrator.report.test_run_report import laboratory

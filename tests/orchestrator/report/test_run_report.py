@@ -14,22 +14,21 @@ from typing import Any, NamedTuple
 import pytest
 from typer.testing import CliRunner
 
-from actors.optimizer.actor import Proposer
-from actors.protocols import LaboratoryError
-from orchestrator.campaign import run_campaign
-from orchestrator.cli import app
-from orchestrator.commands.interrupted import report_of_what_stands
-from orchestrator.config.load import load_campaign
-from orchestrator.errors import RunError
-from orchestrator.journal import JOURNAL_NAME, JournalReader
-from orchestrator.journal_check import JournalCheck
-from orchestrator.plan import CampaignPlan
-from orchestrator.publish import Published, publish, summary_of
-from orchestrator.report import style
-from orchestrator.report.record import read_record
-from orchestrator.report.run_page import run_page
-from orchestrator.run_result import CampaignResult
-from orchestrator.runs import create_run
+from actors.interfaces import LaboratoryError
+from actors.optimizer.optimizer_actor import Proposer
+from orchestrator.cli.app import app
+from orchestrator.cli.foreground_run import report_of_what_stands
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.journal_check import JournalCheck
+from orchestrator.journal.run_record import CampaignResult, read_record
+from orchestrator.results import figure_style as style
+from orchestrator.results.html_report import run_page
+from orchestrator.results.publishing import Published, publish, summary_of
+from orchestrator.run_errors import RunError
+from orchestrator.runs.run_engine import run_campaign
+from orchestrator.runs.run_folder import create_run
+from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.end_to_end.small import CAMPAIGN, write_campaign
 from tests.orchestrator.toy import ToyBench, ToyLaboratory
 

@@ -9,23 +9,16 @@ from typing import Any
 import jsonschema
 import pytest
 
-from orchestrator.report.style import display_value, display_values
-from orchestrator.report.summarise import summarise
-from orchestrator.report.summary import (
-    NotSimulated,
-    PoolUse,
-    RunSummary,
-    Totals,
-    summary_schema,
-    write_summary,
-)
-from orchestrator.report.table import print_summary, summary_table
-from orchestrator.report.words import advice
-from orchestrator.results import decode_results
-from orchestrator.strategies.deployment.adaptive import Belief, Believed
-from orchestrator.strategies.deployment.pours import Foretold
-from orchestrator.strategies.repeats import Foreseen
-from sim_engine.spread import Spread
+from orchestrator.journal.stage_results import decode_results
+from orchestrator.results.console_view import print_summary, summary_table
+from orchestrator.results.figure_style import display_value, display_values
+from orchestrator.results.run_summary import NotSimulated, PoolUse, RunSummary, Totals, summary_schema, write_summary
+from orchestrator.results.summarise import summarise
+from orchestrator.results.wording import advice
+from orchestrator.strategies.deployment.model_monitoring import Belief, Believed
+from orchestrator.strategies.deployment.real_pours import Foretold
+from orchestrator.strategies.repeated_simulation import Foreseen
+from sim_engine.prediction_band import SampleStatistics
 from tests.orchestrator import watched
 from tests.orchestrator.reported import changed, shown
 
@@ -141,7 +134,7 @@ def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(re
         simulations_lost=0,
         thetas=0,
         touching=0,
-        over_seeds={"received": Spread(0.9, 0.01, 2), "spilled": Spread(0.1, 0.01, 2)},
+        over_seeds={"received": SampleStatistics(0.9, 0.01, 2), "spilled": SampleStatistics(0.1, 0.01, 2)},
     )
     summary = summarise(plan, {"narrow cup": deployed, "prediction:narrow cup": foreseen})
     receiver = summary.receivers["narrow cup"]

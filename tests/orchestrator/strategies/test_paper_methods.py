@@ -9,29 +9,28 @@ from typing import Any
 import pytest
 import yaml
 
-from actors.optimizer.core.problem import SuggestProblem
-from orchestrator.commands.campaigns import RunOptions, run
-from orchestrator.commands.speaking import RefusalError
-from orchestrator.config.load import load_campaign
-from orchestrator.config.study.sections import load_study
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.fingerprint import fingerprint
-from orchestrator.plan import CampaignPlan, DeploymentPlan
+from actors.optimizer.questions import SuggestProblem
+from orchestrator.cli.campaign_commands import RunOptions, run
+from orchestrator.cli.console import RefusalError
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.requests import Suggest
-from orchestrator.stages import calibration_stages
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.runs.stages import calibration_stages
+from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.d3_settings import D3Settings
+from orchestrator.strategies.deployment.d3 import D3Settings, Hybrid
 from orchestrator.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, StrategyHarness
 from orchestrator.study.cell_process import run_cell
 from orchestrator.study.cells import cells_of
-from orchestrator.study.folder import finished_results, read_result
-from orchestrator.study.plan import StudyPlan
-from orchestrator.study.report.calibrations import draw_calibrations
-from orchestrator.study.report.deployments import draw_deployments
-from orchestrator.study.report.drawing import colour
-from orchestrator.study.report.gather import gather
-from orchestrator.study.report.tables import tables
+from orchestrator.study.report.calibration_figures import draw_calibrations
+from orchestrator.study.report.cell_results import gather
+from orchestrator.study.report.deployment_figures import draw_deployments
+from orchestrator.study.report.figure_panels import colour
+from orchestrator.study.report.study_tables import tables
+from orchestrator.study.study_file import load_study
+from orchestrator.study.study_folder import finished_results, read_result
+from orchestrator.study.study_plan import StudyPlan
 from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, report, write
 from tests.orchestrator.study_files import read, written
 from tests.orchestrator.toy_study import ToyLaboratory

@@ -15,30 +15,29 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from actors.optimizer.core.problem import Suggestion, SuggestProblem
-from actors.optimizer.core.propose import propose
-from orchestrator.errors import LearningError
-from orchestrator.events import Event, RequestFinished
-from orchestrator.plan import CampaignPlan
+from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.suggest import propose
+from orchestrator.journal.stage_results import encode_result
 from orchestrator.requests import Outcome, Pour, Poured, Request, Suggest
-from orchestrator.results import encode_result
-from orchestrator.strategies.calibration.c1 import UniformGrid
-from orchestrator.strategies.calibration.c2 import StratifiedSampling
-from orchestrator.strategies.calibration.c3 import BayesianCalibration
-from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.design import DesignedPours
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
-from orchestrator.strategies.deployment.d1_risk import RobustPlanning
+from orchestrator.run_errors import LearningError
+from orchestrator.runs.events import Event, RequestFinished
+from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration.pointwise_calibration import (
+    BayesianCalibration,
+    StratifiedSampling,
+    UniformGrid,
+)
+from orchestrator.strategies.calibration.pour_design import DesignedPours
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.deployment.d1 import OneShotPlanning, RobustPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.d3_free import FreeHybrid
+from orchestrator.strategies.deployment.d3 import FreeHybrid, Hybrid
 from orchestrator.strategies.deployment.objectives import Objectives, Retained, Spillage
-from orchestrator.strategies.deployment.prices import PricesSettings
+from orchestrator.strategies.deployment.time_costs import PricesSettings
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, SCENE, THETA, StrategyHarness, failures, replay
-from sim_engine.losses import Loss
-from sim_engine.outcome import PourMeasurement
-from sim_engine.space import Axis, Space
-from sim_engine.task import PoseError
+from sim_engine.outcome import Loss, PourMeasurement
+from sim_engine.scene import PoseError
+from sim_engine.search_space import Axis, Space
 from tests.depth import examples
 from tests.orchestrator import plans
 from tests.orchestrator.plans import calibration_plan, deployment_plan

@@ -16,28 +16,29 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from actors.cluster.versions import sources
-from actors.simulation.in_process import InProcessSimulatorPool
-from orchestrator.cli import app
-from orchestrator.config.load import load_campaign
-from orchestrator.config.study.sections import load_study
+from actors.runtime.cluster_nodes import sources
+from actors.simulators.local_worker import InProcessSimulatorPool
+from orchestrator.cli.app import app
+from orchestrator.config.file_loading import load_campaign
 from orchestrator.requests import Failed, Poured, Slots
-from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.study.cell_process import in_this_process, run_cell
 from orchestrator.study.cells import cells_of
-from orchestrator.study.code import code_now, warning
-from orchestrator.study.folder import (
+from orchestrator.study.study_file import load_study
+from orchestrator.study.study_folder import (
     RESULT,
     CellResult,
     StudyError,
+    code_now,
     finished_results,
     is_finished,
     opened,
     run_folder,
+    warning,
 )
-from orchestrator.study.plan import StudyPlan, study_fingerprint
-from orchestrator.study.strategies import FinalPour
-from sim_engine.liquid import SimulationParameters
+from orchestrator.study.study_plan import StudyPlan, study_fingerprint
+from orchestrator.study.study_strategies import FinalPour
+from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement
 from tests.actors.conftest import make_fake
 from tests.orchestrator import toy_study

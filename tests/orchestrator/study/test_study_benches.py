@@ -8,20 +8,20 @@ from typing import Any
 
 import pytest
 
-from orchestrator.config.study.sections import load_study
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.results import learnt_by
-from orchestrator.stages import CALIBRATION, EVALUATION, POURS
-from orchestrator.strategies.calibration.base import Calibrated
-from orchestrator.strategies.calibration.design import DesignPoured
-from orchestrator.strategies.calibration.evaluation import Scores
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.journal.stage_results import result_of
+from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
+from orchestrator.strategies.calibration.calibration_base import Calibrated
+from orchestrator.strategies.calibration.calibration_scores import Scores
+from orchestrator.strategies.calibration.pour_design import DesignPoured
 from orchestrator.study.cells import cells_of
-from orchestrator.study.folder import finished_results
-from orchestrator.study.plan import StudyPlan
-from orchestrator.study.report.gather import RANDOM, gather
-from orchestrator.study.report.page import write_report
-from sim_engine.pour import InvalidSceneError, PourSimulator
-from sim_engine.task import PourTask
+from orchestrator.study.report.cell_results import RANDOM, gather
+from orchestrator.study.report.study_page import write_report
+from orchestrator.study.study_file import load_study
+from orchestrator.study.study_folder import finished_results
+from orchestrator.study.study_plan import StudyPlan
+from sim_engine.scene import PourTask
+from sim_engine.simulator import InvalidSceneError, PourSimulator
 from tests.orchestrator.study_files import STUDIES, read, written
 from tests.orchestrator.toy_study import run_toy_study
 
@@ -79,7 +79,7 @@ def test_no_bench_lets_the_cups_touch_where_calibration_and_deployment_pour() ->
 def test_calibrations_are_scored_in_vessels_that_they_did_not_learn_in(played: tuple[StudyPlan, Any]) -> None:
     _, results = played
     for arm in ("C4", "C4-active"):
-        scores = learnt_by(results[f"calibration.bench1.{arm}.01"].results, EVALUATION, Scores)
+        scores = result_of(results[f"calibration.bench1.{arm}.01"].results, EVALUATION, Scores)
         tested = {pair.scene for pair in scores.pairs if pair.split == "test"}
         assert tested == {"calibration-narrow", "calibration-cone"}, arm
         assert not tested & {pair.scene for pair in scores.pairs if pair.split == "train"}
@@ -90,18 +90,18 @@ def test_the_active_arm_learns_on_its_own_few_pours_and_is_scored_on_the_same_on
     played: tuple[StudyPlan, Any],
 ) -> None:
     _, results = played
-    own = learnt_by(results["pours.bench1.C4-active.01"].results, POURS, DesignPoured)
+    own = result_of(results["pours.bench1.C4-active.01"].results, POURS, DesignPoured)
     assert len(own.measured) == 4
     assert own.simulated
     even, active = (
-        learnt_by(results[f"calibration.bench1.{arm}.01"].results, EVALUATION, Scores) for arm in ("C4", "C4-active")
+        result_of(results[f"calibration.bench1.{arm}.01"].results, EVALUATION, Scores) for arm in ("C4", "C4-active")
     )
     weighed = [
         [pair.measured for pair in one.pairs if pair.split == "test" and pair.theta == "theta"]
         for one in (even, active)
     ]
     assert weighed[0] == weighed[1]
-    calibrated = learnt_by(results["calibration.bench1.C4-active.01"].results, CALIBRATION, Calibrated)
+    calibrated = result_of(results["calibration.bench1.C4-active.01"].results, CALIBRATION, Calibrated)
     assert calibrated.training_pours == 4
 
 

@@ -11,16 +11,15 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from orchestrator.config.campaign.check import touch
-from orchestrator.config.study.sections import load_study
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.strategies.deployment.d1 import D1Settings
-from orchestrator.strategies.deployment.d1_risk import RobustPlanning
+from orchestrator.config.campaign_checks import touch
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.strategies.deployment.d1 import D1Settings, RobustPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.study.campaigns import campaign_of
 from orchestrator.study.cells import cells_of
-from sim_engine.vessel.build import build_vessel
+from orchestrator.study.study_campaigns import campaign_of
+from orchestrator.study.study_file import load_study
+from sim_engine.vessel.vessel import build_vessel
 from tests.orchestrator import plans
 from tests.orchestrator.study_files import ROOT, STUDIES, read, small, without, written
 

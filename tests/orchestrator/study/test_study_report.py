@@ -13,28 +13,25 @@ import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
 
-from orchestrator.config.study.sections import load_study
-from orchestrator.report.style import new_figure
-from orchestrator.strategies.calibration.base import Calibrated, CalibratedTheta, TriedOnPours
-from orchestrator.strategies.calibration.evaluation import ScoredPair, Scores
-from orchestrator.strategies.deployment.learnt import Deployed
-from orchestrator.strategies.deployment.pours import Foretold, PourRow
-from orchestrator.strategies.display import DisplayedMap
-from orchestrator.study.cells import Cell, cells_of
-from orchestrator.study.code import code_now, told
-from orchestrator.study.folder import CellResult, run_folder, write_result
-from orchestrator.study.plan import StudyPlan
-from orchestrator.study.report.calibrations import draw_calibrations
-from orchestrator.study.report.deployments import draw_deployments, means
-from orchestrator.study.report.drawing import Drawn, look
-from orchestrator.study.report.effects import effect
-from orchestrator.study.report.finals import draw_finals
-from orchestrator.study.report.gather import at_pour, gather, running_least
-from orchestrator.study.report.intervals import Estimate, estimate
-from orchestrator.study.report.page import write_report
-from orchestrator.study.report.tables import pours_needed, tables
-from orchestrator.study.strategies import FinalPoured
-from sim_engine.liquid import SimulationParameters
+from orchestrator.results.figure_style import new_figure
+from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta, TriedOnPours
+from orchestrator.strategies.calibration.calibration_scores import ScoredPair, Scores
+from orchestrator.strategies.deployment.deployment_result import Deployed
+from orchestrator.strategies.deployment.real_pours import Foretold, PourRow
+from orchestrator.strategies.stage_result import DisplayedMap
+from orchestrator.study.cells import StudyCell, cells_of
+from orchestrator.study.report.calibration_figures import draw_calibrations
+from orchestrator.study.report.cell_results import at_pour, gather, running_least
+from orchestrator.study.report.deployment_figures import draw_deployments, draw_finals, means
+from orchestrator.study.report.figure_panels import Drawn, look
+from orchestrator.study.report.statistics import Estimate, effect, estimate
+from orchestrator.study.report.study_page import write_report
+from orchestrator.study.report.study_tables import pours_needed, tables
+from orchestrator.study.study_file import load_study
+from orchestrator.study.study_folder import CellResult, code_now, run_folder, told, write_result
+from orchestrator.study.study_plan import StudyPlan
+from orchestrator.study.study_strategies import FinalPoured
+from sim_engine.liquids import SimulationParameters
 from tests.orchestrator.reported import strays
 from tests.orchestrator.study_files import read, written
 
@@ -50,7 +47,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> StudyPlan:
 DISCREPANCY = {"": (0.10, 0.10), "C1": (0.03, 0.05), "C2": (0.05, 0.05), "C3": (0.02, 0.04), "C4": (0.01, 0.03)}
 
 
-def made_up(cell: Cell) -> CellResult:
+def made_up(cell: StudyCell) -> CellResult:
     """A cell's result as the worker would have written it."""
     results: dict[str, Any] = {}
     if cell.kind in ("calibration", "uncalibrated"):

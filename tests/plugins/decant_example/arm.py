@@ -18,17 +18,24 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.errors import ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
-from actors.arm.geometry import Pose
-from actors.arm.motion_path import ExecutedMotion, MotionPath
-from actors.arm.protocol import ArmFacts, ArmState, Whereabouts
-from actors.arm.spec import ArmSpec
-from actors.bench.planning import plan_pour
-from actors.protocols import InvalidActionError
-from orchestrator.config.laboratory.arms import ArmSettings
-from orchestrator.config.yaml.quantities import Quantity
+from actors.arm.arm_interface import (
+    ArmFacts,
+    ArmLostError,
+    ArmNotReleasedError,
+    ArmPose,
+    ArmRefusedError,
+    ArmState,
+    ArmStoppedError,
+    Pose,
+)
+from actors.arm.arm_settings import ArmSpec
+from actors.arm.planned_pour import ExecutedMotion, MotionPath
+from actors.bench.pour_feasibility import plan_pour
+from actors.interfaces import InvalidActionError
+from orchestrator.config.arm_file import ArmSettings
 from sim_engine.action import Action
-from sim_engine.task import Scene
+from sim_engine.scene import Scene
+from sim_engine.settings.quantity import Quantity
 
 HOME_HEIGHT = 0.05
 """Where the slide waits, above where it pours [m]."""
@@ -130,7 +137,7 @@ class Drive:
 
 
 class Stand:
-    """The driver: see `actors.arm.protocol.Arm`.
+    """The driver: see `actors.arm.arm_interface.Arm`.
 
     Args:
         spec: its settings.
@@ -165,8 +172,8 @@ class Stand:
     def state(self) -> ArmState:
         return self._state
 
-    def where(self) -> Whereabouts:
-        return Whereabouts(Pose(z=self._read()[2]))
+    def where(self) -> ArmPose:
+        return ArmPose(Pose(z=self._read()[2]))
 
     def move_to_start(self, path: MotionPath) -> None:
         self._consent()

@@ -14,12 +14,12 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from actors.balance.protocol import Weight
-from actors.balance.spec import BalanceDevice
-from actors.balance.virtual_balance import Load
-from actors.protocols import LaboratoryError
-from orchestrator.config.laboratory.balance import BalanceDeviceSection
-from orchestrator.config.yaml.quantities import Quantity
+from actors.balance.balance_interface import Weight
+from actors.balance.balance_settings import BalanceDevice
+from actors.balance.simulated_balance import Load
+from actors.interfaces import LaboratoryError
+from orchestrator.config.balance_file import BalanceDeviceSection
+from sim_engine.settings.quantity import Quantity
 
 PATIENCE = 20.0
 """How long it may take to come to rest [s of bench time]."""
@@ -65,7 +65,7 @@ class SpringSection(BalanceDeviceSection):
 
 
 class SpringBalance:
-    """The driver; see `actors.balance.protocol.BalanceDriver`."""
+    """The driver; see `actors.balance.balance_interface.BalanceDriver`."""
 
     def __init__(self, spec: SpringSpec, name: str = "spring") -> None:
         self._spec, self._name = spec, name

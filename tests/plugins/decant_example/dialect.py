@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 
 from actors.balance.dialects.dialect import Dialect
-from actors.balance.reading import LineError, Reading, Reply, Status
+from actors.balance.readings import LineError, Reading, ReadingStatus, Reply
 
 _LINE = re.compile(rb"(?P<value>-?[0-9]+\.[0-9]+) (?P<unit>k?g)(?P<moving>!?)")
 
@@ -26,14 +26,14 @@ class Plain(Dialect):
         match = _LINE.fullmatch(line)
         if match is None:
             raise LineError("not a weight")
-        status = Status.UNSTABLE if match["moving"] else Status.STABLE
+        status = ReadingStatus.UNSTABLE if match["moving"] else ReadingStatus.STABLE
         return Reading(status, Decimal(match["value"].decode()), match["unit"].decode())
 
     def encode(self, reading: Reading) -> bytes:
         """See `Dialect.encode`."""
         if reading.value is None:
             raise ValueError("it has no words for what is not a weight")
-        moving = "!" if reading.status is Status.UNSTABLE else ""
+        moving = "!" if reading.status is ReadingStatus.UNSTABLE else ""
         return f"{reading.value} {reading.unit}{moving}\r\n".encode()
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from orchestrator.config.yaml.quantities import Quantity
 from orchestrator.strategies.deployment.objectives import Objective
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.outcome import Fractions
-from sim_engine.space import Space
-from sim_engine.task import Scene
+from sim_engine.scene import Scene
+from sim_engine.search_space import Space
+from sim_engine.settings.quantity import Quantity
 
 
 class Gentle(Objective):

@@ -6,13 +6,12 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from orchestrator.config.yaml.sections import Switch
-from orchestrator.plan import DeploymentPlan
-from orchestrator.strategies.deployment.base import MAP_RESOLUTION, Deployment
-from orchestrator.strategies.protocol import Strategy
-from orchestrator.strategies.settings import DeploymentSettings
-from sim_engine.liquid import SimulationParameters
-from sim_engine.task import Scene
+from orchestrator.strategies.campaign_plan import DeploymentPlan, DeploymentSettings
+from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment
+from orchestrator.strategies.strategy import Strategy
+from sim_engine.liquids import SimulationParameters
+from sim_engine.scene import Scene
+from sim_engine.settings.model import Switch
 
 
 class HypercubeSettings(DeploymentSettings):

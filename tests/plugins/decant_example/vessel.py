@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from orchestrator.config.yaml.quantities import Quantity
-from orchestrator.config.yaml.sections import Section
-from sim_engine.vessel.errors import VesselError
-from sim_engine.vessel.spec import ProfileShape, Shape
+from sim_engine.settings.model import Section
+from sim_engine.settings.quantity import Quantity
+from sim_engine.vessel.shapes import ProfileShape, Shape, VesselError
 
 Length = Annotated[float, Quantity("m", "40 mm", 5e-3, 0.5)]
 

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.optimizer.core.problem import Data, DesignQuestion, PosteriorQuestion, SuggestProblem
-from actors.optimizer.core.propose import propose
-from orchestrator.config.load import load_campaign
-from orchestrator.config.yaml.errors import ConfigError
+from actors.optimizer.questions import Data, DesignQuestion, PosteriorQuestion, SuggestProblem
+from actors.optimizer.suggest import propose
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.requests import Failed, Pour, Simulate, Slots
-from orchestrator.stages import POURS, known_simulations, measured_pours, stages_of
-from orchestrator.strategies.calibration.active import ActivePours, joint_contexts
-from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
+from orchestrator.runs.stages import POURS, known_simulations, measured_pours, stages_of
+from orchestrator.strategies.calibration.active_design import ActivePours, joint_contexts
+from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
 from orchestrator.strategy_harness import ACTIONS, SCENE, StrategyHarness, replay
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import SimulationParameters
-from sim_engine.space import Axis, Space
+from sim_engine.liquids import SimulationParameters
+from sim_engine.search_space import Axis, Space
 from tests.orchestrator.plans import calibration_plan, deployment_plan
 from tests.orchestrator.strategies.calibration.test_nuisances import SEARCHED, TRUTH, spilled, written
 

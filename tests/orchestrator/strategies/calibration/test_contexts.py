@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrator.config.load import load_campaign
-from orchestrator.config.yaml.errors import ConfigError
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.requests import Simulate
-from orchestrator.stages import POURS, measured_pours, scenes_of
-from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.contexts import Contexts
-from orchestrator.strategies.calibration.design import DesignedPours
+from orchestrator.runs.stages import POURS, measured_pours, scenes_of
+from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration.pour_contexts import Contexts
+from orchestrator.strategies.calibration.pour_design import DesignedPours
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, SCENE, StrategyHarness
 from sim_engine.action import Action
-from sim_engine.liquid import SimulationParameters
-from sim_engine.space import Axis, Space
-from sim_engine.vessel.spec import cylinder
+from sim_engine.liquids import SimulationParameters
+from sim_engine.search_space import Axis, Space
+from sim_engine.vessel.shapes import cylinder
 from tests.orchestrator.plans import calibration_plan
 from tests.orchestrator.strategies.calibration.test_nuisances import written
 

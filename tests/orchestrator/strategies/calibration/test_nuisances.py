@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrator.config.load import load_campaign, load_parameters, load_posterior
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.plan import MeasuredPour, NormalPrior
-from orchestrator.publish import theta_file
-from orchestrator.strategies.calibration.base import described
-from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.draws import drawn_benches
+from orchestrator.config.file_loading import load_campaign, load_parameters, load_posterior
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.results.publishing import theta_file
+from orchestrator.strategies.calibration.bench_draws import drawn_benches
+from orchestrator.strategies.calibration.calibration_base import described
+from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.strategies.campaign_plan import MeasuredPour, NormalPrior
 from orchestrator.strategy_harness import SCENE, StrategyHarness
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import SimulationParameters
-from sim_engine.space import Axis, Space
+from sim_engine.liquids import SimulationParameters
+from sim_engine.search_space import Axis, Space
 from tests.orchestrator.plans import calibration_plan
 
 ACTIONS = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0.08, 0.15)))

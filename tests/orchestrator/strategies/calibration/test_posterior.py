@@ -9,15 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.optimizer.core.problem import Posterior
-from orchestrator.config.load import load_discrepancy, load_parameters, load_posterior
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.plan import MeasuredPour
-from orchestrator.publish import theta_file
-from orchestrator.report.posterior import draw_posterior, posterior_lines
-from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.evaluation import ScoredPair, Scores
-from orchestrator.strategies.calibration.posterior import (
+from actors.optimizer.questions import Posterior
+from orchestrator.config.file_loading import load_discrepancy, load_parameters, load_posterior
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.results.posterior_figures import draw_posterior, posterior_lines
+from orchestrator.results.publishing import theta_file
+from orchestrator.strategies.calibration.calibration_scores import ScoredPair, Scores
+from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration.posterior_summary import (
     PosteriorFound,
     PosteriorSummary,
     RemainingDiscrepancy,
@@ -25,13 +24,14 @@ from orchestrator.strategies.calibration.posterior import (
     left_open,
     region,
 )
-from orchestrator.strategies.deployment.costs import Costing
-from orchestrator.strategies.repeats import RepeatedSimulation
+from orchestrator.strategies.campaign_plan import MeasuredPour
+from orchestrator.strategies.deployment.costing import Costing
+from orchestrator.strategies.repeated_simulation import RepeatedSimulation
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness
 from sim_engine.action import DEG
-from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import Loss
-from sim_engine.space import Axis, Space
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import Loss
+from sim_engine.search_space import Axis, Space
 from tests.orchestrator.plans import calibration_plan
 from tests.orchestrator.reported import is_picture
 from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed

@@ -10,15 +10,15 @@ import pytest
 import yaml
 from scipy.stats import kstest, truncnorm
 
-from actors.optimizer.core.problem import Linear
-from orchestrator.config.load import load_campaign
-from orchestrator.fingerprint import fingerprint
-from orchestrator.plan import CalibrationPlan, NormalPrior
-from orchestrator.stages import calibration_stages
-from orchestrator.strategies.calibration.prior import actions_of_prior
+from actors.optimizer.questions import Linear
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.runs.stages import calibration_stages
+from orchestrator.strategies.calibration.action_prior import actions_of_prior
+from orchestrator.strategies.campaign_plan import CalibrationPlan, NormalPrior
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, StrategyHarness
 from sim_engine.action import DEG
-from sim_engine.space import Axis, Space
+from sim_engine.search_space import Axis, Space
 from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, report, write
 from tests.orchestrator.plans import calibration_plan
 from tests.orchestrator.toys import calibration_spill, weighed

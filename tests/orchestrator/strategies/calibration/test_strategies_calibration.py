@@ -4,19 +4,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orchestrator.errors import LearningError
-from orchestrator.plan import MeasuredPour
 from orchestrator.requests import Failed, Simulate, Simulated, Suggest, Suggested
-from orchestrator.stages import POURS, measured_pours
-from orchestrator.strategies.calibration.baselines import mean_predictor_discrepancy, regression_discrepancy
-from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.contexts import Contexts
-from orchestrator.strategies.calibration.design import DesignedPours, choose_holdout, stratified
-from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPair, ScoredPour, random_parameters
-from orchestrator.strategies.calibration.scorecard import JUSTIFIED, NOT_JUSTIFIED, Scorecard, calibration_gain
+from orchestrator.run_errors import LearningError
+from orchestrator.runs.stages import POURS, measured_pours
+from orchestrator.strategies.calibration.calibration_scores import (
+    JUSTIFIED,
+    NOT_JUSTIFIED,
+    CalibrationEvaluation,
+    Evaluation,
+    ScoredPair,
+    ScoredPour,
+    calibration_gain,
+    mean_predictor_discrepancy,
+    random_parameters,
+    regression_discrepancy,
+)
+from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration.pour_contexts import Contexts
+from orchestrator.strategies.calibration.pour_design import DesignedPours, choose_holdout, stratified
+from orchestrator.strategies.campaign_plan import MeasuredPour
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness, outcome_of, replay
-from sim_engine.liquid import SimulationParameters
-from sim_engine.space import Axis, Space
+from sim_engine.liquids import SimulationParameters
+from sim_engine.search_space import Axis, Space
 from tests.orchestrator.plans import calibration_plan, unit
 from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed
 
@@ -300,7 +309,7 @@ def test_draws_of_the_posterior_are_scored_by_the_mean_of_their_simulations():
     pours = [ScoredPour("cup", MeasuredPour(action, r, 1.0, split)) for r, split in ((0.1, "train"), (0.5, "test"))]
     wide = SimulationParameters(wall_distance=1.0)
     spilled = {TRUE_THETA.wall_distance: 0.3, 1.0: 0.6}
-    card = Scorecard(
+    card = CalibrationEvaluation(
         TRUE_THETA, {}, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, drawn=(TRUE_THETA, wide, TRUE_THETA)
     )
     played = StrategyHarness(lambda a, theta, rng: spilled[theta.wall_distance]).run(card)
@@ -323,8 +332,10 @@ def test_the_uncalibrated_simulator_is_scored_on_all_pours_with_the_seeds_of_the
     pours = [ScoredPour("cup", pour) for pour in measured(count=8, holdout=2)]
     plain = SimulationParameters(particles=4000, cohesion=0.0)
     rivals = random_parameters(PARAMETERS, {}, 2, 1)
-    card = Scorecard(TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=plain)
-    without = Scorecard(TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3)
+    card = CalibrationEvaluation(
+        TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=plain
+    )
+    without = CalibrationEvaluation(TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3)
     played, before = StrategyHarness(calibration_spill).run(card), StrategyHarness(calibration_spill).run(without)
     asked = {theta: [r for r in played.simulations if r.parameters == theta] for theta in (TRUE_THETA, plain)}
     assert [(r.action, r.seed) for r in asked[TRUE_THETA]] == [(r.action, r.seed) for r in asked[plain]]
@@ -335,7 +346,9 @@ def test_the_uncalibrated_simulator_is_scored_on_all_pours_with_the_seeds_of_the
     assert result.discrepancy["uncalibrated"]["train"] > 2 * result.discrepancy["theta"]["train"]
     assert sum(pair.theta == "uncalibrated" for pair in result.pairs) == 8
     assert "uncalibrated" not in without.result().discrepancy
-    same = Scorecard(TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=TRUE_THETA)
+    same = CalibrationEvaluation(
+        TRUE_THETA, rivals, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=TRUE_THETA
+    )
     StrategyHarness(calibration_spill).run(same)
     assert "uncalibrated" not in same.result().discrepancy
 
@@ -378,7 +391,7 @@ def test_a_scorecard_says_at_its_end_whether_the_training_and_test_pours_justify
     pours.append(ScoredPour("cup", replace(pours[0].pour, spillage=1.0, split="transfer")))
     plain = SimulationParameters(particles=4000, cohesion=0.0)
     theta, other = (plain, TRUE_THETA) if swapped else (TRUE_THETA, plain)
-    card = Scorecard(theta, {}, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=other)
+    card = CalibrationEvaluation(theta, {}, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, uncalibrated=other)
     assert card.result().gain is None
     StrategyHarness(calibration_spill).run(card)
     gain = card.result().gain

@@ -3,14 +3,16 @@
 import numpy as np
 import pytest
 
-from orchestrator.errors import LearningError
 from orchestrator.requests import Failed, Simulate, Simulated, Suggest
-from orchestrator.strategies.calibration.c1 import UniformGrid
-from orchestrator.strategies.calibration.c2 import StratifiedSampling
-from orchestrator.strategies.calibration.c3 import BayesianCalibration
-from orchestrator.strategies.calibration.design import DesignedPours
-from orchestrator.strategies.calibration.evaluation import Evaluation, ScoredPour
-from orchestrator.strategies.progress import Progress
+from orchestrator.run_errors import LearningError
+from orchestrator.strategies.calibration.calibration_scores import Evaluation, ScoredPour
+from orchestrator.strategies.calibration.pointwise_calibration import (
+    BayesianCalibration,
+    StratifiedSampling,
+    UniformGrid,
+)
+from orchestrator.strategies.calibration.pour_design import DesignedPours
+from orchestrator.strategies.strategy import Progress
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness, outcome_of
 from tests.orchestrator.plans import calibration_plan
 from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed

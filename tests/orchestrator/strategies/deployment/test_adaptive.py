@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from orchestrator.requests import Answered, Ask, Suggest
-from orchestrator.stages import DEPLOYMENT, with_bench
-from orchestrator.strategies.deployment.adaptive import (
+from orchestrator.runs.stages import DEPLOYMENT, with_bench
+from orchestrator.strategies.deployment.bench_offset import displacement, play_of
+from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.deployment.deployment_result import Deployed
+from orchestrator.strategies.deployment.model_monitoring import (
     Believed,
-    IgnoranceSettings,
+    DiscrepancyPolicySettings,
     RiskLimitSettings,
     StopSettings,
 )
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.learnt import Deployed
-from orchestrator.strategies.deployment.play import displacement, play_of
-from orchestrator.strategies.learnt import Learnt
+from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
-from sim_engine.liquid import SimulationParameters
-from sim_engine.space import Axis, Space
+from sim_engine.liquids import SimulationParameters
+from sim_engine.search_space import Axis, Space
 from tests.orchestrator import plans
 from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.toys import narrow_cup, narrow_cup_biased
@@ -82,11 +82,11 @@ def test_a_result_with_what_was_said_survives_its_file() -> None:
     strategy = adaptive(pours=2)
     StrategyHarness(narrow_cup).run(strategy)
     result = strategy.result()
-    assert Learnt.KINDS[result.kind].model_validate_json(result.model_dump_json()) == result
+    assert StageResult.KINDS[result.kind].model_validate_json(result.model_dump_json()) == result
 
 
 def test_a_simulator_that_says_nothing_of_the_bench_is_found_out_and_gone_on_without() -> None:
-    strategy = adaptive(2, pours=6, ignorance=IgnoranceSettings(limit=0.7))
+    strategy = adaptive(2, pours=6, ignorance=DiscrepancyPolicySettings(limit=0.7))
     StrategyHarness(upside_down, narrow_cup).run(strategy)
     trust = believed(strategy)
     assert trust.alarm
@@ -96,7 +96,7 @@ def test_a_simulator_that_says_nothing_of_the_bench_is_found_out_and_gone_on_wit
 
 
 def test_by_its_policy_it_ends_where_the_simulator_says_nothing() -> None:
-    strategy = adaptive(pours=6, ignorance=IgnoranceSettings(limit=0.7, policy="stop"))
+    strategy = adaptive(pours=6, ignorance=DiscrepancyPolicySettings(limit=0.7, policy="stop"))
     StrategyHarness(upside_down, narrow_cup).run(strategy)
     result = strategy.result()
     assert len(losses(strategy)) < 6
@@ -107,7 +107,7 @@ def test_by_its_policy_it_ends_where_the_simulator_says_nothing() -> None:
 
 @pytest.mark.parametrize("answer", ["go on", "stop"])
 def test_by_its_policy_it_asks_a_person(answer: str) -> None:
-    strategy = adaptive(pours=6, ignorance=IgnoranceSettings(limit=0.7, policy="ask"))
+    strategy = adaptive(pours=6, ignorance=DiscrepancyPolicySettings(limit=0.7, policy="ask"))
     play = StrategyHarness(
         upside_down, narrow_cup, answer=lambda r: Answered(answer) if isinstance(r, Ask) else None
     ).run(strategy)
@@ -180,7 +180,7 @@ def test_rules_of_one_model_are_refused_with_another() -> None:
         def add(self, text: str, *at: Any, key: bool = False, of: str = "") -> None:
             self.at.append(at)
 
-    from orchestrator.strategies.settings import Premises
+    from orchestrator.strategies.campaign_plan import Premises
 
     heard = Heard()
     deployment_plan(model="scaled", stop=StopSettings(), good_enough=0.01).settings.check(Premises(None, False), heard)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import pytest
 
 from orchestrator.requests import Failed, Outcome, Pour, Poured, Slots
-from orchestrator.strategies.deployment.confirm import Confirmation
-from orchestrator.strategies.deployment.costs import Costing
-from orchestrator.strategies.deployment.learnt import Recommended
-from orchestrator.strategies.progress import Progress
-from sim_engine.liquid import Liquid
-from sim_engine.losses import Loss
-from sim_engine.outcome import PourMeasurement
+from orchestrator.strategies.deployment.confirmation import Confirmation
+from orchestrator.strategies.deployment.costing import Costing
+from orchestrator.strategies.deployment.deployment_result import Recommended
+from orchestrator.strategies.strategy import Progress
+from sim_engine.liquids import Liquid
+from sim_engine.outcome import Loss, PourMeasurement
 from tests.orchestrator.toy import SCENE, SPACE, THETA
 
 COSTING = Costing(Loss(), SCENE, THETA)

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrator.config.campaign.check import touch
+from orchestrator.config.campaign_checks import touch
+from orchestrator.journal.stage_results import encode_result
 from orchestrator.requests import Failed, Outcome, Pour, Request, Simulate, Suggest
-from orchestrator.results import encode_result
-from orchestrator.strategies.deployment.base import MAX_REFUSED
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.deployment.deployment_base import MAX_REFUSED
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.action import Action
-from sim_engine.liquid import SimulationParameters
-from sim_engine.vessel.build import build_vessel
+from sim_engine.liquids import SimulationParameters
+from sim_engine.vessel.vessel import build_vessel
 from tests.orchestrator.plans import deployment_plan, unit
 from tests.orchestrator.toys import narrow_cup
 

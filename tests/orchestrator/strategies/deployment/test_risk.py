@@ -8,22 +8,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrator.codec import decode_request, encode_request
-from orchestrator.errors import RunError
+from orchestrator.journal.codec import decode_request, encode_request
+from orchestrator.journal.stage_results import decode_result, encode_result
 from orchestrator.requests import Failed, Simulate, Suggest
-from orchestrator.results import decode_result, encode_result
-from orchestrator.stages import with_posterior
-from orchestrator.strategies.deployment.costs import Costing
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
-from orchestrator.strategies.deployment.d1_risk import RobustPlanning
-from orchestrator.strategies.deployment.risk import Disturbances, RiskSettings
-from orchestrator.strategies.repeats import RepeatedSimulation
+from orchestrator.run_errors import RunError
+from orchestrator.runs.stages import with_posterior
+from orchestrator.strategies.deployment.costing import Costing
+from orchestrator.strategies.deployment.d1 import OneShotPlanning, RobustPlanning
+from orchestrator.strategies.deployment.disturbances import Disturbances, RiskSettings
+from orchestrator.strategies.repeated_simulation import RepeatedSimulation
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, executed, replay
 from sim_engine.action import DEG
-from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import Loss
-from sim_engine.space import Axis, Space
-from sim_engine.task import PoseError
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import Loss
+from sim_engine.scene import PoseError
+from sim_engine.search_space import Axis, Space
 from tests.orchestrator import plans
 from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.toys import quiet_valleys, two_valleys
@@ -244,12 +243,12 @@ def test_a_simulation_that_was_asked_for_with_an_error_is_made_with_it() -> None
     async def run() -> Any:
         import asyncio
 
-        from orchestrator.lanes import Deadlines, Lanes
+        from orchestrator.runs.request_executor import Deadlines, RequestExecutor
 
         class Laboratory:
             simulators = ToySimulators()
 
-        lanes = Lanes(Laboratory(), {"cup": SCENE}, Deadlines(), 0.0)  # type: ignore[arg-type]
+        lanes = RequestExecutor(Laboratory(), {"cup": SCENE}, Deadlines(), 0.0)  # type: ignore[arg-type]
         error = PoseError(x=1e-3)
         action = SCENE.action({"angular_velocity": 1.0})
         for request in (Simulate("cup", action, THETA, 1), Simulate("cup", action, THETA, 1, "plan", error)):

@@ -11,18 +11,18 @@ from typing import Any
 
 import pytest
 
-from actors.optimizer.core.problem import Suggestion, SuggestProblem
-from actors.optimizer.core.propose import propose
-from orchestrator.codec import digest
-from orchestrator.config.load import load_campaign
-from orchestrator.config.yaml.errors import ConfigError
-from orchestrator.fingerprint import fingerprint
-from orchestrator.plan import CampaignPlan, DeploymentPlan
+from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.suggest import propose
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.journal.codec import digest
 from orchestrator.requests import Suggest
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.progress import Progress
+from orchestrator.strategies.strategy import Progress
 from orchestrator.strategy_harness import THETA, StrategyHarness
 from sim_engine.action import DEG
 from tests.orchestrator.toy import ToyLaboratory, run_toy

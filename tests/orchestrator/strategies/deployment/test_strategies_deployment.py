@@ -4,17 +4,16 @@ import math
 import numpy as np
 import pytest
 
+from orchestrator.journal.stage_results import encode_result
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Suggest
-from orchestrator.results import encode_result
-from orchestrator.strategies.deployment.base import MAX_REFUSED
-from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.protocol import Strategy
+from orchestrator.strategies.deployment.deployment_base import MAX_REFUSED
+from orchestrator.strategies.strategy import Strategy
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, replay
-from sim_engine.losses import Loss
-from sim_engine.outcome import PourMeasurement
+from sim_engine.outcome import Loss, PourMeasurement
 from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.toys import narrow_cup, narrow_cup_biased
 

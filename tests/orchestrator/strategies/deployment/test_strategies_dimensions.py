@@ -11,22 +11,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrator.plan import CalibrationPlan, DeploymentPlan, MeasuredPour
 from orchestrator.requests import Failed, Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
-from orchestrator.strategies.calibration.c1 import UniformGrid
-from orchestrator.strategies.calibration.c2 import StratifiedSampling
-from orchestrator.strategies.calibration.c3 import BayesianCalibration
-from orchestrator.strategies.calibration.c4 import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.design import DesignedPours
+from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.strategies.calibration.pointwise_calibration import (
+    BayesianCalibration,
+    StratifiedSampling,
+    UniformGrid,
+)
+from orchestrator.strategies.calibration.pour_design import DesignedPours
+from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan, MeasuredPour
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness, outcome_of, replay
 from sim_engine.action import DEG, Action
-from sim_engine.liquid import SimulationParameters
-from sim_engine.losses import normalised_spillage
-from sim_engine.outcome import PourMeasurement
-from sim_engine.space import Axis, Space
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import PourMeasurement, normalised_spillage
+from sim_engine.search_space import Axis, Space
 from tests.orchestrator.plans import calibration_plan, deployment_plan
 from tests.orchestrator.strategies.test_strategies_properties import Shuffled
 

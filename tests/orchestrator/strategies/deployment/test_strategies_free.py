@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.optimizer.core.problem import Data
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.occupancy import RESTS, Occupancy, occupancies
+from actors.optimizer.questions import Data
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
-from orchestrator.strategies.deployment.d3_free import MOST_SIMULATIONS, FreeHybrid
-from orchestrator.strategies.deployment.prices import Prices, PricesSettings
-from orchestrator.strategies.deployment.thinning import thinned
-from orchestrator.strategies.deployment.trust import TrustSettings
+from orchestrator.results.pool_occupancy import RESTS, Occupancy, occupancies
+from orchestrator.strategies.deployment.bench_offset import thinned
+from orchestrator.strategies.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
+from orchestrator.strategies.deployment.model_check import TrustSettings
+from orchestrator.strategies.deployment.time_costs import Prices, PricesSettings
 from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
 from tests.orchestrator.killed import die_at, finished_times
 from tests.orchestrator.plans import deployment_plan

@@ -13,15 +13,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from orchestrator.report.summarise import summarise
-from orchestrator.report.table import summary_table
+from orchestrator.journal.stage_results import decode_result, encode_result
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
-from orchestrator.results import decode_result, encode_result
-from orchestrator.strategies.deployment.costs import Costing
+from orchestrator.results.console_view import summary_table
+from orchestrator.results.summarise import summarise
+from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.front import scalarised, undominated
 from orchestrator.strategies.deployment.objectives import (
     Objective,
     Objectives,
@@ -31,13 +30,13 @@ from orchestrator.strategies.deployment.objectives import (
     Time,
     duration,
 )
+from orchestrator.strategies.deployment.scalarization import scalarised, undominated
 from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness, outcome_of, replay
 from sim_engine.action import DEG, Action
-from sim_engine.losses import Loss
 from sim_engine.motion import plan_motion
-from sim_engine.outcome import Fractions, PourMeasurement
-from sim_engine.space import Axis, Space
-from sim_engine.vessel.build import build_vessel
+from sim_engine.outcome import Fractions, Loss, PourMeasurement
+from sim_engine.search_space import Axis, Space
+from sim_engine.vessel.vessel import build_vessel
 from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.toy import toy_plan
 

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.optimizer.core.problem import Suggestion
-from orchestrator.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.report.trust import draw_trust, trust_line
-from orchestrator.report.units import deployment_unit
+from actors.optimizer.questions import Suggestion
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Suggest
+from orchestrator.results.loss_units import deployment_unit
+from orchestrator.results.model_check_figures import draw_trust, trust_line
+from orchestrator.runs.unknown_pours import OperatorNeededError
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.pours import PourTrial
-from orchestrator.strategies.deployment.trust import TrustCheck, TrustSettings
+from orchestrator.strategies.deployment.model_check import TrustCheck, TrustSettings
+from orchestrator.strategies.deployment.real_pours import PourTrial
 from orchestrator.strategy_harness import SCENE as PLAYED
 from orchestrator.strategy_harness import THETA, StrategyHarness
-from orchestrator.unknown import OperatorNeededError
-from sim_engine.losses import Loss
+from sim_engine.outcome import Loss
 from tests.orchestrator import plans
 from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.reported import is_picture

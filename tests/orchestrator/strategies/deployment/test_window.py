@@ -10,19 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.optimizer.core.problem import Suggestion, SuggestProblem
-from actors.optimizer.core.propose import propose
-from orchestrator.report.campaign import draw_figures
-from orchestrator.report.risk import risk_line, window_line
-from orchestrator.report.units import loss_unit
+from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.suggest import propose
 from orchestrator.requests import Failed, Simulate
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
-from orchestrator.strategies.deployment.d1_risk import RobustPlanning
-from orchestrator.strategies.deployment.risk import RiskSettings
-from orchestrator.strategies.deployment.window import ROUNDS, SafeWindow
+from orchestrator.results.campaign_figures import draw_figures
+from orchestrator.results.loss_units import loss_unit
+from orchestrator.results.wording import risk_line, window_line
+from orchestrator.strategies.deployment.d1 import OneShotPlanning, RobustPlanning
+from orchestrator.strategies.deployment.disturbances import RiskSettings
+from orchestrator.strategies.deployment.safe_window import ROUNDS, SafeWindow
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, executed
-from sim_engine.losses import Loss
-from sim_engine.task import PoseError
+from sim_engine.outcome import Loss
+from sim_engine.scene import PoseError
 from tests.orchestrator import plans, toy
 from tests.orchestrator.killed import die_at
 from tests.orchestrator.plans import deployment_plan

@@ -1,0 +1,259 @@
+"""What a pour is for the joints of an arm: values that planning makes, checks judge and the driver executes.
+
+Pours for arms that don't look at joints: planned as the motion itself, read back as poses of the pourer. Values.
+"""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.arm_interface import PathReport
+from sim_engine.motion import PourMotion
+from sim_engine.scene import SampledMotion
+
+FloatArray = NDArray[np.float64]
+
+JOINT_UNIT = 1e-6
+"""Joints are kept to this [rad]: a thousandth of what an arm repeats."""
+
+TIME_UNIT = 1e-5
+"""Times likewise [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointPath:
+    """Joints over time, from rest to rest; linear in between.
+
+    Attributes:
+        times: (T,) increasing from 0 [s]; T ≥ 2.
+        joints: (T, 6) [rad], without jumps by full turns.
+    """
+
+    times: FloatArray
+    joints: FloatArray
+
+    @property
+    def duration(self) -> float:
+        """[s]."""
+        return float(self.times[-1])
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """Joints at times [s], clamped at both ends, shape (T, 6) [rad]."""
+        return np.stack([np.interp(times, self.times, self.joints[:, k]) for k in range(6)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class PourPath:
+    """A whole pour for the arm: checked, ready to be executed.
+
+    Attributes:
+        approach: from home to the pour's start, the pourer upright.
+        pour: tilt, hold, return.
+        retreat: back home.
+        tilts: (T,) of the pourer at `pour.times` [rad].
+        phases: (name, start, end) of the pour's parts [s].
+        report: what the checks found.
+    """
+
+    approach: JointPath
+    pour: JointPath
+    retreat: JointPath
+    tilts: FloatArray
+    phases: tuple[tuple[str, float, float], ...]
+    report: PathReport
+
+    @property
+    def approach_time(self) -> float:
+        """[s]."""
+        return self.approach.duration
+
+    @property
+    def pour_time(self) -> float:
+        """[s]."""
+        return self.pour.duration
+
+    @property
+    def retreat_time(self) -> float:
+        """[s]."""
+        return self.retreat.duration
+
+    def slowed(self, factor: float) -> PourPath:
+        """The same way, with all its times divided by a factor in (0, 1]."""
+        if factor == 1.0:
+            return self
+        approach, pour, retreat = (
+            JointPath(part.times / factor, part.joints) for part in (self.approach, self.pour, self.retreat)
+        )
+        r = self.report
+        return PourPath(
+            approach,
+            pour,
+            retreat,
+            self.tilts,
+            tuple((name, start / factor, end / factor) for name, start, end in self.phases),
+            replace(
+                r,
+                joint_speed=factor * r.joint_speed,
+                tool_speed=factor * r.tool_speed,
+                tilt_speed=factor * r.tilt_speed,
+                duration=r.duration / factor,
+            ),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ExecutedPath:
+    """What an arm's own encoders say it did.
+
+    Attributes:
+        times: (T,) since the path's begin, increasing from 0 [s of controller time], at least 100 Hz.
+        joints: (T, 6) [rad].
+        completed: False if it was stopped on the way.
+        tracking: what the path was followed with: 'rms_angle', 'max_angle' [rad] of the joints, 'rms_tool',
+            'max_tool' [m], 'lag' [s] taken out of them, 'longest_gap' between two readings [s].
+        poses: of the pourer in the world, (T, 7); empty where nobody knows the cell, as after `unpack`.
+    """
+
+    times: FloatArray
+    joints: FloatArray
+    completed: bool
+    tracking: dict[str, float] = field(default_factory=dict)
+    poses: FloatArray = field(default_factory=lambda: np.zeros((0, 7)))
+
+    def record(self) -> dict[str, Any]:
+        """See `actors.arm.arm_interface.Executed`."""
+        return pack(self)
+
+
+def pack(executed: ExecutedPath) -> dict[str, Any]:
+    """JSON-ready; a ten-second pour at 125 Hz takes some ten kilobytes.
+
+    Args:
+        executed: as read back.
+    """
+    columns = np.column_stack([executed.times / TIME_UNIT, executed.joints / JOINT_UNIT])
+    whole = np.round(columns).astype("<i4")
+    data = np.diff(whole, axis=0, prepend=np.zeros((1, 7), "<i4")).astype("<i4").T.tobytes()
+    return {
+        "samples": len(whole),
+        "completed": executed.completed,
+        "tracking": dict(executed.tracking),
+        "packed": base64.b85encode(zlib.compress(data, 9)).decode("ascii"),
+    }
+
+
+def unpack(data: dict[str, Any]) -> ExecutedPath:
+    """Inverse of `pack`.
+
+    Raises:
+        ValueError: it is not what `pack` made.
+    """
+    try:
+        raw = zlib.decompress(base64.b85decode(data["packed"]))
+        steps = np.frombuffer(raw, "<i4").reshape(7, int(data["samples"])).T
+        whole = np.cumsum(steps, axis=0)
+        times, joints = whole[:, 0].astype(float) * TIME_UNIT, whole[:, 1:].astype(float) * JOINT_UNIT
+        return ExecutedPath(times, joints, bool(data["completed"]), dict(data["tracking"]))
+    except (KeyError, TypeError, ValueError, zlib.error) as error:
+        raise ValueError(f"not an executed path: {error!r}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPath:
+    """A pour for an arm that makes any motion, and looks at no joints: the motion itself.
+
+    Attributes:
+        motion: of the pourer.
+        approach_time, retreat_time: of the ways there and back [s].
+        factor: of its speed.
+    """
+
+    motion: PourMotion
+    approach_time: float = 4.0
+    retreat_time: float = 0.0
+    factor: float = 1.0
+
+    @property
+    def pour_time(self) -> float:
+        """[s]."""
+        return self.motion.duration / self.factor
+
+    @property
+    def phases(self) -> tuple[tuple[str, float, float], ...]:
+        """See `PlannedPour.phases`."""
+        return tuple((phase.name, phase.start / self.factor, phase.end / self.factor) for phase in self.motion.phases)
+
+    def tilt(self, times: FloatArray) -> FloatArray:
+        """Tilt of the pourer at times of the pour, shape (T,) [rad]."""
+        return self.motion.tilt(times * self.factor)
+
+    def poses(self, times: FloatArray) -> FloatArray:
+        """Poses of the pourer in the world at times of the pour, shape (T, 7)."""
+        return self.motion.sample(times * self.factor)
+
+    def slowed(self, factor: float) -> MotionPath:
+        """See `PlannedPour.slowed`."""
+        return replace(self, factor=self.factor * factor)
+
+    @property
+    def report(self) -> PathReport:
+        """See `PlannedPour.report`."""
+        return motion_report(self.motion, self.approach_time + self.retreat_time, self.factor)
+
+
+def motion_report(motion: PourMotion, travel_time: float = 0.0, factor: float = 1.0) -> PathReport:
+    """What a motion says of a pour, for arms that don't look at their joints: the pourer's origin stands for the tool.
+
+    Args:
+        motion: of the pourer.
+        travel_time: way there and back together [s].
+        factor: of the motion's speed.
+    """
+    times = np.linspace(0.0, motion.duration, 500)
+    poses, tilts = motion.sample(times), motion.tilt(times)
+    step = times[1] / factor
+    low, high = poses[:, :3].min(axis=0), poses[:, :3].max(axis=0)
+    return PathReport(
+        joint_speed=0.0,
+        fastest_joint=0,
+        tool_speed=float(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=-1).max() / step),
+        tilt=float(np.abs(tilts).max()),
+        tilt_speed=float(np.abs(np.diff(tilts)).max() / step),
+        singularity=1.0,
+        clearance=0.0,
+        low=(float(low[0]), float(low[1]), float(low[2])),
+        high=(float(high[0]), float(high[1]), float(high[2])),
+        duration=motion.duration / factor + travel_time,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ExecutedMotion:
+    """See `actors.arm.arm_interface.Executed`; poses as the arm read them back.
+
+    Attributes:
+        times: shape (T,) [s].
+        poses: shape (T, 7).
+        completed: False if it was stopped on the way.
+    """
+
+    times: FloatArray
+    poses: FloatArray
+    completed: bool
+    tracking: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def motion(self) -> SampledMotion:
+        """As a motion that can be simulated again."""
+        return SampledMotion(self.times, self.poses)
+
+    def record(self) -> dict[str, Any]:
+        """See `Executed.record`: the action says all of it."""
+        return {}

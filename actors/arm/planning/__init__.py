@@ -1,0 +1,1 @@
+"""The motion of a pour as joint trajectories, with its checks."""

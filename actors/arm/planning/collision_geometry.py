@@ -1,0 +1,129 @@
+"""What takes up room: the pourer's outermost points, its distance from the receiver, the arm's links as capsules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.planning.frames import cell_transforms
+from actors.arm.planning.trajectory import SampledPath
+from sim_engine.collision import clearance, thinned, way_of
+from sim_engine.vessel.distance_grid import MARGIN
+from sim_engine.vessel.vessel import Vessel
+
+FloatArray = NDArray[np.float64]
+
+COARSE, FINE = 10e-3, 2e-3
+"""Way of any point of the pourer between two poses that are looked at, far from and near to the receiver [m]."""
+
+LINKS = (("upper arm", 1, 2, 0.08), ("forearm", 3, 4, 0.06), ("wrist", 4, 5, 0.06), ("wrist", 5, 6, 0.06),
+         ("wrist", 6, 7, 0.05), ("gripper", 7, 8, 0.04))  # fmt: skip
+"""Name, ends as `link_points` counts (8 is the TCP), radius [m]: rough, and the gripper's a guess at a slim one."""
+
+_hulls: WeakKeyDictionary[Vessel, FloatArray] = WeakKeyDictionary()
+
+
+def hull(vessel: Vessel) -> FloatArray:
+    """Corners of a vessel's convex hull, shape (V, 3) [m]: no point of it reaches farther."""
+    if vessel not in _hulls:
+        corners = vessel.solid_vertices
+        if vessel.spec.shape.outline() is None:
+            from scipy.spatial import ConvexHull  # takes a third of a second to import
+
+            _hulls[vessel] = corners[ConvexHull(corners).vertices]
+        else:
+            _hulls[vessel] = corners[_outermost_rings(corners)]
+    return _hulls[vessel]
+
+
+def _outermost_rings(corners: FloatArray) -> NDArray[np.bool_]:
+    """Which corners (V, 3) of a body of revolution, made of whole rings, are on its convex hull.
+
+    The half section's upper chain by Andrew's monotone chain, seen from the axis: of rings at one height the widest
+    alone, and none that lies within the cone of two others.
+    """
+    radius, height = np.round(np.hypot(corners[:, 0], corners[:, 1]), 12), corners[:, 2]
+    chain: list[tuple[float, float]] = []
+    for z in np.unique(height):
+        r = float(radius[height == z].max())
+        while len(chain) > 1 and _bent_in(chain[-2], chain[-1], (r, float(z))):
+            chain.pop()
+        chain.append((r, float(z)))
+    kept = np.zeros(len(corners), dtype=bool)
+    for r, z in chain:
+        kept |= (height == z) & (radius == r)
+    return kept
+
+
+def _bent_in(below: tuple[float, float], middle: tuple[float, float], above: tuple[float, float]) -> bool:
+    """Whether a ring (radius, height) is no wider than the cone through one below and one above it."""
+    (r0, z0), (r1, z1), (r2, z2) = below, middle, above
+    return (r1 - r0) * (z2 - z0) <= (r2 - r0) * (z1 - z0)
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """Where two things come nearest to each other.
+
+    Attributes:
+        distance: [m]; negative where they overlap.
+        index: of the stretch's sample.
+        name: of the link, for those.
+    """
+
+    distance: float
+    index: int
+    name: str = ""
+
+
+def nearest_to_receiver(stretch: SampledPath, until: float, pourer: Vessel, receiver: Vessel) -> Nearest:
+    """Where the pourer comes nearest to the receiver.
+
+    No point of the pourer moves by more than `FINE` between two poses that are looked at near the receiver, so that it
+    may be nearer by at most half of that in between.
+
+    Args:
+        stretch: of the path.
+        until: time from which on no new poses come [s].
+        pourer, receiver: geometry.
+    """
+    last = int(np.searchsorted(stretch.times, until + 1e-9))
+    poses = stretch.poses[:last]
+    way = way_of(poses, pourer)
+    coarse = thinned(way, COARSE)
+    away = clearance(pourer, receiver, poses[coarse])
+    # between two poses that are a way w apart nothing can come nearer than the nearer one less w/2
+    least = np.minimum(away[:-1], away[1:]) - 0.5 * np.diff(way[coarse])
+    # what is farther off than a vessel's grid reaches is known to be no nearer than that, not how far
+    known = least - np.maximum(np.minimum(away[:-1], away[1:]) - MARGIN, 0.0)
+    doubtful = (known < stretch.spec.limits.clearance) | (least < float(away.min()))
+    dense = thinned(way, FINE)
+    gap = np.clip(np.searchsorted(coarse, dense, side="right") - 1, 0, len(doubtful) - 1)
+    fine = dense[doubtful[gap]]
+    indices = np.concatenate([coarse, fine])
+    away = np.concatenate([away, clearance(pourer, receiver, poses[fine])])
+    best = int(np.argmin(away))
+    return Nearest(float(away[best]), int(indices[best]))
+
+
+def nearest_links(stretch: SampledPath, receiver: Vessel) -> tuple[Nearest, Nearest]:
+    """Where a link of the arm comes nearest to the table, and to the receiver as a cylinder."""
+    points = stretch.links
+    world = cell_transforms(stretch.spec).world.inverse
+    table, cup = [], []
+    along = np.linspace(0.0, 1.0, 13)[:, None]
+    for name, first, second, radius in LINKS:
+        a, b = points[:, first, None], points[:, second, None]
+        line = a + (b - a) * along
+        above = line[..., 2].min(axis=1) - radius - stretch.spec.cell.table
+        table.append(Nearest(float(above.min()), int(np.argmin(above)), name))
+        inside = world.apply(line.reshape(-1, 3)).reshape(line.shape)
+        aside = np.hypot(inside[..., 0], inside[..., 1]) - receiver.outer_radius
+        over = np.maximum(inside[..., 2] - receiver.rim_height, -inside[..., 2])
+        outer = np.hypot(np.maximum(aside, 0.0), np.maximum(over, 0.0))
+        apart = (np.where(outer > 0.0, outer, np.maximum(aside, over)) - radius).min(axis=1)
+        cup.append(Nearest(float(apart.min()), int(np.argmin(apart)), name))
+    return min(table, key=lambda n: n.distance), min(cup, key=lambda n: n.distance)

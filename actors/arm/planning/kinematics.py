@@ -1,0 +1,157 @@
+"""Forward and inverse kinematics of whole paths: the closed forms of `actors.emulators.ur_controller.robot_kinematics` on arrays.
+
+The virtual controller works out one pose every 2 ms; a planner a thousand at once, and keeps apart the postures that a
+pose can be reached in. Both have the robots' lengths from one table, and tests hold them against each other.
+
+A *posture* is one of eight ways to reach a pose: which side of the base's axis the shoulder is on, which way the wrist
+and which way the elbow is bent. A path that keeps clear of singularities stays in one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.ur.robot_models import MODELS, RobotModel
+
+__all__ = ["MODELS", "RobotModel", "beyond_reach", "forward", "inverse", "link_points", "posture", "singularities"]
+
+FloatArray = NDArray[np.float64]
+
+POSTURES = 8
+
+_SINGULAR_WRIST = 1e-6
+"""Below this |sin q5| joints 4 and 6 turn about the same axis; joint 6 is then taken as 0."""
+
+
+def forward(q: FloatArray, m: RobotModel) -> tuple[FloatArray, FloatArray]:
+    """Where the flange is.
+
+    Args:
+        q: joints, shape (..., 6) [rad].
+        m: the robot.
+
+    Returns:
+        Rotation matrices (..., 3, 3) and positions (..., 3) [m], base frame.
+    """
+    s1, c1, s5, c5, s6, c6 = (f(q[..., k]) for k in (0, 4, 5) for f in (np.sin, np.cos))
+    q23 = q[..., 1] + q[..., 2]
+    s, c = np.sin(q23 + q[..., 3]), np.cos(q23 + q[..., 3])
+    # x and z of the frame after joint 4; its y is (s1, −c1, 0), the axis of joints 2 to 4
+    x = np.stack([c1 * c, s1 * c, s], axis=-1)
+    z = np.stack([c1 * s, s1 * s, -c], axis=-1)
+    across = np.stack([s1, -c1, np.zeros_like(s1)], axis=-1)
+    a = x * c5[..., None] + across * s5[..., None]
+    tool = -x * s5[..., None] + across * c5[..., None]
+    rotation = np.stack([a * c6[..., None] - z * s6[..., None], -a * s6[..., None] - z * c6[..., None], tool], axis=-1)
+    reach = m.a2 * np.cos(q[..., 1]) + m.a3 * np.cos(q23)
+    height = m.d1 + m.a2 * np.sin(q[..., 1]) + m.a3 * np.sin(q23)
+    position = np.stack([c1 * reach, s1 * reach, height], axis=-1) + m.d4 * across + m.d5 * z + m.d6 * tool
+    return rotation, position
+
+
+def inverse(rotation: FloatArray, position: FloatArray, m: RobotModel) -> FloatArray:
+    """All postures that put the flange there.
+
+    Args:
+        rotation: of the flange, shape (T, 3, 3).
+        position: shape (T, 3) [m], base frame.
+        m: the robot.
+
+    Returns:
+        Shape (T, 8, 6) [rad], each joint in −π … π, NaN where the pose is out of reach. Along a path a posture keeps
+        its number: 4·shoulder + 2·wrist + elbow.
+    """
+    out = np.full((len(position), POSTURES, 6), np.nan)
+    for number, (q1, q5, q6, q234, u, v) in enumerate(_wrists(rotation, position, m)):
+        cos3 = (u * u + v * v - m.a2 * m.a2 - m.a3 * m.a3) / (2.0 * m.a2 * m.a3)
+        with np.errstate(invalid="ignore"):
+            bend = np.arccos(np.where(np.abs(cos3) > 1.0 + 1e-9, np.nan, np.clip(cos3, -1.0, 1.0)))
+        for elbow, q3 in enumerate((bend, -bend)):
+            q2 = np.arctan2(v, u) - np.arctan2(m.a3 * np.sin(q3), m.a2 + m.a3 * np.cos(q3))
+            q = np.stack([q1, q2, q3, q234 - q2 - q3, q5, q6], axis=-1)
+            q = np.where(np.isfinite(q).all(axis=-1, keepdims=True), q, np.nan)
+            out[:, 2 * number + elbow] = q - 2.0 * np.pi * np.round(q / (2.0 * np.pi))
+    return out
+
+
+def _wrists(rotation: FloatArray, position: FloatArray, m: RobotModel) -> Iterator[tuple[FloatArray, ...]]:
+    """Four ways to hold the wrist: q1, q5, q6, q2 + q3 + q4, and where elbow and shoulder have to bring wrist 1, in
+    the arm's plane from the shoulder [m]; each of shape (T,), NaN where the wrist can't be."""
+    r = rotation
+    w = position - m.d6 * r[:, :, 2]
+    radius = np.hypot(w[:, 0], w[:, 1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        # inside the cylinder about the base that the wrist can't enter there is no solution: asin gives NaN
+        offset = np.arcsin(np.where(radius < m.d4 - 1e-9, np.nan, np.minimum(1.0, m.d4 / radius)))
+    bearing = np.arctan2(w[:, 1], w[:, 0])
+    for q1 in (bearing + offset, bearing + np.pi - offset):
+        s1, c1 = np.sin(q1), np.cos(q1)
+        bend = np.arccos(np.clip(s1 * r[:, 0, 2] - c1 * r[:, 1, 2], -1.0, 1.0))
+        for sign in (1.0, -1.0):
+            q6 = np.arctan2(-sign * (s1 * r[:, 0, 1] - c1 * r[:, 1, 1]), sign * (s1 * r[:, 0, 0] - c1 * r[:, 1, 0]))
+            q6 = np.where(np.abs(np.sin(bend)) < _SINGULAR_WRIST, 0.0, q6)
+            z = -(r[:, :, 0] * np.sin(q6)[:, None] + r[:, :, 1] * np.cos(q6)[:, None])
+            q234 = np.arctan2(c1 * z[:, 0] + s1 * z[:, 1], -z[:, 2])
+            u = c1 * (w[:, 0] - m.d5 * z[:, 0]) + s1 * (w[:, 1] - m.d5 * z[:, 1])
+            yield q1, sign * bend, q6, q234, u, w[:, 2] - m.d5 * z[:, 2] - m.d1
+
+
+def posture(q: FloatArray, m: RobotModel) -> int:
+    """Number of the posture that joints (6,) are in, as `inverse` counts."""
+    rotation, position = forward(q[None], m)
+    solutions = inverse(rotation, position, m)[0]
+    apart = np.abs(np.angle(np.exp(1j * (solutions - q)))).max(axis=-1)
+    return int(np.nanargmin(apart))
+
+
+def singularities(q: FloatArray, m: RobotModel) -> FloatArray:
+    """How far joints are from losing a direction, shape (..., 3): shoulder, elbow, wrist; 0 is singular.
+
+    Elbow and wrist: |sin| of their angle. Shoulder: distance of the wrist from the plane through the base's axis and
+    along joint 2's, over the length of both links.
+    """
+    q23 = q[..., 1] + q[..., 2]
+    u = m.a2 * np.cos(q[..., 1]) + m.a3 * np.cos(q23) + m.d5 * np.sin(q23 + q[..., 3])
+    shoulder = np.abs(u) / (abs(m.a2) + abs(m.a3))
+    return np.stack([shoulder, np.abs(np.sin(q[..., 2])), np.abs(np.sin(q[..., 4]))], axis=-1)
+
+
+def beyond_reach(rotation: FloatArray, position: FloatArray, m: RobotModel) -> FloatArray:
+    """By how much poses lie out of reach, shape (T, 8) [m], in every posture as `inverse` counts; 0 within reach.
+
+    Negative where a pose is too near for the arm to fold or, inside the base's own cylinder, to get the wrist there.
+    """
+    distances = np.stack([np.hypot(u, v) for *_, u, v in _wrists(rotation, position, m)], axis=-1)
+    too_far = distances - abs(m.a2) - abs(m.a3)
+    too_near = distances - abs(abs(m.a2) - abs(m.a3))
+    w = position - m.d6 * rotation[:, :, 2]
+    inside = (np.hypot(w[:, 0], w[:, 1]) - m.d4)[:, None]
+    beyond = np.where(too_far > 0.0, too_far, np.minimum(too_near, 0.0))
+    return np.repeat(np.where(np.isnan(distances), inside, beyond), 2, axis=-1)
+
+
+def link_points(q: FloatArray, m: RobotModel) -> FloatArray:
+    """Points along the arm's middle line, shape (..., 8, 3) [m].
+
+    Shoulder, upper arm's begin and end, forearm's begin and end, wrist 1, wrist 2, flange. Upper arm and forearm run
+    beside each other: the upper arm outside by about d4, the forearm by a quarter of that.
+    """
+    s1, c1 = np.sin(q[..., 0]), np.cos(q[..., 0])
+    zero = np.zeros_like(s1)
+    radial, across = np.stack([c1, s1, zero], axis=-1), np.stack([s1, -c1, zero], axis=-1)
+    up = np.array([0.0, 0.0, 1.0])
+    q23 = q[..., 1] + q[..., 2]
+    s, c = np.sin(q23 + q[..., 3]), np.cos(q23 + q[..., 3])
+    shoulder = np.broadcast_to(m.d1 * up, across.shape)
+    elbow = shoulder + m.a2 * (np.cos(q[..., 1])[..., None] * radial + np.sin(q[..., 1])[..., None] * up)
+    w1 = elbow + m.a3 * (np.cos(q23)[..., None] * radial + np.sin(q23)[..., None] * up)
+    w2 = w1 + m.d4 * across
+    w3 = w2 + m.d5 * (s[..., None] * radial - c[..., None] * up)
+    _, flange = forward(q, m)
+    outside, inside = m.d4 * across, 0.25 * m.d4 * across
+    return np.stack(
+        [shoulder, shoulder + outside, elbow + outside, elbow + inside, w1 + inside, w2, w3, flange], axis=-2
+    )

@@ -1,0 +1,416 @@
+"""What forbids a path, in words for the person who can change it: all of it at once, before anything moves.
+
+Whether an arm's settings make sense in themselves: asked when a laboratory's file is read, before any pour.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.arm_interface import JOINT_NAMES, PathReport
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planned_pour import JointPath
+from actors.arm.planning.collision_geometry import Nearest, hull, nearest_links, nearest_to_receiver
+from actors.arm.planning.frames import cell_transforms, flange_poses, flange_transforms, pourer_transforms
+from actors.arm.planning.kinematics import MODELS, beyond_reach, inverse, posture, singularities
+from actors.arm.planning.trajectory import SampledPath
+from actors.arm.planning.transfer_motion import RacingJointError
+from actors.interfaces import InvalidActionError
+from sim_engine.vessel.distance_grid import MARGIN
+from sim_engine.vessel.vessel import Vessel
+
+UPRIGHT = math.radians(3.0)
+"""How far a pourer that waits or travels may lean [rad]: it is full."""
+
+PARTS = ("shoulder", "elbow", "wrist")
+"""As `singularities` counts."""
+
+
+def check_limits(spec: UrArmSpec) -> list[str]:
+    """What is wrong with the settings of an arm; empty if nothing is. Texts name the keys of a laboratory's file."""
+    limits = spec.limits
+    low, high = np.array(limits.box_low), np.array(limits.box_high)
+    if np.any(low >= high):
+        axis = "xyz"[int(np.argmax(low >= high))]
+        return [f"limits.box: {axis} of 'low' should be smaller than that of 'high'"]
+    return [*_speed_limits(spec), *_clearance(spec), *_receiver(spec), *_home(spec)]
+
+
+def _speed_limits(spec: UrArmSpec) -> list[str]:
+    problems = []
+    deg = math.degrees
+    if spec.approach_speed > spec.limits.joint_speed:
+        problems.append(
+            f"approach_speed: {deg(spec.approach_speed):.4g} deg/s is above limits.joint_speed, "
+            f"{deg(spec.limits.joint_speed):.4g} deg/s"
+        )
+    if spec.untilt_speed > spec.limits.tilt_speed:
+        problems.append(
+            f"untilt_speed: {deg(spec.untilt_speed):.4g} deg/s is above limits.tilt_speed, "
+            f"{deg(spec.limits.tilt_speed):.4g} deg/s"
+        )
+    return problems
+
+
+def _clearance(spec: UrArmSpec) -> list[str]:
+    if spec.limits.clearance <= MARGIN:
+        return []
+    return [
+        f"limits.clearance: {1e3 * spec.limits.clearance:.4g} mm is more than the {1e3 * MARGIN:.0f} mm up to which "
+        "distances between vessels are known"
+    ]
+
+
+def _receiver(spec: UrArmSpec) -> list[str]:
+    problems = []
+    x, y, z = spec.cell.receiver
+    low, high = spec.limits.box_low, spec.limits.box_high
+    if not (low[0] <= x <= high[0] and low[1] <= y <= high[1]):
+        problems.append(f"cell.receiver: ({x:.3f}, {y:.3f}) m lies outside limits.box, seen from above")
+    for number, plane in enumerate(spec.limits.planes, 1):
+        # a plane that lies flat may well pass above where the receiver stands
+        if abs(plane.normal[2]) < 0.5 and float(np.dot(plane.normal, spec.cell.receiver)) < plane.offset:
+            problems.append(f"cell.receiver: ({x:.3f}, {y:.3f}, {z:.3f}) m lies beyond plane {number} of limits.planes")
+    if z < spec.cell.table - 1e-6:
+        problems.append(f"cell.receiver: stands at {z:.3f} m, below cell.table at {spec.cell.table:.3f} m")
+    model = MODELS[spec.model]
+    beside = np.array([[-0.1, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0]])
+    flange = flange_poses(beside, spec)
+    if not np.isfinite(inverse(flange.rotation, flange.position, model)).any():
+        beyond = beyond_reach(flange.rotation, flange.position, model)[0]
+        least = 1e3 * float(beyond[np.argmin(np.abs(beyond))])
+        text = (
+            f"out of reach by {least:.0f} mm; move the receiver nearer to the base"
+            if least > 0.0
+            else f"{-least:.0f} mm too near to the arm's base; move the receiver away from it"
+        )
+        problems.append(
+            f"cell.receiver: an upright pourer beside it, 100 mm up, is {text}, or turn 'direction' or 'grip'"
+        )
+    return problems
+
+
+def _home(spec: UrArmSpec) -> list[str]:
+    model, q = MODELS[spec.model], np.array([spec.home])
+    problems = []
+    for name, angle, most in zip(JOINT_NAMES, spec.home, model.joint_range, strict=True):
+        if abs(angle) > most:
+            problems.append(
+                f"home: {name} at {math.degrees(angle):.1f} deg is outside its range of ±{math.degrees(most):.0f} deg"
+            )
+    pourer = pourer_transforms(q, spec)
+    lean = math.acos(float(np.clip(pourer.rotation[0, 2, 2], -1.0, 1.0)))
+    if lean > UPRIGHT:
+        problems.append(
+            f"home: the pourer leans {math.degrees(lean):.1f} deg there; it waits full, at most "
+            f"{math.degrees(UPRIGHT):.0f} deg are allowed. Are 'tool', 'grip' and 'mount' right?"
+        )
+    tool = flange_transforms(q, spec).apply(cell_transforms(spec).tool.position)
+    for name, point in (("the tool", tool[0]), ("the pourer", pourer.position[0])):
+        problems += [f"home: {name} is {text}" for text in outside(point, spec)]
+    margins = singularities(q, model)[0]
+    for part, margin in zip(PARTS, margins, strict=True):
+        if margin < spec.limits.singularity:
+            problems.append(
+                f"home: the {part} is {margin:.2f} from singular, limits.singularity asks for "
+                f"{spec.limits.singularity:.2f}; bend it more"
+            )
+    return problems
+
+
+def outside(point: np.ndarray[tuple[int], np.dtype[np.float64]], spec: UrArmSpec) -> list[str]:
+    """Where a point of the room's frame, shape (3,) [m], is not where it may be: box, planes, table."""
+    texts = []
+    for axis, value, low, high in zip("xyz", point, spec.limits.box_low, spec.limits.box_high, strict=True):
+        if not low <= value <= high:
+            texts.append(f"outside the box, at {axis} = {value:.3f} m ({low:.3f} … {high:.3f} m are allowed)")
+    for number, plane in enumerate(spec.limits.planes, 1):
+        beyond = plane.offset - float(np.dot(plane.normal, point))
+        if beyond > 0.0:
+            texts.append(f"{1e3 * beyond:.1f} mm beyond plane {number}")
+    if point[2] < spec.cell.table:
+        texts.append(f"{1e3 * (spec.cell.table - point[2]):.1f} mm below the table")
+    return texts
+
+
+FloatArray = NDArray[np.float64]
+
+SLACK = 1e-6
+"""Relative: a path planned at a limit may lie above it by rounding."""
+
+THROUGH = 0.02
+"""Nearer to a singularity than this a path goes through it, as far as speeds are concerned."""
+
+LARGEST_STEP = math.radians(15.0)
+"""The largest step of a joint between two waypoints [rad]: more is not a path but a jump."""
+
+
+def check_stretch(stretch: SampledPath, pourer: Vessel, receiver: Vessel) -> list[str]:
+    """What is wrong with a stretch, other than the distance of the pourer from the receiver."""
+    points = hull(pourer)
+    problems = [*_tilts(stretch), *_places(stretch, points)]
+    if stretch.unreached is not None:
+        return [*_speeds(stretch, points), *problems]
+    problems = [*_ranges(stretch), *_singular(stretch), *problems, *_links(stretch, receiver)]
+    if stretch.margins.min() < THROUGH:
+        return problems  # joints then race, but that is not what to mend
+    return [*_joint_speeds(stretch), *_speeds(stretch, points), *problems]
+
+
+def check_clearance(stretch: SampledPath, until: float, pourer: Vessel, receiver: Vessel) -> tuple[Nearest, list[str]]:
+    """Where the pourer comes nearest to the receiver until a time [s], and what is wrong with that."""
+    nearest = nearest_to_receiver(stretch, until, pourer, receiver)
+    least = stretch.spec.limits.clearance
+    if nearest.distance >= least:
+        return nearest, []
+    tilt = math.degrees(float(stretch.tilts[nearest.index]))
+    apart = 1e3 * nearest.distance
+    how = "would touch the receiver"
+    if apart >= 0.05:
+        how = f"would come within {apart:.1f} mm of the receiver"
+    elif apart <= -0.05:
+        how = f"would run {-apart:.1f} mm into the receiver"
+    return nearest, [
+        f"the pourer {how} at a tilt of {tilt:.0f} deg, {stretch.when(nearest.index)}; "
+        f"{1e3 * least:.0f} mm have to stay free: a larger x_offset or height clears it"
+    ]
+
+
+def check_reach(unreached: SampledPath) -> str:
+    """What to say about a stretch of which some poses can't be reached in the posture of home."""
+    home = posture(np.array(unreached.spec.home), unreached.model)
+    assert unreached.unreached is not None
+    beyond = beyond_reach(unreached.unreached.rotation, unreached.unreached.position, unreached.model)
+    worst = _first_worst(np.abs(beyond[:, home]))
+    # a way that can't be made has no pace yet
+    when = "on the way from home" if unreached.name == "approach" else unreached.when(worst)
+    distance = 1e3 * float(beyond[worst, home])
+    another = (
+        "; another posture of the arm would reach it: wait at a 'home' with the wrist bent the other way"
+        if np.any(np.all(beyond == 0.0, axis=0))
+        else ""
+    )
+    if distance > 0.0:
+        return f"{when}: out of the arm's reach by {distance:.0f} mm; move the receiver nearer or lower{another}"
+    return f"{when}: {-distance:.0f} mm too near to the arm's base; move the receiver away from it{another}"
+
+
+def check_way(racing: RacingJointError, spec: UrArmSpec) -> str:
+    """What to say about a way from home through a singularity."""
+    direction = math.degrees(spec.cell.direction)
+    facing = math.degrees(math.remainder(spec.cell.direction + racing.heading, 2.0 * math.pi))
+    turned = math.degrees(racing.turn)
+    why = (
+        f"home holds the pourer as for a direction of {facing:.0f} deg, and cell.direction is {direction:.0f} deg: the "
+        f"full pourer would be turned by {turned:.0f} deg on its way"
+        if turned >= 1.0
+        else "on the way from home"
+    )
+    cure = f"set cell.direction nearer to {facing:.0f} deg, or wait at a 'home' nearer to the pour"
+    return (
+        f"{why}, through a place where two joints turn about one axis and {JOINT_NAMES[racing.joint]} would have to "
+        f"race; {cure if turned >= 1.0 else 'move the receiver, or let the arm wait elsewhere'}"
+    )
+
+
+def report(stretches: list[SampledPath], clearance: float, pourer: Vessel, deviation: float) -> PathReport:
+    """What was found out about a whole path.
+
+    Args:
+        stretches: approach, pour, retreat.
+        clearance: smallest distance of pourer and receiver [m].
+        pourer: geometry.
+        deviation: of the tilt from what was asked for [rad].
+    """
+    joint_speeds = np.array([s.joint_speeds.max(axis=0) for s in stretches]).max(axis=0)
+    points = hull(pourer)
+    lows, highs = [], []
+    for s in stretches:
+        lows += [s.tool.min(axis=0), [_support(s, axis, points)[0].min() for axis in np.eye(3)]]
+        highs += [s.tool.max(axis=0), [-_support(s, -axis, points)[0].min() for axis in np.eye(3)]]
+    low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+    return PathReport(
+        joint_speed=float(joint_speeds.max()),
+        fastest_joint=int(np.argmax(joint_speeds)),
+        tool_speed=max(float(s.point_speeds(points).max()) for s in stretches),
+        tilt=max(float(s.tilts.max()) for s in stretches),
+        tilt_speed=max(float(s.turning.max()) for s in stretches),
+        singularity=min(float(s.margins.min()) for s in stretches),
+        clearance=clearance,
+        low=(float(low[0]), float(low[1]), float(low[2])),
+        high=(float(high[0]), float(high[1]), float(high[2])),
+        duration=sum(float(s.times[-1]) for s in stretches),
+        deviation=deviation,
+    )
+
+
+def recheck(path: JointPath, spec: UrArmSpec) -> None:
+    """Look at a path again right before it is executed, without knowing what it is for.
+
+    Ranges, joint speeds and jumps; tool centre point and the pourer's underside against box, planes and table.
+
+    Raises:
+        InvalidActionError: it must not be executed; with everything that is wrong.
+    """
+    times, joints = path.times, path.joints
+    if times.ndim != 1 or len(times) < 2 or joints.shape != (len(times), 6):
+        raise InvalidActionError("the path has no two waypoints of six joints each")
+    if not (np.isfinite(times).all() and np.isfinite(joints).all()) or times[0] != 0.0 or np.any(np.diff(times) <= 0):
+        raise InvalidActionError("the path's times should increase from 0, and all its numbers be finite")
+    problems = []
+    jumps = np.abs(np.diff(joints, axis=0))
+    if jumps.max() > LARGEST_STEP:
+        row, joint = divmod(int(np.argmax(jumps)), 6)
+        degrees = math.degrees(jumps.max())
+        problems.append(f"{JOINT_NAMES[joint]} would jump by {degrees:.0f} deg, {times[row]:.2f} s into the path")
+    stretch = SampledPath.of("path", path, spec)
+    problems += [*_ranges(stretch), *_joint_speeds(stretch), *_places(stretch, np.zeros((1, 3)))]
+    if problems:
+        raise InvalidActionError(refusal(problems))
+
+
+def refusal(problems: list[str]) -> str:
+    """All problems of a path in one text."""
+    if len(problems) == 1:
+        return f"the arm can't make this pour: {problems[0]}"
+    return "the arm can't make this pour:\n" + "\n".join(f"  - {problem}" for problem in problems)
+
+
+def _first_worst(values: FloatArray) -> int:
+    """Where the largest value is reached first: a hold keeps it to within rounding."""
+    most = float(values.max())
+    return int(np.argmax(values >= most - 1e-6 * abs(most) - 1e-9))
+
+
+def _ranges(s: SampledPath) -> Iterator[str]:
+    for k, (name, most) in enumerate(zip(JOINT_NAMES, s.model.joint_range, strict=True)):
+        worst = _first_worst(np.abs(s.joints[:, k]))
+        angle = float(s.joints[worst, k])
+        if abs(angle) > most:
+            yield (
+                f"{name} would turn to {math.degrees(angle):.1f} deg, {s.when(worst)}; its range is "
+                f"±{math.degrees(most):.0f} deg: let it start a full turn back at 'home'"
+            )
+
+
+def _joint_speeds(s: SampledPath) -> Iterator[str]:
+    for k, (name, own) in enumerate(zip(JOINT_NAMES, s.model.joint_speed, strict=True)):
+        most = min(own, s.spec.limits.joint_speed)
+        worst = _first_worst(s.joint_speeds[:, k])
+        speed = float(s.joint_speeds[worst, k])
+        if speed > most * (1.0 + SLACK):
+            yield (
+                f"{name} would turn at {math.degrees(speed):.0f} deg/s, {s.when(worst)}; "
+                f"{math.degrees(most):.0f} deg/s are allowed: {_slower(s, 'joint_speed' if most < own else None)}"
+            )
+
+
+def _slower(s: SampledPath, limit: str | None) -> str:
+    """What to do about something too fast; `limit`: key of the laboratory's file that could allow it, if one can."""
+    lower = "angular_velocity or return_velocity" if s.name == "pour" else "approach_speed"
+    return f"lower {lower}" + ("" if limit is None else f", or raise arm.limits.{limit}")
+
+
+def _singular(s: SampledPath) -> Iterator[str]:
+    least = s.spec.limits.singularity
+    worst = np.argmin(s.margins, axis=0)
+    margins = s.margins[worst, np.arange(3)]
+    reach = abs(s.model.a2) + abs(s.model.a3)
+    shoulder, elbow, wrist = margins
+    if shoulder < least:
+        yield (
+            f"{s.when(worst[0])}: the wrist {1e3 * shoulder * reach:.0f} mm from above the base's axis, "
+            f"{1e3 * least * reach:.0f} mm are asked for; move the receiver away from the base"
+        )
+    asked = math.degrees(math.asin(least))
+    if elbow < least:
+        folded = math.cos(float(s.joints[worst[1], 2])) < 0.0
+        state, help_ = ("folded", "away from the base") if folded else ("straight", "nearer or lower")
+        yield (
+            f"{s.when(worst[1])}: elbow {math.degrees(math.asin(elbow)):.1f} deg from {state}, {asked:.1f} deg are "
+            f"asked for; move the receiver {help_}"
+        )
+    if wrist < least:
+        yield (
+            f"{s.when(worst[2])}: wrist 2 {math.degrees(math.asin(wrist)):.1f} deg from where joints 4 and 6 turn "
+            f"about one axis, {asked:.1f} deg are asked for; turn 'direction', or move the receiver sideways"
+        )
+
+
+def _speeds(s: SampledPath, points: FloatArray) -> Iterator[str]:
+    speeds = s.point_speeds(points)
+    worst = _first_worst(speeds)
+    if speeds[worst] > s.spec.limits.tool_speed * (1.0 + SLACK):
+        yield (
+            f"tool or pourer would move at {speeds[worst]:.2f} m/s, {s.when(worst)}; "
+            f"{s.spec.limits.tool_speed:.2f} m/s are allowed: {_slower(s, 'tool_speed')}"
+        )
+    worst = _first_worst(s.turning)
+    if s.turning[worst] > s.spec.limits.tilt_speed * (1.0 + 1e-4):
+        yield (
+            f"the pourer would turn at {math.degrees(s.turning[worst]):.0f} deg/s, {s.when(worst)}; "
+            f"{math.degrees(s.spec.limits.tilt_speed):.0f} deg/s are allowed: {_slower(s, 'tilt_speed')}"
+        )
+
+
+def _tilts(s: SampledPath) -> Iterator[str]:
+    worst = _first_worst(s.tilts)
+    # on its way the pourer is full: what a pour may is not what an approach may
+    most = UPRIGHT if s.name == "approach" else s.spec.limits.tilt
+    if s.tilts[worst] > most * (1.0 + SLACK):
+        yield (
+            f"the pourer would lean {math.degrees(s.tilts[worst]):.1f} deg, {s.when(worst)}; "
+            f"{math.degrees(most):.1f} deg are allowed"
+            f"{' while it is full' if s.name == 'approach' else ': lower max_angle, or raise arm.limits.tilt'}"
+        )
+
+
+def _places(s: SampledPath, points: FloatArray) -> Iterator[str]:
+    """Box, planes and table, for the TCP and points (V, 3) of the pourer."""
+    limits = s.spec.limits
+    for k, axis in enumerate("xyz"):
+        for sign, bound, word in ((1.0, limits.box_low[k], "least"), (-1.0, limits.box_high[k], "most")):
+            for thing, where, value in _beyond(s, sign * np.eye(3)[k], sign * bound, points):
+                yield (
+                    f"{thing} would leave the box at {axis} = {sign * value:.3f} m, {s.when(where)}; "
+                    f"at {word} {bound:.3f} m are allowed: move the receiver, or widen arm.limits.box"
+                )
+    for number, plane in enumerate(limits.planes, 1):
+        for thing, where, value in _beyond(s, np.array(plane.normal), plane.offset, points):
+            yield f"{thing} would go {1e3 * (plane.offset - value):.1f} mm beyond plane {number}, {s.when(where)}"
+    table = s.spec.cell.table
+    for thing, where, value in _beyond(s, np.array([0.0, 0.0, 1.0]), table, points):
+        yield f"{thing} would go {1e3 * (table - value):.1f} mm below the table, {s.when(where)}"
+
+
+def _beyond(s: SampledPath, normal: FloatArray, offset: float, points: FloatArray) -> Iterator[tuple[str, int, float]]:
+    """What would leave normal · point ≥ offset the farthest: its name, sample, and normal · point [m]."""
+    tool = s.tool @ normal
+    if tool.min() < offset:
+        yield "the tool", _first_worst(-tool), float(tool.min())
+    least, lowest = _support(s, normal, points)
+    if least.min() < offset:
+        where = _first_worst(-least)
+        rim = points[lowest[where], 2] > 0.5 * points[:, 2].max() > 0.0
+        yield f"the pourer's {'rim' if rim else 'underside'}", where, float(least.min())
+
+
+def _support(s: SampledPath, normal: FloatArray, points: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Smallest normal · point of the pourer's points (V, 3) at every sample [m], and which point; each (N,)."""
+    along = (normal @ s.pourer.rotation) @ points.T
+    return s.pourer.position @ normal + along.min(axis=1), along.argmin(axis=1)
+
+
+def _links(s: SampledPath, receiver: Vessel) -> Iterator[str]:
+    table, cup = nearest_links(s, receiver)
+    if table.distance < 0.0:
+        yield f"the {table.name} would come {-1e3 * table.distance:.0f} mm too near to the table, {s.when(table.index)}"
+    if cup.distance < s.spec.limits.clearance:
+        yield (
+            f"the {cup.name} would come within {1e3 * cup.distance:.0f} mm of the receiver, {s.when(cup.index)}; "
+            f"{1e3 * s.spec.limits.clearance:.0f} mm have to stay free"
+        )

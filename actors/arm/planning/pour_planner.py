@@ -1,0 +1,207 @@
+"""From a pour's motion to joints over time: approach, pour, retreat, checked as a whole before the first movement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planned_pour import JointPath, PourPath
+from actors.arm.planning.path_checks import (
+    check_clearance,
+    check_limits,
+    check_reach,
+    check_stretch,
+    check_way,
+    refusal,
+    report,
+)
+from actors.arm.planning.trajectory import STEEPEST, Phases, SampledPath, followable, pour_times
+from actors.arm.planning.transfer_motion import (
+    STEP,
+    OutOfReachError,
+    RacingJointError,
+    follow,
+    home_pose,
+    routes,
+    travel,
+)
+from actors.interfaces import InvalidActionError, UnreachablePlaceError
+from sim_engine.collision import rotations
+from sim_engine.motion import Phase, PourMotion, turn
+from sim_engine.vessel.vessel import Vessel
+
+FloatArray = NDArray[np.float64]
+
+ANGLE_ERROR, PLACE_ERROR = np.radians(0.1), 3e-4
+"""How far linear joints between two waypoints may leave the pose that is wanted [rad], [m]."""
+
+FINEST = 8
+"""So many times the usual waypoints are tried before saying that joints can't follow the motion."""
+
+MOST_WAYPOINTS = 1_200
+"""The most waypoints of a pour: they travel to the controller as a program."""
+
+OVER = 0.02
+"""Height above the receiver, beside `ArmLimits.clearance`, at which the pourer is carried over it [m]."""
+
+UNTILT_ACCELERATION = STEEPEST / 10.0
+"""Into and out of the turn back upright that a pour without a return ends with [rad/s²]."""
+
+
+def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Vessel) -> PourPath:
+    """Joints for a whole pour.
+
+    The arm goes from home to the pour's first pose in straight lines, the pourer upright: directly, or where that
+    is forbidden up, across the receiver's rim and down. It pours in the posture that it waits in (a change of posture
+    would have to pass a singularity with a full vessel), and goes back the way it came; a pour that ends tilted is
+    brought upright first.
+
+    Steps in speed, and accelerations above `pace.STEEPEST`, become ramps of that (`pace.followable`): each such turn
+    ends speed / STEEPEST later, and what follows is as much later. `PathReport.deviation` says how far the tilt is then
+    from the one asked for.
+
+    Args:
+        motion: as `sim_engine.motion.plan_motion` makes it.
+        spec: of the arm and its cell.
+        pourer, receiver: geometry of the scene's vessels.
+
+    Returns:
+        The path, with what was found out about it.
+
+    Raises:
+        InvalidActionError: it must not or can't be executed; the text lists everything that was found wrong.
+        UnreachablePlaceError: likewise, and no other pour that begins in the same place can.
+    """
+    problems = check_limits(spec)
+    if problems:
+        raise InvalidActionError(refusal(problems))
+    made = followable(motion)
+    phases: Phases = tuple((p.name, p.start, p.end) for p in made.phases)
+    first_pose = tuple(made.sample(np.zeros(1))[0].tolist())
+    approach, approached, wrong = _approach(first_pose, spec, pourer, receiver)
+    problems = list(wrong)
+    barred = bool(problems)
+    pour = None
+    try:
+        pour = _pour(made, np.array(spec.home) if approach is None else approach.joints[-1], spec)
+        during = SampledPath.of("pour", pour, spec, phases)
+    except OutOfReachError as error:
+        during = SampledPath.beyond("pour", pour_times(made), error.poses, spec, phases)
+        problems = [check_reach(during)]  # which is why the approach failed too, if it did
+    problems += check_stretch(during, pourer, receiver)
+    # hold, return and retreat pass through poses that tilt and approach have passed through
+    nearest, texts = check_clearance(during, made.phases[0].end, pourer, receiver)
+    if approached >= spec.limits.clearance or nearest.index > 0:  # its first pose is the approach's last
+        problems += texts
+    if pour is not None and not problems and not _follows(pour, made, spec):
+        problems.append(
+            "joints that are linear between waypoints leave the pour's poses by more than 0.1 deg or 0.3 mm"
+        )
+    if pour is not None and len(pour.times) > MOST_WAYPOINTS:
+        problems.append(f"the pour needs {len(pour.times)} waypoints, a controller takes {MOST_WAYPOINTS}")
+    if problems or pour is None or approach is None:
+        raise (UnreachablePlaceError if barred else InvalidActionError)(refusal(problems))
+    retreat = _retreat(made, approach, pour, spec)
+    back = SampledPath.of("retreat", retreat, spec)
+    problems = check_stretch(back, pourer, receiver)
+    if problems:
+        raise InvalidActionError(refusal(problems))
+    return PourPath(
+        approach=approach,
+        pour=pour,
+        retreat=retreat,
+        tilts=made.tilt(pour.times),
+        phases=phases,
+        report=report(
+            [SampledPath.of("approach", approach, spec), during, back],
+            min(nearest.distance, approached),
+            pourer,
+            _deviation(motion, made),
+        ),
+    )
+
+
+@lru_cache(maxsize=16)
+def _approach(
+    start: tuple[float, ...], spec: UrArmSpec, pourer: Vessel, receiver: Vessel
+) -> tuple[JointPath | None, float, tuple[str, ...]]:
+    """The way there with the fewest problems, the shortest of those, its clearance [m], and its problems.
+
+    Args:
+        start: pose of the pourer in the world that the pour begins with. Pours at one place share it, so that the way
+            there is worked out and looked at once for all of them.
+        spec: of the arm and its cell.
+        pourer, receiver: geometry.
+    """
+    over = receiver.rim_height + spec.limits.clearance + OVER
+    best: tuple[JointPath | None, float, list[str]] | None = None
+    for knots in routes(home_pose(spec), np.array(start), over):
+        path: JointPath | None = None
+        try:
+            path = travel(knots, np.array(spec.home), spec)
+            stretch = SampledPath.of("approach", path, spec)
+        except OutOfReachError as error:
+            stretch = SampledPath.beyond(
+                "approach", np.linspace(0.0, STEP * len(error.poses), len(error.poses)), error.poses, spec
+            )
+            found, distance = [check_reach(stretch)], np.inf
+        except RacingJointError as error:
+            found, distance = [check_way(error, spec)], np.inf
+        else:
+            nearest, found = check_clearance(stretch, path.duration, pourer, receiver)
+            found += check_stretch(stretch, pourer, receiver)
+            distance = nearest.distance
+        if best is None or len(found) < len(best[2]):
+            best = (path, distance, found)
+        if not found:
+            break
+    assert best is not None
+    return best[0], best[1], tuple(best[2])
+
+
+def _pour(motion: PourMotion, near: FloatArray, spec: UrArmSpec) -> JointPath:
+    """As few waypoints as follow the motion within the errors allowed."""
+    finer = 1
+    while True:
+        times = pour_times(motion, finer)
+        path = JointPath(times, follow(motion.sample(times), near, spec))
+        if finer >= FINEST or _follows(path, motion, spec):
+            return path
+        finer *= 2
+
+
+def _follows(path: JointPath, motion: PourMotion, spec: UrArmSpec) -> bool:
+    middles = 0.5 * (path.times[1:] + path.times[:-1])
+    wanted = motion.sample(middles)
+    world = SampledPath("pour", middles, path.at(middles), spec)
+    apart = np.linalg.norm(world.poses[:, :3] - wanted[:, :3], axis=-1)
+    turned = np.linalg.norm(rotations(world.poses) - rotations(wanted), axis=(1, 2)) / np.sqrt(2.0)
+    return bool(apart.max() < PLACE_ERROR and turned.max() < ANGLE_ERROR)
+
+
+def _retreat(motion: PourMotion, approach: JointPath, pour: JointPath, spec: UrArmSpec) -> JointPath:
+    """Upright first, if the pour ends tilted; then the way back."""
+    times = approach.times[-1] - approach.times[::-1]
+    back = JointPath(times, approach.joints[::-1])
+    first, last = (float(motion.tilt(np.array([t]))[0]) - motion.tilt_error for t in (0.0, motion.duration))
+    if abs(last - first) < 1e-9:
+        return back
+    segments = tuple(turn(0.0, last, first, spec.untilt_speed, UNTILT_ACCELERATION))
+    end = segments[-1].start + segments[-1].duration
+    upright = replace(motion, segments=segments, phases=(Phase("untilt", 0.0, end),))
+    first_part = _pour(upright, pour.joints[-1], spec)
+    return JointPath(
+        np.concatenate([first_part.times, end + back.times[1:]]),
+        np.concatenate([first_part.joints, back.joints[1:]]),
+    )
+
+
+def _deviation(asked: PourMotion, made: PourMotion) -> float:
+    if asked is made:
+        return 0.0
+    times = np.linspace(0.0, made.duration, 2000)
+    return float(np.abs(asked.tilt(times) - made.tilt(times)).max())

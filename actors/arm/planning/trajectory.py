@@ -1,0 +1,245 @@
+"""When an arm is where: accelerations that joints can make, and times at which a path is written down.
+
+A part of an executed pour, sampled densely, with what its checks look at.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planned_pour import JointPath
+from actors.arm.planning.frames import Transforms, cell_transforms, flange_poses, flange_transforms, quaternions
+from actors.arm.planning.kinematics import MODELS, RobotModel, link_points, singularities
+from sim_engine.motion import Phase, PourMotion, Segment, turn
+
+FloatArray = NDArray[np.float64]
+
+STEEPEST = math.radians(1000.0)
+"""Largest acceleration of a tilt [rad/s²]: what a wrist that holds a full vessel follows closely; stands for steps."""
+
+TILT_STEP = math.radians(1.0)
+"""Largest turn between two waypoints [rad]: on a circle of 100 mm the chord is then 4 μm off."""
+
+RAMP_ERROR = math.radians(0.01)
+"""Largest difference between an accelerated turn and its chords [rad]."""
+
+
+def followable(motion: PourMotion, steepest: float = STEEPEST) -> PourMotion:
+    """The motion as joints can make it: no steps in speed, no acceleration above `steepest`.
+
+    A turn that asks for more keeps its speed and its ends and gets ramps of `steepest`: it lags behind by half a ramp,
+    ends one ramp (speed / steepest) later, and everything after it is as much later. Other motions stay as they are.
+
+    Args:
+        motion: as `sim_engine.motion.plan_motion` makes it: every phase a turn from rest to rest, or a hold.
+        steepest: [rad/s²].
+    """
+    if _hardest(motion.segments) <= steepest * (1.0 + 1e-9):
+        return motion
+    segments: list[Segment] = []
+    phases: list[Phase] = []
+    late = 0.0
+    for phase in motion.phases:
+        own = [s for s in motion.segments if phase.start - 1e-9 <= s.start < phase.end - 1e-9]
+        start, end = phase.start + late, phase.end + late
+        if own:
+            speed = max(max(abs(s.velocity), abs(s.velocity + s.acceleration * s.duration)) for s in own)
+            acceleration = min(_hardest(tuple(own)), steepest)
+            turned = turn(start, own[0].tilt, own[-1].end_tilt, speed, acceleration)
+            segments += turned
+            end = turned[-1].start + turned[-1].duration
+            late = end - phase.end
+        phases.append(Phase(phase.name, start, end))
+    return replace(motion, segments=tuple(segments), phases=tuple(phases))
+
+
+def _hardest(segments: tuple[Segment, ...]) -> float:
+    """Largest acceleration, infinite for a step in speed [rad/s²]."""
+    before, ended, hardest = 0.0, -math.inf, 0.0
+    for s in segments:
+        if s.start > ended + 1e-9:
+            if abs(before) > 1e-9:
+                return math.inf
+            before = 0.0
+        if abs(s.velocity - before) > 1e-6:
+            return math.inf
+        hardest = max(hardest, abs(s.acceleration))
+        before, ended = s.velocity + s.acceleration * s.duration, s.start + s.duration
+    return math.inf if abs(before) > 1e-6 else hardest
+
+
+def pour_times(motion: PourMotion, finer: int = 1) -> FloatArray:
+    """Times of a pour's waypoints, shape (T,) [s]: all ends of segments and phases, and as many between as needed.
+
+    Args:
+        motion: a followable one.
+        finer: so many times more than that.
+    """
+    ends = {0.0, *(p.start for p in motion.phases), *(p.end for p in motion.phases)}
+    pieces = [np.array(sorted(ends))]
+    for s in motion.segments:
+        count = max(
+            abs(s.end_tilt - s.tilt) / TILT_STEP,
+            s.duration * math.sqrt(abs(s.acceleration) / (8.0 * RAMP_ERROR)),
+        )
+        pieces.append(s.start + np.linspace(0.0, s.duration, finer * max(math.ceil(count), 1) + 1))
+    times = np.sort(np.concatenate(pieces))
+    # ends that were computed in two ways differ in the last bits; the phases' own stay
+    distinct = np.concatenate([[True], np.diff(times) > 1e-6])
+    kept: FloatArray = times[distinct]
+    for end in ends:
+        kept[np.argmin(np.abs(kept - end))] = end
+    return kept
+
+
+def trapezoid(length: float, speed: float, acceleration: float, step: float) -> tuple[FloatArray, FloatArray]:
+    """From rest to rest along a length: times and distances, about every `step` seconds and at the ramps' ends.
+
+    Args:
+        length: > 0.
+        speed: at most.
+        acceleration: and deceleration.
+        step: [s].
+    """
+    peak = min(speed, math.sqrt(length * acceleration))
+    ramp = peak / acceleration
+    cruise = max(length / peak - ramp, 0.0)
+    count = max(math.ceil(ramp / step), 1)
+    rising = np.linspace(0.0, ramp, count + 1)
+    steady = np.linspace(ramp, ramp + cruise, max(math.ceil(cruise / step), 1) + 1)[1:] if cruise > 1e-9 else rising[:0]
+    times = np.concatenate([rising, steady, ramp + cruise + rising[1:]])
+    end = times[-1]
+    way = np.where(
+        times <= ramp,
+        0.5 * acceleration * times**2,
+        np.where(times <= ramp + cruise, peak * (times - 0.5 * ramp), length - 0.5 * acceleration * (end - times) ** 2),
+    )
+    way[-1] = length
+    return times, way
+
+
+Phases = tuple[tuple[str, float, float], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SampledPath:
+    """Approach, pour or retreat.
+
+    Attributes:
+        name: one of these.
+        times: (N,) of waypoints, and of middles between them [s].
+        joints: (N, 6) [rad]; of no meaning where `unreached`.
+        spec: of the arm and its cell.
+        phases: of a pour: name, start and end [s]; empty otherwise.
+        unreached: flange in the base's frame, for poses that the arm can't take: some have one all the same.
+    """
+
+    name: str
+    times: FloatArray
+    joints: FloatArray
+    spec: UrArmSpec
+    phases: Phases = ()
+    unreached: Transforms | None = None
+
+    @classmethod
+    def of(cls, name: str, path: JointPath, spec: UrArmSpec, phases: Phases = ()) -> SampledPath:
+        """A path with middles between its waypoints: joints are linear in between, poses all but."""
+        times = np.sort(np.concatenate([path.times, 0.5 * (path.times[1:] + path.times[:-1])]))
+        return cls(name, times, path.at(times), spec, phases)
+
+    @classmethod
+    def beyond(
+        cls, name: str, times: FloatArray, poses: FloatArray, spec: UrArmSpec, phases: Phases = ()
+    ) -> SampledPath:
+        """Poses of the pourer in the world (N, 7) of which some can't be reached."""
+        return cls(name, times, np.zeros((len(times), 6)), spec, phases, flange_poses(poses, spec))
+
+    @cached_property
+    def links(self) -> FloatArray:
+        """Points along the arm, see `link_points`, and its TCP; room frame, shape (N, 9, 3) [m]."""
+        points = link_points(self.joints, self.model)
+        room = cell_transforms(self.spec).base.apply(points.reshape(-1, 3)).reshape(points.shape)
+        return np.concatenate([room, self.tool[:, None]], axis=1)
+
+    @property
+    def model(self) -> RobotModel:
+        """The robot."""
+        return MODELS[self.spec.model]
+
+    @cached_property
+    def flange(self) -> Transforms:
+        """Room frame."""
+        base = cell_transforms(self.spec).base
+        return flange_transforms(self.joints, self.spec) if self.unreached is None else base @ self.unreached
+
+    @cached_property
+    def tool(self) -> FloatArray:
+        """TCP, room frame, shape (N, 3) [m]."""
+        return self.flange.apply(cell_transforms(self.spec).tool.position)
+
+    @cached_property
+    def pourer(self) -> Transforms:
+        """Room frame."""
+        return self.flange @ cell_transforms(self.spec).pourer
+
+    @cached_property
+    def poses(self) -> FloatArray:
+        """Poses of the pourer in the world, shape (N, 7)."""
+        world = cell_transforms(self.spec).world.inverse @ self.pourer
+        return np.concatenate([world.position, quaternions(world.rotation)], axis=-1)
+
+    @cached_property
+    def tilts(self) -> FloatArray:
+        """Tilts of the pourer from upright, shape (N,), ≥ 0 [rad]."""
+        axis = self.pourer.rotation[:, :, 2]
+        return np.arctan2(np.hypot(axis[:, 0], axis[:, 1]), axis[:, 2])
+
+    @cached_property
+    def steps(self) -> FloatArray:
+        """Between two samples, shape (N − 1,) [s]."""
+        return np.diff(self.times)
+
+    @cached_property
+    def joint_speeds(self) -> FloatArray:
+        """Between two samples, shape (N − 1, 6), ≥ 0 [rad/s]."""
+        speeds: FloatArray = np.abs(np.diff(self.joints, axis=0)) / self.steps[:, None]
+        return speeds
+
+    @cached_property
+    def turning(self) -> FloatArray:
+        """Angular velocity of the pourer between two samples, shape (N − 1,) [rad/s]."""
+        q = self.poses[:, 3:]
+        half = np.linalg.norm(q[1:] - q[:-1], axis=-1)  # chord of unit quaternions, exact to third order in the angle
+        turning: FloatArray = 4.0 * np.arcsin(np.minimum(0.5 * half, 1.0)) / self.steps
+        return turning
+
+    @cached_property
+    def margins(self) -> FloatArray:
+        """From singularities: shoulder, elbow, wrist, shape (N, 3)."""
+        return singularities(self.joints, self.model)
+
+    def point_speeds(self, points: FloatArray) -> FloatArray:
+        """Speeds of the fastest of the TCP and points (V, 3) of the pourer between samples, shape (N − 1,) [m/s]."""
+        turn, shift = np.diff(self.pourer.rotation, axis=0), np.diff(self.pourer.position, axis=0)
+        moved = np.sqrt(np.square(turn @ points.T + shift[:, :, None]).sum(axis=1).max(axis=1))
+        tool = np.linalg.norm(np.diff(self.tool, axis=0), axis=-1)
+        speeds: FloatArray = np.maximum(moved, tool) / self.steps
+        return speeds
+
+    def when(self, index: int) -> str:
+        """A moment in words: '0.81 s into the tilt'."""
+        t = float(self.times[index])
+        for name, start, end in self.phases:
+            if t <= end + 1e-6:
+                if end - start > 1e-6 and t >= end - 1e-6:
+                    return f"at the {name}'s end, {t:.2f} s into the pour"
+                return f"{t - start:.2f} s into the {name}"
+        if t >= self.times[-1] - 1e-6:
+            return f"at the {self.name}'s end"
+        return f"{t:.2f} s into the {self.name}"

@@ -1,0 +1,412 @@
+"""What `decant doctor` makes of what a controller says: pure, one line for each thing, with what to do about it.
+
+Whether the settings of a laboratory's file and those of the controller agree: tool, mount, payload, home, limits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from actors.arm.arm_interface import JOINT_NAMES, Pose
+from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord, UrArmSpec
+from actors.arm.ur.controller_readout import PORTS, SCRIPTS, SLIDER, Exchange, Findings, ReadoutError, look_at
+from actors.arm.ur.primary_interface import RobotState
+from actors.arm.ur.worker_messages import why_not_ready
+from actors.interfaces import DeviceCheck, State
+
+TOOL_TOLERANCE, TURN_TOLERANCE = 1e-3, math.radians(0.5)
+"""How far the controller's TCP may be from the file's [m], [rad]."""
+
+PAYLOAD_TOLERANCE, CENTRE_TOLERANCE = 0.1, 0.02
+"""How far its payload [kg] and its payload's centre [m] may be."""
+
+MOUNT_TOLERANCE, GRAVITY = math.radians(15.0), 9.81
+"""How far up may be from where the file says [rad]: the tool's accelerometer is not a level. [m/s²]"""
+
+HOME_TOLERANCE = math.radians(1.0)
+
+
+def tool_check(spec: UrArmSpec, state: RobotState) -> DeviceCheck:
+    """Whether the controller's TCP is the file's."""
+    there = Pose(*state.tool)
+    away, turned = distance(spec.tool, there), turn(spec.tool, there)
+    if away <= TOOL_TOLERANCE and turned <= TURN_TOLERANCE:
+        return DeviceCheck("tool", "ok", f"TCP {_point(there)}")
+    return DeviceCheck(
+        "tool",
+        "fail",
+        f"TCP on the controller {_point(there)}, in the file {_point(spec.tool)}: {1e3 * away:.1f} mm and "
+        f"{math.degrees(turned):.1f} deg apart",
+        "set the TCP in the installation on the teach pendant, or correct 'tool' in the file: they have to agree",
+    )
+
+
+def mount_check(spec: UrArmSpec, state: RobotState, exchange: Exchange) -> DeviceCheck:
+    """Whether up is where the file says: the tool feels it."""
+    from scipy.spatial.transform import Rotation
+
+    felt = exchange.acceleration
+    strength = math.hypot(*felt) if felt is not None else 0.0
+    if felt is None or not state.pose or not 0.5 * GRAVITY < strength < 1.5 * GRAVITY:
+        return DeviceCheck(
+            "mount", "warn", "where up is, the tool doesn't tell", "compare 'mount' with the teach pendant yourself"
+        )
+    up = Rotation.from_rotvec(state.pose[3:]).apply([a / strength for a in felt])
+    away = math.acos(max(-1.0, min(1.0, sum(a * b for a, b in zip(up, spec.mount.up, strict=True)))))
+    tilt = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
+    if away <= MOUNT_TOLERANCE:
+        return DeviceCheck("mount", "ok", f"tilted by {tilt:.0f} deg, as the file says")
+    turn = math.degrees(math.atan2(float(up[0]), float(up[1])))
+    return DeviceCheck(
+        "mount",
+        "fail",
+        f"the tool feels up {math.degrees(away):.0f} deg away from where the file has it: tilt {tilt:.0f} deg, turn "
+        f"{turn:.0f} deg would agree with it",
+        "correct 'mount' in the file and the mounting in the installation on the teach pendant: pours would go astray",
+    )
+
+
+def payload_check(spec: UrArmSpec, exchange: Exchange) -> DeviceCheck:
+    """Whether the controller's payload is the file's."""
+    if exchange.payload is None or exchange.payload_centre is None:
+        return DeviceCheck("payload", "warn", "not told", "compare payload and centre with the teach pendant yourself")
+    away = math.dist(exchange.payload_centre, spec.payload_centre)
+    text = f"{exchange.payload:.2f} kg"
+    if abs(exchange.payload - spec.payload) <= PAYLOAD_TOLERANCE and away <= CENTRE_TOLERANCE:
+        return DeviceCheck("payload", "ok", text)
+    return DeviceCheck(
+        "payload",
+        "fail",
+        f"{text} on the controller, {spec.payload:.2f} kg in the file; centres {1e3 * away:.0f} mm apart",
+        "set payload and centre in the installation on the teach pendant, or correct them in the file: a wrong payload "
+        "ends in protective stops",
+    )
+
+
+def home_check(spec: UrArmSpec, state: RobotState) -> DeviceCheck:
+    """Whether the arm stands where it waits."""
+    away = [abs(a - b) for a, b in zip(state.joints, spec.home, strict=True)]
+    worst = max(range(6), key=away.__getitem__)
+    if away[worst] <= HOME_TOLERANCE:
+        return DeviceCheck("position", "ok", "at home")
+    return DeviceCheck(
+        "position",
+        "warn",
+        f"not at home: {JOINT_NAMES[worst]} is {math.degrees(away[worst]):.1f} deg away",
+        "bring it home slowly with 'decant jog', watching it, before a pour",
+    )
+
+
+def limit_checks(spec: UrArmSpec, state: RobotState) -> list[DeviceCheck]:
+    """Whether the file stays within the controller's limits."""
+    checks = []
+    if state.joint_speeds:
+        slowest = min(state.joint_speeds)
+        if spec.limits.joint_speed > slowest + 1e-6:
+            checks.append(
+                DeviceCheck(
+                    "joint speed",
+                    "warn",
+                    f"the file allows {math.degrees(spec.limits.joint_speed):.0f} deg/s, the controller "
+                    f"{math.degrees(slowest):.0f} deg/s for its slowest joint",
+                    "a fast pour may end in a protective stop; lower 'joint_speed' in the file",
+                )
+            )
+        else:
+            checks.append(DeviceCheck("joint speed", "ok", "the file's limit is within the controller's"))
+    out = [
+        i for i, (q, (low, high)) in enumerate(zip(spec.home, state.joint_ranges, strict=False)) if not low <= q <= high
+    ]
+    if out:
+        checks.append(
+            DeviceCheck(
+                "home", "fail", f"{JOINT_NAMES[out[0]]} of 'home' is outside the controller's range", "correct 'home'"
+            )
+        )
+    return checks
+
+
+def distance(a: Pose, b: Pose) -> float:
+    """Between two frames' origins [m]."""
+    return math.dist((a.x, a.y, a.z), (b.x, b.y, b.z))
+
+
+def turn(a: Pose, b: Pose) -> float:
+    """Between two frames' directions [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    turned = Rotation.from_rotvec([a.rx, a.ry, a.rz]).inv() * Rotation.from_rotvec([b.rx, b.ry, b.rz])
+    return float(turned.magnitude())
+
+
+def _point(pose: Pose) -> str:
+    return f"({1e3 * pose.x:.1f}, {1e3 * pose.y:.1f}, {1e3 * pose.z:.1f}) mm"
+
+
+ANSWERS = "is this a UR controller? If it is, and has booted, it hangs: restart it"
+
+GOOD_ROUND_TRIP, GOOD_GAP, LONGEST_GAP = 10e-3, 60e-3, 0.2
+"""Limits of RTDE's timing [s]: from there a warning; from `LONGEST_GAP` no pour should be tried."""
+
+KNOWN_SOFTWARE: dict[int, tuple[int, int]] = {3: (14, 15), 5: (6, 17)}
+"""Minor versions, by major one, that the client library is tested with by its makers."""
+
+
+@dataclass(frozen=True)
+class UrDiagnostics(ArmDiagnostics):
+    """A UR controller that was looked at.
+
+    Attributes:
+        spec: what the laboratory's file says.
+        found: what the controller says.
+    """
+
+    spec: UrArmSpec | None = None
+    found: Findings | None = None
+
+    @classmethod
+    def at(cls, spec: UrArmSpec) -> UrDiagnostics:
+        """Ask the controller everything."""
+        found = look_at(spec.address)
+        return cls(
+            checksum="" if found.state is None else found.state.checksum,
+            serial=found.serial,
+            model=found.model,
+            software=".".join(str(part) for part in found.software[:3]),
+            spec=spec,
+            found=found,
+        )
+
+    def checks(self, record: SafetyRecord | None, *, accept: str, virtual: bool) -> list[DeviceCheck]:
+        """See `ArmDiagnostics.checks`."""
+        assert self.spec is not None
+        assert self.found is not None
+        return judge(self.spec, self.found, record, accept=accept, virtual=virtual)
+
+    def at_home(self) -> DeviceCheck:
+        """See `ArmDiagnostics.at_home`."""
+        assert self.spec is not None
+        assert self.found is not None
+        if self.found.state is None:
+            raise ReadoutError("; ".join(self.found.problems) or f"the controller at {self.spec.address} tells nothing")
+        return home_check(self.spec, self.found.state)
+
+
+def judge(
+    spec: UrArmSpec, found: Findings, record: SafetyRecord | None, *, accept: str, virtual: bool = False
+) -> list[DeviceCheck]:
+    """One line for everything that was found.
+
+    Args:
+        spec: what the file says.
+        found: what the controller says.
+        record: the safety settings that were accepted; None if none were.
+        accept: the command that accepts them.
+        virtual: nobody has to.
+    """
+    if not found.address:
+        return [
+            DeviceCheck(
+                "address",
+                "fail",
+                f"'{spec.address}' stands for no machine: {found.problems[0]}",
+                "write the controller's IP address into the file (teach pendant: Settings, System, Network)",
+            )
+        ]
+    checks = [DeviceCheck("address", "ok", found.address), *_ports(found)]
+    checks += [DeviceCheck("answers", "fail", text, ANSWERS) for text in found.problems]
+    if found.software:
+        checks.append(_software(found))
+    if found.dashboard is not None:
+        checks += _dashboard(spec, found, found.dashboard)
+    if found.state is not None:
+        checks += [
+            _checksum(found, record, accept, virtual=virtual),
+            tool_check(spec, found.state),
+            home_check(spec, found.state),
+        ]
+        checks += limit_checks(spec, found.state)
+    if found.state is not None and found.exchange is not None:
+        checks.append(mount_check(spec, found.state, found.exchange))
+    if found.exchange is not None:
+        checks += [payload_check(spec, found.exchange), *_motion(found.exchange), _network(found.exchange)]
+    return checks
+
+
+def _ports(found: Findings) -> list[DeviceCheck]:
+    reasons = set(found.ports.values())
+    if None not in reasons:
+        everything = "all ports that Decant uses are closed" if reasons == {"refused"} else "no port answers"
+        advice = (
+            "the machine is there, but lets nobody in: on PolyScope 5.10 or later look at Settings, Security, both at "
+            "Services and at the inbound access of this computer's network; while booting, wait"
+            if reasons == {"refused"}
+            else "is it switched on, its cable plugged in, this computer in the same network, no firewall between?"
+        )
+        return [
+            DeviceCheck("network", "fail", f"{everything} at {found.address} ({', '.join(map(str, reasons))})", advice)
+        ]
+    checks = []
+    for port, name in PORTS.items():
+        reason = found.ports[port]
+        advice = (
+            f"on PolyScope 5.10 or later enable the service '{name}' under Settings, Security, Services; else look for "
+            "a firewall between"
+        )
+        state: State = "ok" if reason is None else "warn" if port == SCRIPTS else "fail"
+        if port == SCRIPTS:
+            advice = "programs go to the primary interface; other tools may want this one"
+        checks.append(
+            DeviceCheck(f"port {port}", state, f"{name}: {reason or 'open'}", "" if reason is None else advice)
+        )
+    return checks
+
+
+def _software(found: Findings) -> DeviceCheck:
+    version = ".".join(str(part) for part in found.software[:3])
+    major, minor = found.software[:2]
+    if major not in KNOWN_SOFTWARE:
+        return DeviceCheck(
+            "software",
+            "fail",
+            f"PolyScope {version}",
+            "Decant needs PolyScope 3 (CB3) or 5 (e-Series); PolyScope X has no dashboard server",
+        )
+    low, high = KNOWN_SOFTWARE[major]
+    if low <= minor <= high:
+        return DeviceCheck("software", "ok", f"PolyScope {version}")
+    return DeviceCheck(
+        "software",
+        "warn",
+        f"PolyScope {version}",
+        f"the client library's makers test {major}.{low} to {major}.{high}; go slowly through the commissioning page",
+    )
+
+
+def _dashboard(spec: UrArmSpec, found: Findings, said: dict[str, str]) -> list[DeviceCheck]:
+    checks = [
+        DeviceCheck("model", "ok", f"{found.model.upper()}, serial number {found.serial}")
+        if found.model == spec.model
+        else DeviceCheck(
+            "model",
+            "fail",
+            f"the controller says {found.model or said.get('get robot model', 'nothing')}, the file {spec.model}",
+            "is this the right controller? Lengths and limits differ between models: correct 'model' or 'address'",
+        )
+    ]
+    remote = said.get("is in remote control", "").lower()
+    if found.software and found.software[0] < 5:
+        checks.append(DeviceCheck("remote control", "ok", "a CB3 controller always takes programs"))
+    elif remote == "true":
+        checks.append(DeviceCheck("remote control", "ok", "on"))
+    else:
+        checks.append(
+            DeviceCheck(
+                "remote control",
+                "fail",
+                "off: the controller refuses programs",
+                "switch from Local to Remote at the top right of the teach pendant (allow it first under Settings, "
+                "System, Remote Control)",
+            )
+        )
+    checks += [_robot_mode(_value(said, "robotmode")), _safety_mode(_value(said, "safetystatus"))]
+    program = said.get("programState", "").split(" ")[0]
+    idle = program in ("STOPPED", "")
+    advice = "" if idle else "stop it on the teach pendant, unless Decant runs there now"
+    checks.append(DeviceCheck("program", "ok" if idle else "fail", f"{program.lower() or 'not told'}", advice))
+    return checks
+
+
+def _value(said: dict[str, str], question: str) -> str:
+    return said.get(question, "").partition(":")[2].strip()
+
+
+def _robot_mode(mode: str) -> DeviceCheck:
+    advice = {
+        "RUNNING": "",
+        "IDLE": "power is on and the brakes hold: press START (release the brakes) on the teach pendant",
+        "POWER_OFF": "switch the arm on and release the brakes on the teach pendant",
+        "BOOTING": "wait until it has booted",
+        "CONFIRM_SAFETY": "somebody has to look at the safety settings on the teach pendant and confirm them",
+        "BACKDRIVE": "free drive is on: end it on the teach pendant",
+    }.get(mode, "look at the teach pendant; the arm has to be in normal operation")
+    return DeviceCheck(
+        "arm", "ok" if mode == "RUNNING" else "fail", mode.lower().replace("_", " ") or "not told", advice
+    )
+
+
+def _safety_mode(mode: str) -> DeviceCheck:
+    advice = {
+        "NORMAL": "",
+        "REDUCED": "pours are planned within the normal limits: end the reduced mode, at the pendant or its input",
+        "PROTECTIVE_STOP": "find the cause, then unlock it on the teach pendant; Decant never does so by itself",
+        "RECOVERY": "the arm is outside its limits: bring it back by hand in the recovery mode of the teach pendant",
+        "SAFEGUARD_STOP": "a door, mat or light curtain holds it: close it",
+        "SYSTEM_EMERGENCY_STOP": "release the emergency stop, once you know why it was pressed",
+        "ROBOT_EMERGENCY_STOP": "release the emergency stop, once you know why it was pressed",
+    }.get(mode, "look at the teach pendant; a fault of the safety system needs a restart, or the maker's service")
+    state: State = "ok" if mode == "NORMAL" else "fail"
+    return DeviceCheck("safety", state, mode.lower().replace("_", " ") or "not told", advice)
+
+
+def _checksum(found: Findings, record: SafetyRecord | None, accept: str, *, virtual: bool) -> DeviceCheck:
+    assert found.state is not None
+    checksum = found.state.checksum
+    if not checksum:
+        return DeviceCheck(
+            "safety checksum",
+            "fail",
+            "the controller tells none",
+            "no safety configuration is applied: set and confirm one on the teach pendant",
+        )
+    if virtual:
+        return DeviceCheck("safety checksum", "ok", f"{checksum}; of a virtual controller, nobody has to accept it")
+    if record is None:
+        return DeviceCheck(
+            "safety checksum",
+            "fail",
+            f"{checksum}, accepted by nobody",
+            f"compare it with the teach pendant, read the safety settings there, then: {accept}",
+        )
+    if record.serial != found.serial:
+        return DeviceCheck(
+            "safety checksum",
+            "fail",
+            f"{record.checksum} was accepted for robot {record.serial}, this is {found.serial or 'unknown'}",
+            f"is this the right controller? If so, read its safety settings, then: {accept}",
+        )
+    if record.checksum.upper() != checksum:
+        return DeviceCheck(
+            "safety checksum",
+            "fail",
+            f"{checksum}, but {record.checksum.upper()} was accepted on {record.date} by {record.accepted_by}",
+            f"find out who changed what on the teach pendant; when the settings are right: {accept}",
+        )
+    return DeviceCheck("safety checksum", "ok", f"{checksum}, accepted on {record.date} by {record.accepted_by}")
+
+
+def _motion(exchange: Exchange) -> list[DeviceCheck]:
+    """Whether a motion could begin now: the decision of the driver itself."""
+    values = [exchange.values.get(name) for name in ("robot_mode", "safety_mode", "runtime_state", SLIDER)]
+    if any(value is None for value in values):
+        return [DeviceCheck("motion", "warn", "not told", "look at the teach pendant whether the arm is ready")]
+    robot, safety, runtime, slider = (value[0] for value in values if value is not None)
+    why = why_not_ready(int(robot), int(safety), int(runtime), slider)
+    if not why:
+        return [DeviceCheck("motion", "ok", "the arm is ready to move")]
+    return [DeviceCheck("motion", "fail", why, "mend that first: no motion begins before")]
+
+
+def _network(exchange: Exchange) -> DeviceCheck:
+    text = (
+        f"{1e3 * exchange.round_trip:.1f} ms there and back (slowest {1e3 * exchange.slowest:.1f} ms), "
+        f"{exchange.rate:.0f} of {exchange.wanted:.0f} packages a second, longest gap {1e3 * exchange.gap:.0f} ms"
+    )
+    if exchange.gap >= LONGEST_GAP or exchange.rate < 0.8 * exchange.wanted:
+        return DeviceCheck(
+            "connection", "fail", text, "connect by cable, without wireless or VPN; is this computer overloaded?"
+        )
+    if exchange.gap >= GOOD_GAP or exchange.round_trip >= GOOD_ROUND_TRIP:
+        return DeviceCheck("connection", "warn", text, "a cable straight to the controller would be better")
+    return DeviceCheck("connection", "ok", text)

@@ -1,0 +1,321 @@
+"""What a UR controller says of itself when nobody steers it: read over plain sockets, one port at a time.
+
+Nothing here can move the arm or change a setting: questions on the dashboard, the robot's state from the primary port,
+values over RTDE. It works in states in which a driver can't connect, which is when people want to know why.
+
+What `decant doctor` reads from a UR controller. Nothing moves, nothing is set.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import re
+import socket
+import statistics
+import struct
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from actors.arm.ur import dashboard as dashboard_port
+from actors.arm.ur import primary_interface as primary
+from actors.arm.ur import rtde
+from actors.arm.ur.dashboard import Dashboard, DashboardError
+from actors.arm.ur.primary_interface import RobotState
+from actors.interfaces import LaboratoryError
+
+SCRIPTS, RTDE = 30003, 30004
+PORTS: dict[int, str] = {
+    dashboard_port.PORT: "dashboard",
+    primary.PORT: "primary interface",
+    SCRIPTS: "programs",
+    RTDE: "real-time data exchange",
+}
+"""Ports that Decant uses, with their names."""
+
+QUESTIONS = (
+    "PolyscopeVersion",
+    "get robot model",
+    "get serial number",
+    "is in remote control",
+    "robotmode",
+    "safetystatus",
+    "programState",
+)
+"""Asked on the dashboard; none of them does anything."""
+
+SLIDER = "target_speed_fraction"
+STATUS = ("robot_mode", "safety_mode", "runtime_state", SLIDER)
+"""Values over RTDE that decide whether the arm can move."""
+
+ROUND_TRIPS = 20
+
+
+class ReadoutError(LaboratoryError):
+    """A port says nothing, or nothing that can be understood."""
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """What RTDE tells, and how well the network carries it.
+
+    Attributes:
+        version: of the controller's software.
+        payload: [kg], None if it doesn't tell.
+        payload_centre: in the flange's frame [m], None if it doesn't tell.
+        round_trip: median time from question to answer [s].
+        slowest: longest of them [s].
+        rate: packages received per second, of `wanted` [Hz].
+        gap: longest time between two packages [s].
+    """
+
+    version: tuple[int, ...]
+    payload: float | None
+    payload_centre: tuple[float, ...] | None
+    round_trip: float
+    slowest: float
+    rate: float
+    gap: float
+    wanted: float
+    values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    @property
+    def acceleration(self) -> tuple[float, ...] | None:
+        """What the tool feels, in its own frame [m/s²]: upwards at rest; None if the controller doesn't tell."""
+        return self.values.get("actual_tool_accelerometer")
+
+
+def port_problem(address: str, port: int, patience: float = 2.0) -> str | None:
+    """Why a port can't be reached; None if it is open."""
+    try:
+        with socket.create_connection((address, port), timeout=patience):
+            return None
+    except ConnectionRefusedError:
+        return "refused"
+    except TimeoutError:
+        return "no answer"
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def ask_dashboard(address: str, questions: Sequence[str] = QUESTIONS, patience: float = 3.0) -> dict[str, str]:
+    """Answers of the dashboard, by question.
+
+    Raises:
+        SurveyError: it doesn't answer.
+    """
+    try:
+        with Dashboard(address, patience) as dashboard:
+            return {question: dashboard.ask(question) for question in questions}
+    except DashboardError as error:
+        raise ReadoutError(str(error)) from error
+
+
+def read_state(address: str, patience: float = 3.0) -> RobotState:
+    """The robot's state, once all its parts have come.
+
+    Args:
+        address: of the controller.
+        patience: longest wait [s]; the checksum and the limits, which may be missing, are waited for half of it.
+
+    Raises:
+        SurveyError: no state came, or one that can't be read.
+    """
+    begin, rest, parts = time.monotonic(), b"", dict[int, bytes]()
+    needed, welcome = {primary.JOINTS, primary.CARTESIAN}, {primary.SAFETY, primary.CONFIGURATION}
+    try:
+        with socket.create_connection((address, primary.PORT), timeout=patience) as connection:
+            while not (needed | welcome) <= parts.keys():
+                spent = time.monotonic() - begin
+                if spent > patience or (needed <= parts.keys() and spent > patience / 2.0):
+                    break
+                data = connection.recv(65536)
+                if not data:
+                    break
+                packages, rest = primary.split(rest + data)
+                for kind, body in packages:
+                    if kind == primary.STATE:
+                        parts |= dict(primary.split(body)[0])
+    except (OSError, primary.PrimaryError) as error:
+        raise ReadoutError(f"the primary port at {address} can't be read: {error}") from error
+    if not needed <= parts.keys():
+        raise ReadoutError(f"the primary port at {address} sent no robot state within {patience:g} s")
+    return primary.robot_state(parts)
+
+
+def read_exchange(address: str, rate: float = 125.0, seconds: float = 1.0, patience: float = 3.0) -> Exchange:
+    """Values over RTDE, round trips, and how evenly packages arrive.
+
+    Args:
+        address: of the controller.
+        rate: packages asked for [Hz].
+        seconds: for how long they are counted.
+        patience: longest wait for an answer [s].
+
+    Raises:
+        SurveyError: it doesn't answer, or not in a way that can be understood.
+    """
+    try:
+        with socket.create_connection((address, RTDE), timeout=patience) as connection:
+            return _exchange(_Rtde(connection), rate, seconds)
+    except (OSError, struct.error, rtde.PackageError) as error:
+        raise ReadoutError(f"RTDE at {address} doesn't answer as it should: {error}") from error
+
+
+class _Rtde:
+    """Questions and answers on one connection."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._packages = rtde.PackageReader()
+        self._waiting: list[tuple[int, bytes]] = []
+
+    def ask(self, kind: int, payload: bytes = b"") -> bytes:
+        self._connection.sendall(rtde.package(kind, payload))
+        while True:
+            got, answer = self.next()
+            if got == kind:
+                return answer
+
+    def next(self) -> tuple[int, bytes]:
+        while not self._waiting:
+            data = self._connection.recv(65536)
+            if not data:
+                raise OSError("it hung up")
+            self._waiting.extend(self._packages.feed(data))
+        return self._waiting.pop(0)
+
+
+def _exchange(talk: _Rtde, rate: float, seconds: float) -> Exchange:
+    if talk.ask(rtde.REQUEST_PROTOCOL_VERSION, struct.pack(">H", 2)) != b"\x01":
+        raise OSError("it doesn't know protocol 2")
+    trips = []
+    version: tuple[int, ...] = ()
+    for _ in range(ROUND_TRIPS):
+        asked = time.monotonic()
+        version = struct.unpack(">4I", talk.ask(rtde.GET_URCONTROL_VERSION)[:16])
+        trips.append(time.monotonic() - asked)
+    names = ("timestamp", "payload", "payload_cog", "actual_tool_accelerometer", *STATUS)
+    known = _known(talk, names, rate)
+    if talk.ask(rtde.START) != b"\x01":
+        raise OSError("it doesn't begin to send")
+    layout = struct.Struct(">B" + "".join(rtde.FORMATS[kind][0] for kind in known.values()))
+    arrivals, package, begin = [], b"", time.monotonic()
+    while time.monotonic() - begin < seconds:
+        kind, payload = talk.next()
+        if kind == rtde.DATA_PACKAGE:
+            arrivals.append(time.monotonic())
+            package = payload
+    if len(arrivals) < 2:
+        raise OSError("it sends no packages")
+    values, place = {}, 1
+    numbers = layout.unpack(package)
+    for name, kind_name in known.items():
+        count = rtde.FORMATS[kind_name][1]
+        values[name] = tuple(numbers[place : place + count])
+        place += count
+    payload_mass = values.get("payload")
+    return Exchange(
+        version=version,
+        payload=None if payload_mass is None else payload_mass[0],
+        payload_centre=values.get("payload_cog"),
+        round_trip=statistics.median(trips),
+        slowest=max(trips),
+        rate=(len(arrivals) - 1) / (arrivals[-1] - arrivals[0]),
+        gap=max(b - a for a, b in itertools.pairwise(arrivals)),
+        wanted=rate,
+        values=values,
+    )
+
+
+def _known(talk: _Rtde, names: Sequence[str], rate: float) -> dict[str, str]:
+    """Those of the values asked for that this controller has, with their types; they are sent from now on."""
+    while True:
+        answer = talk.ask(rtde.SETUP_OUTPUTS, struct.pack(">d", rate) + ",".join(names).encode("ascii"))
+        kinds = rtde.names(answer[1:])
+        found = {name: kind for name, kind in zip(names, kinds, strict=False) if kind in rtde.FORMATS}
+        if len(found) == len(names):
+            return found
+        if not found:
+            raise OSError(f"it knows none of {', '.join(names)}")
+        names = tuple(found)
+
+
+PATIENT_GAP = 0.1
+"""Between two packages over RTDE [s]; beyond it they are looked at once more."""
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was read from a controller; None where it couldn't be.
+
+    Attributes:
+        address: that the name stands for; '' if it stands for none.
+        ports: why each can't be reached, None where it can.
+        dashboard: answers by question.
+    """
+
+    address: str
+    ports: dict[int, str | None] = field(default_factory=dict)
+    dashboard: dict[str, str] | None = None
+    state: RobotState | None = None
+    exchange: Exchange | None = None
+    problems: tuple[str, ...] = ()
+
+    @property
+    def software(self) -> tuple[int, ...]:
+        """Version of the controller's software; empty if it isn't known."""
+        if self.exchange is not None:
+            return self.exchange.version
+        told = re.search(r"(\d+)\.(\d+)\.(\d+)", (self.dashboard or {}).get("PolyscopeVersion", ""))
+        return tuple(int(part) for part in told.groups()) if told else ()
+
+    @property
+    def serial(self) -> str:
+        """Serial number of the robot; '' if it isn't known."""
+        return (self.dashboard or {}).get("get serial number", "")
+
+    @property
+    def model(self) -> str:
+        """As in laboratory files; '' if it isn't known."""
+        name = (self.dashboard or {}).get("get robot model", "").lower()
+        if not name or not self.software:
+            return ""
+        return name if name.endswith("e") or self.software[0] < 5 else f"{name}e"
+
+
+def look_at(host: str) -> Findings:
+    """Ask the controller everything.
+
+    Args:
+        host: its address or name.
+    """
+    try:
+        address = socket.getaddrinfo(host, None, socket.AF_INET)[0][4][0]
+    except OSError as error:
+        return Findings("", problems=(str(error),))
+    assert isinstance(address, str)
+    ports = {port: port_problem(address, port) for port in PORTS}
+    dashboard = state = exchange = None
+    problems: list[str] = []
+    if ports[dashboard_port.PORT] is None:
+        with _noting(problems):
+            dashboard = ask_dashboard(address)
+    if ports[primary.PORT] is None:
+        with _noting(problems):
+            state = read_state(address)
+    if ports[RTDE] is None:
+        with _noting(problems):
+            exchange = read_exchange(address)
+            if exchange.gap > PATIENT_GAP:  # a hiccup of this computer, or the rule? The better of two tells
+                exchange = min(exchange, read_exchange(address), key=lambda e: e.gap)
+    return Findings(address, ports, dashboard, state, exchange, tuple(problems))
+
+
+@contextlib.contextmanager
+def _noting(problems: list[str]) -> Iterator[None]:
+    try:
+        yield
+    except ReadoutError as error:
+        problems.append(str(error))

@@ -1,0 +1,170 @@
+"""What an arm did, from what was read of it, and how well it followed its path. Pure.
+
+Stops that were asked for, from any thread, and whether the arm was seen to stand.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath
+from actors.arm.planning.frames import cell_transforms, pourer_motion
+from actors.arm.planning.kinematics import MODELS, forward
+from actors.arm.ur.worker_messages import MotionOutcome, Sample
+
+LONGEST_LAG = 0.3
+"""Searched for the lag that explains most of the difference [s]."""
+
+
+def executed_path(
+    samples: list[Sample], path: JointPath, spec: UrArmSpec, *, completed: bool, slider: float = 1.0
+) -> ExecutedPath:
+    """What was read, on the path's own clock.
+
+    The controller's program tells in every package how far on the path it is, so that both clocks are joined without
+    asking when a package arrived here.
+
+    Args:
+        samples: in the order of their times.
+        path: that was to be followed.
+        spec: of the arm.
+        completed: False if it was stopped on the way.
+        slider: lowest position of the speed slider.
+    """
+    stamps = np.array([t for t, _, _ in samples])
+    joints = np.array([q for _, q, _ in samples]).reshape(-1, 6)
+    clocks = np.array([c for _, _, c in samples])
+    running = (clocks > 0.0) & (clocks < path.duration - 1e-6)
+    if not np.any(running):
+        running = clocks > 0.0
+    if not np.any(running):
+        return ExecutedPath(np.zeros(0), np.zeros((0, 6)), False, {})
+    times = stamps - float(np.median(stamps[running] - clocks[running]))
+    first = max(int(np.searchsorted(times, 0.0, side="right")) - 1, 0)
+    times, joints = times[first:], joints[first:]
+    times[0] = max(times[0], 0.0) if len(times) > 1 else 0.0
+    if times[0] > 0.0:
+        times, joints = np.concatenate([[0.0], times]), np.vstack([path.joints[0], joints])
+    followed = np.ones(len(times), dtype=bool) if completed else times <= clocks.max()
+    tracking = _tracking(times[followed], joints[followed], path, spec) if np.any(followed) else {}
+    poses = pourer_motion(joints, times, spec).poses if len(times) > 1 else np.zeros((0, 7))
+    return ExecutedPath(times, joints, completed, tracking | {"slider": slider}, poses)
+
+
+def best_lag(times: FloatArray, joints: FloatArray, path: JointPath) -> float:
+    """By how much the path has to be delayed to be most like what was read [s]."""
+    low, high = 0.0, LONGEST_LAG
+    for _ in range(4):
+        candidates = np.linspace(low, high, 31)
+        errors = [float(np.mean((joints - path.at(times - lag)) ** 2)) for lag in candidates]
+        best = int(np.argmin(errors))
+        low, high = candidates[max(best - 1, 0)], candidates[min(best + 1, 30)]
+    return float(candidates[best])
+
+
+def _tracking(times: FloatArray, joints: FloatArray, path: JointPath, spec: UrArmSpec) -> dict[str, float]:
+    lag = best_lag(times, joints, path)
+    planned = path.at(times - lag)
+    angles = np.abs(joints - planned).max(axis=1)
+    model, tool = MODELS[spec.model], cell_transforms(spec).tool.position
+    points = []
+    for q in (joints, planned):
+        rotation, position = forward(q, model)
+        points.append(position + rotation @ tool)
+    apart = np.linalg.norm(points[0] - points[1], axis=1)
+    return {
+        "rms_angle": float(np.sqrt(np.mean((joints - planned) ** 2))),
+        "max_angle": float(angles.max()),
+        "rms_tool": float(np.sqrt(np.mean(apart**2))),
+        "max_tool": float(apart.max()),
+        "lag": lag,
+        "longest_gap": float(np.diff(times).max()) if len(times) > 1 else float("inf"),
+    }
+
+
+@dataclass(frozen=True)
+class StopTimes:
+    """How soon a stop took effect, from the call on.
+
+    Attributes:
+        answered: until the program was seen to have taken the order [s]; None if other means stopped it.
+        standing: until the arm was seen to stand [s].
+    """
+
+    answered: float | None
+    standing: float
+
+
+class Stops:
+    """Shared by the thread that moves the arm and those that stop it.
+
+    Attributes:
+        count: of stops so far.
+        unseen: the last motion ended without the arm being seen to stand.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._under_way = False
+        self._outcome: MotionOutcome | None = None
+        self.count = 0
+        self.unseen = False
+
+    # ---- who moves
+
+    def begin(self) -> None:
+        """A motion begins."""
+        with self._changed:
+            self._under_way, self._outcome, self.unseen = True, None, False
+
+    def came_to(self, outcome: MotionOutcome) -> None:
+        """What the motion came to."""
+        with self._changed:
+            self._outcome = outcome
+            self.unseen = outcome.moved and outcome.standing is None
+
+    def lost(self) -> None:
+        """Nobody knows what the motion came to."""
+        self.unseen = True
+
+    def end(self) -> None:
+        """The motion is over."""
+        with self._changed:
+            self._under_way = False
+            self._changed.notify_all()
+
+    def wait_for_one(self, since: int, seconds: float) -> bool:
+        """Wait, unless another stop is asked for. Returns whether one was."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self.count != since, max(seconds, 0.0))
+
+    # ---- who stops
+
+    @property
+    def under_way(self) -> bool:
+        """A motion is under way, or announced."""
+        return self._under_way
+
+    def ask(self) -> int:
+        """A stop is asked for. Returns how many that makes."""
+        with self._changed:
+            self.count += 1
+            self._changed.notify_all()
+            return self.count
+
+    def wait_for_end(self, seconds: float) -> bool:
+        """Wait for the motion to be over. Returns whether it is."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._under_way, seconds)
+
+    def times(self, asked: float) -> StopTimes | None:
+        """How soon the last motion ended after a moment [s of `time.monotonic`]; None if nothing had moved."""
+        outcome = self._outcome
+        if outcome is None or outcome.standing is None:
+            return None
+        answered = None if outcome.answered is None else max(0.0, outcome.answered - asked)
+        return StopTimes(answered, max(0.0, outcome.standing - asked))

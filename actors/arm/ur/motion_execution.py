@@ -1,0 +1,394 @@
+"""One motion, from the upload of its program to rest: the loop that lets it go on, and looks at what it does.
+
+The way back from a stop to a robot that could move, and doesn't. A person has seen to the cause before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+
+from actors.arm.arm_interface import JOINT_NAMES
+from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
+from actors.arm.ur.primary_interface import Primary, PrimaryError
+from actors.arm.ur.rtde_client import AT_REST, RtdeClient
+from actors.arm.ur.worker_messages import (
+    DONE,
+    NORMAL,
+    PLAYING,
+    READY,
+    ROBOT_MODES,
+    RUNNING_MODE,
+    SAFETY_MODES,
+    SLOWEST_HEARTBEAT,
+    STOPPED,
+    STOPPED_PROGRAM,
+    DataPackage,
+    MotionOrder,
+    MotionOutcome,
+    MotionProgress,
+    Sample,
+    TroubleError,
+    why_not_ready,
+)
+
+AT_START = 0.01
+"""Joints may be so far from a path's first point [rad]: that is aligned slowly before the path begins."""
+
+AT_END = 0.01
+"""Joints may be so far from a path's last point [rad] for it to count as completed."""
+
+SAME_TOOL, SAME_PAYLOAD = 1e-4, 1e-3
+"""Differences that count as none, of tool [m], [rad] and payload [kg], [m]."""
+
+UPLOAD_TIME, STANDING_TIME = 5.0, 3.0
+"""Longest wait for a program to say that it is ready, and for the arm to stand [s of the clock]."""
+
+OVERTIME = 10.0
+"""How much longer than planned a path may take [s of controller time]."""
+
+BEAT_INTERVAL, TELL_INTERVAL, LOOK_INTERVAL = 0.02, 0.05, 0.002
+OWNER_SILENCE = 3.0
+"""After which a driver that says nothing is taken for dead [s of the clock]."""
+
+_KINDS = {3: "protective stop", 5: "safeguard", 6: "emergency stop", 7: "emergency stop"}
+"""Kinds of stops by safety mode; "safety" for all others."""
+
+
+class MotionMonitor:
+    """One motion.
+
+    Args:
+        client: to the controller.
+        address: of the controller, for its other ports.
+        motion: which.
+        tell: told some twenty times a second where it is.
+        owner_seen: when the driver last said that it lives [s of `time.monotonic`].
+    """
+
+    def __init__(
+        self,
+        client: RtdeClient,
+        address: str,
+        motion: MotionOrder,
+        tell: Callable[[MotionProgress], None],
+        owner_seen: Callable[[], float],
+    ) -> None:
+        self._client, self._address, self._motion = client, address, motion
+        self._tell, self._owner_seen = tell, owner_seen
+        self._ordered = threading.Event()
+        self._samples: list[Sample] = []
+        self._clock, self._slider = 0.0, 1.0
+        self._joints: tuple[float, ...] = motion.start
+        self._began = 0.0
+        self._went = False
+        self._beats, self._next_beat, self._last_beat, self._longest_pause = 0, 0.0, 0.0, 0.0
+        self._next_tell = 0.0
+        self._standing: float | None = None
+        self._answered: float | None = None
+
+    def order_stop(self) -> None:
+        """Stop; from any thread."""
+        self._ordered.set()
+        self._client.order_stop(self._motion.number)
+
+    def run(self) -> MotionOutcome:
+        """The whole motion.
+
+        Raises:
+            TroubleError: refused before anything moved.
+        """
+        reading = self._client.fresh()
+        self._refuse_if(why_not_ready(reading.robot_mode, reading.safety_mode, reading.runtime, reading.slider))
+        self._refuse_if(_elsewhere(reading.joints, self._motion.start))
+        self._refuse_if(_not_remote(self._address))
+        self._joints = reading.joints
+        try:
+            primary = Primary(self._address)
+        except PrimaryError as error:
+            raise TroubleError("lost", str(error)) from None
+        try:
+            return self._through(primary)
+        finally:
+            primary.close()
+
+    @staticmethod
+    def _refuse_if(why: str) -> None:
+        if why:
+            raise TroubleError("refused", why)
+
+    def _through(self, primary: Primary) -> MotionOutcome:
+        self._beat()
+        try:
+            primary.upload(self._motion.program)
+            refusal = self._until_ready(primary)
+            if refusal:
+                self._end_program()
+                said = "; ".join(primary.complaints)
+                raise TroubleError("refused", refusal + (f" (the controller says: {said})" if said else ""))
+            if self._ordered.is_set():
+                return self._broken_off("operator", "stopped by the operator")
+            self._began = self._client.fresh().time
+            self._went = True
+            self._client.go(self._motion.number)
+            return self._until_end(primary)
+        except TroubleError as trouble:
+            if trouble.kind == "refused":
+                raise
+            self._end_program()
+            return self._outcome("lost", trouble.text)
+        except PrimaryError as error:
+            raise TroubleError("lost", str(error)) from None
+
+    # ---- before the go
+
+    def _until_ready(self, primary: Primary) -> str:
+        """Wait for the program, and read back what it set. Returns why it must not go on, or ''."""
+        motion, settings = self._motion, self._motion.settings
+        end = time.monotonic() + UPLOAD_TIME
+        while True:
+            reading = self._look()
+            if self._ordered.is_set():
+                return ""
+            payload = (reading.payload, *reading.centre)
+            if reading.number == motion.number and reading.status == READY:
+                tool_is_set = _near(reading.tool, settings.tool, SAME_TOOL)
+                payload_is_set = _near(payload, (settings.payload, *settings.centre), SAME_PAYLOAD)
+                if tool_is_set and payload_is_set:
+                    why = _elsewhere(reading.joints, motion.start)
+                    return why
+                if time.monotonic() > end - 0.5 * UPLOAD_TIME:
+                    return (
+                        f"tool and payload were set to {_show((*settings.tool, settings.payload, *settings.centre))}; "
+                        f"the controller has {_show((*reading.tool, *payload))}"
+                    )
+            if reading.safety_mode != NORMAL or reading.robot_mode != RUNNING_MODE:
+                return "the robot is not ready any more"
+            if primary.broken or time.monotonic() > end:
+                return "the program did not start on the controller"
+            time.sleep(LOOK_INTERVAL)
+
+    # ---- after it
+
+    def _until_end(self, primary: Primary) -> MotionOutcome:
+        motion, arrived = self._motion, 0.0
+        while True:
+            reading = self._look()
+            if reading.status == STOPPED and reading.number == motion.number:
+                self._answered = time.monotonic()
+                return self._broken_off("operator", "stopped by the operator")
+            if reading.safety_mode != NORMAL or reading.robot_mode != RUNNING_MODE:
+                return self._stopped_by_safety(reading)
+            if reading.status == DONE and reading.number == motion.number:
+                arrived = arrived or time.monotonic()
+                if reading.runtime == STOPPED_PROGRAM and reading.stands:
+                    if _near(reading.joints, motion.end, AT_END):
+                        self._standing = time.monotonic()
+                        return self._outcome("completed", "")
+                    return self._outcome(
+                        "program ended", f"the path was run through, but {_elsewhere(reading.joints, motion.end)}"
+                    )
+                if time.monotonic() - arrived > STANDING_TIME:
+                    return self._broken_off("program ended", "the arm does not come to rest at the path's end")
+            elif reading.runtime != PLAYING and reading.time > self._began:
+                return self._stopped_by_program(primary)
+            if reading.time - self._began > motion.duration + OVERTIME + STANDING_TIME:
+                return self._broken_off("program ended", "the motion takes far longer than planned")
+            if time.monotonic() - self._owner_seen() > OWNER_SILENCE:
+                self.order_stop()
+            time.sleep(LOOK_INTERVAL)
+
+    def _stopped_by_safety(self, reading: DataPackage) -> MotionOutcome:
+        # A safeguard stop would go on by itself once it is released, a protective stop at somebody's 'play'.
+        kind = _KINDS.get(reading.safety_mode, "safety")
+        text = SAFETY_MODES.get(reading.safety_mode, "") if reading.safety_mode != NORMAL else ""
+        text = text or f"the robot is {ROBOT_MODES.get(reading.robot_mode, 'not running')}"
+        return self._broken_off(kind, text)
+
+    def _stopped_by_program(self, primary: Primary) -> MotionOutcome:
+        time.sleep(0.05)  # the safety mode may be reported a little later
+        reading = self._look()
+        if reading.safety_mode != NORMAL or reading.robot_mode != RUNNING_MODE:
+            return self._stopped_by_safety(reading)
+        if self._ordered.is_set():
+            return self._broken_off("operator", "stopped by the operator")
+        limit = 1.0 / SLOWEST_HEARTBEAT
+        if self._longest_pause > 0.8 * limit:
+            return self._broken_off(
+                "watchdog", f"the heartbeat paused for {self._longest_pause:.2f} s: this computer is too busy"
+            )
+        said = "; ".join(primary.complaints)
+        return self._broken_off(
+            "program ended", "the program was ended on the controller" + (f": {said}" if said else "")
+        )
+
+    def _broken_off(self, kind: str, text: str) -> MotionOutcome:
+        """End the program, whatever it is doing, and see the arm stand."""
+        self._client.order_stop(self._motion.number)
+        end = time.monotonic() + STANDING_TIME
+        asked = False
+        while time.monotonic() < end:
+            reading = self._look()
+            if reading.stands and reading.runtime == STOPPED_PROGRAM:
+                self._standing = self._standing or time.monotonic()
+                return self._outcome(kind, text)
+            if reading.stands:
+                self._standing = self._standing or time.monotonic()
+            if not asked and (kind != "operator" or time.monotonic() > end - 0.6 * STANDING_TIME):
+                asked = True
+                self._end_program()
+            time.sleep(LOOK_INTERVAL)
+        return self._outcome(kind, text + "; it could not be seen to stand and its program to end")
+
+    def _end_program(self) -> None:
+        self._client.order_stop(self._motion.number)
+        with contextlib.suppress(DashboardError):
+            stop_program(self._address, 0.5)
+
+    def _outcome(self, kind: str, text: str) -> MotionOutcome:
+        return MotionOutcome(
+            kind,
+            text,
+            self._samples,
+            self._clock,
+            self._joints,
+            self._standing,
+            self._answered,
+            self._went,
+            self._slider,
+        )
+
+    # ---- each turn
+
+    def _look(self) -> DataPackage:
+        self._beat()
+        reading = self._client.look(1.0 if self._went else AT_REST)
+        self._joints = reading.joints
+        if self._went:
+            self._slider = min(self._slider, reading.slider)
+            if reading.number == self._motion.number:
+                self._clock = reading.clock
+            if not self._samples or reading.time > self._samples[-1][0]:
+                self._samples.append((reading.time, reading.joints, reading.clock))
+        now = time.monotonic()
+        if now > self._next_tell:
+            self._next_tell = now + TELL_INTERVAL
+            self._tell(MotionProgress(self._clock, reading.joints, not reading.stands))
+        return reading
+
+    def _beat(self) -> None:
+        now = time.monotonic()
+        if now < self._next_beat:
+            return
+        if self._last_beat:
+            self._longest_pause = max(self._longest_pause, now - self._last_beat)
+        self._last_beat, self._next_beat = now, now + BEAT_INTERVAL
+        self._beats += 1
+        self._client.beat(self._beats)
+
+
+def _near(a: tuple[float, ...], b: tuple[float, ...], tolerance: float) -> bool:
+    return all(abs(x - y) <= tolerance for x, y in zip(a, b, strict=True))
+
+
+def _show(values: tuple[float, ...]) -> str:
+    return "[" + ", ".join(f"{v:.4g}" for v in values) + "]"
+
+
+def _elsewhere(joints: tuple[float, ...], wanted: tuple[float, ...]) -> str:
+    """How far joints are from where they should be, in words; '' if they are there."""
+    errors = [abs(a - b) for a, b in zip(joints, wanted, strict=True)]
+    worst = max(range(6), key=errors.__getitem__)
+    if errors[worst] <= AT_START:
+        return ""
+    return f"{JOINT_NAMES[worst]} is {errors[worst] * 57.29578:.1f}° away from where it should be; stand there first"
+
+
+def _not_remote(address: str) -> str:
+    try:
+        with Dashboard(address) as dashboard:
+            answer = dashboard.ask("is in remote control")
+    except DashboardError as error:
+        raise TroubleError("lost", str(error)) from None
+    # The older generation knows no such thing, and says so.
+    return "the robot is in local control; switch it to remote control" if answer.lower() == "false" else ""
+
+
+UNLOCK_DELAY = 5.5
+"""A protective stop can't be unlocked earlier [s of controller time]."""
+
+POWER_TIME = 60.0
+"""Longest wait for power and brakes [s of controller time]."""
+
+_PROTECTIVE, _SAFEGUARD, _EMERGENCIES, _FAULTS = 3, 5, (6, 7), (8, 9)
+_IDLE = 5
+
+
+def recover(client: RtdeClient, address: str, scale: float) -> str:
+    """Unlock, switch on, release the brakes: whatever is needed.
+
+    Args:
+        client: to the controller.
+        address: of its dashboard.
+        scale: controller seconds per second of the clock.
+
+    Returns:
+        What was done, for people.
+
+    Raises:
+        TroubleError: what has to be done by hand first.
+    """
+    done = []
+    try:
+        mode = client.fresh().safety_mode
+        if mode in _EMERGENCIES:
+            raise TroubleError("refused", "the emergency stop is still pressed; release its button first")
+        if mode == _SAFEGUARD:
+            raise TroubleError("refused", "the safeguard stop is still in force; leave the guarded area, then reset it")
+        if mode in _FAULTS:
+            raise TroubleError(
+                "refused", "the safety system reports a fault; restart it at the pendant, after its cause was found"
+            )
+        with Dashboard(address) as dashboard:
+            # A program that is only held would go on, and the next one that is uploaded would be thrown away.
+            dashboard.demand("stop", "Stopped")
+            dashboard.ask("close popup")
+            dashboard.ask("close safety popup")
+            if mode == _PROTECTIVE:
+                _unlock(dashboard, scale)
+                done.append("protective stop unlocked")
+                _until(lambda: client.fresh().safety_mode == NORMAL, POWER_TIME / scale, "the safety mode stays")
+            if client.fresh().robot_mode < _IDLE:
+                dashboard.demand("power on", "Powering on")
+                done.append("switched on")
+                _until(lambda: client.fresh().robot_mode >= _IDLE, POWER_TIME / scale, "the robot does not switch on")
+            if client.fresh().robot_mode != RUNNING_MODE:
+                dashboard.demand("brake release", "Brake releasing")
+                done.append("brakes released")
+                _until(
+                    lambda: client.fresh().robot_mode == RUNNING_MODE, POWER_TIME / scale, "the brakes are not released"
+                )
+        _until(lambda: client.fresh().runtime == STOPPED_PROGRAM, 3.0, "a program still runs on the controller")
+    except DashboardError as error:
+        raise TroubleError("lost", str(error)) from None
+    return ", ".join(done)
+
+
+def _unlock(dashboard: Dashboard, scale: float) -> None:
+    for last in (False, True):
+        answer = dashboard.ask("unlock protective stop")
+        if answer.lower().startswith("protective stop releasing"):
+            return
+        if last:
+            raise TroubleError("refused", f"the protective stop can't be unlocked: {answer}")
+        time.sleep(UNLOCK_DELAY / scale + 0.05)
+
+
+def _until(condition: Callable[[], bool], seconds: float, otherwise: str) -> None:
+    end = time.monotonic() + max(seconds, 3.0)
+    while not condition():
+        if time.monotonic() > end:
+            raise TroubleError("refused", otherwise)
+        time.sleep(0.02)

@@ -1,0 +1,323 @@
+"""A motion and what to call its parts; what to say about one that was broken off. Pure.
+
+From wherever an arm was stopped back to where it waits: along the paths that were checked, slowly. Pure.
+
+Small steps for setting up: checked, limited, as paths like any other. Pure.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from actors.arm.arm_interface import JOINT_NAMES, ArmRefusedError, ArmStoppedError, Joints
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath, PourPath
+from actors.arm.planning.frames import cell_transforms, flange_transforms, pourer_transforms
+from actors.arm.planning.kinematics import MODELS, forward, inverse
+from actors.arm.planning.path_checks import outside
+from actors.arm.ur.urscript_writer import checked
+from actors.arm.ur.worker_messages import MotionOutcome
+
+OFF_PATH = 0.1
+"""Joints farther than that from every point of a path are not on it [rad]: something has moved the arm."""
+
+HARDLY = 0.01
+"""Joints so near to a point are there [rad]."""
+
+RAMP = 0.6
+"""Time to get up to speed, and down again [s]."""
+
+_GRID = 0.02
+
+
+def leans(joints: FloatArray, spec: UrArmSpec) -> FloatArray:
+    """Tilt of the pourer for joints (T, 6) [rad], shape (T,) [rad]."""
+    tilts: FloatArray = np.arccos(np.clip(pourer_transforms(joints, spec).rotation[..., 2, 2], -1.0, 1.0))
+    return tilts
+
+
+def rejoin(path: JointPath, joints: FloatArray) -> tuple[float, float]:
+    """Where on a path an arm stands.
+
+    Args:
+        path: any.
+        joints: (6,) [rad].
+
+    Returns:
+        Time of the nearest point of the path [s], and how far the joint that is farthest is from it [rad].
+    """
+    begin, along = path.joints[:-1], np.diff(path.joints, axis=0)
+    squares = np.einsum("ij,ij->i", along, along)
+    share = np.einsum("ij,ij->i", joints - begin, along) / np.where(squares > 0.0, squares, 1.0)
+    share = np.clip(share, 0.0, 1.0)
+    apart = np.abs(begin + share[:, None] * along - joints)
+    nearest = int(np.argmin(np.einsum("ij,ij->i", apart, apart)))
+    time = path.times[nearest] + share[nearest] * (path.times[nearest + 1] - path.times[nearest])
+    return float(time), float(apart[nearest].max())
+
+
+def upright_way(path: PourPath, joints: FloatArray, spec: UrArmSpec) -> tuple[JointPath, FloatArray]:
+    """From a stopped pour to an upright pourer: back the way it came, or on if the pourer was coming up already.
+
+    Args:
+        path: that was being executed.
+        joints: (6,) where the arm stands [rad].
+        spec: how fast.
+
+    Returns:
+        The way, from rest to rest, and the pourer's tilt at its times [rad].
+
+    Raises:
+        ArmRefusedError: the arm doesn't stand on the path.
+    """
+    here, apart = rejoin(path.pour, joints)
+    if apart > OFF_PATH:
+        raise ArmRefusedError(_astray("the pour's path", apart, "bring the pourer upright at the pendant, by hand"))
+    tilt = float(np.interp(here, path.pour.times, path.tilts))
+    back, on = _between(path.pour.times, here, 0.0), _between(path.pour.times, here, path.pour.duration)
+    back_tilts, on_tilts = (np.interp(times, path.pour.times, path.tilts) for times in (back, on))
+    goes_back = back_tilts.max() <= max(on_tilts.max(), tilt + 1e-3)
+    times, tilts = (back, back_tilts) if goes_back else (on, on_tilts)
+    points = np.vstack([joints, path.pour.at(times)])
+    tilts = np.concatenate([[tilt], tilts])
+    turning = np.abs(np.diff(tilts)) / spec.untilt_speed
+    costs = np.maximum(turning, np.abs(np.diff(points, axis=0)).max(axis=1) / (0.5 * spec.approach_speed))
+    return _paced(points, tilts, costs)
+
+
+def way_home(path: PourPath, joints: FloatArray, spec: UrArmSpec) -> JointPath:
+    """From anywhere on the way to a pour or from it, upright, to where the arm waits.
+
+    Args:
+        path: that was being executed.
+        joints: (6,) where the arm stands [rad].
+        spec: how fast.
+
+    Raises:
+        ArmRefusedError: the arm stands on neither way.
+    """
+    if np.abs(path.retreat.joints[0] - joints).max() <= HARDLY:
+        return path.retreat
+    on, off_retreat = rejoin(path.retreat, joints)
+    back, off_approach = rejoin(path.approach, joints)
+    apart = min(off_retreat, off_approach)
+    if apart > OFF_PATH:
+        raise ArmRefusedError(_astray("the way home", apart, "un-tilt the pourer first, or bring the arm home by hand"))
+    if off_retreat <= off_approach:
+        chosen, times = path.retreat, _between(path.retreat.times, on, path.retreat.duration)
+    else:
+        chosen, times = path.approach, _between(path.approach.times, back, 0.0)
+    points = np.vstack([joints, chosen.at(times)])
+    # A way back may begin tilted, after a pour without a return.
+    turning = np.abs(np.diff(leans(points, spec))) / spec.untilt_speed
+    costs = np.maximum(turning, np.abs(np.diff(points, axis=0)).max(axis=1) / (0.5 * spec.approach_speed))
+    return _paced(points, np.zeros(len(points)), costs)[0]
+
+
+def _between(times: FloatArray, here: float, there: float) -> FloatArray:
+    """A path's times from one to another, in the order they are passed."""
+    low, high = min(here, there), max(here, there)
+    inner = times[(times > low) & (times < high)]
+    chosen = np.concatenate([[low], inner, [high]])
+    return chosen if there >= here else chosen[::-1]
+
+
+def _paced(points: FloatArray, tilts: FloatArray, costs: FloatArray) -> tuple[JointPath, FloatArray]:
+    """Points passed one after the other, each stretch in its time [s] at most, with a soft begin and end."""
+    along = np.concatenate([[0.0], np.cumsum(costs)])
+    whole = float(along[-1])
+    ramp = min(RAMP, max(whole, 1e-3))
+    duration = max(whole + ramp, 0.1)
+    times = np.linspace(0.0, duration, max(3, int(duration / _GRID)))
+    done = np.where(times < ramp, times**2 / (2.0 * ramp), times - 0.5 * ramp)
+    left = np.where(duration - times < ramp, (duration - times) ** 2 / (2.0 * ramp), duration - times - 0.5 * ramp)
+    place = np.where(times < 0.5 * duration, done, duration - ramp - left) * whole / max(duration - ramp, 1e-9)
+    place = np.clip(place, 0.0, whole)
+    joints = np.stack([np.interp(place, along, points[:, k]) for k in range(6)], axis=-1)
+    joints[0], joints[-1] = points[0], points[-1]
+    return JointPath(times, joints), np.interp(place, along, tilts)
+
+
+def _astray(where: str, apart: float, remedy: str) -> str:
+    return f"the arm does not stand on {where}: a joint is {np.degrees(apart):.1f}° away from it; {remedy}"
+
+
+UPRIGHT = 0.02
+"""Tilts below this aren't worth a word [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSegment:
+    """One motion, and what to call it.
+
+    Attributes:
+        path: to be followed.
+        phases: (name, start, end) [s].
+        tilts: of the pourer at the path's times [rad].
+    """
+
+    path: JointPath
+    phases: tuple[tuple[str, float, float], ...]
+    tilts: FloatArray
+
+    @classmethod
+    def of(cls, name: str, path: JointPath, spec: UrArmSpec) -> MotionSegment:
+        """A way of one phase.
+
+        Raises:
+            ArmRefusedError: it is not a path.
+        """
+        path = checked(path)
+        return cls(path, ((name, 0.0, path.duration),), leans(path.joints, spec))
+
+    @classmethod
+    def of_pour(cls, path: PourPath) -> MotionSegment:
+        """A pour's tilt, hold and return.
+
+        Raises:
+            ArmRefusedError: it is not a path.
+        """
+        if path.tilts.shape != path.pour.times.shape or not path.phases:
+            raise ArmRefusedError("a pour's path has a tilt for each of its times, and phases")
+        return cls(checked(path.pour), path.phases, path.tilts)
+
+    @property
+    def name(self) -> str:
+        """Name of its first phase."""
+        return self.phases[0][0]
+
+    def phase(self, time: float) -> str:
+        """What goes on at a time [s]."""
+        return next((name for name, _, end in self.phases if time < end), self.phases[-1][0])
+
+    def tilt(self, time: float) -> float:
+        """Tilt of the pourer then [rad]."""
+        return float(np.interp(time, self.path.times, self.tilts))
+
+    def tilt_left(self, outcome: MotionOutcome) -> float:
+        """Tilt of the pourer where the arm was stopped [rad]: it braked for a while after the path's clock stopped."""
+        if outcome.standing is not None:
+            time, apart = rejoin(self.path, np.array(outcome.joints))
+            if apart <= HARDLY:
+                return self.tilt(time)
+        return self.tilt(outcome.clock)
+
+    def stopped(self, outcome: MotionOutcome, executed: ExecutedPath) -> ArmStoppedError:
+        """What to tell of a motion that was broken off."""
+        phase, tilt = self.phase(outcome.clock), self.tilt_left(outcome)
+        tilted = f", the pourer tilted by {np.degrees(tilt):.0f}°" if tilt > UPRIGHT else ""
+        return ArmStoppedError(
+            f"{outcome.kind} during {phase}, {outcome.clock:.2f} s after its begin{tilted}: {outcome.text}. "
+            "The arm holds still; look into it, then release",
+            *(outcome.kind, phase, outcome.clock, tilt, executed),
+        )
+
+    def last_seen(self, clock: float) -> str:
+        """What to tell of a motion that was lost from sight."""
+        return (
+            f"Last seen during {self.phase(clock)}, {clock:.2f} s after its begin, the pourer tilted by "
+            f"{np.degrees(self.tilt(clock)):.0f}°; the program on the controller ends by its watchdog"
+        )
+
+
+FARTHEST_TURN, FARTHEST_WAY = math.radians(10.0), 0.05
+"""The largest single step [rad], [m]."""
+
+FASTEST_TURN, FASTEST_WAY = math.radians(20.0), 0.1
+"""[rad/s], [m/s]."""
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+_JOINT_AXES = tuple(f"joint {k}" for k in range(1, 7))
+_POINTS = 101
+
+
+def jog_path(spec: UrArmSpec, joints: Joints, axis: str, amount: float, speed: float) -> JointPath:
+    """A step from where the arm stands.
+
+    Args:
+        spec: limits and tool.
+        joints: where it stands [rad].
+        axis: see `UrArm.jog`.
+        amount: [rad] or [m].
+        speed: [rad/s] or [m/s].
+
+    Raises:
+        ArmRefusedError: too far, too fast, out of reach, or out of where the arm may be.
+    """
+    if axis not in (*AXES, *_JOINT_AXES):
+        raise ArmRefusedError(f"no axis '{axis}'; there are {', '.join((*_JOINT_AXES, *AXES))}")
+    straight = axis in ("x", "y", "z")
+    farthest, fastest = (FARTHEST_WAY, FASTEST_WAY) if straight else (FARTHEST_TURN, FASTEST_TURN)
+    if not 0.0 < abs(amount) <= farthest:
+        raise ArmRefusedError(f"a step is at most 50 mm or 10°; {_show(amount, straight)} was asked for")
+    if not 0.0 < speed <= fastest:
+        raise ArmRefusedError(f"a step's speed is at most 100 mm/s or 20°/s; {_show(speed, straight)}/s was asked for")
+    duration = max(2.0 * abs(amount) / speed, 0.2)
+    times = np.linspace(0.0, duration, _POINTS)
+    share = 0.5 - 0.5 * np.cos(np.pi * times / duration)  # the fastest of it is π/2 of the mean, below the speed
+    start = np.array(joints)
+    if axis in _JOINT_AXES:
+        points = np.repeat(start[None], _POINTS, axis=0)
+        points[:, _JOINT_AXES.index(axis)] += share * amount
+    else:
+        points = _tool_steps(spec, start, axis, share * amount)
+    _check(spec, points)
+    return JointPath(times, points)
+
+
+def _tool_steps(spec: UrArmSpec, start: FloatArray, axis: str, amounts: FloatArray) -> FloatArray:
+    model, tool = MODELS[spec.model], cell_transforms(spec).tool
+    rotation, position = forward(start[None], model)
+    rotations, positions = np.repeat(rotation, _POINTS, axis=0), np.repeat(position, _POINTS, axis=0)
+    along = np.eye(3)[AXES.index(axis) % 3]
+    if axis in ("x", "y", "z"):
+        positions = positions + amounts[:, None] * along
+    else:
+        point = position + rotation @ tool.position
+        turns = np.stack([_turn(along, angle) for angle in amounts])
+        rotations = turns @ rotation
+        positions = point - (rotations @ tool.position[None, :, None])[..., 0]
+    solutions = inverse(rotations, positions, model)
+    points = [start]
+    for candidates in solutions[1:]:
+        turned = candidates - 2.0 * np.pi * np.round((candidates - points[-1]) / (2.0 * np.pi))
+        apart = np.abs(turned - points[-1]).max(axis=-1)
+        if not np.isfinite(apart).any() or np.nanmin(apart) > 0.05:
+            raise ArmRefusedError("the arm can't make this step: out of its reach, or past a singularity")
+        points.append(turned[int(np.nanargmin(apart))])
+    return np.stack(points)
+
+
+def _turn(axis: FloatArray, angle: float) -> FloatArray:
+    cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    turned: FloatArray = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+    return turned
+
+
+def _check(spec: UrArmSpec, points: FloatArray) -> None:
+    model = MODELS[spec.model]
+    for name, positions, most in zip(JOINT_NAMES, points.T, model.joint_range, strict=True):
+        if np.abs(positions).max() > most:
+            raise ArmRefusedError(f"{name} would leave its range")
+    flange = flange_transforms(points[[0, -1]], spec)
+    frames = {"tool": cell_transforms(spec).tool.position, "pourer": cell_transforms(spec).pourer.position}
+    for thing, place in frames.items():
+        begin, end = flange.apply(place)
+        # Who stands outside may come back in: only what a step makes worse is refused.
+        if np.any(_beyond(end, spec) > np.maximum(_beyond(begin, spec), 0.0) + 1e-9):
+            raise ArmRefusedError(f"the {thing} would be {', '.join(outside(end, spec))}")
+
+
+def _beyond(point: FloatArray, spec: UrArmSpec) -> FloatArray:
+    """How far a point lies beyond each limit [m], negative inside."""
+    limits = spec.limits
+    planes = [plane.offset - float(np.dot(plane.normal, point)) for plane in limits.planes]
+    low, high = np.array(limits.box_low) - point, point - np.array(limits.box_high)
+    return np.concatenate([low, high, planes, [spec.cell.table - point[2]]])
+
+
+def _show(value: float, straight: bool) -> str:
+    return f"{1e3 * value:.1f} mm" if straight else f"{math.degrees(value):.1f}°"

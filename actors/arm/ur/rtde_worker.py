@@ -1,0 +1,186 @@
+"""`python -m actors.arm.ur.rtde_worker FD`: the process that holds the client library, until its driver hangs up or dies.
+
+Whatever the library prints goes where standard output goes: the driver reads it if things go wrong. Requests are done
+one after the other; stops and signs of life are taken by a thread of their own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import os
+import queue
+import sys
+import threading
+import time
+from multiprocessing.connection import Connection
+from typing import Any
+
+from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
+from actors.arm.ur.motion_execution import MotionMonitor, recover
+from actors.arm.ur.primary_interface import Primary, PrimaryError
+from actors.arm.ur.rtde_client import RtdeClient
+from actors.arm.ur.worker_messages import (
+    STOPPED_PROGRAM,
+    DataPackage,
+    Facts,
+    MotionOrder,
+    MotionOutcome,
+    MotionProgress,
+    TroubleError,
+)
+
+HANDS_IN_TIME = 3.0
+
+
+class Worker:
+    """What can be asked for.
+
+    Args:
+        connection: to the driver.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._sending = threading.Lock()
+        self._requests: queue.SimpleQueue[tuple[int, str, tuple[Any, ...]]] = queue.SimpleQueue()
+        self._client: RtdeClient | None = None
+        self._address = ""
+        self._watch: MotionMonitor | None = None
+        self._stops = 0
+        self._owner_seen = time.monotonic()
+
+    # ---- life
+
+    def serve(self) -> None:
+        """Until the driver hangs up."""
+        threading.Thread(target=self._hear, name="hear", daemon=True).start()
+        parent = os.getppid()
+        while True:
+            try:
+                number, method, arguments = self._requests.get(timeout=1.0)
+            except queue.Empty:
+                if os.getppid() != parent:  # dead, though somebody else holds the connection's other end
+                    os._exit(0)
+                continue
+            try:
+                answer = (number, True, getattr(self, method)(*arguments))
+            except TroubleError as trouble:
+                answer = (number, False, trouble)
+            except Exception as error:
+                answer = (number, False, TroubleError("lost", f"{method}: {error!r}"))
+            self._send(answer)
+
+    def _hear(self) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                request = self._connection.recv()
+                self._owner_seen = time.monotonic()
+                if request[0] == "stop":
+                    self._stops = max(self._stops, request[1])
+                    if (watch := self._watch) is not None:
+                        watch.order_stop()
+                elif request[0] == "call":
+                    self._requests.put(request[1:])
+        os._exit(0)  # the heartbeat ends with the process, and any motion with the heartbeat
+
+    def _send(self, message: Any) -> None:
+        with self._sending:
+            try:
+                self._connection.send(message)
+            except OSError:
+                os._exit(0)
+
+    def _tell(self, progress: MotionProgress) -> None:
+        self._send(progress)
+
+    # ---- requests
+
+    def open(self, address: str, rate: float, silence: float) -> DataPackage:
+        """Connect; nothing moves."""
+        self._address = address
+        self._client = RtdeClient(address, rate, silence)
+        return self._client.fresh()
+
+    @property
+    def client(self) -> RtdeClient:
+        """To the controller."""
+        if self._client is None:
+            raise TroubleError("lost", "not connected")
+        return self._client
+
+    def facts(self) -> Facts:
+        """Who is there, and how it is; nothing moves."""
+        reading = self.client.fresh()
+        try:
+            with Dashboard(self._address) as dashboard:
+                version = _version(dashboard.ask("PolyscopeVersion"))
+                model = dashboard.ask("get robot model")
+                serial = dashboard.ask("get serial number")
+                program = dashboard.ask("programState")
+                remote = None if version[0] < 5 else dashboard.ask("is in remote control").lower() == "true"
+            primary = Primary(self._address)
+            primary.close()
+        except (DashboardError, PrimaryError) as error:
+            raise TroubleError("lost", str(error)) from None
+        return Facts(
+            *(model, serial, version, remote, program, reading),
+            *(primary.state.checksum, primary.state.tool, primary.state.joint_ranges, primary.state.joint_speeds),
+        )
+
+    def read(self) -> DataPackage:
+        """A fresh package."""
+        return self.client.fresh()
+
+    def run(self, motion: MotionOrder) -> MotionOutcome:
+        """Make a motion."""
+        watch = MotionMonitor(self.client, self._address, motion, self._tell, lambda: self._owner_seen)
+        self._watch = watch
+        try:
+            if self._stops > motion.stops:
+                watch.order_stop()
+            return watch.run()
+        finally:
+            self._watch = None
+
+    def hands_in(self) -> None:
+        """End any program, and see that none runs."""
+        end = time.monotonic() + HANDS_IN_TIME
+        refusal = ""
+        if self.client.fresh().runtime != STOPPED_PROGRAM:
+            try:
+                stop_program(self._address)
+            except DashboardError as error:
+                refusal = f" ({error})"
+        while self.client.fresh().runtime != STOPPED_PROGRAM:
+            if time.monotonic() > end:
+                raise TroubleError("refused", f"a program still runs on the controller{refusal}: keep hands out")
+        try:
+            with Dashboard(self._address) as dashboard:
+                answer = dashboard.ask("programState")
+        except DashboardError as error:
+            raise TroubleError("lost", str(error)) from None
+        if not answer.upper().startswith("STOPPED"):
+            raise TroubleError("refused", f"the controller says that its program is '{answer}': keep hands out")
+        if not self.client.fresh().stands:
+            raise TroubleError("refused", "the arm still moves: keep hands out")
+
+    def recover(self, scale: float) -> str:
+        """Make the robot ready after a stop; nothing moves but the brakes."""
+        return recover(self.client, self._address, scale)
+
+
+def _version(text: str) -> tuple[int, ...]:
+    numbers = "".join(c if c.isdigit() or c == "." else " " for c in text).split()
+    dotted = next((n for n in numbers if "." in n), "0.0")
+    return tuple(int(part) for part in dotted.split(".") if part)
+
+
+def main() -> None:
+    """Serve on the connection whose number is the first argument."""
+    faulthandler.enable()
+    Worker(Connection(int(sys.argv[1]))).serve()
+
+
+if __name__ == "__main__":
+    main()

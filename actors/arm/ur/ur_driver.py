@@ -1,0 +1,398 @@
+"""A UR arm as everything above sees it: plain, blocking, and still until an operator has said that it may move.
+
+The client library lives in a worker process; here are consent, checks, and what came of a motion.
+
+The driver of an arm of hardware: it moves nothing under safety settings that nobody has accepted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from actors.arm.arm_interface import (
+    ArmError,
+    ArmLostError,
+    ArmNotReleasedError,
+    ArmPose,
+    ArmRefusedError,
+    ArmState,
+    ArmStoppedError,
+    Joints,
+    NotAcceptedError,
+    Pose,
+)
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.planned_pour import ExecutedPath, PourPath
+from actors.arm.planning.frames import cell_transforms
+from actors.arm.planning.kinematics import MODELS, forward
+from actors.arm.planning.path_checks import recheck
+from actors.arm.ur.dashboard import DashboardError, stop_program
+from actors.arm.ur.executed_motion import Stops, StopTimes, executed_path
+from actors.arm.ur.motion_segments import MotionSegment, jog_path, upright_way, way_home
+from actors.arm.ur.ur_session import ANSWER_TIME, Session, UrFacts
+from actors.arm.ur.urscript_writer import path_program
+from actors.arm.ur.worker_messages import DataPackage, MotionOrder, MotionOutcome, MotionSettings
+from actors.interfaces import LaboratoryError
+
+RECOVERY_TIME = 90.0
+"""Longest wait for a robot to be made ready [s of controller time]."""
+
+MOTION_MARGIN = 40.0
+"""What a motion may take beyond twice its planned time before its worker counts as hung [s]."""
+
+STOP_TIME = 1.0
+"""Each means of stopping gets so long before the next is tried [s]."""
+
+_numbers = itertools.count(os.getpid() % 4096 * 65536 + 1)
+"""Numbers of motions: unlike any that another process may have left in the controller's registers."""
+
+
+class UrArm:
+    """The arm.
+
+    Args:
+        spec: which arm, where, and what it may do. Its address must be filled in.
+
+    Attributes:
+        last_stop: how soon the last stop of a moving arm took effect.
+    """
+
+    def __init__(self, spec: UrArmSpec) -> None:
+        self._spec = spec
+        self._session = Session(spec)
+        self._working = threading.Lock()
+        self._released_at: float | None = None
+        self._stops = Stops()
+        self._stopped = False
+        self.last_stop: StopTimes | None = None
+        self._leg: MotionSegment | None = None
+        self._announced = False
+        self._last_pour: PourPath | None = None
+        self._tilt = 0.0
+
+    # ---- nothing moves
+
+    def connect(self) -> UrFacts:
+        """See `Arm.connect`: by a new worker."""
+        if not self._spec.address:
+            raise ArmRefusedError("the arm has no address; give the controller's, or have a virtual one started")
+        with self._at_work("connecting"):
+            self.lock()
+            return self._session.open()
+
+    def facts(self) -> UrFacts:
+        """See `Arm.facts`."""
+        with self._at_work("asking for facts"):
+            return self._session.find_out()
+
+    def joints(self) -> Joints:
+        """Measured, now [rad]; during a motion as last told, some twenty times a second."""
+        progress = self._session.progress
+        if self._leg is not None and progress is not None:
+            a, b, c, d, e, f = progress.joints
+            return a, b, c, d, e, f
+        with self._at_work("asking for joints"):
+            return self._joints()
+
+    def _joints(self) -> Joints:
+        reading: DataPackage = self._session.ask("read")
+        a, b, c, d, e, f = reading.joints
+        return a, b, c, d, e, f
+
+    def where(self) -> ArmPose:
+        """See `Arm.where`."""
+        from scipy.spatial.transform import Rotation
+
+        joints = self.joints()
+        rotation, position = forward(np.array([joints]), MODELS[self._spec.model])
+        tool = cell_transforms(self._spec).tool
+        x, y, z = map(float, position[0] + rotation[0] @ tool.position)
+        rx, ry, rz = map(float, Rotation.from_matrix(rotation[0] @ tool.rotation).as_rotvec())
+        return ArmPose(Pose(x, y, z, rx, ry, rz), joints, self._spec.home)
+
+    def release(self) -> None:
+        """See `Arm.release`."""
+        self._released_at = time.monotonic()
+        self._stopped = False
+
+    def lock(self) -> None:
+        """Nothing may begin to move until `release`."""
+        self._released_at = None
+
+    def hands_in(self) -> None:
+        """See `Arm.hands_in`: no program runs on the controller."""
+        self.lock()
+        with self._at_work("being made safe"):
+            self._session.ask("hands_in")
+
+    def state(self) -> ArmState:
+        """See `Arm.state`."""
+        leg, progress = self._leg, self._session.progress
+        if leg is None:
+            joints = () if progress is None else progress.joints
+            return ArmState(stopped=self._stopped, tilt=self._tilt, joints=joints)
+        clock = 0.0 if progress is None or self._announced else min(progress.clock, leg.path.duration)
+        return ArmState(
+            moving=not self._announced,
+            stopped=self._stopped,
+            time=clock,
+            fraction=clock / leg.path.duration,
+            phase="announced" if self._announced else leg.phase(clock),
+            tilt=leg.tilt(clock),
+            joints=() if progress is None else progress.joints,
+        )
+
+    # ---- motions
+
+    def move_to_start(self, path: PourPath) -> None:
+        """See `Arm.move_to_start`."""
+        with self._at_work("moving"):
+            self._go(MotionSegment.of("approach", path.approach, self._spec))
+
+    def execute(self, path: PourPath) -> ExecutedPath:
+        """See `Arm.execute`; what the encoders say, sampled `spec.rate` times per second of the clock."""
+        with self._at_work("pouring"):
+            self._last_pour = path
+            executed = self._go(MotionSegment.of_pour(path))
+            self._tilt = float(path.tilts[-1])
+            return executed
+
+    def retreat(self, path: PourPath) -> None:
+        """See `Arm.retreat`."""
+        with self._at_work("retreating"):
+            self._consent()
+            way = way_home(path, np.array(self._joints()), self._spec)
+            self._go(MotionSegment.of("retreat", way, self._spec))
+            self.lock()
+
+    def untilt(self, path: PourPath | None = None) -> None:
+        """See `Arm.untilt`."""
+        with self._at_work("un-tilting"):
+            self._consent()
+            poured = path or self._last_pour
+            if poured is None:
+                raise ArmRefusedError("no pour is known that was stopped; bring the pourer upright at the pendant")
+            self._last_pour = poured
+            way, tilts = upright_way(poured, np.array(self._joints()), self._spec)
+            self._go(MotionSegment(way, (("untilt", 0.0, way.duration),), tilts))
+            self._tilt = float(tilts[-1])
+            self.lock()
+
+    def jog(self, axis: str, amount: float, speed: float) -> None:
+        """See `Arm.jog`: at most 10°, or 50 mm."""
+        with self._at_work("jogging"):
+            self._consent()
+            self._go(MotionSegment.of("jog", jog_path(self._spec, self._joints(), axis, amount, speed), self._spec))
+            self.lock()
+
+    def recover(self) -> str:
+        """See `Arm.recover`: unlock, switch on, connect anew."""
+        self._consent()
+        self.lock()
+        self.connect()
+        with self._at_work("recovering"):
+            done: str = self._session.ask(
+                "recover", self._spec.time_scale, deadline=ANSWER_TIME + 2.0 * RECOVERY_TIME / self._spec.time_scale
+            )
+            self._stopped = True
+            return done
+
+    # ---- stopping
+
+    def stop(self) -> float:
+        """See `Arm.stop`. Three means, one after the other: an order that the running program looks for in every cycle;
+        the dashboard, over a connection of its own; an end of the heartbeat.
+        """
+        asked = time.monotonic()
+        self._stopped = True
+        self.lock()
+        self._session.stop(self._stops.ask())
+        if not self._stops.under_way:
+            return 0.0
+        for means in (self._stop_by_dashboard, self._session.kill, None):
+            if self._stops.wait_for_end(STOP_TIME):
+                if self._stops.unseen:
+                    break
+                times = self._stops.times(asked)
+                self.last_stop = times or self.last_stop
+                return 0.0 if times is None else times.standing
+            if means is not None:
+                means()
+        raise ArmLostError(
+            "the arm was told to stop by all means there are, but could not be seen to stand: "
+            "look at it, and press the emergency stop if it moves"
+        )
+
+    def _stop_by_dashboard(self) -> None:
+        with contextlib.suppress(DashboardError):
+            stop_program(self._spec.address, 0.5)
+
+    def close(self) -> None:
+        """See `Arm.close`."""
+        if self._stops.under_way:
+            with contextlib.suppress(ArmError):
+                self.stop()
+        self.lock()
+        self._session.discard()
+
+    # ---- how
+
+    @contextlib.contextmanager
+    def _at_work(self, doing: str) -> Iterator[None]:
+        if not self._working.acquire(timeout=0.5):
+            raise ArmRefusedError(f"the arm is busy; {doing} has to wait")
+        try:
+            yield
+        except ArmNotReleasedError:
+            raise
+        except LaboratoryError:
+            self.lock()
+            self._stopped = True
+            raise
+        finally:
+            self._working.release()
+
+    def _consent(self) -> float:
+        released = self._released_at
+        if released is None:
+            raise ArmNotReleasedError("the arm is locked: an operator has to release it before it moves")
+        return released
+
+    def _go(self, leg: MotionSegment) -> ExecutedPath:
+        """One motion, to its end."""
+        stops = self._stops.count  # before consent is looked at: a stop in between must count
+        released, spec = self._consent(), self._spec
+        path = leg.path
+        if leg.name != "jog":  # which checks itself: it may be the way back in
+            recheck(path, spec)
+        facts = self._session.facts
+        if facts is None:
+            raise ArmLostError("the arm is not connected; connect first")
+        settings = MotionSettings(tuple(spec.tool.as_list), spec.payload, spec.payload_centre)
+        number = next(_numbers)
+        program = path_program(path, settings, number, cb3=not facts.e_series)
+        start, end = (tuple(map(float, path.joints[k])) for k in (0, -1))
+        motion = MotionOrder(program, number, start, end, path.duration, settings, stops)
+        self._announced, self._leg = True, leg
+        self._session.forget_progress()
+        self._stops.begin()
+        try:
+            self._announce(released, leg, stops)
+            self._announced = False
+            outcome = self._run(motion, leg)
+            return self._judge(outcome, leg)
+        except LaboratoryError:
+            raise
+        except BaseException:  # an interrupt at the keyboard, say: whoever waited for the motion doesn't any more
+            self._session.stop(self._stops.ask())
+            self.lock()
+            self._stopped = True
+            raise
+        finally:
+            self._announced, self._leg = False, None
+            self._stops.end()
+
+    def _announce(self, released: float, leg: MotionSegment, stops: int) -> None:
+        until = released + self._spec.announcement / self._spec.time_scale
+        if self._stops.wait_for_one(stops, until - time.monotonic()):
+            raise ArmStoppedError("stopped before it moved", "operator", "announced", 0.0, leg.tilt(0.0))
+
+    def _run(self, motion: MotionOrder, leg: MotionSegment) -> MotionOutcome:
+        deadline = MOTION_MARGIN + 2.0 * motion.duration / self._spec.time_scale
+        try:
+            outcome = self._session.ask("run", motion, deadline=deadline)
+        except ArmRefusedError as error:
+            raise ArmRefusedError(f"{leg.name} refused: {error}") from None
+        except ArmLostError as error:
+            progress = self._session.progress
+            clock = 0.0 if progress is None else progress.clock
+            self._stops.lost()
+            self._tilt, self._stopped = leg.tilt(clock), True
+            raise ArmLostError(f"{error}. {leg.last_seen(clock)}") from None
+        assert isinstance(outcome, MotionOutcome)
+        return outcome
+
+    def _judge(self, outcome: MotionOutcome, leg: MotionSegment) -> ExecutedPath:
+        self._stops.came_to(outcome)
+        executed = executed_path(
+            outcome.samples, leg.path, self._spec, completed=outcome.kind == "completed", slider=outcome.slider
+        )
+        if outcome.kind == "completed":
+            return executed
+        self._tilt, self._stopped = leg.tilt_left(outcome), True
+        if outcome.kind == "lost":
+            self._session.kill()
+            raise ArmLostError(f"{outcome.text}. {leg.last_seen(outcome.clock)}", executed)
+        raise leg.stopped(outcome, executed)
+
+
+class AcceptedArm(UrArm):
+    """A `UrArm` that compares the controller's safety checksum whenever it asks who is there.
+
+    Args:
+        spec: as for `UrArm`.
+        accepted: checksum that people have accepted; '' if nobody has.
+    """
+
+    def __init__(self, spec: UrArmSpec, accepted: str) -> None:
+        super().__init__(spec)
+        self._accepted = accepted
+        self._address = spec.address
+
+    def connect(self) -> UrFacts:
+        """See `UrArm.connect`.
+
+        Raises:
+            NotAcceptedError: other safety settings than the accepted ones; the arm is let go of.
+        """
+        return self._compared(super().connect())
+
+    def facts(self) -> UrFacts:
+        """See `UrArm.facts`; raises as `connect`."""
+        return self._compared(super().facts())
+
+    def _compared(self, facts: UrFacts) -> UrFacts:
+        try:
+            require_accepted(self._accepted or None, facts.checksum or None, self._address)
+        except NotAcceptedError:
+            self.close()
+            raise
+        return facts
+
+
+def require_accepted(accepted: str | None, found: str | None, controller: str) -> None:
+    """Compare the checksum of a controller's safety configuration with the accepted one.
+
+    Called once the controller is connected, before anything is asked to move.
+
+    Args:
+        accepted: eight hexadecimal digits, as `decant doctor --accept-safety` recorded them; None if nobody has.
+        found: as the controller says now; None if it says nothing.
+        controller: its address, for people.
+
+    Raises:
+        NotAcceptedError: with what to do about it.
+    """
+    if accepted is None:
+        raise NotAcceptedError(
+            f"arm at {controller}: nobody has accepted its safety settings (checksum {found or 'unknown'}) for this "
+            "laboratory. Run 'decant doctor' on the laboratory's file first; it says how"
+        )
+    if found is None:
+        raise NotAcceptedError(
+            f"arm at {controller}: the controller tells no safety checksum, which it leaves out while no safety "
+            f"configuration is applied; {accepted} was accepted. Confirm the settings on the teach pendant"
+        )
+    if found.upper() != accepted.upper():
+        raise NotAcceptedError(
+            f"arm at {controller}: its safety settings have changed: checksum {found.upper()}, accepted was "
+            f"{accepted.upper()}. Nothing moves. Find out on the teach pendant who changed what; when the settings are "
+            "right, accept them with 'decant doctor --accept-safety'"
+        )

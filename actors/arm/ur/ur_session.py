@@ -1,0 +1,289 @@
+"""A connection to one robot: made by a new worker, discarded with it, never mended.
+
+What a driver knows of its robot, for people and for records.
+
+The worker as its driver sees it: calls with deadlines, stops that overtake them, and an end that is noticed.
+
+The worker isn't asked to die with the thread that started it, as Linux offers, for that thread may end while the arm
+moves. It ends when this process closes its side of the connection, in whatever way that happens.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from dataclasses import dataclass, field
+from typing import Any
+
+from actors.arm.arm_interface import ArmError, ArmFacts, ArmLostError, ArmRefusedError, Joints, Pose, Vector
+from actors.arm.arm_settings import UrArmSpec
+from actors.arm.ur.worker_messages import (
+    ROBOT_MODES,
+    SAFETY_MODES,
+    SILENCE,
+    Facts,
+    MotionProgress,
+    TroubleError,
+    why_not_ready,
+)
+from actors.runtime.child_process import ConnectedProcess
+
+
+@dataclass(frozen=True)
+class UrFacts(ArmFacts):
+    """A robot as its controller tells of it.
+
+    Attributes:
+        checksum: of the safety configuration, eight hexadecimal digits; '' if it isn't told.
+        robot_mode, safety_mode: in words; 'running' and 'normal' if it could move.
+        remote: remote control is on; None where the controller knows no such thing.
+        tool: TCP in the flange's frame, as set at present.
+        payload: as set at present [kg]; `payload_centre` [m].
+        joints: measured [rad].
+        slider: 0 … 1.
+        program: state and name of the controller's program.
+        joint_ranges: lowest and highest of each joint [rad], as configured; empty if they aren't told.
+        joint_speeds: likewise [rad/s].
+    """
+
+    robot_mode: str = ""
+    safety_mode: str = ""
+    remote: bool | None = None
+    tool: Pose = field(default_factory=Pose)
+    payload: float = 0.0
+    payload_centre: Vector = (0.0, 0.0, 0.0)
+    joints: Joints = (0.0,) * 6
+    slider: float = 1.0
+    program: str = ""
+    joint_ranges: tuple[tuple[float, float], ...] = ()
+    joint_speeds: tuple[float, ...] = ()
+
+    @property
+    def e_series(self) -> bool:
+        """Whether the robot is of the generation after CB3."""
+        return int(self.version.split(".")[0]) >= 5
+
+
+def facts_of(told: Facts) -> UrFacts:
+    """As a worker has found out."""
+    r = told.reading
+    a, b, c, d, e, f = r.joints
+    x, y, z = r.centre
+    return UrFacts(
+        model=told.model,
+        serial=told.serial,
+        version=".".join(map(str, told.version)),
+        problem=why_not_ready(r.robot_mode, r.safety_mode, r.runtime, r.slider),
+        robot_mode=ROBOT_MODES.get(r.robot_mode, str(r.robot_mode)),
+        safety_mode=SAFETY_MODES.get(r.safety_mode, str(r.safety_mode)),
+        remote=told.remote,
+        checksum=told.checksum,
+        tool=Pose(*told.tool),
+        payload=r.payload,
+        payload_centre=(x, y, z),
+        joints=(a, b, c, d, e, f),
+        slider=r.slider,
+        program=told.program,
+        joint_ranges=told.ranges,
+        joint_speeds=told.speeds,
+    )
+
+
+SIGN_OF_LIFE = 0.1
+"""Between two signs of life to the worker while a call is awaited [s]."""
+
+
+class WorkerProcess:
+    """One worker, from its start to its end; never restarted.
+
+    Attributes:
+        progress: what it last told of a motion.
+        pid: of the process.
+    """
+
+    def __init__(self) -> None:
+        self._child = ConnectedProcess("actors.arm.ur.rtde_worker")
+        self._connection = self._child.connection
+        self.pid = self._child.pid
+        self._sending = threading.Lock()
+        self._pending: dict[int, Future[Any]] = {}
+        self._number = 0
+        self._gone = threading.Event()
+        self.progress: MotionProgress | None = None
+        threading.Thread(target=self._hear, name="arm-worker", daemon=True).start()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it can be asked."""
+        return not self._gone.is_set()
+
+    def call(self, method: str, *arguments: Any, deadline: float) -> Any:
+        """Have something done.
+
+        Args:
+            method: of `worker.Worker`.
+            arguments: plain values.
+            deadline: longest wait [s]; a worker that misses it is ended.
+
+        Raises:
+            ArmRefusedError: refused before anything moved.
+            ArmLostError: the controller can't be reached, or the worker died or missed its deadline.
+        """
+        future: Future[Any] = Future()
+        with self._sending:
+            self._number += 1
+            number = self._number
+            self._pending[number] = future
+        if not self.alive:
+            raise ArmLostError(self._obituary(method))
+        self._send(("call", number, method, arguments))
+        end = time.monotonic() + deadline
+        while time.monotonic() < end:
+            try:
+                return future.result(timeout=SIGN_OF_LIFE)
+            except FutureTimeoutError:
+                self._send(("alive",))
+            except TroubleError as trouble:
+                if trouble.kind == "refused":
+                    raise ArmRefusedError(trouble.text) from None
+                raise ArmLostError(trouble.text + self._errors()) from None
+        self.kill()
+        raise ArmLostError(f"the arm's worker did not answer '{method}' within {deadline:g} s{self._errors()}")
+
+    def stop(self, stops: int) -> None:
+        """Stop whatever moves; doesn't wait."""
+        self._send(("stop", stops))
+
+    def kill(self) -> None:
+        """End it: a motion under way ends by its watchdog."""
+        self._child.kill()
+        self._gone.wait(2.0)
+
+    def _send(self, message: Any) -> None:
+        with self._sending, contextlib.suppress(OSError):  # that it is gone is noticed where its answers are read
+            self._connection.send(message)
+
+    def _hear(self) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                message = self._connection.recv()
+                if isinstance(message, MotionProgress):
+                    self.progress = message
+                    continue
+                number, good, value = message
+                future = self._pending.pop(number, None)
+                if future is not None and good:
+                    future.set_result(value)
+                elif future is not None:
+                    future.set_exception(value)
+        self._gone.set()
+        self._child.wait(5.0)
+        with self._sending:
+            pending = list(self._pending.values())
+            self._pending.clear()
+            self._connection.close()
+        for future in pending:
+            future.set_exception(TroubleError("lost", self._obituary("a request")))
+
+    def _obituary(self, method: str) -> str:
+        return f"the arm's worker died during {method} (status {self._child.status}); connect again"
+
+    def _errors(self) -> str:
+        kept = self._child.errors_kept
+        return f" (it said: {kept})" if kept else ""
+
+
+OPEN_TIME, ANSWER_TIME = 30.0, 15.0
+"""Longest waits for the worker [s]: to start and connect, to answer."""
+
+
+class Session:
+    """None to begin with.
+
+    Args:
+        spec: where the robot is, and what it should be.
+
+    Attributes:
+        facts: of the robot, as it was when the connection was made; None without one.
+    """
+
+    def __init__(self, spec: UrArmSpec) -> None:
+        self._spec = spec
+        self._worker: WorkerProcess | None = None
+        self.facts: UrFacts | None = None
+
+    def open(self) -> UrFacts:
+        """Connect anew; nothing moves.
+
+        Raises:
+            ArmLostError: the robot can't be reached; ArmRefusedError: it is another one than the settings say.
+        """
+        self.discard()
+        spec = self._spec
+        self._worker = WorkerProcess()
+        # Only a virtual controller has its time scaled; its process may be kept waiting where a real one isn't.
+        silence = SILENCE if spec.time_scale == 1.0 else 8.0 * SILENCE
+        try:
+            self.ask("open", spec.address, spec.rate, silence, deadline=OPEN_TIME)
+            self.facts = self.find_out()
+            self._check_model(self.facts)
+        except ArmError:
+            self.discard()
+            raise
+        return self.facts
+
+    def ask(self, method: str, *arguments: object, deadline: float = ANSWER_TIME) -> Any:
+        """Have the worker do something; see `WorkerProcess.call`."""
+        worker = self._worker
+        if worker is None or not worker.alive:
+            raise ArmLostError("the arm is not connected; connect first")
+        try:
+            return worker.call(method, *arguments, deadline=deadline)
+        except ArmLostError:
+            worker.kill()
+            raise
+
+    def find_out(self) -> UrFacts:
+        """The robot as it is now."""
+        return facts_of(self.ask("facts"))
+
+    @property
+    def progress(self) -> MotionProgress | None:
+        """What the worker last told of a motion."""
+        return None if self._worker is None else self._worker.progress
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the worker."""
+        return None if self._worker is None else self._worker.pid
+
+    def forget_progress(self) -> None:
+        """Before another motion."""
+        if self._worker is not None:
+            self._worker.progress = None
+
+    def stop(self, stops: int) -> None:
+        """Order a stop; doesn't wait."""
+        if self._worker is not None:
+            self._worker.stop(stops)
+
+    def kill(self) -> None:
+        """End the worker: a motion under way ends by its watchdog."""
+        if self._worker is not None:
+            self._worker.kill()
+
+    def discard(self) -> None:
+        """End it, and forget the robot."""
+        self.kill()
+        self._worker, self.facts = None, None
+
+    def _check_model(self, facts: UrFacts) -> None:
+        model = facts.model.lower().removesuffix("e") + ("e" if facts.e_series else "")
+        if model != self._spec.model:
+            raise ArmRefusedError(
+                f"the robot at {self._spec.address} is a {model.upper()} (software {facts.version}); "
+                f"the arm is set up as {self._spec.model.upper()}"
+            )

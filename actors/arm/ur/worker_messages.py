@@ -1,0 +1,221 @@
+"""What driver and worker say to each other. Plain values, and nothing heavy to import: the worker starts in an instant.
+
+Registers that programs and worker share; the client library lets 18 … 22 be written and 12 … 19 be read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+STOP_ORDER, HEARTBEAT, GO = 19, 20, 21
+"""Integer inputs. An order is the number of the motion that it is meant for, so an old one orders nothing."""
+
+NUMBER, STATUS = 12, 13
+"""Integer outputs: the number of the motion whose program runs, and what it is doing."""
+
+CLOCK, TOOL = 12, 13
+"""Double outputs: time on the path [s]; from here on six of the tool, as the controller has it."""
+
+READY, RUNNING, DONE, STOPPED = 1, 2, 3, 4
+"""Statuses: set up and waiting for `GO`; moving; arrived; stopped on order."""
+
+SLOWEST_HEARTBEAT = 2.0
+"""A program whose heartbeat is written less often than that ends, and the arm with it [Hz of the clock]."""
+
+SILENCE = 0.2
+"""Data whose time stands still for so long, while the arm moves, are stale [s of the clock]."""
+
+
+ROBOT_MODES = {
+    -1: "no controller",
+    0: "disconnected",
+    1: "safety to be confirmed",
+    2: "booting",
+    3: "off",
+    4: "on, not started",
+    5: "idle, brakes closed",
+    6: "being moved by hand",
+    7: "running",
+    8: "updating firmware",
+}
+SAFETY_MODES = {
+    1: "normal",
+    2: "reduced mode",
+    3: "protective stop",
+    4: "recovery mode",
+    5: "safeguard stop",
+    6: "emergency stop (system)",
+    7: "emergency stop (robot)",
+    8: "safety violation",
+    9: "fault of the safety system",
+}
+RUNNING_MODE, NORMAL, REDUCED = 7, 1, 2
+STOPPED_PROGRAM, PLAYING = 1, 2
+
+
+def why_not_ready(robot_mode: int, safety_mode: int, runtime: int, slider: float) -> str:
+    """Why an arm can't move; '' if it can. Driver, worker, `decant doctor` and what shows its lines all decide by this.
+
+    Reduced mode prevents motion: pours are planned within the normal limits, and would end in a protective stop.
+
+    Args:
+        robot_mode, safety_mode, runtime: as numbers of RTDE (`robot_mode`, `safety_mode`, `runtime_state`).
+        slider: `target_speed_fraction`, 0 … 1.
+    """
+    if safety_mode != NORMAL:
+        return f"{SAFETY_MODES.get(safety_mode, f'safety mode {safety_mode}')} is in force"
+    if robot_mode != RUNNING_MODE:
+        return f"the robot is {ROBOT_MODES.get(robot_mode, f'in mode {robot_mode}')}, not running"
+    if runtime != STOPPED_PROGRAM:
+        return "a program runs on the controller, or is paused; stop it at the pendant"
+    if slider < 0.999:
+        return f"the speed slider is at {100.0 * slider:.0f} %; a pour needs 100 %"
+    return ""
+
+
+class TroubleError(Exception):
+    """The worker can't do what was asked.
+
+    Args:
+        kind: 'refused' before anything moved, or 'lost'.
+        text: for people.
+    """
+
+    def __init__(self, kind: str, text: str) -> None:
+        super().__init__(kind, text)
+        self.kind, self.text = kind, text
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """What every motion is made with.
+
+    Attributes:
+        tool: TCP in the flange's frame [m], [rad].
+        payload: [kg]; `centre` [m].
+    """
+
+    tool: tuple[float, ...]
+    payload: float
+    centre: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class MotionOrder:
+    """A program that moves the arm, and what has to hold around it.
+
+    Attributes:
+        program: text, waiting for `GO` before it moves anything.
+        number: its own.
+        start, end: joints [rad].
+        duration: of its path [s of controller time].
+        settings: read back before it may go.
+        stops: how many stops had been asked for when it was asked for; one more and it doesn't go.
+    """
+
+    program: str
+    number: int
+    start: tuple[float, ...]
+    end: tuple[float, ...]
+    duration: float
+    settings: MotionSettings
+    stops: int
+
+
+@dataclass(frozen=True)
+class DataPackage:
+    """One package of the controller.
+
+    Attributes:
+        time: of the controller [s]; `seen` [s of `time.monotonic`].
+        joints, speeds: measured [rad], [rad/s].
+        robot_mode, safety_mode, runtime: as numbers.
+        slider: 0 … 1.
+        payload: [kg]; `centre` [m].
+        number, status, clock, tool: of the program, see the registers.
+    """
+
+    time: float
+    seen: float
+    joints: tuple[float, ...]
+    speeds: tuple[float, ...]
+    robot_mode: int
+    safety_mode: int
+    runtime: int
+    slider: float
+    payload: float
+    centre: tuple[float, ...]
+    number: int
+    status: int
+    clock: float
+    tool: tuple[float, ...]
+
+    @property
+    def stands(self) -> bool:
+        """No joint moves."""
+        return max(map(abs, self.speeds)) < STANDSTILL
+
+
+STANDSTILL = 2e-3
+"""Joint speed that counts as none [rad/s]."""
+
+Sample = tuple[float, tuple[float, ...], float]
+"""Controller time [s], joints [rad], time on the path [s]."""
+
+
+@dataclass(frozen=True)
+class MotionProgress:
+    """Where a motion is now, told unasked.
+
+    Attributes:
+        clock: time on the path [s].
+        joints: [rad].
+        moving: a joint moves.
+    """
+
+    clock: float
+    joints: tuple[float, ...]
+    moving: bool
+
+
+@dataclass(frozen=True)
+class MotionOutcome:
+    """What came of a motion.
+
+    Attributes:
+        kind: 'completed', or why it was broken off: see `errors.ArmStoppedError`, or 'lost'.
+        text: why, for people.
+        samples: what was read from its go on.
+        clock: time on the path where it ended [s].
+        joints: where the arm stands [rad]; as last seen, if `standing` is None.
+        standing: when it was first seen at rest [s of `time.monotonic`].
+        answered: when the program was first seen to have taken an order to stop [s of `time.monotonic`].
+        moved: it had been commanded to go.
+        slider: the lowest it was seen at.
+    """
+
+    kind: str
+    text: str
+    samples: list[Sample]
+    clock: float
+    joints: tuple[float, ...]
+    standing: float | None
+    answered: float | None = None
+    moved: bool = True
+    slider: float = 1.0
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What the worker found out about a controller; see `facts.UrFacts`."""
+
+    model: str
+    serial: str
+    version: tuple[int, ...]
+    remote: bool | None
+    program: str
+    reading: DataPackage
+    checksum: str
+    tool: tuple[float, ...]
+    ranges: tuple[tuple[float, float], ...] = field(default=())
+    speeds: tuple[float, ...] = field(default=())

@@ -1,0 +1,98 @@
+"""The balance behind its protocol: a blocking driver in a process (or thread) of its own, reached from the loop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+
+from actors.balance.balance_interface import Weight
+from actors.balance.simulated_balance import PATIENCE, Load
+from actors.runtime.remote_object import Device
+
+ANSWER_DEADLINE = 30.0
+"""Wall time an idle balance may take to answer [s]; its process may still be starting."""
+
+
+class DeviceBalance:
+    """A balance with a tray: a `BalanceDriver` behind a `Device`, awaited.
+
+    Args:
+        device: of the driver.
+        time_scale: bench seconds per wall second, for deadlines; 0 waits for nothing.
+        longest_call: wall time that the driver allows itself [s], see `BalanceDevice.longest_call`.
+    """
+
+    def __init__(self, device: Device, time_scale: float = 1.0, *, longest_call: float = 0.0) -> None:
+        self.device = device
+        self._scale = time_scale
+        self._longest_call = longest_call
+
+    def _deadline(self, bench_time: float) -> float:
+        passing = 2.0 * bench_time / self._scale if self._scale > 0.0 else 0.0
+        return ANSWER_DEADLINE + max(self._longest_call, passing)
+
+    async def tare(self) -> None:
+        """See `BalanceDriver.tare`."""
+        await self.device.call("tare", deadline=self._deadline(PATIENCE))
+
+    async def weigh(self) -> Weight:
+        """See `BalanceDriver.weigh`."""
+        weight: Weight = await self.device.call("weigh", deadline=self._deadline(PATIENCE))
+        return weight
+
+    async def read(self) -> Weight:
+        """See `BalanceDriver.read`."""
+        weight: Weight = await self.device.call("read", deadline=ANSWER_DEADLINE, urgent=True)
+        return weight
+
+    async def stream(self, interval: float = 0.1) -> AsyncIterator[Weight]:
+        """What the display shows, again and again.
+
+        Args:
+            interval: wall time between two readings [s].
+        """
+        while True:
+            yield await self.read()
+            await asyncio.sleep(interval)
+
+    async def connect(self) -> str:
+        """See `BalanceDriver.connect`."""
+        said: str = await self.device.call("connect", deadline=self._deadline(PATIENCE))
+        return said
+
+    async def zero(self) -> None:
+        """Balances on serial lines only: set the zero of the empty balance."""
+        await self.device.call("zero", deadline=self._deadline(PATIENCE))
+
+    async def keep_reference(self) -> None:
+        """See `BalanceDriver.keep_reference`."""
+        await self.device.call("keep_reference", deadline=ANSWER_DEADLINE, urgent=True)
+
+    async def statistics(self) -> dict[str, int]:
+        """Balances on serial lines only: what the line has seen."""
+        counts: dict[str, int] = await self.device.call("statistics", deadline=ANSWER_DEADLINE, urgent=True)
+        return counts
+
+    async def resume(self) -> None:
+        """See `BalanceDriver.resume`."""
+        await self.device.call("resume", deadline=ANSWER_DEADLINE, urgent=True)
+
+    async def release(self) -> None:
+        """Let go of it."""
+        await self.device.call("close", deadline=ANSWER_DEADLINE)
+
+    async def prepare(self, seed: tuple[int, ...]) -> None:
+        """Balances that are only given what stands on them: empty tray, bench time 0, noise of a new pour."""
+        await self.device.call("prepare", seed, deadline=ANSWER_DEADLINE)
+
+    async def put(self, load: Load) -> None:
+        """Balances that are only given what stands on them: what comes onto the tray from now on."""
+        await self.device.call("put", load, deadline=ANSWER_DEADLINE)
+
+    async def pass_time(self, seconds: float) -> None:
+        """Balances that are only given what stands on them: bench time passes [s]."""
+        await self.device.call("pass_time", seconds, deadline=self._deadline(seconds))
+
+    async def interrupt(self) -> None:
+        """End the wait that is under way."""
+        await self.device.call("interrupt", deadline=ANSWER_DEADLINE, urgent=True)

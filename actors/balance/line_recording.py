@@ -1,0 +1,114 @@
+"""Raw bytes of a serial line with their times, in a file that people can read and a test can play."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TextIO
+
+Direction = Literal["out", "in"]
+Source = Literal["hardware", "virtual", "typed"]
+"""Where the bytes come from: a real balance, our own virtual one, or somebody's keyboard and a manual."""
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class LineEvent:
+    """Bytes that went over the line together.
+
+    Attributes:
+        time: since the recording began [s].
+        direction: 'out' to the balance, 'in' from it.
+        data: the bytes.
+    """
+
+    time: float
+    direction: Direction
+    data: bytes
+
+
+@dataclass(frozen=True)
+class LineRecording:
+    """A recording.
+
+    Attributes:
+        source: where the bytes come from.
+        events: in the order of time.
+        about: what else is known: balance, line settings, dialect, date, remarks.
+    """
+
+    source: Source
+    events: tuple[LineEvent, ...] = ()
+    about: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, path: Path) -> LineRecording:
+        """Read a file.
+
+        Raises:
+            ValueError: it is not a recording, or a line is damaged; says which.
+        """
+        lines = path.read_text(encoding="utf-8").splitlines()
+        number = 0
+        try:
+            head = json.loads(lines[0])
+            if head.pop("decant_serial_recording") != FORMAT:
+                raise ValueError("written by another version")
+            source = head.pop("source")
+            if source not in ("hardware", "virtual", "typed"):
+                raise ValueError(f"source {source!r}")
+            events = []
+            for line in lines[1:]:
+                number += 1
+                entry = json.loads(line)
+                if entry["dir"] not in ("in", "out"):
+                    raise ValueError(f"direction {entry['dir']!r}")
+                events.append(LineEvent(float(entry["t"]), entry["dir"], bytes.fromhex(entry["hex"])))
+        except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path}:{number + 1}: not a recording of a serial line ({error})") from error
+        return cls(source, tuple(events), head)
+
+    def save(self, path: Path) -> None:
+        """Write a file."""
+        with path.open("w", encoding="utf-8") as file:
+            file.write(header(self.source, self.about))
+            for event in self.events:
+                file.write(line_of(event))
+
+
+class Recorder:
+    """Writes while it listens; use it as a wire's tap.
+
+    Args:
+        file: open for writing.
+        source: where the bytes come from.
+        about: what else is known.
+    """
+
+    def __init__(self, file: TextIO, source: Source, about: dict[str, Any]) -> None:
+        self._file = file
+        self._start = time.monotonic()
+        self.count = 0
+        file.write(header(source, about))
+
+    def __call__(self, direction: str, data: bytes) -> None:
+        """Note bytes."""
+        self.count += len(data)
+        way: Direction = "out" if direction == "out" else "in"
+        self._file.write(line_of(LineEvent(time.monotonic() - self._start, way, data)))
+        self._file.flush()
+
+
+def header(source: Source, about: dict[str, Any]) -> str:
+    """First line of a file."""
+    return json.dumps({"decant_serial_recording": FORMAT, "source": source, **about}, ensure_ascii=False) + "\n"
+
+
+def line_of(event: LineEvent) -> str:
+    """A line of a file; the text is for people, the hexadecimal digits count."""
+    text = event.data.decode("ascii", "backslashreplace")
+    entry = {"t": round(event.time, 4), "dir": event.direction, "hex": event.data.hex(), "text": text}
+    return json.dumps(entry) + "\n"

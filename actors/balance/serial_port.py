@@ -1,0 +1,273 @@
+"""A serial port that may vanish and return: lines in, bytes out, every call with a deadline.
+
+What `decant doctor` says about a serial port, before anything is opened for good.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from actors.balance.balance_interface import LineSettingsError, NoConnectionError
+from actors.balance.dialects.dialect import LineSettings
+from actors.interfaces import DeviceCheck
+from sim_engine.resources import require
+
+if TYPE_CHECKING:
+    from serial import Serial
+
+try:
+    from termios import error as _TermiosError  # noqa: N812
+except ImportError:  # not on Windows, and not raised there
+    _TermiosError = OSError  # type: ignore[misc, assignment]
+
+Tap = Callable[[str, bytes], None]
+"""Sees the bytes of a wire: direction 'out' (to the balance) or 'in', and what went."""
+
+_WRITE_TIME = 2.0
+_GLANCE = 0.02
+"""Longest single wait for a character [s]; fixed, since pyserial sets the whole port anew for another."""
+
+
+class PortLostError(NoConnectionError):
+    """The port vanished while it was open."""
+
+
+@dataclass
+class Counters:
+    """What a wire has seen, for `doctor` and for error messages.
+
+    Attributes:
+        lines: understood.
+        damaged: not understood.
+        stale: waiting unread when a new question was asked.
+        unanswered: questions without an answer.
+        lost: connections lost.
+    """
+
+    lines: int = 0
+    damaged: int = 0
+    stale: int = 0
+    unanswered: int = 0
+    lost: int = 0
+
+
+class Wire:
+    """One open port with fixed line settings. Not for several threads.
+
+    Args:
+        port: device.
+        line: baud rate and character format.
+        handshake: 'none', 'software' or 'hardware'.
+        counters: where to count.
+        tap: sees all bytes.
+
+    Raises:
+        LineSettingsError: it can't be set to that line.
+        NoConnectionError: it can't be opened; says why and what to do.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        line: LineSettings,
+        handshake: str = "none",
+        counters: Counters | None = None,
+        tap: Tap | None = None,
+    ) -> None:
+        self.port, self.line = port, line
+        self.counters = counters or Counters()
+        self._tap = tap
+        self._buffer = bytearray()
+        self._serial = _open(port, line, handshake)
+
+    def send(self, data: bytes) -> None:
+        """Write.
+
+        Raises:
+            PortLostError: the port vanished, or doesn't take the bytes.
+        """
+        try:
+            self._serial.write(data)  # not drained: that has no deadline where the other side stops the line
+        except OSError as error:  # pyserial's errors are OSErrors
+            raise self._lost(error) from error
+        if self._tap is not None:
+            self._tap("out", data)
+
+    def flush(self) -> None:
+        """Throw away what came unasked; whole lines are counted as stale."""
+        while self._pull(only_waiting=True):
+            pass
+        self.counters.stale += self._buffer.count(b"\n")
+        self._buffer.clear()
+
+    def line_until(self, moment: float) -> bytes | None:
+        """The next line, without its end.
+
+        Args:
+            moment: of `time.monotonic` to give up at.
+
+        Returns:
+            None if no whole line came by then.
+
+        Raises:
+            PortLostError: the port vanished.
+        """
+        while True:
+            end = self._buffer.find(b"\n")
+            if end >= 0:
+                line = bytes(self._buffer[:end])
+                del self._buffer[: end + 1]
+                return line.removesuffix(b"\r")
+            if moment <= time.monotonic():
+                return None
+            self._pull()
+
+    @property
+    def waiting(self) -> bool:
+        """Whether something has come that has no end of line yet."""
+        return bool(self._buffer)
+
+    def take(self) -> bytes:
+        """What is waiting and has no end of line yet, taken out."""
+        rest = bytes(self._buffer)
+        self._buffer.clear()
+        return rest
+
+    def close(self) -> None:
+        """Close the port; never fails."""
+        for step in (self._serial.reset_output_buffer, self._serial.close):  # unsent bytes would hold the closing up
+            with contextlib.suppress(OSError, _TermiosError):
+                step()
+
+    def _pull(self, *, only_waiting: bool = False) -> bool:
+        """Take in what has come, or wait a moment for a first character; whether anything came."""
+        try:
+            count = self._serial.in_waiting
+            data = self._serial.read(count or 1) if count or not only_waiting else b""
+        except OSError as error:
+            raise self._lost(error) from error
+        except TypeError as error:  # pyserial, closed by another thread in the middle of a read
+            raise self._lost(OSError("closed")) from error
+        if data and self._tap is not None:
+            self._tap("in", data)
+        self._buffer += data
+        return bool(data)
+
+    def _lost(self, error: OSError) -> PortLostError:
+        self.counters.lost += 1
+        self.close()
+        return PortLostError(f"{self.port}: the connection was lost ({error.strerror or error})")
+
+
+def _open(port: str, line: LineSettings, handshake: str) -> Serial:
+    require("serial", f"balance at {port}")
+    import serial
+
+    try:
+        return serial.Serial(
+            port,
+            line.baud,
+            bytesize=line.bits,
+            parity=line.parity,
+            stopbits=line.stop,
+            xonxoff=handshake == "software",
+            rtscts=handshake == "hardware",
+            timeout=_GLANCE,
+            write_timeout=_WRITE_TIME,
+            exclusive=True,
+        )
+    except (_TermiosError, ValueError) as error:
+        if isinstance(error, OSError):
+            raise NoConnectionError(f"{port}: {_reason(port, error)}") from error
+        raise LineSettingsError(f"{port}: can't be set to {line}") from error
+    except OSError as error:  # pyserial's errors are such
+        raise NoConnectionError(f"{port}: {_reason(port, error)}") from error
+
+
+def _reason(port: str, error: OSError) -> str:
+    """Why a port can't be opened, and what to do."""
+    number = error.errno
+    if number == 2 or not Path(port).exists():
+        found = ports()
+        there = f"there are {', '.join(found)}" if found else "no serial port of a balance is there"
+        return f"there is no such port; {there}. Is the cable plugged in and the balance switched on?"
+    if number == 13:
+        return "this user may not open it; add the user to the group that owns it (often 'dialout') and log in anew"
+    if number in (11, 16) or "exclusively" in str(error):
+        return "another program has it open; close that one (a terminal, another run)"
+    return f"can't be opened: {error}"
+
+
+def ports() -> list[str]:
+    """Serial ports of this machine, by the names that they keep where there are such."""
+    by_id = sorted(str(path) for path in Path("/dev/serial/by-id").glob("*"))
+    if by_id:
+        return by_id
+    from serial.tools.list_ports import comports
+
+    return sorted(port.device for port in comports())
+
+
+def port_advice(port: str) -> str | None:
+    """What is wrong with a port's name, if anything: 'ttyUSB0' may be another device after the next plugging.
+
+    Args:
+        port: as in the settings.
+    """
+    path = Path(port)
+    if not path.name.startswith(("ttyUSB", "ttyACM")) or path.parent != Path("/dev"):
+        return None
+    same = [link for link in Path("/dev/serial/by-id").glob("*") if link.resolve() == path]
+    better = str(same[0]) if same else "its name under /dev/serial/by-id/"
+    return f"it may be another device once something is plugged in anew; use {better}"
+
+
+def look_at_port(name: str) -> DeviceCheck:
+    """Whether it is there, is a serial port, and may be opened.
+
+    Args:
+        name: as in the laboratory's file.
+    """
+    port = Path(name)
+    if not port.exists():
+        known = ports()
+        there = f"there are {', '.join(known)}" if known else "no serial port is there"
+        return DeviceCheck("balance port", "fail", f"{port} isn't there", f"plug the cable in, switch it on; {there}")
+    if (other := _other_than_a_port(port)) is not None:
+        return DeviceCheck("balance port", "fail", f"{port} is {other}", "name the serial port that the balance is on")
+    if not os.access(port, os.R_OK | os.W_OK):
+        todo = f"add the user to the group '{_group(port)}' and log in anew"
+        return DeviceCheck("balance port", "fail", f"this user may not open {port}", todo)
+    if (advice := port_advice(name)) is not None:
+        return DeviceCheck("balance port", "warn", str(port), advice)
+    return DeviceCheck("balance port", "ok", str(port))
+
+
+def _group(port: Path) -> str:
+    try:
+        return port.group()
+    except (KeyError, OSError):
+        return "dialout"
+
+
+def _other_than_a_port(port: Path) -> str | None:
+    """What stands there, if it is not a serial port; None where it is one, or can't be opened to see."""
+    if port.is_dir():
+        return "a folder"
+    if not stat.S_ISCHR(port.stat().st_mode):
+        return "a file"
+    try:
+        opened = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError:
+        return None
+    try:
+        return None if os.isatty(opened) else "a device, and not a serial port"
+    finally:
+        os.close(opened)

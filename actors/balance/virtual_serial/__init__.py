@@ -1,1 +1,0 @@
-"""Balances without balances on real serial lines: another process at the far end of a pseudo-terminal."""

@@ -1,0 +1,365 @@
+"""Where the balance stands, and what therefore has to be weighed. Pure; what the weighings say is in `masses`.
+
+Four masses belong to a pour: loaded = received + spilled + retained. No balance reads all of them at once. Each
+placement is a list of steps and a table that says each mass as a sum of weighings: uncertainties follow from the same
+table, and what is in two weighings (the pourer's own mass) cancels where it does.
+
+What the weighings of a pour say: its masses, their uncertainties, and whether they can be right. Pure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Literal
+
+from actors.balance.balance_interface import BalanceError
+from sim_engine.outcome import PourMeasurement
+
+
+class Placement(StrEnum):
+    """Where the balance stands."""
+
+    TRAY = "tray"
+    """Under a tray, with the receiver on a stand of its own: it reads what was spilled."""
+
+    RECEIVER = "receiver"
+    """Under the receiver alone: it reads what was received."""
+
+    EVERYTHING = "everything"
+    """Under tray and receiver together: it reads what was poured."""
+
+    TARED = "tared"
+    """The weighings of the bench of numbers: vessels are tared away, so that each is liquid alone."""
+
+    MANUAL = "manual"
+    """Anywhere, and not connected: the operator weighs and types."""
+
+
+When = Literal["once", "before", "pour", "after"]
+
+
+@dataclass(frozen=True)
+class WeighingStep:
+    """Something to do, in order.
+
+    Attributes:
+        do: 'tare' the balance with what is listed on it, 'weigh' what is listed, or 'pour'.
+        put: what has to stand where, for the person who puts it there; whole sentences.
+        when: 'once' for a vessel (and again when it is replaced), else 'before' or 'after' the pour.
+        key: of the weighing; '' for other steps.
+        by: who gives the number: the 'balance' that stands here, or the 'operator', who types it.
+        hands: whether somebody has to do something first; else it is done at once, before anything drifts or dries.
+        about: what it is about, for programs, where it has no key.
+    """
+
+    do: Literal["tare", "weigh", "pour"]
+    put: str
+    when: When
+    key: str = ""
+    by: Literal["balance", "operator"] = "balance"
+    hands: bool = True
+    about: str = ""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A placement: steps, and each mass as Σ coefficient · weighing."""
+
+    steps: tuple[WeighingStep, ...]
+    masses: Mapping[str, Mapping[str, float]]
+
+
+_POUR = WeighingStep("pour", "The arm pours.", "pour")
+_DRY = "Put the empty, dry pourer on the balance, alone."
+_FULL = "Fill the pourer and put it on the balance."
+_GRIP = "Give the pourer to the gripper. "
+_LOADED = {"pourer_full": 1.0, "pourer_empty": -1.0}
+_RETAINED = {"pourer_after": 1.0, "pourer_empty": -1.0}
+
+
+def _tare(about: str, put: str, when: When, *, hands: bool = True) -> WeighingStep:
+    return WeighingStep("tare", put, when, hands=hands, about=about)
+
+
+PLANS: dict[Placement, Plan] = {
+    Placement.TRAY: Plan(
+        (
+            _tare("tray_wiped", "Leave the wiped tray on the balance, with nothing on it.", "before"),
+            WeighingStep("weigh", "Put the empty, dry pourer on the tray.", "once", "pourer_empty"),
+            WeighingStep("weigh", "Fill the pourer and put it on the tray.", "before", "pourer_full"),
+            _tare(
+                "set_up",
+                _GRIP + "Wipe the tray, and put the receiver on its stand; it must not touch the tray.",
+                "before",
+            ),
+            _POUR,
+            WeighingStep("weigh", "Touch nothing: what lies on the tray is weighed.", "after", "spilled", hands=False),
+            _tare("spill_left", "Leave the spill on the tray.", "after", hands=False),
+            WeighingStep("weigh", "Put the pourer on the tray, beside what lies there.", "after", "pourer_after"),
+        ),
+        {"loaded": _LOADED, "spilled": {"spilled": 1.0}, "retained": _RETAINED},
+    ),
+    Placement.RECEIVER: Plan(
+        (
+            _tare("cleared", "Take everything off the balance.", "before"),
+            WeighingStep("weigh", _DRY, "once", "pourer_empty"),
+            WeighingStep("weigh", _FULL, "before", "pourer_full"),
+            _tare("set_up", _GRIP + "Put the empty receiver on the balance; nothing else may touch its pan.", "before"),
+            _POUR,
+            WeighingStep(
+                "weigh", "Touch nothing: what is in the receiver is weighed.", "after", "received", hands=False
+            ),
+            _tare("cleared_after", "Take everything off the balance, and wipe its pan.", "after"),
+            WeighingStep("weigh", "Put the pourer on the balance, alone.", "after", "pourer_after"),
+        ),
+        {
+            "loaded": _LOADED,
+            # The pourer's own mass cancels.
+            "spilled": {"pourer_full": 1.0, "pourer_after": -1.0, "received": -1.0},
+            "retained": _RETAINED,
+        },
+    ),
+    Placement.EVERYTHING: Plan(
+        (
+            _tare("tray_wiped", "Leave the wiped tray on the balance, with nothing on it.", "before"),
+            WeighingStep("weigh", "Put the empty, dry pourer on the tray.", "once", "pourer_empty"),
+            WeighingStep("weigh", "Fill the pourer and put it on the tray.", "before", "pourer_full"),
+            WeighingStep(
+                "weigh", _GRIP + "Put the empty receiver on the tray, where it will stand.", "before", "receiver_empty"
+            ),
+            _tare("set_up", "Leave tray and receiver as they are.", "before", hands=False),
+            _POUR,
+            WeighingStep("weigh", "Touch nothing: what was poured is weighed.", "after", "poured", hands=False),
+            WeighingStep(
+                "weigh",
+                "Lift the receiver off without losing a drop, and leave the spill: less than nothing is shown.",
+                "after",
+                "receiver_gone",
+            ),
+        ),
+        {
+            "loaded": _LOADED,
+            "spilled": {"receiver_gone": 1.0, "receiver_empty": 1.0},
+            "retained": {"pourer_full": 1.0, "pourer_empty": -1.0, "poured": -1.0},
+        },
+    ),
+    Placement.TARED: Plan(
+        (
+            _tare("dry_pourer", "Put a dry pourer on the balance, alone; it counts as nothing.", "before"),
+            WeighingStep("weigh", "Put the filled pourer on the balance in its place.", "before", "pourer_full"),
+            _tare("set_up", _GRIP + "Put the wiped tray on the balance, the receiver on its stand.", "before"),
+            _POUR,
+            WeighingStep("weigh", "Touch nothing: what lies on the tray is weighed.", "after", "spilled", hands=False),
+            _tare("dry_pourer_after", "Put a dry pourer on the balance, alone; it counts as nothing.", "after"),
+            WeighingStep("weigh", "Put the pourer on the balance in its place.", "after", "pourer_after"),
+        ),
+        {"loaded": {"pourer_full": 1.0}, "spilled": {"spilled": 1.0}, "retained": {"pourer_after": 1.0}},
+    ),
+    Placement.MANUAL: Plan(
+        (
+            WeighingStep("weigh", "Weigh the empty, dry pourer.", "once", "pourer_empty", "operator"),
+            WeighingStep("weigh", "Fill the pourer and weigh it.", "before", "pourer_full", "operator"),
+            WeighingStep(
+                "weigh", _GRIP + "Wipe the tray, weigh it, and put it under.", "before", "tray_before", "operator"
+            ),
+            _POUR,
+            WeighingStep("weigh", "Weigh the tray with what was spilled on it.", "after", "tray_after", "operator"),
+            WeighingStep("weigh", "Weigh the pourer with what is left in it.", "after", "pourer_after", "operator"),
+        ),
+        {"loaded": _LOADED, "spilled": {"tray_after": 1.0, "tray_before": -1.0}, "retained": _RETAINED},
+    ),
+}
+
+
+def weighings(
+    placement: Placement, *, known: Collection[str] = (), pourer_elsewhere: bool = False
+) -> tuple[WeighingStep, ...]:
+    """What has to be done, in order, the pour among it.
+
+    Args:
+        placement: where the balance stands.
+        known: keys of weighings of before that still hold; their 'once' steps are left out.
+        pourer_elsewhere: the pourer is weighed on another balance and typed.
+    """
+    steps = [step for step in PLANS[placement].steps if not (step.when == "once" and step.key in known)]
+    if not pourer_elsewhere or placement is Placement.MANUAL:
+        return tuple(steps)
+    elsewhere = [_elsewhere(step) if step.key.startswith("pourer") else step for step in steps]
+    return tuple(step for i, step in enumerate(elsewhere) if not _idle(elsewhere, i))
+
+
+def needed(placement: Placement) -> tuple[str, ...]:
+    """Keys of all weighings that a measurement is made of."""
+    return tuple(step.key for step in PLANS[placement].steps if step.key)
+
+
+def _elsewhere(step: WeighingStep) -> WeighingStep:
+    texts = {
+        "pourer_empty": "Weigh the empty, dry pourer on the other balance.",
+        "pourer_full": "Fill the pourer and weigh it on the other balance.",
+        "pourer_after": "Weigh the pourer with what is left in it on the other balance.",
+    }
+    return WeighingStep("weigh", texts[step.key], step.when, step.key, "operator")
+
+
+def _idle(steps: list[WeighingStep], index: int) -> bool:
+    """Whether a tare serves no weighing: another tare comes before this balance is read, or none is read after it."""
+    if steps[index].do != "tare":
+        return False
+    for step in steps[index + 1 :]:
+        if step.do == "tare":
+            return True
+        if step.do == "weigh" and step.by == "balance":
+            return False
+    return True
+
+
+SURE = 4.0
+"""Standard deviations beyond which a mass below nothing is a mistake and no noise."""
+
+
+class WeighingError(BalanceError):
+    """The weighings of a pour are incomplete, or can't all be right."""
+
+
+@dataclass(frozen=True)
+class PourMasses:
+    """One weighing.
+
+    Attributes:
+        mass: net [kg].
+        uncertainty: standard deviation [kg].
+    """
+
+    mass: float
+    uncertainty: float = 0.0
+
+
+def loaded_mass(placement: Placement, weighed: Mapping[str, PourMasses]) -> float:
+    """What was filled in [kg], by the weighings before the pour."""
+    return sum(c * weighed[key].mass for key, c in PLANS[placement].masses["loaded"].items())
+
+
+def measurement(
+    placement: Placement,
+    weighed: Mapping[str, PourMasses],
+    *,
+    nominal: float | None = None,
+    tolerance: float = math.inf,
+) -> PourMeasurement:
+    """The masses of a pour.
+
+    A mass that comes out a little below nothing, within `SURE` standard deviations, is nothing; the notes keep what was
+    read.
+
+    Args:
+        placement: where the balance stood.
+        weighed: all that `needed` names.
+        nominal: load that was asked for [kg].
+        tolerance: how far the load may lie from it [kg].
+
+    Raises:
+        WeighingError: a weighing is missing or no number, a mass is less than nothing beyond noise, more came out
+            than was in, or the load is not the one that was asked for. Nothing is assumed in place of what is missing.
+    """
+    _check_complete(placement, weighed)
+    table = PLANS[placement].masses
+    mass = {name: sum(c * weighed[key].mass for key, c in row.items()) for name, row in table.items()}
+    sigma = {name: _sigma(row, weighed) for name, row in table.items()}
+    received = dict(_difference(table))
+    mass["received"] = sum(c * weighed[key].mass for key, c in received.items())
+    sigma["received"] = _sigma(received, weighed)
+    _check_sense(mass, sigma, nominal, tolerance)
+    spilled = max(mass["spilled"], 0.0)
+    retained = min(max(mass["retained"], 0.0), mass["loaded"])
+    return PourMeasurement(
+        loaded=mass["loaded"],
+        spilled=spilled,
+        retained=retained,
+        notes={
+            "placement": str(placement),
+            "received_g": _grams(max(mass["loaded"] - spilled - retained, 0.0)),
+            "uncertainty_g": {name: _grams(sigma[name]) for name in ("loaded", "received", "spilled", "retained")},
+            "as_weighed_g": {name: _grams(mass[name]) for name in ("loaded", "received", "spilled", "retained")},
+            "weighings_g": {key: _grams(weighed[key].mass) for key in needed(placement)},
+        },
+    )
+
+
+def weighing_uncertainty(step: float, repeatability: float, *, tared: bool = True) -> float:
+    """Standard deviation of one weighing [kg].
+
+    Args:
+        step: of the display [kg]; a value within it is as likely as another.
+        repeatability: standard deviation of weighing the same thing again [kg].
+        tared: net of a tare, which was a weighing too.
+    """
+    return math.sqrt((step**2 / 12.0 + repeatability**2) * (2.0 if tared else 1.0))
+
+
+def _difference(table: Mapping[str, Mapping[str, float]]) -> Mapping[str, float]:
+    """received = loaded − spilled − retained, by weighings; what cancels is left out."""
+    total: dict[str, float] = {}
+    for name, sign in (("loaded", 1.0), ("spilled", -1.0), ("retained", -1.0)):
+        for key, c in table[name].items():
+            total[key] = total.get(key, 0.0) + sign * c
+    return {key: c for key, c in total.items() if c != 0.0}
+
+
+def _sigma(row: Mapping[str, float], weighed: Mapping[str, PourMasses]) -> float:
+    return math.sqrt(sum((c * weighed[key].uncertainty) ** 2 for key, c in row.items()))
+
+
+def _check_complete(placement: Placement, weighed: Mapping[str, PourMasses]) -> None:
+    asked = {step.key: step.put for step in PLANS[placement].steps if step.key}
+    missing = [key for key in asked if key not in weighed]
+    if missing:
+        what = "; ".join(f"{key} ('{asked[key]}')" for key in missing)
+        raise WeighingError(
+            f"not weighed: {what}. Without it the pour can't be counted; nothing is assumed in its place"
+        )
+    for key in asked:
+        one = weighed[key]
+        if not (math.isfinite(one.mass) and math.isfinite(one.uncertainty) and one.uncertainty >= 0.0):
+            raise WeighingError(f"{key} is not a weight: {one.mass} kg ± {one.uncertainty} kg")
+
+
+def _check_sense(mass: dict[str, float], sigma: dict[str, float], nominal: float | None, tolerance: float) -> None:
+    """Refuse what can't be; rounding of the sums is not an offence."""
+    slack = {name: SURE * sigma[name] + 1e-9 for name in mass}
+    shown = {name: f"{_grams(mass[name]):g} ± {_grams(sigma[name]):g} g" for name in mass}
+    if mass["loaded"] <= slack["loaded"]:
+        raise WeighingError(
+            f"loaded {shown['loaded']}: the filled pourer weighed no more than the empty one. Was it filled? "
+            "Were the two mixed up?"
+        )
+    if nominal is not None and abs(mass["loaded"] - nominal) > tolerance:
+        raise WeighingError(
+            f"loaded {shown['loaded']}, but {_grams(nominal):g} ± {_grams(tolerance):g} g was asked for. Fill anew, or "
+            "weigh anew if it was filled right"
+        )
+    hints = {
+        "spilled": "the tray got lighter: was something taken off it, or did the zero drift?",
+        "retained": "the pourer got lighter than when it was dry and empty: was another one weighed?",
+        "received": "more was spilled and left over than was in the pourer: was it refilled, or a weighing mixed up?",
+    }
+    for name, hint in hints.items():
+        if mass[name] < -slack[name]:
+            raise WeighingError(f"{name} {shown[name]} is less than nothing: {hint} All: {_all(shown)}")
+        if mass[name] > mass["loaded"] + slack[name] + slack["loaded"]:
+            raise WeighingError(
+                f"{name} {shown[name]} is more than was loaded, {shown['loaded']}: did something else fall on the "
+                f"balance, or was a weighing mixed up? All: {_all(shown)}"
+            )
+
+
+def _all(shown: dict[str, str]) -> str:
+    return ", ".join(f"{name} {text}" for name, text in shown.items())
+
+
+def _grams(mass: float) -> Any:
+    """[g], with a microgram's digits: the rest is noise of the computer."""
+    return round(1e3 * mass, 6)

@@ -1,0 +1,226 @@
+"""Opens a bench: drivers of arm and balance, and on a virtual bench what is at their other ends.
+
+The bench: an arm, a balance and somebody beside them, be they hardware, virtual or numbers. One pour at a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from actors.arm.arm_device import DeviceArm
+from actors.arm.arm_interface import PlannedPour
+from actors.arm.arm_settings import ArmSpec, UrArmSpec
+from actors.arm.simulated_arm import NumbersSpec
+from actors.balance.balance_device import DeviceBalance
+from actors.balance.balance_settings import BalanceDevice, BalanceSpec
+from actors.balance.weighing_plan import PourMasses
+from actors.bench.consent import Setup
+from actors.bench.device_emulators import BenchEmulators, DeviceEmulators
+from actors.bench.operator_questions import OperatorQuestions
+from actors.bench.pour_procedure import PourProcedure
+from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
+from actors.bench.virtual_bench import FollowedBench, GroundTruth, VirtualBench
+from actors.bench.virtual_operator import BenchContents, Hands, PlayedOperator, VirtualOperator
+from actors.interfaces import InvalidActionError, LaboratoryError, Notice, Operator, ProgressCallback, SimulatorPool
+from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
+from actors.runtime.remote_object import Device
+from sim_engine.action import Action
+from sim_engine.outcome import PourMeasurement
+from sim_engine.scene import Scene
+
+
+class PouringBench:
+    """`Bench`. Nothing moves before everything was checked, weighed and confirmed.
+
+    Args:
+        setup: arm, balance, operator, and what happens around them.
+    """
+
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
+        self.arm, self.balance, self.nature = setup.arm, setup.balance, setup.nature
+        self._known: dict[str, dict[str, PourMasses]] = {}
+        self._one_at_a_time = asyncio.Lock()
+
+    @property
+    def mode(self) -> str:
+        """'virtual' or 'hardware'."""
+        return self._setup.mode
+
+    async def pour(
+        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
+    ) -> PourMeasurement:
+        """See `Bench.pour`. Cancelling stops the arm.
+
+        Raises:
+            InvalidActionError: refused before anything moved, and before anybody was asked.
+            NotPouredError: it did not begin.
+            UnknownPourError: it began, and did not go as it should.
+        """
+        async with self._one_at_a_time:
+            path = await asyncio.to_thread(self._checked, scene, action)
+            pour = PourProcedure(
+                self._setup, scene, action, path, seed=seed, known=self._known.get(scene.pourer.name), progress=progress
+            )
+            try:
+                return await pour.run()
+            finally:
+                self._known[scene.pourer.name] = pour.lasting
+
+    def _checked(self, scene: Scene, action: Action) -> PlannedPour:
+        try:
+            return self._setup.spec.plan(scene, action)
+        except ValueError as error:
+            raise InvalidActionError(str(error)) from error
+
+
+MakeDevice = Callable[..., Device]
+"""Makes a device of a name, a class and its arguments, where the bench is."""
+
+
+@dataclass
+class OpenBench:
+    """What was opened.
+
+    Attributes:
+        bench: pours.
+        devices: to be closed after `close`.
+        stand_ins: of a virtual bench with wires.
+        operator: who answers.
+    """
+
+    bench: PouringBench
+    devices: list[Device]
+    stand_ins: DeviceEmulators | None = None
+    operator: Operator | None = None
+
+    async def close(self) -> None:
+        """Let go of arm and balance; end what was started in their place."""
+        with contextlib.suppress(LaboratoryError):
+            await self.bench.arm.close()
+        if self.bench.balance is not None:
+            with contextlib.suppress(LaboratoryError):
+                await self.bench.balance.release()
+        if self.stand_ins is not None:
+            with contextlib.suppress(LaboratoryError):
+                await self.stand_ins.close()
+
+
+@dataclass
+class _Opening:
+    """Devices so far, for what fails half-way."""
+
+    make: MakeDevice
+    devices: list[Device] = field(default_factory=list)
+
+    def __call__(self, name: str, cls: type[Any], *args: Any) -> Device:
+        self.devices.append(self.make(name, cls, *args))
+        return self.devices[-1]
+
+    def arm(self, spec: ArmSpec, accepted: str | None = None) -> DeviceArm:
+        cls, args = spec.driver(accepted)
+        return DeviceArm(self("arm", cls, *args), spec)
+
+    def balance(self, spec: BalanceDevice, name: str) -> DeviceBalance:
+        cls, args = spec.driver(name)
+        return DeviceBalance(self("balance", cls, *args), spec.time_scale, longest_call=spec.longest_call)
+
+
+def needs_person(spec: LaboratorySpec) -> bool:
+    """Whether somebody has to be there to answer."""
+    return spec.arm is not None and spec.operator.answers == "person"
+
+
+async def open_bench(
+    spec: LaboratorySpec,
+    make: MakeDevice,
+    liquid: SimulatorPool | None,
+    operator: Operator | None,
+    tell: Callable[[Notice], None],
+) -> OpenBench:
+    """The bench of a laboratory that pours.
+
+    Args:
+        spec: of the laboratory.
+        make: makes devices where the bench is.
+        liquid: simulates the hidden liquid of a virtual bench.
+        operator: a person, where one answers.
+        tell: takes notices.
+
+    Raises:
+        LaboratoryError: something does not start, or nobody is there to answer.
+    """
+    opening = _Opening(make)
+    try:
+        if spec.arm is None:
+            assert spec.bench is not None
+            assert liquid is not None
+            return _numbers(spec.bench, opening, liquid)
+        if spec.balance is None:
+            raise LaboratoryError(f"laboratory {spec.name}: an arm that pours needs a balance; add a 'balance' to it")
+        if operator is None and needs_person(spec):
+            raise LaboratoryError(
+                f"laboratory {spec.name} needs a person beside it who answers questions, and nobody is here to be asked"
+            )
+        return await _wired(spec, spec.arm, spec.balance, opening, liquid, operator, tell)
+    except BaseException:
+        for device in reversed(opening.devices):
+            with contextlib.suppress(LaboratoryError):
+                await device.close()
+        raise
+
+
+def _numbers(spec: VirtualBenchSpec, opening: _Opening, liquid: SimulatorPool) -> OpenBench:
+    arm_spec, balance_spec = NumbersSpec(spec.time_scale), simulated_balance(spec)
+    arm = opening.arm(arm_spec)
+    assert balance_spec.device is not None
+    balance = opening.balance(balance_spec.device, "virtual")
+    nature = SimulatedBench(spec, liquid, arm, balance)
+    operator = SimulatedOperator(nature, balance, spec.operator_time)
+    setup = Setup("virtual", arm_spec, balance_spec, spec.operator_time, arm, balance, operator, nature, _nobody)
+    return OpenBench(PouringBench(setup), opening.devices, operator=operator)
+
+
+def _nobody(notice: Notice) -> None:
+    """Whoever would get every weighing on a bench of numbers."""
+
+
+async def _wired(
+    spec: LaboratorySpec,
+    arm_spec: ArmSpec,
+    balance_spec: BalanceSpec,
+    opening: _Opening,
+    liquid: SimulatorPool | None,
+    operator: Operator | None,
+    tell: Callable[[Notice], None],
+) -> OpenBench:
+    stand_ins: DeviceEmulators | None = None
+    follows = False
+    if spec.mode == "virtual":
+        stand_ins = DeviceEmulators(opening("stand-ins", BenchEmulators, arm_spec, balance_spec.device))
+        found = await stand_ins.found()
+        arm_spec, follows = found.arm, found.follows
+        balance_spec = replace(balance_spec, device=found.balance)
+    arm = opening.arm(arm_spec, None if spec.mode == "virtual" else spec.accepted_checksum)
+    balance = None if balance_spec.device is None else opening.balance(balance_spec.device, spec.name)
+    if stand_ins is not None and balance_spec.device is not None and balance_spec.device.told:
+        stand_ins.told = balance
+    nature = GroundTruth(arm_spec.time_scale)
+    if stand_ins is not None and spec.bench is not None and liquid is not None:
+        hands = Hands(BenchContents(balance_spec.placement), None if balance is None else stand_ins.put)
+        if follows and isinstance(arm_spec, UrArmSpec):
+            nature = FollowedBench(spec.bench, arm_spec, stand_ins, hands, liquid)
+        else:
+            nature = VirtualBench(spec.bench, arm_spec.time_scale, stand_ins, hands, liquid)
+        if spec.operator.answers == "virtual":
+            operator = operator or VirtualOperator(hands, spec.operator.time / arm_spec.time_scale)
+        elif operator is not None:
+            operator = PlayedOperator(operator, hands)
+    assert operator is not None
+    questions = OperatorQuestions(operator, spec.operator, tell, arm_spec.time_scale)
+    setup = Setup(spec.mode, arm_spec, balance_spec, spec.operator.time, arm, balance, questions, nature, tell)
+    return OpenBench(PouringBench(setup), opening.devices, stand_ins, operator)

@@ -1,0 +1,39 @@
+"""Is a pour possible at all? Answered before anything moves."""
+
+from __future__ import annotations
+
+import functools
+
+from actors.interfaces import InvalidActionError
+from sim_engine.action import Action
+from sim_engine.motion import PourMotion, plan_motion
+from sim_engine.scene import PoseError, Scene
+from sim_engine.simulator import check_motion
+from sim_engine.vessel.shapes import VesselSpec
+from sim_engine.vessel.vessel import Vessel, build_vessel, check_holds
+
+
+@functools.lru_cache(maxsize=16)
+def vessel(spec: VesselSpec) -> Vessel:
+    """Built once: a mesh's distance grid takes seconds."""
+    return build_vessel(spec)
+
+
+def plan_pour(scene: Scene, action: Action) -> PourMotion:
+    """The motion that the arm will make, by the same definitions as the simulator's.
+
+    Args:
+        scene: vessels and liquid.
+        action: how to pour.
+
+    Raises:
+        InvalidActionError: the vessels would touch, the pourer can't hold the load, or the motion can't be made.
+    """
+    try:
+        pourer, receiver = vessel(scene.pourer), vessel(scene.receiver)
+        check_holds(pourer, scene.liquid.volume)
+        motion = plan_motion(scene, action, pourer, receiver)
+        check_motion(motion, scene, action, pourer, receiver, PoseError())
+    except (ValueError, OSError) as error:
+        raise InvalidActionError(str(error)) from error
+    return motion

@@ -1,0 +1,371 @@
+"""One pour: the operator's steps, consent, the arm's ways and the weighings, in their order.
+
+Two rules hold throughout. While somebody is asked to put hands into the cell, no program runs on the controller, which
+is read back first. And nothing moves unless somebody has just said that it may, and been told how long they have.
+
+Tells who watches where a pour stands.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from actors.arm.arm_interface import (
+    ArmFacts,
+    ArmLostError,
+    ArmRefusedError,
+    ArmState,
+    ArmStoppedError,
+    Executed,
+    PlannedPour,
+)
+from actors.balance.balance_interface import BalanceError
+from actors.balance.weighing import Weighings
+from actors.balance.weighing_plan import PourMasses
+from actors.bench.consent import STUCK, Consent, Setup, grams, start_question
+from actors.bench.virtual_bench import PourAsk
+from actors.interfaces import (
+    InvalidActionError,
+    LaboratoryError,
+    Notice,
+    NotPouredError,
+    PourFailedError,
+    PourProgress,
+    ProgressCallback,
+    UnknownPourError,
+)
+from actors.runtime.remote_object import DeviceLostError
+from sim_engine.action import Action
+from sim_engine.outcome import PourMeasurement, RecordedFrames
+from sim_engine.scene import SampledMotion, Scene
+
+
+class PourReport:
+    """In bench time done of bench time expected; never runs backwards.
+
+    Args:
+        progress: told; what it raises is its own affair.
+        parts: expected time of each checkpoint, in order [s].
+        motion_time: of tilt, hold and return together [s].
+    """
+
+    def __init__(self, progress: ProgressCallback | None, parts: Mapping[str, float], motion_time: float) -> None:
+        self._progress, self._parts, self._motion_time = progress, dict(parts), motion_time
+        self._checkpoint = "operator"
+        self._fraction = 0.0
+        self._tilt: float | None = None
+        self._balance: float | None = None
+        self._stable: bool | None = None
+        self._joints: tuple[float, ...] = ()
+        self._pourer: tuple[float, ...] = ()
+
+    def enter(self, checkpoint: str, done: float = 0.0) -> None:
+        """A checkpoint is reached, or `done` (0 … 1) of it."""
+        self._checkpoint = checkpoint
+        before = 0.0
+        for name, duration in self._parts.items():
+            if name == checkpoint:
+                before += done * duration
+                break
+            before += duration
+        self._fraction = max(self._fraction, before / sum(self._parts.values()))
+        self._tell()
+
+    def move(self, phase: str, fraction: float, tilt: float | None, *, moving: bool = True) -> None:
+        """Where the arm is during the pour itself.
+
+        Args:
+            phase: 'tilt', 'hold' or 'return'.
+            fraction: of the pour's motion, 0 … 1.
+            tilt: of the pourer [rad].
+            moving: whether it is on its way; else only the tilt is noted.
+        """
+        self._tilt = tilt
+        if not moving:
+            return
+        start = sum(duration for name, duration in self._parts.items() if name in ("operator", "tare", "approach"))
+        self._checkpoint = phase if phase in self._parts else self._checkpoint
+        self._fraction = max(self._fraction, (start + fraction * self._motion_time) / sum(self._parts.values()))
+        self._tell()
+
+    def stand(self, joints: tuple[float, ...], pourer: tuple[float, ...]) -> None:
+        """Where the arm is, see `PourProgress`; as far as it tells."""
+        self._joints, self._pourer = joints or self._joints, pourer or self._pourer
+        self._tell()
+
+    def show(self, balance: float, stable: bool | None = None) -> None:
+        """The balance's display [kg], and whether it says that it is at rest."""
+        self._balance, self._stable = balance, stable
+        self._tell()
+
+    @property
+    def watched(self) -> bool:
+        """Whether anybody gets it."""
+        return self._progress is not None
+
+    def pour(self, liquid: RecordedFrames) -> None:
+        """What the liquid of a virtual bench does in this pour."""
+        self._tell(liquid)
+
+    def _tell(self, liquid: RecordedFrames | None = None) -> None:
+        if self._progress is not None:
+            told = PourProgress(
+                self._checkpoint,
+                self._fraction,
+                self._tilt,
+                self._balance,
+                self._stable,
+                self._joints,
+                self._pourer,
+                liquid,
+            )
+            with contextlib.suppress(Exception):
+                self._progress(told)
+
+
+WEIGHING_TIME = 3.0
+"""Bench time that a weight usually takes, for the progress bar [s]."""
+
+SETTLING_TIME = 2.0
+"""From the arm's return home to the first weighing [s of bench time]: the last drops fall."""
+
+LOOK_INTERVAL = 0.1
+"""Between two looks at the balance's display [s of the clock]."""
+
+_BROKEN_OFF = (ArmStoppedError, ArmLostError, DeviceLostError)
+
+
+class PourProcedure:
+    """One pour, from the first question to the last weight.
+
+    Args:
+        setup: of the bench.
+        scene, action: what to pour.
+        path: checked.
+        seed: of a virtual bench's chance.
+        known: weighings of this pourer that still hold.
+        progress: told where it stands.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        scene: Scene,
+        action: Action,
+        path: PlannedPour,
+        *,
+        seed: int,
+        known: Mapping[str, PourMasses] | None,
+        progress: ProgressCallback | None,
+    ) -> None:
+        self._setup, self._scene, self._action, self._path, self._seed = setup, scene, action, path, seed
+        self._consent = Consent(setup, path)
+        self._weighings = Weighings(
+            setup.balance_spec, setup.balance, self._consent.ask, known, self._note_weight, nominal=scene.liquid.mass
+        )
+        self._report = PourReport(progress, _expected(setup, path), path.pour_time)
+        self._begun = False
+        self._broken: Exception | None = None
+        self._executed: Executed | None = None
+        self._facts: ArmFacts | None = None
+
+    @property
+    def lasting(self) -> dict[str, PourMasses]:
+        """Weighings that hold for later pours with this pourer."""
+        return self._weighings.lasting
+
+    async def run(self) -> PourMeasurement:
+        """All of it.
+
+        Raises:
+            NotPouredError: nothing was poured.
+            UnknownPourError: something may have been.
+        """
+        self._setup.questions.take_log()
+        watching = asyncio.create_task(self._watch())
+        try:
+            await self._before()
+            await self._move()
+            return await self._after()
+        except asyncio.CancelledError as error:
+            await self._consent.leave_safe()
+            if self._begun:
+                weighed = f"The pour was given up after it had begun. Weighed until then: {self._weighed()}"
+                self._setup.tell(Notice("warning", weighed))
+                raise
+            raise NotPouredError("the pour was given up before it began; nothing was poured") from error
+        except (InvalidActionError, PourFailedError):
+            await self._consent.leave_safe()
+            raise
+        except LaboratoryError as error:
+            if self._begun and not isinstance(error, BalanceError):
+                await self._keep_what_shows()
+            await self._consent.leave_safe()
+            raise self._said(error) from error
+        finally:
+            watching.cancel()
+            await asyncio.gather(watching, return_exceptions=True)
+            await self._setup.nature.end()
+
+    # ---- in order
+
+    async def _before(self) -> None:
+        setup = self._setup
+        self._report.enter("operator")
+        self._facts = await setup.arm.ready()
+        await self._consent.make_safe()
+        if setup.balance is not None:
+            await setup.balance.device.revive()
+            await setup.balance.resume()
+        show = self._report.pour if self._report.watched else None
+        await setup.nature.prepare(PourAsk(self._scene, self._action, self._path, self._seed, show))
+        await self._weighings.before()
+
+    async def _move(self) -> None:
+        """Out, pour, home: all of it after one consent, unless something stops it."""
+        setup, path = self._setup, self._path
+        await self._consent.given(start_question(setup.spec, path))
+        async with self._setup.nature.followed():
+            await self._out_and_home()
+
+    async def _out_and_home(self) -> None:
+        setup, path = self._setup, self._path
+        self._report.enter("approach")
+        try:
+            await setup.nature.lasting(setup.arm.move_to_start(path, self._seen), path.approach_time)
+        except STUCK as error:
+            await self._consent.bring_home(error, begun=self._begun)
+            raise
+        await setup.nature.note()
+        await setup.nature.tilts()
+        self._report.enter("tilt")
+        self._begun = True
+        try:
+            self._executed = await setup.nature.lasting(setup.arm.execute(path, self._follow), path.pour_time)
+        except ArmRefusedError as error:  # before anything moved
+            self._begun = False
+            await self._consent.bring_home(error, begun=self._begun)
+            raise
+        except _BROKEN_OFF as error:
+            self._broken, self._executed = error, getattr(error, "executed", None)
+            await self._consent.bring_upright(error)
+        await setup.nature.note()
+        try:
+            if self._broken is not None:
+                await setup.arm.release()  # agreed to with the un-tilting
+            await setup.arm.retreat(path, self._seen)
+        except STUCK as error:
+            await self._consent.bring_home(error, begun=self._begun)
+        await self._let_it_land()
+
+    async def _after(self) -> PourMeasurement:
+        await self._consent.make_safe()
+        self._report.enter("settle")
+        await self._setup.nature.settle(SETTLING_TIME)
+        self._report.enter("weigh")
+        await self._weighings.after()
+        measured = self._weighings.measurement(self._scene.liquid.mass)
+        self._report.enter("record", 1.0)
+        if self._broken is not None:
+            raise self._broken
+        return PourMeasurement(measured.loaded, measured.spilled, measured.retained, self._notes(measured))
+
+    # ---- the liquid
+
+    async def _let_it_land(self) -> None:
+        """What was executed is over: the liquid does what it does, and lies on the balance."""
+        await self._setup.nature.lands(self._executed, self._broken)
+
+    async def _keep_what_shows(self) -> None:
+        """Weigh whatever can be weighed of a pour that was broken off without touching anything."""
+        with contextlib.suppress(LaboratoryError):
+            await self._let_it_land()
+            await self._setup.nature.settle(SETTLING_TIME)
+            await self._weighings.at_once()
+
+    # ---- what is kept
+
+    def _note_weight(self, key: str, weighed: PourMasses) -> None:
+        """Into the journal at once: no weight is lost, whatever happens next."""
+        self._setup.tell(Notice("note", f"weighed, {key}: {grams(weighed.mass)} ± {1e3 * weighed.uncertainty:.2f} g"))
+
+    def _said(self, error: Exception) -> LaboratoryError:
+        """The error for those above, with what is known of the liquid."""
+        if not self._begun:
+            return NotPouredError(f"{error}. Nothing was poured")
+        text = f"{error}. What was poured is unknown"
+        with contextlib.suppress(LaboratoryError):
+            m = self._weighings.measurement()
+            text = (
+                f"{error}. It was not the pour that was asked for; weighed were {grams(m.loaded)} loaded, "
+                f"{grams(m.spilled)} spilled, {grams(m.retained)} retained"
+            )
+        return UnknownPourError(f"{text}. All weighings: {self._weighed()}")
+
+    def _weighed(self) -> str:
+        return ", ".join(f"{key} {grams(w.mass)}" for key, w in self._weighings.weighed.items()) or "nothing"
+
+    def _notes(self, measured: PourMeasurement) -> dict[str, Any]:
+        executed = self._executed
+        assert executed is not None
+        return {
+            "mode": self._setup.mode,
+            **measured.notes,
+            "arm": _who(self._facts),
+            "executed_s": float(executed.times[-1]),
+            "largest_tilt_deg": _largest_tilt(executed),
+            "executed": executed.record(),
+            "operator": self._setup.questions.take_log(),
+        }
+
+    # ---- screens
+
+    def _follow(self, state: ArmState) -> None:
+        self._report.move(state.phase, state.fraction, state.tilt, moving=state.moving)
+        self._seen(state)
+
+    def _seen(self, state: ArmState) -> None:
+        self._report.stand(state.joints, state.pourer)
+
+    async def _watch(self) -> None:
+        """Give the balance's display to those who watch; it can't hold the pour up."""
+        balance = self._setup.balance
+        if balance is None:
+            return
+        while True:
+            with contextlib.suppress(LaboratoryError):
+                weight = await balance.read()
+                if math.isfinite(weight.mass):
+                    self._report.show(weight.mass, weight.stable)
+            await asyncio.sleep(LOOK_INTERVAL)
+
+
+def _expected(setup: Setup, path: PlannedPour) -> dict[str, float]:
+    """Time of each checkpoint [s of bench time]."""
+    return {
+        "operator": setup.operator_time + 4.0 * WEIGHING_TIME,
+        "approach": setup.spec.announcement + path.approach_time,
+        **{name: end - start for name, start, end in path.phases},
+        "settle": path.retreat_time + SETTLING_TIME,
+        "weigh": WEIGHING_TIME,
+        "record": 2.0 * WEIGHING_TIME,
+    }
+
+
+def _largest_tilt(executed: Executed) -> float:
+    """As read back [deg]."""
+    if len(executed.times) < 2:
+        return 0.0
+    return math.degrees(float(SampledMotion(executed.times, executed.poses).tilt(executed.times).max()))
+
+
+def _who(facts: ArmFacts | None) -> dict[str, Any]:
+    """What a later reader will ask about the robot."""
+    if facts is None:
+        return {}
+    told = {name: getattr(facts, name) for name in ("model", "serial", "version", "checksum")}
+    return {name: text for name, text in told.items() if text}

@@ -1,0 +1,176 @@
+"""The bench of numbers: neither arm nor balance has wires, and the hidden liquid is poured before the arm has moved.
+
+Same seed and action → same measurement, bit for bit, whatever happened before and however the clock runs: time passes
+on the balance, and only there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable
+from typing import Any, TypeVar
+
+from actors.arm.arm_device import DeviceArm
+from actors.arm.arm_interface import Executed
+from actors.arm.simulated_arm import Grip
+from actors.balance.balance_device import DeviceBalance
+from actors.balance.balance_settings import BalanceSpec, NumbersBalanceSpec
+from actors.balance.simulated_balance import BalanceSettings, Load
+from actors.balance.weighing_plan import Placement
+from actors.bench.ground_truth import Spill, TouchingError, draw_pose_error, hidden_spill, stream
+from actors.bench.operator_questions import OperatorQuestions
+from actors.bench.virtual_bench import GroundTruth, PourAsk
+from actors.interfaces import LaboratoryError, OperatorQuestion, OperatorSpec, PourFailedError, SimulatorPool
+from actors.laboratory_settings import VirtualBenchSpec
+
+CARRYING_TIME = 2.0
+"""Bench time to put something on the balance or take it off [s]."""
+
+T = TypeVar("T")
+
+_NOTHING = Load((0.0,), (0.0,))
+
+
+def simulated_balance(spec: VirtualBenchSpec) -> BalanceSpec:
+    """The balance of a bench of numbers: the dry pourer is tared away, and no load is ever wrong."""
+    settings = BalanceSettings(
+        resolution=spec.balance_resolution,
+        noise=spec.balance_noise,
+        drift=spec.balance_drift,
+        settling_time=spec.settling_time,
+        time_scale=spec.time_scale,
+    )
+    return BalanceSpec(Placement.TARED, NumbersBalanceSpec(settings), load_tolerance=float("inf"))
+
+
+class SimulatedBench(GroundTruth):
+    """What is hidden on a bench of numbers.
+
+    Args:
+        spec: hidden liquid, errors, pace.
+        simulators: a pool of its own for the hidden liquid.
+        arm: of numbers.
+        balance: of numbers; bench time passes on it.
+    """
+
+    def __init__(
+        self, spec: VirtualBenchSpec, simulators: SimulatorPool, arm: DeviceArm, balance: DeviceBalance
+    ) -> None:
+        super().__init__(spec.time_scale)
+        self._spec, self._simulators, self._arm, self._balance = spec, simulators, arm, balance
+        self._pour: PourAsk | None = None
+        self._liquid: asyncio.Task[Spill] | None = None
+
+    async def prepare(self, pour: PourAsk) -> None:
+        """See `GroundTruth.prepare`: the liquid is poured from here on."""
+        self._pour = pour
+        self._liquid = asyncio.create_task(
+            hidden_spill(self._spec, self._simulators, pour.scene, pour.action, pour.seed, pour.record_rate)
+        )
+        await self._balance.prepare(stream(pour.seed, "balance"))
+        error = draw_pose_error(self._spec, pour.seed)
+        await self._arm.device.call("grip", Grip(error.speed_factor, stream(pour.seed, "arm")), deadline=30.0)
+
+    async def tilts(self) -> None:
+        """See `GroundTruth.tilts`: the tray must know what falls on it while the arm moves.
+
+        Raises:
+            PourFailedError: the vessels would touch as they truly stand.
+        """
+        try:
+            spill = await self._spill()
+        except TouchingError as error:
+            raise PourFailedError(str(error)) from error
+        assert self._pour is not None
+        self._pour.shown(spill.frames)
+        await self._balance.put(Load(spill.times, spill.spilled_curve))
+
+    async def lands(self, executed: Executed | None, broken: Exception | None) -> None:
+        """See `GroundTruth.lands`; what a broken motion poured is not what was foretold."""
+        if broken is not None or executed is None or not executed.completed:
+            raise LaboratoryError(f"{broken or 'the arm did not complete the pour'}")
+
+    async def lasting(self, doing: Awaitable[T], seconds: float) -> T:
+        """See `GroundTruth.lasting`: time passes on the balance meanwhile."""
+        return (await _together(doing, self._balance.pass_time(seconds)))[0]
+
+    async def wait(self, seconds: float) -> None:
+        """See `GroundTruth.wait`."""
+        await self._balance.pass_time(seconds)
+
+    async def settle(self, seconds: float) -> None:
+        """See `GroundTruth.settle`: drops may fall for longer than the arm moves; a settled tray carries all of them."""
+        assert self._pour is not None
+        last = (await self._spill()).times[-1]
+        await self.wait(max(last - self._pour.path.pour_time, 0.0) + self._spec.settling_time)
+
+    async def end(self) -> None:
+        """See `GroundTruth.end`."""
+        if self._liquid is not None:
+            await _end(self._liquid)
+
+    async def content(self, about: str) -> Load | None:
+        """What is on the balance after a question was answered, net of what is dry; None: as it was."""
+        assert self._pour is not None
+        match about:
+            case "pourer_full":
+                return Load((0.0,), (self._pour.scene.liquid.mass,))
+            case "pourer_after":
+                return Load((0.0,), ((await self._spill()).retained,))
+            case "dry_pourer" | "set_up" | "dry_pourer_after":
+                return _NOTHING
+        return None
+
+    async def _spill(self) -> Spill:
+        assert self._liquid is not None
+        return await asyncio.shield(self._liquid)
+
+
+class SimulatedOperator(OperatorQuestions):
+    """The person at the bench of numbers: refills, wipes, carries things to the balance, and always says yes.
+
+    Nothing of it is written down: it happens in no time, and is the same in every pour.
+
+    Args:
+        bench: that they stand beside.
+        balance: that they put things on.
+        preparation_time: refilling, placing, wiping [s of bench time].
+    """
+
+    def __init__(self, bench: SimulatedBench, balance: DeviceBalance, preparation_time: float) -> None:
+        super().__init__(self, OperatorSpec(answers="virtual"), lambda notice: None)
+        self._bench, self._balance, self._time = bench, balance, preparation_time
+
+    async def ask(self, question: OperatorQuestion) -> str:
+        """See `Operator.ask`."""
+        load = await self._bench.content(question.about)
+        if load is not None and not question.problem:
+            if question.about == "dry_pourer":
+                await self._balance.pass_time(self._time)
+            await self._balance.put(load)
+            await self._balance.pass_time(CARRYING_TIME)
+        if question.problem and question.wants == "done":
+            raise LaboratoryError(question.problem)  # nobody can mend numbers
+        return "done" if question.wants == "done" else "no" if question.about in ("balance", "unsafe") else "yes"
+
+    async def announce(self, text: str, seconds: float) -> None:
+        """See `Operator.announce`."""
+
+
+async def _together(first: Awaitable[T], second: Awaitable[Any]) -> tuple[T, Any]:
+    """Both; if one fails, the other is awaited no longer and the error is raised."""
+    tasks: list[asyncio.Future[Any]] = [asyncio.ensure_future(first), asyncio.ensure_future(second)]
+    try:
+        await asyncio.gather(*tasks)
+    finally:
+        for task in tasks:
+            await _end(task)
+    return tasks[0].result(), tasks[1].result()
+
+
+async def _end(task: asyncio.Future[Any]) -> None:
+    """Cancel a task unless it is done, wait for it, and take note of its error."""
+    task.cancel()
+    await asyncio.wait({task})
+    if not task.cancelled():
+        task.exception()

@@ -1,0 +1,34 @@
+"""What the contracts share: a call in a thread of its own, and how long a result may take."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+PATIENCE = 60.0
+"""After which something that should have happened has not [s]."""
+
+
+class Call(threading.Thread):
+    """A blocking call that goes on in a thread."""
+
+    def __init__(self, call: Callable[..., Any], *arguments: Any) -> None:
+        super().__init__(daemon=True)
+        self._call, self._arguments = call, arguments
+        self.value: Any = None
+        self.error: Exception | None = None
+        self.start()
+
+    def run(self) -> None:
+        """See `threading.Thread.run`."""
+        try:
+            self.value = self._call(*self._arguments)
+        except Exception as error:
+            self.error = error
+
+    def ended(self) -> Exception | None:
+        """Wait for its end; what it raised."""
+        self.join(PATIENCE)
+        assert not self.is_alive(), f"the call has not come back after {PATIENCE:g} s"
+        return self.error

@@ -1,0 +1,1 @@
+"""Emulated balances behind a pseudo-terminal."""

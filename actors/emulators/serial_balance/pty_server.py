@@ -1,0 +1,124 @@
+"""The process of a virtual balance: orders on standard input, characters on a pseudo-terminal.
+
+It ends when its standard input ends or its parent is gone, whichever comes first: nobody needs to clean up behind a
+killed test.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from actors.balance.simulated_balance import ScaleSettings
+from actors.emulators.serial_balance.emulated_balance import EmulatedBalance, Emulation
+from actors.emulators.serial_balance.pty_end import PtyEnd
+
+_PARENT_CHECK = 1.0
+"""How often it is seen whether the parent still lives [s]."""
+
+
+class Server:
+    """One line, one character, one stream of orders.
+
+    Args:
+        line: the far end.
+        character: who sits there.
+    """
+
+    def __init__(self, line: PtyEnd, character: EmulatedBalance) -> None:
+        self._line, self._character = line, character
+        self._orders = bytearray()
+        self._parent = os.getppid()
+
+    def run(self) -> None:
+        """Until the parent is gone or closes its end."""
+        wake: float | None = None
+        while os.getppid() == self._parent:
+            now = time.monotonic()
+            timeout = _PARENT_CHECK if wake is None else min(max(wake - now, 0.0), _PARENT_CHECK)
+            watched = [0] if self._line.descriptor is None else [0, self._line.descriptor]
+            ready, _, _ = select.select(watched, [], [], timeout)
+            now = time.monotonic()
+            if 0 in ready and not self._take_orders(now):
+                return
+            if self._line.descriptor is not None and self._line.descriptor in ready:
+                self._character.hear(self._line.receive(), now)
+            self._line.send(self._character.speak(now), now)
+            times = [self._line.pump(now), self._character.due(now)]
+            wake = min((moment for moment in times if moment is not None), default=None)
+
+    def _take_orders(self, now: float) -> bool:
+        """Carry out what came on standard input; False at its end."""
+        data = os.read(0, 65536)
+        self._orders += data
+        *whole, rest = self._orders.split(b"\n")
+        self._orders = bytearray(rest)
+        for text in whole:
+            try:
+                answer = self._order(json.loads(text), now)
+            except (KeyError, TypeError, ValueError, OSError) as error:
+                answer = {"error": f"{type(error).__name__}: {error}"}
+            tell(answer)
+        return bool(data)
+
+    def _order(self, order: dict[str, Any], now: float) -> dict[str, Any]:
+        match order.get("do"):
+            case "unplug":
+                self._line.unplug()
+            case "plug":
+                self._line.plug()
+            case _:
+                return self._character.control(order, now)
+        return {}
+
+
+def tell(answer: dict[str, Any]) -> None:
+    """Answer on standard output; nobody may be listening any more."""
+    with contextlib.suppress(BrokenPipeError):
+        os.write(1, json.dumps(answer).encode("ascii") + b"\n")
+
+
+def make_character(settings: dict[str, Any]) -> EmulatedBalance:
+    """The one who sits at the far end.
+
+    Args:
+        settings: as `VirtualSerialBalance` or `RecordedBalance` writes them.
+    """
+    if "recording" in settings:
+        from actors.balance.line_recording import LineRecording
+        from actors.emulators.serial_balance.pty_end import Replay
+
+        return Replay(LineRecording.load(Path(settings["recording"])), settings["speed"])
+    return Emulation(
+        settings["dialect"],
+        ScaleSettings(**settings["scale"]),
+        settings["time_scale"],
+        settings["latency"],
+        tuple(settings["seed"]),
+    )
+
+
+def main() -> None:
+    """Serve with the settings of the first argument, JSON, until the parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C goes to the whole group; the parent decides
+    settings = json.loads(sys.argv[1])
+    line = PtyEnd(Path(settings["link"]), settings["baud"])
+    try:
+        character = make_character(settings)
+        tell({"port": str(line.link)})
+        Server(line, character).run()
+    finally:
+        line.unplug()
+        with contextlib.suppress(OSError):
+            line.link.parent.rmdir()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,360 @@
+"""The controller: one tick per control cycle runs the program, moves the arm and watches over both."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from enum import IntEnum
+
+from actors.arm.ur.robot_models import Joints
+from actors.emulators.ur_controller.commands import commands_of
+from actors.emulators.ur_controller.controlled_models import HOME, ControlledModel
+from actors.emulators.ur_controller.motion.mover import ViolationError
+from actors.emulators.ur_controller.registers import Registers, Signals, Watchdogs
+from actors.emulators.ur_controller.robot import Power, Robot, RobotMode
+from actors.emulators.ur_controller.safety_system import Safety, SafetyConfiguration, SafetyMode
+from actors.emulators.ur_controller.servers.primary_messages import ControllerMessage, Listener
+from actors.emulators.ur_controller.urscript.lexer import ScriptError
+from actors.emulators.ur_controller.urscript.program import Program, waiting
+from actors.emulators.ur_controller.urscript.translator import Translated, translate
+
+
+class RuntimeState(IntEnum):
+    """State of the program, as RTDE reports it."""
+
+    STOPPING = 0
+    STOPPED = 1
+    PLAYING = 2
+    PAUSING = 3
+    PAUSED = 4
+    RESUMING = 5
+
+
+_POWERLESS = (SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.FAULT)
+"""Modes in which the arm has no power."""
+
+MOST_SECONDARY = 10
+"""Secondary programs beside the main one."""
+
+Watcher = Callable[[], bool]
+"""Called each cycle until it returns True."""
+
+
+class Controller:
+    """One robot with its controller. Knows no sockets; servers read and write it between ticks.
+
+    Args:
+        model: which robot.
+        frequency: control cycles per second of controller time [Hz].
+        time_scale: controller seconds per wall second; only watchdogs care.
+        mode: of power, to begin with.
+        remote: remote control is on.
+        joints: where the arm stands [rad].
+        configuration: safety limits; the model's own by default.
+
+    Attributes:
+        now: controller time [s].
+        known_commands: what the translator has to know of the commands that programs may call.
+        switches: how often somebody switched between remote and local control.
+    """
+
+    def __init__(
+        self,
+        model: ControlledModel,
+        *,
+        frequency: float | None = None,
+        time_scale: float = 1.0,
+        mode: RobotMode = RobotMode.RUNNING,
+        remote: bool = True,
+        joints: Joints = HOME,
+        configuration: SafetyConfiguration | None = None,
+    ) -> None:
+        self.model = model
+        self.frequency = frequency or model.frequency
+        self.dt = 1.0 / self.frequency
+        self.time_scale = time_scale
+        self.remote = remote
+        self.switches = 0
+        self.now = 0.0
+        self.ticks = 0
+        configuration = configuration or SafetyConfiguration.of(model)
+        self.safety = Safety(configuration)
+        self.power = Power(mode)
+        self.robot = Robot(model, joints, configuration)
+        self.registers = Registers()
+        self.signals = Signals()
+        self.runtime = RuntimeState.STOPPED
+        self.program: Program | None = None
+        self.secondary: list[Program] = []
+        self.running: Program | None = None
+        self.watchdogs = Watchdogs()
+        self.watchers: list[Watcher] = []
+        self.listeners: list[Listener] = []
+        self.popup: str | None = None
+        self.safety_popup = False
+        self._resumes = False
+        self._commands = commands_of(self)
+        self.known_commands = waiting(self._commands)
+
+    # ---- telling
+
+    def tell(self, kind: str, text: str, line: int = 0) -> None:
+        """Give a message to all who listen."""
+        message = ControllerMessage(kind, text.encode("utf-8", "replace").decode("utf-8"), line, self.now)
+        for listener in self.listeners:
+            listener(message)
+
+    # ---- programs
+
+    @property
+    def playing(self) -> bool:
+        """Whether a program runs."""
+        return self.runtime is RuntimeState.PLAYING
+
+    def upload(self, text: str) -> None:
+        """Run a program; one that runs is ended. What can't be run is refused with a message, whatever is wrong."""
+        try:
+            translated = translate(text, self.known_commands)
+        except Exception as error:
+            self.refuse(error)
+        else:
+            self.begin(translated)
+
+    def refuse(self, error: Exception) -> None:
+        """Report why a program can't be run; what is not a `ScriptError` is a defect here, and is logged as one."""
+        if not isinstance(error, ScriptError):
+            traceback.print_exception(error)
+            error = ScriptError(f"internal error of the controller: {error}")
+        self.tell("exception", f"compile error: {error.text}", error.line)
+
+    def begin(self, translated: Translated) -> None:
+        """Run a program that has been translated; see `upload`."""
+        try:
+            program = Program(translated, self._commands)
+        except Exception as error:
+            self.refuse(error)
+            return
+        if program.secondary:
+            if len(self.secondary) >= MOST_SECONDARY:
+                self.tell("key", f"program {program.name} not started: {MOST_SECONDARY} secondary programs run already")
+                return
+            self.secondary.append(program)
+            return
+        if not (self.power.running and self.safety.may_move):
+            self.tell("key", f"program {program.name} not started: the robot is not ready")
+            return
+        if self.runtime in (RuntimeState.PAUSED, RuntimeState.PAUSING):
+            # Seen with the manufacturer's simulator: the first upload only ends the program that is held.
+            self.tell("key", f"program {program.name} not started: a paused program was stopped instead")
+            self.stop()
+            return
+        self._drop_program()
+        self.robot.mover.thaw()
+        self.program = program
+        self.runtime = RuntimeState.PLAYING
+        self.tell("key", f"program {program.name} started")
+
+    @property
+    def control_line(self) -> int:
+        """Line of the program that moves the arm; 0 if none does."""
+        holder = self.robot.mover.holder
+        return 0 if self.program is None or holder is None else self.program.line_of(holder)
+
+    @property
+    def local(self) -> bool:
+        """Whether commands over the network are refused. CB3 controllers know no such thing."""
+        return self.model.remote_control and not self.remote
+
+    def stop(self) -> None:
+        """End the program; the arm comes to rest."""
+        if self.program is not None:
+            self.tell("key", f"program {self.program.name} stopped")
+        self._drop_program()
+
+    def pause(self) -> bool:
+        """Hold program and arm. Returns whether there was anything to hold."""
+        if not self.playing:
+            return False
+        self.runtime = RuntimeState.PAUSING
+        self.robot.mover.freeze()
+        return True
+
+    def play(self) -> bool:
+        """Go on with a program that is held. Returns whether that is possible."""
+        held = self.program is not None and self.runtime in (RuntimeState.PAUSED, RuntimeState.PAUSING)
+        if not held or not self.safety.may_move or not self.power.running:
+            return False
+        self.robot.mover.thaw()
+        self.runtime = RuntimeState.PLAYING
+        return True
+
+    def _drop_program(self) -> None:
+        self.program = None
+        self.watchdogs.clear()
+        self._resumes = False
+        self.robot.mover.abandon()
+        if self.runtime is not RuntimeState.STOPPED:
+            self.runtime = RuntimeState.STOPPING
+
+    # ---- safety
+
+    def protective_stop(self, reason: str) -> None:
+        """Stop the arm, hold the program; to be unlocked by a person."""
+        self.safety.protective_stop(self.now)
+        self.safety_popup = True
+        self._hold()
+        self._resumes = False
+        self.tell("safety", f"protective stop: {reason}")
+
+    def emergency_stop(self, *, system: bool = False) -> None:
+        """Stop the arm, end the program, switch off."""
+        self.safety.emergency_stop(system=system)
+        self._drop_program()
+        self.robot.mover.freeze()
+        self.tell("safety", "emergency stop")
+
+    def release_emergency_stop(self) -> None:
+        """The button is pulled out; power stays off."""
+        self.safety.release_emergency_stop()
+        self.tell("safety", "emergency stop released")
+
+    def safety_fault(self) -> None:
+        """The safety system fails: stop, off, and only a restart helps."""
+        self.safety.fault = True
+        self._drop_program()
+        self.robot.mover.freeze()
+        self.tell("safety", "fault")
+
+    def configure_safety(self, configuration: SafetyConfiguration) -> None:
+        """Other limits, with another checksum."""
+        self.safety.configuration = configuration
+        self.robot.configure(configuration)
+        self.tell("key", f"safety checksum changed to {configuration.checksum}")
+
+    def set_remote(self, active: bool) -> None:
+        """Somebody switches between remote and local control; a program that came over the network ends."""
+        if self.remote != active:
+            self.stop()
+            self.remote = active
+            self.switches += 1
+
+    def reboot(self) -> None:
+        """As after a power cut: everything but the safety configuration and the remote switch is forgotten."""
+        self.power_off()
+        self.runtime = RuntimeState.STOPPED
+        self.now = 0.0
+        self.robot.forget()
+        self.secondary.clear()
+        self.watchers.clear()
+        self.safety.restart()
+        self.robot.mover.place(self.robot.mover.q)
+        self.robot.mover.slider = 1.0
+        for store in (self.registers.input_int, self.registers.output_int):
+            store[:] = [0] * len(store)
+        for values in (self.registers.input_double, self.registers.output_double):
+            values[:] = [0.0] * len(values)
+        self.signals.digital_out = 0
+
+    def set_safeguard(self, active: bool) -> None:
+        """Someone enters or leaves the guarded area. Without a reset button, as here, the program goes on by itself."""
+        was = self.safety.safeguard
+        self.safety.safeguard = active
+        if active and not was:
+            self._resumes = self.playing
+            self._hold()
+            self.tell("safety", "safeguard stop")
+        elif was and not active and self._resumes:
+            self._resumes = False
+            self.play()
+
+    def _hold(self) -> None:
+        self.robot.mover.freeze()
+        if self.playing:
+            self.runtime = RuntimeState.PAUSING
+
+    def unlock_protective_stop(self) -> str | None:
+        """A person has seen to the cause. Returns why it can't be unlocked yet, or None."""
+        refusal = self.safety.unlock(self.now)
+        if refusal is None:
+            self.safety_popup = False
+            self.tell("safety", "protective stop unlocked")
+        return refusal
+
+    def power_on(self) -> str | None:
+        """Switch on. Returns why not, or None."""
+        if self.safety.mode in _POWERLESS:
+            return "Failed to execute: power on"
+        self.power.on(self.now)
+        return None
+
+    def release_brakes(self) -> str | None:
+        """Release the brakes. Returns why not, or None."""
+        if self.safety.mode in _POWERLESS:
+            return "Failed to execute: brake release"
+        self.power.release_brakes(self.now)
+        return None
+
+    def restart_safety(self) -> None:
+        """After a fault: everything off."""
+        self.power_off()
+        self.safety.restart()
+
+    def power_off(self) -> None:
+        """Brakes close, the program ends."""
+        self._drop_program()
+        self.power.off()
+
+    # ---- time
+
+    def tick(self) -> None:
+        """One control cycle."""
+        self.ticks += 1
+        self.now += self.dt
+        self.power.step(self.now)
+        for watcher in list(self.watchers):
+            if watcher() and watcher in self.watchers:  # what it does may have cleared the list
+                self.watchers.remove(watcher)
+        if self.runtime is RuntimeState.PLAYING:
+            due = self.watchdogs.step(self.dt / self.time_scale)
+            if due is not None:
+                self._bite(*due)
+            else:
+                self._run()
+        self.secondary = [program for program in self.secondary if self._goes_on(program)]
+        try:
+            self.robot.step(self.now, self.dt)
+        except (ViolationError, ValueError, ArithmeticError) as violation:
+            # Whatever can't be computed must not move: the mover keeps its last targets and brakes.
+            self.robot.mover.freeze()
+            if self.safety.may_move:
+                self.protective_stop(str(violation))
+        if self.runtime in (RuntimeState.STOPPING, RuntimeState.PAUSING) and not self._in_motion():
+            self.runtime = RuntimeState.STOPPED if self.runtime is RuntimeState.STOPPING else RuntimeState.PAUSED
+        if self.safety.mode in _POWERLESS and self.power.powered and not self._in_motion():
+            self.power.off()
+
+    def _bite(self, action: str, why: str) -> None:
+        self.tell("key", why)
+        if action == "pause":
+            self.pause()
+        else:
+            self.stop()
+
+    def _in_motion(self) -> bool:
+        return any(abs(v) > 1e-6 for v in self.robot.mover.qd)
+
+    def _run(self) -> None:
+        program = self.program
+        if program is not None and not self._goes_on(program) and self.program is program:
+            self.stop()
+
+    def _goes_on(self, program: Program) -> bool:
+        """One cycle of a program: whether it wants another."""
+        self.running = program
+        try:
+            return program.tick()
+        except ScriptError as error:
+            self.tell("exception", error.text, error.line)
+            return False
+        finally:
+            self.running = None

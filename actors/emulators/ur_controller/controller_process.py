@@ -1,0 +1,129 @@
+"""Starting a virtual controller from Python, talking to its fault port, and making sure that it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Sequence
+from math import degrees
+from types import TracebackType
+from typing import Any
+
+from actors.runtime.child_process import ChildProcess, python_module
+
+START_TIME = 40.0
+"""Longest wait for the process to be ready [s]."""
+
+
+class VirtualControllerError(Exception):
+    """The process doesn't start, or doesn't understand a fault; the text says why."""
+
+
+class VirtualController:
+    """A controller in a process of its own. Made by `start`; a context manager that closes.
+
+    Attributes:
+        address: of its ports 30001 … 30004 and 29999.
+        fault_port: where faults are asked for, at the same address.
+        pid: of its process.
+    """
+
+    def __init__(self, process: ChildProcess, address: str, fault_port: int) -> None:
+        self._process = process
+        self.address = address
+        self.fault_port = fault_port
+        self.pid = process.pid
+
+    @classmethod
+    def start(
+        cls,
+        address: str = "127.0.0.2",
+        model: str = "ur10e",
+        time_scale: float = 1.0,
+        frequency: float | None = None,
+        *,
+        state: str = "running",
+        local: bool = False,
+        joints: Sequence[float] | None = None,
+        prioritised: bool = True,
+        patience: float = START_TIME,
+    ) -> VirtualController:
+        """Start the process and wait until all its ports are open.
+
+        Args:
+            address: any loopback address; each controller needs one of its own.
+            model: 'ur10' or 'ur10e'.
+            time_scale: controller seconds per wall second.
+            frequency: control cycles per controller second [Hz]; the model's by default.
+            state: of power, 'running', 'idle' or 'off'.
+            local: begin in local control.
+            joints: six positions to begin with [rad]; a pose in the middle of its reach by default.
+            prioritised: its clock goes before other work on the machine; see docs/virtual-ur.md, "Control period".
+            patience: longest wait [s].
+
+        Raises:
+            VirtualControllerError: it did not get ready, with what it said.
+        """
+        command = python_module("actors.emulators.ur_controller", "--address", address, "--model", model)
+        command += ["--time-scale", repr(float(time_scale)), "--state", state, "--parent", str(os.getpid())]
+        command += [] if frequency is None else ["--frequency", repr(float(frequency))]
+        command += ["--local"] if local else []
+        command += [] if prioritised else ["--normal-priority"]
+        command += [] if joints is None else ["--joints=" + ",".join(repr(degrees(q)) for q in joints)]
+        process = ChildProcess(command)
+        try:
+            ready = json.loads(process.read_line(patience))
+            return cls(process, address, int(ready["fault_port"]))
+        except BaseException as error:
+            process.kill()
+            said = process.last_error or str(error)
+            process.release()
+            if not isinstance(error, Exception):
+                raise
+            raise VirtualControllerError(
+                f"virtual controller at {address}: not ready within {patience:g} s: {said}"
+            ) from error
+
+    def fault(self, name: str, *, patience: float = 5.0, **arguments: Any) -> dict[str, Any]:
+        """Ask for a fault, or for what the controller knows of itself; see docs/virtual-ur.md for names.
+
+        Args:
+            name: of the fault.
+            patience: longest wait for the answer [s].
+            arguments: of the fault.
+
+        Returns:
+            What it answers; {'ok': True} at least.
+
+        Raises:
+            VirtualControllerError: it doesn't know such a fault, or its arguments are wrong, or it doesn't answer.
+        """
+        try:
+            with socket.create_connection((self.address, self.fault_port), timeout=patience) as connection:
+                connection.sendall(json.dumps({"fault": name, **arguments}).encode() + b"\n")
+                with connection.makefile("rb") as lines:
+                    line = lines.readline()
+            answer: dict[str, Any] = json.loads(line)
+        except (OSError, ValueError) as error:
+            raise VirtualControllerError(f"virtual controller at {self.address}: '{name}': {error}") from error
+        if not answer.get("ok"):
+            raise VirtualControllerError(f"virtual controller at {self.address}: {answer.get('error')}")
+        return answer
+
+    @property
+    def alive(self) -> bool:
+        """Whether its process runs."""
+        return self._process.alive
+
+    def close(self, patience: float = 5.0) -> None:
+        """End the process."""
+        self._process.close(patience, terminate=True)
+
+    def __enter__(self) -> VirtualController:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

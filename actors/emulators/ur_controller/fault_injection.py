@@ -1,0 +1,345 @@
+"""What may go wrong, on request: one TCP port with a line of JSON in and a line of JSON out. For tests only."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+from actors.emulators.ur_controller.control_clock import Host
+from actors.emulators.ur_controller.controller import Watcher
+from actors.emulators.ur_controller.robot import TRACKING_LAG, RobotMode
+from actors.emulators.ur_controller.safety_system import SafetyConfiguration, SafetyPlane
+
+LONGEST_LINE = 100_000
+
+
+class FaultError(Exception):
+    """There is no such fault, or not with these arguments."""
+
+
+class ControllerFaults:
+    """All faults of one host, by name. Times are of the controller [s] unless they say wall.
+
+    Args:
+        host: what they happen to.
+    """
+
+    def __init__(self, host: Host) -> None:
+        self._host = host
+        self._controller = host.controller
+        self._names: dict[str, Callable[..., dict[str, Any] | None]] = {
+            "protective_stop": self.protective_stop,
+            "emergency_stop": self.emergency_stop,
+            "release_emergency_stop": self.release_emergency_stop,
+            "safeguard": self.safeguard,
+            "reduced": self.reduced,
+            "safety_fault": self.safety_fault,
+            "stall": self.stall,
+            "drop": self.drop,
+            "refuse": self.refuse,
+            "reboot": self.reboot,
+            "noise": self.noise,
+            "lag": self.lag,
+            "slider": self.slider,
+            "remote": self.remote,
+            "checksum": self.checksum,
+            "limits": self.limits,
+            "inputs": self.inputs,
+            "power": self.power,
+            "state": self.state,
+            "history": self.history,
+            "clear": self.clear,
+        }
+
+    def call(self, request: Any) -> dict[str, Any]:
+        """Do what a request asks.
+
+        Raises:
+            FaultError: it can't be done as asked.
+        """
+        if not isinstance(request, dict) or not isinstance(request.get("fault"), str):
+            raise FaultError('a request is an object with "fault" and its arguments')
+        arguments = {str(k): v for k, v in request.items() if k != "fault"}
+        name = request["fault"]
+        if name not in self._names:
+            raise FaultError(f"no fault '{name[:50]}'; there are {', '.join(self._names)}")
+        try:
+            return self._names[name](**arguments) or {}
+        except (TypeError, ValueError, LookupError, ArithmeticError) as error:
+            raise FaultError(f"{name}: {error!r} with {arguments}"[:500]) from error
+
+    # ---- when
+
+    def _when(
+        self,
+        do: Callable[[], None],
+        after: float | None = None,
+        joint: int | None = None,
+        above: float | None = None,
+        below: float | None = None,
+    ) -> None:
+        """Now, after a time, or once a joint's measured position passes a value [rad]."""
+        if after is None and joint is None:
+            do()
+            return
+        watcher: Watcher
+        if after is not None:
+            due = self._controller.now + _finite(after)
+            watcher = _once(lambda: self._controller.now >= due, do)
+        else:
+            number = int(joint or 0)
+            if not 0 <= number <= 5 or (above is None) == (below is None):
+                raise ValueError("a joint is 0 … 5, and either 'above' or 'below' says where")
+            robot = self._controller.robot
+            if above is not None:
+                high = _finite(above)
+                watcher = _once(lambda: robot.q[number] >= high, do)
+            else:
+                low = _finite(below or 0.0)
+                watcher = _once(lambda: robot.q[number] <= low, do)
+        self._controller.watchers.append(watcher)
+
+    # ---- safety
+
+    def protective_stop(self, reason: str = "fault port", **when: Any) -> None:
+        """A protective stop."""
+        self._when(lambda: self._controller.protective_stop(str(reason)), **when)
+
+    def emergency_stop(self, system: bool = False, **when: Any) -> None:
+        """The emergency stop button is pressed."""
+        self._when(lambda: self._controller.emergency_stop(system=bool(system)), **when)
+
+    def release_emergency_stop(self, **when: Any) -> None:
+        """The button is pulled out."""
+        self._when(self._controller.release_emergency_stop, **when)
+
+    def reduced(self, active: bool = True, **when: Any) -> None:
+        """An input or a plane sets the reduced mode; its lower limits are not modelled."""
+
+        def apply() -> None:
+            self._controller.safety.reduced = bool(active)
+
+        self._when(apply, **when)
+
+    def safeguard(self, active: bool = True, **when: Any) -> None:
+        """Someone enters the guarded area, or leaves it."""
+        self._when(lambda: self._controller.set_safeguard(bool(active)), **when)
+
+    def safety_fault(self, **when: Any) -> None:
+        """The safety system itself fails: only a restart helps."""
+        self._when(self._controller.safety_fault, **when)
+
+    def checksum(self, value: str | None = None) -> None:
+        """Report another safety checksum, up to eight hexadecimal digits; none for the true one."""
+        self._controller.safety.reported_checksum = None if value is None else f"{int(value, 16) & 0xFFFFFFFF:08X}"
+
+    def limits(
+        self,
+        joint_ranges: list[list[float]] | None = None,
+        joint_speeds: list[float] | None = None,
+        tool_speed: float | None = None,
+        planes: list[dict[str, Any]] | None = None,
+    ) -> dict[str, Any]:
+        """Narrow the safety configuration; what isn't named becomes the model's own."""
+        own = SafetyConfiguration.of(self._controller.model)
+        ranges, speeds = own.joint_ranges, own.joint_speeds
+        if joint_ranges is not None:
+            ranges = tuple((_finite(low), _finite(high)) for low, high in joint_ranges)
+        if joint_speeds is not None:
+            a, b, c, d, e, f = (_finite(v) for v in joint_speeds)
+            speeds = (a, b, c, d, e, f)
+        if len(ranges) != 6:
+            raise ValueError("six joint ranges")
+        walls = []
+        for plane in planes or []:
+            x, y, z = (_finite(v) for v in plane["normal"])
+            size = math.sqrt(x * x + y * y + z * z)
+            walls.append(SafetyPlane((x / size, y / size, z / size), _finite(plane["offset"])))
+        speed = own.tool_speed if tool_speed is None else _finite(tool_speed)
+        configuration = SafetyConfiguration(ranges, speeds, speed, tuple(walls))
+        self._controller.configure_safety(configuration)
+        return {"checksum": configuration.checksum}
+
+    # ---- connections
+
+    def stall(self, seconds: float | None = None, motion: bool = True, **when: Any) -> None:
+        """Connections stay but nothing is answered, for some wall seconds or until 'clear'.
+
+        With `motion` False the whole controller hangs: the arm keeps still where it is.
+        """
+
+        def begin() -> None:
+            self._host.stall(True, motion=bool(motion))
+            if seconds is not None:
+                self._later(_finite(seconds), self._resume)
+
+        self._when(begin, **when)
+
+    def _resume(self) -> None:
+        self._host.stall(False)
+
+    def drop(self, **when: Any) -> None:
+        """Cut all connections off; new ones are welcome."""
+        self._when(self._host.connections.drop, **when)
+
+    def refuse(self, seconds: float | None = None, **when: Any) -> None:
+        """Cut all connections off and accept none, for some wall seconds or until 'clear'."""
+
+        def begin() -> None:
+            self._host.close()
+            self._host.connections.drop()
+            if seconds is not None:
+                self._later(_finite(seconds), self._reopen)
+
+        self._when(begin, **when)
+
+    def reboot(self, seconds: float = 10.0, **when: Any) -> None:
+        """Gone for some wall seconds, then switched off as after a power cut."""
+
+        def begin() -> None:
+            self._controller.reboot()
+            self._host.connections.uploads.forget()
+            self.refuse(seconds)
+
+        self._when(begin, **when)
+
+    def _later(self, seconds: float, do: Callable[[], None]) -> None:
+        asyncio.get_running_loop().call_later(seconds, do)
+
+    def _reopen(self) -> None:
+        self._host.reopen()
+
+    # ---- the arm and its panel
+
+    def noise(self, sigma: float = 0.0) -> None:
+        """Measured joint positions get noise [rad]."""
+        self._controller.robot.noise = max(0.0, _finite(sigma))
+
+    def lag(self, seconds: float = TRACKING_LAG) -> None:
+        """The joints follow their targets with this time constant [s], as weak ones do; healthy ones by default."""
+        value = _finite(seconds)
+        if value <= 0.0:
+            raise ValueError("a time constant is above 0 s")
+        self._controller.robot.lag = value
+
+    def slider(self, fraction: float, **when: Any) -> None:
+        """Someone moves the speed slider."""
+        value = _finite(fraction)
+        if not 0.0 <= value <= 1.0:
+            raise ValueError("the slider goes from 0 to 1")
+
+        def move() -> None:
+            self._controller.robot.mover.slider = value
+
+        self._when(move, **when)
+
+    def remote(self, active: bool, **when: Any) -> None:
+        """Someone switches remote control on or off."""
+        self._when(lambda: self._host.set_remote(bool(active)), **when)
+
+    def inputs(self, digital: dict[str, bool] | None = None, analog: list[float] | None = None) -> None:
+        """What is wired to the inputs: levels by number, 0–7 standard, 8–15 configurable, 16–17 tool."""
+        for number, level in (digital or {}).items():
+            if not 0 <= int(number) <= 17:
+                raise ValueError("digital inputs are 0 … 17")
+            self._controller.signals.set_input(int(number), bool(level))
+        for at, value in enumerate(analog or []):
+            self._controller.signals.analog_in[at] = _finite(value)
+
+    def power(self, mode: str) -> None:
+        """Be in a power mode at once: 'running', 'idle', 'off'."""
+        modes = {"running": RobotMode.RUNNING, "idle": RobotMode.IDLE, "off": RobotMode.POWER_OFF}
+        if mode == "off":
+            self._controller.power_off()
+        self._controller.power.mode = modes[mode]
+
+    # ---- questions
+
+    def state(self) -> dict[str, Any]:
+        """What the controller knows of itself, and how its clock kept time."""
+        c = self._controller
+        return {
+            "time": c.now,
+            "robot_mode": c.power.mode.name,
+            "safety_mode": c.safety.mode.name,
+            "runtime_state": c.runtime.name,
+            "program": c.program.name if c.program is not None else None,
+            "remote": c.remote,
+            "joints": list(c.robot.mover.q),
+            "speeds": list(c.robot.mover.qd),
+            "pose": list(c.robot.target_pose),
+            "tcp": list(c.robot.tcp),
+            "payload": c.robot.payload,
+            "cog": list(c.robot.cog),
+            "slider": c.robot.mover.slider,
+            "checksum": c.safety.checksum,
+            "popup": c.popup,
+            "safety_popup": c.safety_popup,
+            "messages": list(self._host.messages),
+            "timing": self._host.timing.report(),
+        }
+
+    def history(self, since: float = 0.0) -> dict[str, Any]:
+        """Joint positions as executed since a controller time, without noise."""
+        start = _finite(since)
+        kept = [(t, q) for t, q in self._controller.robot.history if t >= start]
+        return {"times": [t for t, _ in kept], "joints": [list(q) for _, q in kept]}
+
+    def clear(self) -> None:
+        """End stalls and refusals, forget what was to happen."""
+        self._controller.watchers.clear()
+        self._resume()
+        self._reopen()
+
+
+def _finite(value: Any) -> float:
+    result = float(value)
+    if not math.isfinite(result):
+        raise ValueError(f"{value} is not a number to work with")
+    return result
+
+
+def _once(condition: Callable[[], bool], do: Callable[[], None]) -> Watcher:
+    def watch() -> bool:
+        if not condition():
+            return False
+        do()
+        return True
+
+    return watch
+
+
+class FaultServer:
+    """The port.
+
+    Args:
+        host: what faults happen to.
+    """
+
+    def __init__(self, host: Host) -> None:
+        self._host = host
+        self._faults = ControllerFaults(host)
+        self._server: asyncio.Server | None = None
+
+    async def open(self, port: int) -> int:
+        """Listen; returns the port, which is any free one for 0."""
+        self._server = await asyncio.start_server(self._serve, self._host.address, port, limit=LONGEST_LINE)
+        number: int = self._server.sockets[0].getsockname()[1]
+        return number
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            while line := await reader.readline():
+                try:
+                    answer = {"ok": True, **self._faults.call(json.loads(line))}
+                except (FaultError, ValueError, RecursionError) as error:
+                    answer = {"ok": False, "error": str(error)}
+                writer.write(json.dumps(answer).encode() + b"\n")
+                await writer.drain()
+        except (ConnectionError, ValueError):
+            pass  # gone, or a line without an end
+        finally:
+            writer.close()

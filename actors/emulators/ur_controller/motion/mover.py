@@ -1,0 +1,271 @@
+"""The part of a controller that moves the arm: one action at a time, one step per control cycle.
+
+It makes target positions and velocities that never jump. What must not happen (a joint too fast or out of its range, a
+point out of reach) ends the action with a `ViolationError` and a stop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import degrees
+
+from actors.arm.arm_interface import JOINT_NAMES
+from actors.arm.ur.robot_models import Joints, RobotModel
+from actors.emulators.ur_controller.motion.motion_actions import STILL, JointSpeed, MotionAction, Path, Servo, ToolSpeed
+from actors.emulators.ur_controller.motion.motion_lines import KinematicArm, Line, UnreachableError
+
+PROGRAM_STOP = 5.0
+"""Deceleration when a program ends or is stopped while the arm moves [rad/s²]. Plausible, not measured."""
+
+SAFETY_STOP = 10.0
+"""Deceleration of a protective, safeguard or emergency stop [rad/s²]. Plausible, not measured."""
+
+RAMP = 2.0
+"""How fast the speed slider takes effect [1/s]."""
+
+_GRACE = 3
+"""Cycles that a servo or speed command may be late before the arm is stopped."""
+
+_SPEED_MARGIN = 1.1
+"""A joint may be so much faster than its limit before that counts as a violation: rounding, filters, blends."""
+
+
+class ViolationError(Exception):
+    """A motion that a controller ends with a protective stop; the text tells why."""
+
+
+class ControlledElsewhereError(Exception):
+    """Two threads of a program move the arm at once."""
+
+
+class Mover:
+    """Targets of the six joints.
+
+    Args:
+        model: limits.
+        q: where the arm stands [rad].
+
+    Attributes:
+        q, qd, qdd: targets [rad], [rad/s], [rad/s²].
+        slider: speed of paths, 0 … 1.
+        rate: what of it is in effect.
+        joint_speed, joint_range: limits; a safety configuration may narrow the model's.
+    """
+
+    def __init__(self, model: RobotModel, q: Joints) -> None:
+        zero: Joints = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self.q, self.qd, self.qdd = q, zero, zero
+        self.slider = 1.0
+        self.rate = 1.0
+        self.joint_speed = model.joint_speed
+        self.joint_range: tuple[tuple[float, float], ...] = tuple((-r, r) for r in model.joint_range)
+        self._action: MotionAction | None = None
+        self._holder: int | None = None
+        self._idle = 0
+        self._frozen = False
+
+    # ---- what may be asked
+
+    @property
+    def moving(self) -> bool:
+        """Whether a target still changes."""
+        return self._action is not None or any(abs(v) > STILL for v in self.qd)
+
+    @property
+    def action(self) -> MotionAction | None:
+        """What is under way."""
+        return self._action
+
+    @property
+    def frozen(self) -> bool:
+        """Paths are held where they are until `thaw`."""
+        return self._frozen
+
+    # ---- who moves
+
+    @property
+    def holder(self) -> int | None:
+        """Thread whose command moves the arm; None if none does."""
+        return self._holder
+
+    def take(self, thread: int) -> None:
+        """A thread's command begins.
+
+        Raises:
+            ControlledElsewhereError: another thread's is not over.
+        """
+        if self._holder is not None and self._holder != thread:
+            raise ControlledElsewhereError("another thread is already controlling the robot")
+        self._holder = thread
+
+    def let_go(self, thread: int) -> None:
+        """A thread's command is over, or the thread is."""
+        if self._holder == thread:
+            self._holder = None
+
+    # ---- commands
+
+    def follow(
+        self,
+        line: Callable[[Joints], Line],
+        speed: float,
+        acceleration: float,
+        *,
+        duration: float = 0.0,
+        radius: float = 0.0,
+    ) -> Path:
+        """Begin a path; out of any other motion than a path's blend the arm is stopped first."""
+        prelude = self._action
+        if prelude is None or not isinstance(prelude, Path) or not prelude.released:
+            prelude = self._braking() if any(abs(v) > STILL for v in self.qd) else None
+        path = Path(line, speed, acceleration, self.joint_speed, duration=duration, radius=radius, prelude=prelude)
+        if not any(abs(v) > STILL for v in self.qd):
+            self.rate = self.slider
+        self._action = path
+        return path
+
+    def servo(self, target: Joints, lookahead: float, gain: float) -> None:
+        """One servo command."""
+        if not isinstance(self._action, Servo):
+            self._action = Servo()
+        self._action.aim(target, lookahead, gain)
+        self._idle = 0
+
+    def joint_speeds(self, target: Sequence[float], acceleration: float) -> None:
+        """One speed command in joint space."""
+        if isinstance(self._action, JointSpeed):
+            self._action.aim(target, acceleration)
+        else:
+            self._action = JointSpeed(target, acceleration)
+        self._idle = 0
+
+    def tool_speed(self, arm: KinematicArm, target: Sequence[float], acceleration: float, turning: float) -> None:
+        """One speed command in tool space."""
+        if isinstance(self._action, ToolSpeed):
+            self._action.aim(target, acceleration, turning)
+        else:
+            self._action = ToolSpeed(arm, target, acceleration, turning)
+        self._idle = 0
+
+    def stop_joints(self, deceleration: float) -> MotionAction:
+        """Come to rest in joint space."""
+        self._action = JointSpeed((0.0,) * 6, deceleration)
+        return self._action
+
+    def stop_tool(self, arm: KinematicArm, deceleration: float) -> MotionAction:
+        """Come to rest along the way the tool goes."""
+        self._action = ToolSpeed(arm, (0.0,) * 6, deceleration, deceleration)
+        return self._action
+
+    def abandon(self) -> None:
+        """Nobody commands any more: come to rest."""
+        self._holder = None
+        if self._action is not None:
+            self._action = self._braking()
+
+    def freeze(self) -> None:
+        """Come to rest quickly; a path stays where it is, to be gone on with."""
+        self._frozen = True
+        if self._action is not None and not isinstance(self._action, Path):
+            self._action = JointSpeed((0.0,) * 6, SAFETY_STOP)
+
+    def thaw(self) -> None:
+        """Go on."""
+        self._frozen = False
+
+    def place(self, q: Joints) -> None:
+        """Stand somewhere, at once: for the start only."""
+        zero: Joints = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self.q, self.qd, self.qdd, self._action = q, zero, zero, None
+
+    def _braking(self) -> JointSpeed:
+        return JointSpeed((0.0,) * 6, PROGRAM_STOP)
+
+    # ---- one cycle
+
+    def step(self, dt: float) -> None:
+        """One control cycle.
+
+        Args:
+            dt: its length [s].
+
+        Raises:
+            ViolationError: why the motion was broken off; the arm is being stopped.
+        """
+        action = self._action
+        if action is None:
+            if self.qd != _ZERO or self.qdd != _ZERO:
+                self.qd = self.qdd = _ZERO
+            return
+        if isinstance(action, Path):
+            self._ramp(dt)
+        elif not _is_stop(action):
+            self._idle += 1
+            if self._idle > _GRACE:
+                self._action = action = self._braking()
+        try:
+            q = action.step(self.q, self.qd, dt * self.rate if isinstance(action, Path) else dt)
+            self._check(q, dt)
+        except (UnreachableError, ViolationError) as error:
+            # Out of reach, near a singularity, out of range: whatever it was, the arm brakes in joint space. For a stop
+            # that is all there is to do.
+            self._break_off(dt)
+            if _is_stop(action):
+                return
+            raise ViolationError(str(error)) from None
+        self._advance(q, dt)
+        if action.finished:
+            self._action = None
+
+    def _ramp(self, dt: float) -> None:
+        if self._frozen:
+            fastest = max(abs(v) for v in self.qd)
+            self.rate = 0.0 if fastest <= SAFETY_STOP * dt else self.rate * (1.0 - SAFETY_STOP * dt / fastest)
+        elif self.rate != self.slider:
+            step = RAMP * dt
+            self.rate = (
+                max(self.slider, self.rate - step) if self.rate > self.slider else min(self.slider, self.rate + step)
+            )
+
+    def _check(self, q: Joints, dt: float) -> None:
+        for i in range(6):
+            speed = abs(q[i] - self.q[i]) / dt
+            if not speed <= _SPEED_MARGIN * self.joint_speed[i]:  # so that what is not a number is caught too
+                raise ViolationError(
+                    f"{JOINT_NAMES[i]} would turn at {degrees(speed):.0f} deg/s; "
+                    f"its limit is {degrees(self.joint_speed[i]):.0f} deg/s"
+                )
+            low, high = self.joint_range[i]
+            if not low <= q[i] <= high and abs(q[i] - 0.5 * (low + high)) > abs(self.q[i] - 0.5 * (low + high)):
+                raise ViolationError(f"{JOINT_NAMES[i]} would leave its range at {degrees(q[i]):.1f} deg")
+
+    def _break_off(self, dt: float) -> None:
+        self._action = stop = JointSpeed((0.0,) * 6, SAFETY_STOP)
+        self._advance(stop.step(self.q, self.qd, dt), dt)
+
+    def _advance(self, q: Joints, dt: float) -> None:
+        a, v = self.q, self.qd
+        qd: Joints = (
+            (q[0] - a[0]) / dt,
+            (q[1] - a[1]) / dt,
+            (q[2] - a[2]) / dt,
+            (q[3] - a[3]) / dt,
+            (q[4] - a[4]) / dt,
+            (q[5] - a[5]) / dt,
+        )
+        self.qdd = (
+            (qd[0] - v[0]) / dt,
+            (qd[1] - v[1]) / dt,
+            (qd[2] - v[2]) / dt,
+            (qd[3] - v[3]) / dt,
+            (qd[4] - v[4]) / dt,
+            (qd[5] - v[5]) / dt,
+        )
+        self.q, self.qd = q, qd
+
+
+_ZERO: Joints = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def _is_stop(action: MotionAction) -> bool:
+    return isinstance(action, JointSpeed | ToolSpeed) and not any(action.target)

@@ -1,0 +1,97 @@
+"""Programs on their way to the controller: one after the other, while its clock goes on."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from typing import Protocol
+
+from actors.emulators.ur_controller.controller import Controller
+from actors.emulators.ur_controller.urscript.lexer import ScriptError
+from actors.emulators.ur_controller.urscript.translator import LONGEST_HERE, Translated, question, read_answer
+from actors.runtime.child_process import python_module, run_async
+
+MOST_WAITING = 100
+"""Programs that may wait before no more is read from those who send them."""
+
+PATIENCE = 60.0
+"""Longest wait for a translation apart [s of wall time]."""
+
+
+class Sender(Protocol):
+    """Whom a program came from."""
+
+    @property
+    def privileged(self) -> bool:
+        """Whether it may command now."""
+
+    def refuse(self) -> None:
+        """Say that it may not."""
+
+    def wait(self, active: bool) -> None:
+        """Send no more for now, or again."""
+
+
+class Uploads:
+    """The queue. Short programs are translated between two cycles of the clock, long ones in a process of their own.
+
+    The clock calls `work`; so a flood of programs can't take it its time.
+
+    Args:
+        controller: runs them.
+    """
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+        self._waiting: deque[tuple[str, Sender]] = deque()
+        self._held: set[Sender] = set()
+        self._apart: asyncio.Task[None] | None = None
+
+    def put(self, text: str, sender: Sender) -> None:
+        """Run a program when its turn comes; whether the sender may command is asked then."""
+        self._waiting.append((text, sender))
+        if len(self._waiting) > MOST_WAITING and sender not in self._held:
+            self._held.add(sender)
+            sender.wait(True)
+
+    def forget(self) -> None:
+        """Drop what waits, as at a power cut."""
+        self._waiting.clear()
+
+    def work(self, seconds: float = 0.0) -> None:
+        """Run the next program, and further ones for a time [s]; one that is translated apart is waited for."""
+        end = time.monotonic() + seconds
+        while self._waiting and (self._apart is None or self._apart.done()):
+            text, sender = self._waiting.popleft()
+            if not sender.privileged:
+                sender.refuse()
+            elif len(text) <= LONGEST_HERE:
+                self._controller.upload(text)
+            else:
+                self._apart = asyncio.get_running_loop().create_task(self._upload_apart(text, sender))
+            if time.monotonic() >= end:
+                break
+        while self._held and len(self._waiting) < MOST_WAITING:
+            self._held.pop().wait(False)
+
+    async def _upload_apart(self, text: str, sender: Sender) -> None:
+        try:
+            translated = await self._translate_apart(text)
+        except Exception as error:
+            self._controller.refuse(error)
+            return
+        if sender.privileged:
+            self._controller.begin(translated)
+        else:
+            sender.refuse()
+
+    async def _translate_apart(self, text: str) -> Translated:
+        asked = question(text, self._controller.known_commands)
+        try:
+            answer = await run_async(python_module("actors.emulators.ur_controller.urscript"), asked, timeout=PATIENCE)
+        except TimeoutError:
+            answer = b""
+        except OSError as error:
+            raise ScriptError(f"no process to translate it could be started: {error}") from error
+        return read_answer(answer)

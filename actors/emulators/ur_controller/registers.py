@@ -1,0 +1,106 @@
+"""What programs, clients and wires share: registers and inputs and outputs.
+
+Inputs that a client has to write often enough, or its program is paused or stopped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+REGISTERS = 48
+"""Integer and double registers of each direction."""
+
+
+@dataclass
+class Registers:
+    """General-purpose registers. Programs write outputs and read inputs, clients the other way round."""
+
+    input_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
+    input_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
+    input_bits: int = 0
+    output_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
+    output_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
+    output_bits: int = 0
+
+
+@dataclass
+class Signals:
+    """Digital and analogue inputs and outputs.
+
+    Attributes:
+        digital_in, digital_out: bits 0–7 standard, 8–15 configurable, 16–17 tool.
+        analog_in: two values in volt or ampere.
+        analog_out: two fractions 0 … 1 of the range.
+        analog_voltage: whether each analogue output is in volt (0 … 10 V), else ampere (4 … 20 mA).
+    """
+
+    digital_in: int = 0
+    digital_out: int = 0
+    analog_in: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    analog_out: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    analog_voltage: list[bool] = field(default_factory=lambda: [True, True])
+
+    def set_output(self, bit: int, level: bool) -> None:
+        """Switch one digital output."""
+        self.digital_out = self.digital_out | (1 << bit) if level else self.digital_out & ~(1 << bit)
+
+    def set_outputs(self, mask: int, levels: int, offset: int) -> None:
+        """Switch the digital outputs that a mask names."""
+        mask, levels = mask << offset, levels << offset
+        self.digital_out = (self.digital_out & ~mask) | (levels & mask)
+
+    def set_input(self, bit: int, level: bool) -> None:
+        """What the outside world applies to a digital input."""
+        self.digital_in = self.digital_in | (1 << bit) if level else self.digital_in & ~(1 << bit)
+
+    def analog_reading(self, number: int) -> float:
+        """An analogue output in its unit [V] or [A]."""
+        share = self.analog_out[number]
+        return 10.0 * share if self.analog_voltage[number] else 0.004 + 0.016 * share
+
+
+@dataclass
+class _Watch:
+    longest: float
+    action: str
+    waited: float = 0.0
+
+
+class Watchdogs:
+    """All that a program has set up. They watch a network, so they go by wall time, however time is scaled."""
+
+    def __init__(self) -> None:
+        self._watches: dict[str, _Watch] = {}
+
+    def set(self, name: str, longest: float, action: str) -> None:
+        """Watch an input.
+
+        Args:
+            name: of the input.
+            longest: between two writes [s of wall time].
+            action: 'pause' or 'stop'.
+        """
+        self._watches[name] = _Watch(longest, action)
+
+    def remove(self, name: str) -> None:
+        """Watch it no more."""
+        self._watches.pop(name, None)
+
+    def clear(self) -> None:
+        """Watch nothing."""
+        self._watches.clear()
+
+    def written(self, name: str) -> None:
+        """A client wrote this input."""
+        watch = self._watches.get(name)
+        if watch is not None:
+            watch.waited = 0.0
+
+    def step(self, wall: float) -> tuple[str, str] | None:
+        """Let wall time pass [s]. Returns the action that is due, and why; None if none is."""
+        for name, watch in self._watches.items():
+            watch.waited += wall
+            if watch.waited > watch.longest:
+                watch.waited = 0.0
+                return watch.action, f"watchdog: {name} was not written for {watch.longest:g} s"
+        return None

@@ -1,0 +1,315 @@
+"""The arm itself: where it is commanded to be, where it is, what it carries, what it reports of itself.
+
+From switched off to running: modes and how long they take.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from enum import IntEnum
+from math import exp
+
+from actors.arm.ur.robot_models import Joints, RobotModel
+from actors.emulators.ur_controller.motion.motion_lines import KinematicArm
+from actors.emulators.ur_controller.motion.mover import Mover, ViolationError
+from actors.emulators.ur_controller.poses import IDENTITY, Transform, Vector, compose, distance, pose_of, transform_of
+from actors.emulators.ur_controller.robot_kinematics import Kinematics
+from actors.emulators.ur_controller.safety_system import SafetyConfiguration
+
+TRACKING_LAG = 0.004
+"""Time constant with which healthy joints follow their targets [s]. Plausible, not measured."""
+
+STEADY = 1e-4
+"""Joint speed below which the arm counts as steady [rad/s]."""
+
+SETTLING = 0.2
+"""Time that it must have been below for that [s]."""
+
+HISTORY_RATE = 125.0
+"""Positions remembered per second of controller time [Hz]."""
+
+HISTORY_TIME = 120.0
+"""How long they are remembered [s]."""
+
+Pose = tuple[float, float, float, float, float, float]
+
+
+class Robot:
+    """Joints, tool and payload.
+
+    Args:
+        model: which robot.
+        q: where it stands [rad].
+        configuration: safety limits.
+
+    Attributes:
+        q, qd: what the joints measure, noise included [rad], [rad/s].
+        noise: standard deviation of the measured positions [rad].
+        lag: time constant with which the joints follow their targets [s].
+        payload: [kg]; `cog` [m], `inertia` [kg m²].
+        gravity: direction in the base's frame [m/s²].
+        recent: measured positions of the last cycles.
+        history: (time, q) as executed, without noise, at `HISTORY_RATE`.
+    """
+
+    def __init__(self, model: RobotModel, q: Joints, configuration: SafetyConfiguration) -> None:
+        self.model = model
+        self.kinematics = Kinematics(model)
+        self.mover = Mover(model, q)
+        self.arm = KinematicArm(self.kinematics, transform_of((0.0,) * 6))
+        self.tcp: Pose = (0.0,) * 6
+        self.payload = 0.0
+        self.cog: Vector = (0.0, 0.0, 0.0)
+        self.inertia: Pose = (0.0,) * 6
+        self.gravity: Vector = (0.0, 0.0, 9.82)
+        self.noise = 0.0
+        self.lag = TRACKING_LAG
+        self._random = random.Random(0)
+        self._true = q
+        self.q, self.qd = q, self.mover.qd
+        self._point = self.arm.frame(q)[1]
+        self._steady_for = SETTLING
+        self.history: deque[tuple[float, Joints]] = deque(maxlen=int(HISTORY_RATE * HISTORY_TIME))
+        self.recent: deque[Joints] = deque([q], maxlen=1000)
+        self._next_memory = 0.0
+        self._cache: dict[str, object] = {}
+        self.configure(configuration)
+
+    def configure(self, configuration: SafetyConfiguration) -> None:
+        """Take over safety limits."""
+        self.configuration = configuration
+        self.mover.joint_range = configuration.joint_ranges
+        self.mover.joint_speed = configuration.joint_speeds
+
+    def set_tcp(self, pose: Pose) -> None:
+        """Mount a tool: its centre point in the flange's frame."""
+        self.tcp = pose
+        self.arm = KinematicArm(self.kinematics, transform_of(pose))
+        self._point = self.arm.frame(self.mover.q)[1]
+        self._cache.clear()
+
+    def forget(self) -> None:
+        """As after a power cut: no tool, no payload, no memory."""
+        self.set_tcp((0.0,) * 6)
+        self.payload, self.cog, self.inertia = 0.0, (0.0, 0.0, 0.0), (0.0,) * 6
+        self.history.clear()
+        self._next_memory = 0.0
+
+    def step(self, now: float, dt: float) -> None:
+        """One control cycle.
+
+        Raises:
+            ViolationError: a limit; the mover is stopping already, or must be stopped.
+        """
+        self._cache.clear()
+        moves = self.mover.moving
+        try:
+            self.mover.step(dt)
+            if moves:
+                self._check(dt)
+        finally:
+            self._follow(now, dt, moves)
+
+    def _check(self, dt: float) -> None:
+        before, point = self._point, self.arm.frame(self.mover.q)[1]
+        self._point = point
+        speed = distance(before, point) / dt
+        if speed > 1.05 * self.configuration.tool_speed:
+            raise ViolationError(
+                f"the tool moves at {speed:.2f} m/s; its limit is {self.configuration.tool_speed:.2f} m/s"
+            )
+        if self.configuration.planes:
+            beyond = self.configuration.point_violation(point)
+            if beyond is not None and self._deeper(before, point):
+                raise ViolationError(beyond)
+
+    def _deeper(self, before: Vector, point: Vector) -> bool:
+        """Whether a step led (further) out of the allowed space: the way back is free."""
+
+        def inside(p: Vector) -> float:
+            return min(
+                sum(a * b for a, b in zip(x.normal, p, strict=True)) - x.offset for x in self.configuration.planes
+            )
+
+        return inside(point) < inside(before)
+
+    def _follow(self, now: float, dt: float, moves: bool) -> None:
+        target, true = self.mover.q, self._true
+        if moves or true != target:
+            share = 1.0 - exp(-dt / self.lag)
+            there = [a + share * (b - a) for a, b in zip(true, target, strict=True)]
+            if all(abs(a - b) < 1e-9 for a, b in zip(there, target, strict=True)):
+                there = list(target)
+            fresh: Joints = (there[0], there[1], there[2], there[3], there[4], there[5])
+            rates = [(b - a) / dt for a, b in zip(true, fresh, strict=True)]
+            self.qd = (rates[0], rates[1], rates[2], rates[3], rates[4], rates[5])
+            self._true = fresh
+        elif self.qd != _ZERO:
+            self.qd = _ZERO
+        if self.noise > 0.0:
+            noisy = [a + self._random.gauss(0.0, self.noise) for a in self._true]
+            self.q = (noisy[0], noisy[1], noisy[2], noisy[3], noisy[4], noisy[5])
+        else:
+            self.q = self._true
+        self.recent.append(self.q)
+        self._steady_for = self._steady_for + dt if max(map(abs, self.qd)) < STEADY else 0.0
+        if now >= self._next_memory:
+            self._next_memory = now + 1.0 / HISTORY_RATE - 1e-9
+            self.history.append((now, self._true))
+
+    # ---- what it reports
+
+    @property
+    def steady(self) -> bool:
+        """Whether it stands still, and has for a moment."""
+        return self._steady_for >= SETTLING
+
+    @property
+    def frame(self) -> Transform:
+        """Transform of the tool centre point, as measured."""
+        cached = self._cache.get("frame")
+        if cached is None:
+            cached = self._cache["frame"] = self.arm.frame(self.q)
+        return cached  # type: ignore[return-value]
+
+    @property
+    def pose(self) -> Pose:
+        """Pose of the tool centre point, as measured."""
+        cached = self._cache.get("pose")
+        if cached is None:
+            cached = self._cache["pose"] = pose_of(self.frame)
+        return cached  # type: ignore[return-value]
+
+    @property
+    def target_pose(self) -> Pose:
+        """Pose of the tool centre point, as targeted."""
+        cached = self._cache.get("target_pose")
+        if cached is None:
+            cached = self._cache["target_pose"] = pose_of(self.arm.frame(self.mover.q))
+        return cached  # type: ignore[return-value]
+
+    @property
+    def tool_speed(self) -> Pose:
+        """Measured velocity of the tool centre point [m/s], [rad/s]."""
+        if self.qd == _ZERO:
+            return _ZERO
+        cached = self._cache.get("tool_speed")
+        if cached is None:
+            cached = self._cache["tool_speed"] = self.kinematics.velocity(self.q, self.qd, self.frame[1])
+        return cached  # type: ignore[return-value]
+
+    @property
+    def elbow_velocity(self) -> Vector:
+        """Measured velocity of the elbow, which the first two joints move [m/s]."""
+        if self.qd == _ZERO:
+            return 0.0, 0.0, 0.0
+        elbow = self.kinematics.axes(self.q)[1][2]
+        x, y, z, *_ = self.kinematics.velocity(self.q, (self.qd[0], self.qd[1], 0.0, 0.0, 0.0, 0.0), elbow)
+        return x, y, z
+
+    @property
+    def deviation(self) -> float:
+        """Largest distance of a joint from its target [rad]."""
+        return max(abs(a - b) for a, b in zip(self.q, self.mover.q, strict=True))
+
+    @property
+    def target_tool_speed(self) -> Pose:
+        """Targeted velocity of the tool centre point [m/s], [rad/s]."""
+        if self.mover.qd == _ZERO:
+            return _ZERO
+        point = self.arm.frame(self.mover.q)[1]
+        return self.kinematics.velocity(self.mover.q, self.mover.qd, point)
+
+    @property
+    def holding_torques(self) -> Joints:
+        """Joint torques that hold the arm and its payload against gravity [N m]; friction and acceleration left out."""
+        axes, origins = self.kinematics.axes(self.q)
+        frames, model = self.kinematics.links(self.q), self.model
+        weights = [
+            (mass, compose(frame, (IDENTITY, centre))[1])
+            for mass, centre, frame in zip(model.masses, model.centres, frames, strict=True)
+        ]
+        load = (self.payload, compose(frames[5], (IDENTITY, self.cog))[1])
+        gx, gy, gz = self.gravity
+        torques = []
+        for joint, ((ax, ay, az), (ox, oy, oz)) in enumerate(zip(axes, origins, strict=True)):
+            torque = 0.0
+            for mass, (px, py, pz) in (*weights[joint:], load):
+                rx, ry, rz = px - ox, py - oy, pz - oz
+                torque += mass * ((ay * rz - az * ry) * gx + (az * rx - ax * rz) * gy + (ax * ry - ay * rx) * gz)
+            torques.append(torque)
+        return torques[0], torques[1], torques[2], torques[3], torques[4], torques[5]
+
+
+_ZERO: Joints = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class RobotMode(IntEnum):
+    """As RTDE and the dashboard report it."""
+
+    NO_CONTROLLER = -1
+    DISCONNECTED = 0
+    CONFIRM_SAFETY = 1
+    BOOTING = 2
+    POWER_OFF = 3
+    POWER_ON = 4
+    IDLE = 5
+    BACKDRIVE = 6
+    RUNNING = 7
+    UPDATING_FIRMWARE = 8
+
+
+BOOT_TIME = 4.0
+"""From 'power on' until the joints answer [s]. Plausible, not measured."""
+
+POWER_ON_TIME = 1.0
+"""From there to idle [s]."""
+
+BRAKE_TIME = 3.0
+"""From 'brake release' to running [s]."""
+
+
+class Power:
+    """Modes over controller time.
+
+    Args:
+        mode: to begin with.
+    """
+
+    def __init__(self, mode: RobotMode = RobotMode.RUNNING) -> None:
+        self.mode = mode
+        self._plan: list[tuple[float, RobotMode]] = []
+
+    @property
+    def powered(self) -> bool:
+        """Whether the joints have power."""
+        return self.mode in (RobotMode.POWER_ON, RobotMode.IDLE, RobotMode.BACKDRIVE, RobotMode.RUNNING)
+
+    @property
+    def running(self) -> bool:
+        """Whether the brakes are off and the arm may move."""
+        return self.mode is RobotMode.RUNNING
+
+    def on(self, now: float) -> None:
+        """Switch on; idle after some seconds."""
+        if self.mode is RobotMode.POWER_OFF and not self._plan:
+            self.mode = RobotMode.BOOTING
+            self._plan = [(now + BOOT_TIME, RobotMode.POWER_ON), (now + BOOT_TIME + POWER_ON_TIME, RobotMode.IDLE)]
+
+    def release_brakes(self, now: float) -> None:
+        """Release the brakes, switching on first if need be."""
+        self.on(now)
+        if self.mode is RobotMode.RUNNING or (self._plan and self._plan[-1][1] is RobotMode.RUNNING):
+            return
+        idle = self._plan[-1][0] if self._plan else now
+        self._plan.append((idle + BRAKE_TIME, RobotMode.RUNNING))
+
+    def off(self) -> None:
+        """Switch off: brakes close."""
+        self.mode, self._plan = RobotMode.POWER_OFF, []
+
+    def step(self, now: float) -> None:
+        """Let time pass."""
+        while self._plan and now >= self._plan[0][0]:
+            self.mode = self._plan.pop(0)[1]

@@ -1,0 +1,172 @@
+"""Forward and inverse kinematics of the six-axis arm, in closed form.
+
+Source: standard Denavit–Hartenberg frames with twists π/2, 0, 0, π/2, −π/2, 0. Three parallel axes (2, 3, 4) let the
+inverse fall apart: joint 1 from where the wrist is, 5 and 6 from orientation, 2, 3, 4 from a triangle in the plane.
+Up to eight solutions: shoulder left or right, wrist up or down, elbow up or down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from math import acos, asin, atan2, cos, hypot, pi, sin
+
+from actors.arm.ur.robot_models import Joints, RobotModel
+from actors.emulators.ur_controller.poses import IDENTITY, Transform, Vector, compose, multiply, rotation_matrix
+
+_SINGULAR_WRIST = 1e-6
+"""Below this |sin q5| joints 4 and 6 turn about the same axis, and q6 is taken as it was."""
+
+
+class Kinematics:
+    """Kinematics of one robot model. Poses are those of the flange; a tool is composed by the caller.
+
+    Args:
+        model: lengths and joint ranges.
+    """
+
+    def __init__(self, model: RobotModel) -> None:
+        self.model = model
+
+    def flange(self, q: Sequence[float]) -> Transform:
+        """Where the flange is in the base's frame [m]."""
+        m = self.model
+        q1, q2, q3, q4, q5, q6 = q
+        s1, c1, s5, c5, s6, c6 = sin(q1), cos(q1), sin(q5), cos(q5), sin(q6), cos(q6)
+        s2, c2, s23, c23 = sin(q2), cos(q2), sin(q2 + q3), cos(q2 + q3)
+        s, c = sin(q2 + q3 + q4), cos(q2 + q3 + q4)
+        # x and z of the frame after joint 4; its y is (s1, −c1, 0), the axis of joints 2 to 4.
+        xx, xy, xz = c1 * c, s1 * c, s
+        zx, zy, zz = c1 * s, s1 * s, -c
+        ax, ay, az = xx * c5 + s1 * s5, xy * c5 - c1 * s5, xz * c5
+        tx, ty, tz = -xx * s5 + s1 * c5, -xy * s5 - c1 * c5, -xz * s5
+        reach = m.a2 * c2 + m.a3 * c23
+        return (
+            (
+                ax * c6 - zx * s6,
+                -ax * s6 - zx * c6,
+                tx,
+                ay * c6 - zy * s6,
+                -ay * s6 - zy * c6,
+                ty,
+                az * c6 - zz * s6,
+                -az * s6 - zz * c6,
+                tz,
+            ),
+            (
+                c1 * reach + m.d4 * s1 + m.d5 * zx + m.d6 * tx,
+                s1 * reach - m.d4 * c1 + m.d5 * zy + m.d6 * ty,
+                m.d1 + m.a2 * s2 + m.a3 * s23 + m.d5 * zz + m.d6 * tz,
+            ),
+        )
+
+    def axes(self, q: Sequence[float]) -> tuple[list[Vector], list[Vector]]:
+        """Directions of the six joint axes and a point on each, base frame [m]."""
+        m = self.model
+        q1, q2, q3, q4, q5, _ = q
+        s1, c1, s5, c5 = sin(q1), cos(q1), sin(q5), cos(q5)
+        s, c = sin(q2 + q3 + q4), cos(q2 + q3 + q4)
+        across, wrist = (s1, -c1, 0.0), (c1 * s, s1 * s, -c)
+        tool = (-c1 * c * s5 + s1 * c5, -s1 * c * s5 - c1 * c5, -s * s5)
+        upper, both = m.a2 * cos(q2), m.a2 * cos(q2) + m.a3 * cos(q2 + q3)
+        shoulder = (0.0, 0.0, m.d1)
+        elbow = (c1 * upper, s1 * upper, m.d1 + m.a2 * sin(q2))
+        w1 = (c1 * both, s1 * both, elbow[2] + m.a3 * sin(q2 + q3))
+        w2 = (w1[0] + m.d4 * across[0], w1[1] + m.d4 * across[1], w1[2])
+        w3 = (w2[0] + m.d5 * wrist[0], w2[1] + m.d5 * wrist[1], w2[2] + m.d5 * wrist[2])
+        return [(0.0, 0.0, 1.0), across, across, across, wrist, tool], [(0.0, 0.0, 0.0), shoulder, elbow, w1, w2, w3]
+
+    def links(self, q: Sequence[float]) -> list[Transform]:
+        """Denavit–Hartenberg frames of the six links, each at its link's far end, base frame."""
+        m = self.model
+        lengths = ((0.0, m.d1, 0.5), (m.a2, 0.0, 0.0), (m.a3, 0.0, 0.0), (0.0, m.d4, 0.5), (0.0, m.d5, -0.5))
+        frame: Transform = (IDENTITY, (0.0, 0.0, 0.0))
+        frames = []
+        for angle, (a, d, twist) in zip(q, (*lengths, (0.0, m.d6, 0.0)), strict=True):
+            turned = multiply(rotation_matrix((0.0, 0.0, angle)), rotation_matrix((pi * twist, 0.0, 0.0)))
+            frame = compose(frame, (turned, (a * cos(angle), a * sin(angle), d)))
+            frames.append(frame)
+        return frames
+
+    def velocity(
+        self, q: Sequence[float], qd: Sequence[float], point: Vector
+    ) -> tuple[float, float, float, float, float, float]:
+        """Velocity of a point fixed to the flange [m/s] and the flange's angular velocity [rad/s], base frame."""
+        axes, origins = self.axes(q)
+        vx = vy = vz = wx = wy = wz = 0.0
+        px, py, pz = point
+        for (ax, ay, az), (ox, oy, oz), rate in zip(axes, origins, qd, strict=True):
+            if rate:
+                rx, ry, rz = px - ox, py - oy, pz - oz
+                vx += rate * (ay * rz - az * ry)
+                vy += rate * (az * rx - ax * rz)
+                vz += rate * (ax * ry - ay * rx)
+                wx += rate * ax
+                wy += rate * ay
+                wz += rate * az
+        return vx, vy, vz, wx, wy, wz
+
+    def inverse(self, flange: Transform, q6: float = 0.0) -> Iterator[Joints]:
+        """All joint positions, each in (−π, π], that put the flange there. None if it is out of reach.
+
+        Args:
+            flange: where to.
+            q6: taken where the wrist is singular and joint 6 may be anything [rad].
+        """
+        m = self.model
+        r, p = flange
+        wx, wy, wz = p[0] - m.d6 * r[2], p[1] - m.d6 * r[5], p[2] - m.d6 * r[8]
+        radius = hypot(wx, wy)
+        if radius < m.d4 - 1e-9 or radius == 0.0:
+            return  # inside the cylinder about the base that the wrist can't enter
+        bearing, offset = atan2(wy, wx), asin(min(1.0, m.d4 / radius))
+        for q1 in (bearing + offset, bearing + pi - offset):
+            s1, c1 = sin(q1), cos(q1)
+            cos5 = max(-1.0, min(1.0, s1 * r[2] - c1 * r[5]))
+            for q5 in (acos(cos5), -acos(cos5)):
+                sin5 = sin(q5)
+                if abs(sin5) < _SINGULAR_WRIST:
+                    sixth = q6
+                else:
+                    sixth = atan2(-(s1 * r[1] - c1 * r[4]) / sin5, (s1 * r[0] - c1 * r[3]) / sin5)
+                s6, c6 = sin(sixth), cos(sixth)
+                zx, zy, zz = -(r[0] * s6 + r[1] * c6), -(r[3] * s6 + r[4] * c6), -(r[6] * s6 + r[7] * c6)
+                q234 = atan2(c1 * zx + s1 * zy, -zz)
+                u = c1 * (wx - m.d5 * zx) + s1 * (wy - m.d5 * zy)
+                w = wz - m.d5 * zz - m.d1
+                cos3 = (u * u + w * w - m.a2 * m.a2 - m.a3 * m.a3) / (2.0 * m.a2 * m.a3)
+                if abs(cos3) > 1.0 + 1e-9:
+                    continue
+                bend = acos(max(-1.0, min(1.0, cos3)))
+                for q3 in (bend, -bend):
+                    q2 = atan2(w, u) - atan2(m.a3 * sin(q3), m.a2 + m.a3 * cos(q3))
+                    yield _turn(q1), _turn(q2), q3, _turn(q234 - q2 - q3), q5, sixth
+
+    def nearest(self, flange: Transform, near: Sequence[float]) -> Joints | None:
+        """The solution whose joints are nearest to `near`, within the joints' ranges. None if there is none.
+
+        Args:
+            flange: where to.
+            near: joint positions [rad]; solutions may lie beyond ±π to stay near them.
+        """
+        best: Joints | None = None
+        least = float("inf")
+        limits = self.model.joint_range
+        for solution in self.inverse(flange, near[5]):
+            total = 0.0
+            turned = []
+            for angle, there, limit in zip(solution, near, limits, strict=True):
+                k = angle + 2.0 * pi * round((there - angle) / (2.0 * pi))
+                if k > limit:
+                    k -= 2.0 * pi
+                elif k < -limit:
+                    k += 2.0 * pi
+                total += (k - there) ** 2
+                turned.append(k)
+            if total < least:
+                least = total
+                best = (turned[0], turned[1], turned[2], turned[3], turned[4], turned[5])
+        return best
+
+
+def _turn(angle: float) -> float:
+    return angle - 2.0 * pi * round(angle / (2.0 * pi))

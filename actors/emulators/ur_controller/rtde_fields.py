@@ -1,0 +1,216 @@
+"""Which values clients may read and write over RTDE, and what they mean here.
+
+Names, types and versions: the manufacturer's RTDE guide. Fields that came after the software modelled here (3.15, 5.12)
+are not found: `collision_detection_ratio`, `time_scale_source`, `actual_current_as_torque`, energies, accelerations of
+the tool and others. For `tcp_offset`, encoders and configurable inputs and outputs no version could be found; they are
+assumed to have come with the e-Series.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from actors.emulators.ur_controller.controller import Controller
+from actors.emulators.ur_controller.registers import REGISTERS
+from actors.emulators.ur_controller.servers.rtde_recipes import Field
+
+_ZERO6 = (0.0,) * 6
+_RUNNING, _POWER_OFF, _IDLE = 253, 239, 255
+_TEMPERATURES = (31.0, 32.0, 32.0, 34.0, 35.0, 36.0)
+_DIGITAL_OUTPUTS, _SINKING = 0, 1
+"""Modes of the tool's outputs: digital outputs rather than power, and NPN."""
+
+_CURRENT_WINDOW = (5.0, 5.0, 4.0, 2.5, 2.5, 2.5)
+"""Allowed deviations from the target currents [A]. Plausible, not measured."""
+
+_DEVIATION_LIMIT = 0.2
+"""Deviation of a joint from its target that a real controller stops for [rad]. Plausible, not measured."""
+
+
+def output_fields(controller: Controller) -> dict[str, Field]:
+    """What can be read, by name."""
+    robot, mover, power = controller.robot, controller.robot.mover, controller.power
+    safety, signals, registers = controller.safety, controller.signals, controller.registers
+    slow = _Slow(controller)
+
+    def joint_modes() -> tuple[int, ...]:
+        return (_RUNNING if power.running else _IDLE if power.powered else _POWER_OFF,) * 6
+
+    def status_bits() -> int:
+        return int(power.powered) | (int(controller.playing) << 1)
+
+    readers: dict[str, tuple[str, Callable[[], Any]]] = {
+        "timestamp": ("DOUBLE", lambda: controller.now),
+        "target_q": ("VECTOR6D", lambda: mover.q),
+        "target_qd": ("VECTOR6D", lambda: mover.qd),
+        "target_qdd": ("VECTOR6D", lambda: mover.qdd),
+        "target_current": ("VECTOR6D", slow.currents),
+        "target_moment": ("VECTOR6D", slow.torques),
+        "actual_q": ("VECTOR6D", lambda: robot.q),
+        "actual_qd": ("VECTOR6D", lambda: robot.qd),
+        "actual_current": ("VECTOR6D", slow.currents),
+        "actual_current_window": ("VECTOR6D", lambda: _CURRENT_WINDOW if power.powered else _ZERO6),
+        "actual_moment": ("VECTOR6D", slow.torques),
+        "joint_control_output": ("VECTOR6D", slow.currents),
+        "actual_TCP_pose": ("VECTOR6D", lambda: robot.pose),
+        "actual_TCP_speed": ("VECTOR6D", lambda: robot.tool_speed),
+        "actual_TCP_force": ("VECTOR6D", lambda: _ZERO6),
+        "target_TCP_pose": ("VECTOR6D", lambda: robot.target_pose),
+        "target_TCP_speed": ("VECTOR6D", lambda: robot.target_tool_speed),
+        "actual_digital_input_bits": ("UINT64", lambda: signals.digital_in),
+        "joint_temperatures": ("VECTOR6D", lambda: _TEMPERATURES),
+        "actual_execution_time": ("DOUBLE", lambda: 0.0),
+        "robot_mode": ("INT32", lambda: power.mode),
+        "joint_mode": ("VECTOR6INT32", joint_modes),
+        "safety_mode": ("INT32", lambda: safety.mode),
+        "safety_status": ("INT32", lambda: safety.mode),
+        "actual_tool_accelerometer": ("VECTOR3D", slow.accelerometer),
+        "speed_scaling": ("DOUBLE", lambda: mover.rate),
+        "target_speed_fraction": ("DOUBLE", lambda: mover.slider),
+        "actual_momentum": ("DOUBLE", lambda: 0.0),
+        "actual_main_voltage": ("DOUBLE", lambda: 48.0),
+        "actual_robot_voltage": ("DOUBLE", lambda: 48.0 if power.powered else 0.0),
+        "actual_robot_current": ("DOUBLE", lambda: 0.6 if power.powered else 0.0),
+        "actual_joint_voltage": ("VECTOR6D", lambda: (48.0 if power.powered else 0.0,) * 6),
+        "actual_digital_output_bits": ("UINT64", lambda: signals.digital_out),
+        "runtime_state": ("UINT32", lambda: controller.runtime),
+        "elbow_position": ("VECTOR3D", lambda: robot.kinematics.axes(robot.q)[1][2]),
+        "elbow_velocity": ("VECTOR3D", lambda: robot.elbow_velocity),
+        "robot_status_bits": ("UINT32", status_bits),
+        "safety_status_bits": ("UINT32", lambda: safety.status_bits),
+        "analog_io_types": ("UINT32", lambda: sum(int(v) << (2 + i) for i, v in enumerate(signals.analog_voltage))),
+        "standard_analog_input0": ("DOUBLE", lambda: signals.analog_in[0]),
+        "standard_analog_input1": ("DOUBLE", lambda: signals.analog_in[1]),
+        "standard_analog_output0": ("DOUBLE", lambda: signals.analog_reading(0)),
+        "standard_analog_output1": ("DOUBLE", lambda: signals.analog_reading(1)),
+        "io_current": ("DOUBLE", lambda: 0.0),
+        "euromap67_input_bits": ("UINT32", lambda: 0),
+        "euromap67_output_bits": ("UINT32", lambda: 0),
+        "euromap67_24V_voltage": ("DOUBLE", lambda: 0.0),
+        "euromap67_24V_current": ("DOUBLE", lambda: 0.0),
+        "tool_mode": ("UINT32", lambda: _RUNNING if power.powered else _POWER_OFF),
+        "tool_analog_input_types": ("UINT32", lambda: 0),
+        "tool_analog_input0": ("DOUBLE", lambda: 0.0),
+        "tool_analog_input1": ("DOUBLE", lambda: 0.0),
+        "tool_output_voltage": ("INT32", lambda: 0),
+        "tool_output_current": ("DOUBLE", lambda: 0.0),
+        "tool_temperature": ("DOUBLE", lambda: 33.0),
+        "tcp_force_scalar": ("DOUBLE", lambda: 0.0),
+        "output_bit_registers0_to_31": ("UINT32", lambda: registers.output_bits & 0xFFFFFFFF),
+        "output_bit_registers32_to_63": ("UINT32", lambda: registers.output_bits >> 32 & 0xFFFFFFFF),
+        "input_bit_registers0_to_31": ("UINT32", lambda: registers.input_bits & 0xFFFFFFFF),
+        "input_bit_registers32_to_63": ("UINT32", lambda: registers.input_bits >> 32 & 0xFFFFFFFF),
+        "payload": ("DOUBLE", lambda: robot.payload),
+        "payload_cog": ("VECTOR3D", lambda: robot.cog),
+        "payload_inertia": ("VECTOR6D", lambda: robot.inertia),
+        "script_control_line": ("UINT32", lambda: controller.control_line),
+        "joint_position_deviation_ratio": ("DOUBLE", lambda: robot.deviation / _DEVIATION_LIMIT),
+    }
+    if controller.model.e_series:
+        readers |= {
+            "ft_raw_wrench": ("VECTOR6D", lambda: _ZERO6),
+            "tcp_offset": ("VECTOR6D", lambda: robot.tcp),
+            "tool_output_mode": ("UINT8", lambda: _DIGITAL_OUTPUTS),
+            "tool_digital_output0_mode": ("UINT8", lambda: _SINKING),
+            "tool_digital_output1_mode": ("UINT8", lambda: _SINKING),
+            "actual_configurable_digital_input_bits": ("UINT64", lambda: signals.digital_in >> 8 & 0xFF),
+            "actual_configurable_digital_output_bits": ("UINT64", lambda: signals.digital_out >> 8 & 0xFF),
+            "encoder0_raw": ("INT32", lambda: 0),
+            "encoder1_raw": ("INT32", lambda: 0),
+        }
+    for i in range(REGISTERS):
+        readers[f"output_int_register_{i}"] = ("INT32", _entry(registers.output_int, i))
+        readers[f"output_double_register_{i}"] = ("DOUBLE", _entry(registers.output_double, i))
+        readers[f"input_int_register_{i}"] = ("INT32", _entry(registers.input_int, i))
+        readers[f"input_double_register_{i}"] = ("DOUBLE", _entry(registers.input_double, i))
+    for i in range(64, 128):
+        readers[f"output_bit_register_{i}"] = ("BOOL", _bit(lambda: registers.output_bits, i))
+        readers[f"input_bit_register_{i}"] = ("BOOL", _bit(lambda: registers.input_bits, i))
+    return {name: Field(kind, read) for name, (kind, read) in readers.items()}
+
+
+def _entry(store: list[Any], at: int) -> Callable[[], Any]:
+    return lambda: store[at]
+
+
+def _bit(bits: Callable[[], int], at: int) -> Callable[[], bool]:
+    return lambda: bool(bits() >> at & 1)
+
+
+class _Slow:
+    """Values that follow from gravity: computed ten times a second of controller time, for nobody steers by them."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+        self._due = -1.0
+        self._torques: tuple[float, ...] = _ZERO6
+
+    def torques(self) -> tuple[float, ...]:
+        if self._controller.now >= self._due:
+            self._due = self._controller.now + 0.1
+            self._torques = self._controller.robot.holding_torques if self._controller.power.powered else _ZERO6
+        return self._torques
+
+    def currents(self) -> tuple[float, ...]:
+        return tuple(t / 10.0 for t in self.torques())
+
+    def accelerometer(self) -> tuple[float, float, float]:
+        m = self._controller.robot.frame[0]
+        x, y, z = self._controller.robot.gravity
+        return (m[0] * x + m[3] * y + m[6] * z, m[1] * x + m[4] * y + m[7] * z, m[2] * x + m[5] * y + m[8] * z)
+
+
+INPUT_KINDS: dict[str, str] = {
+    "speed_slider_mask": "UINT32",
+    "speed_slider_fraction": "DOUBLE",
+    "standard_digital_output_mask": "UINT8",
+    "standard_digital_output": "UINT8",
+    "configurable_digital_output_mask": "UINT8",
+    "configurable_digital_output": "UINT8",
+    "tool_digital_output_mask": "UINT8",
+    "tool_digital_output": "UINT8",
+    "standard_analog_output_mask": "UINT8",
+    "standard_analog_output_type": "UINT8",
+    "standard_analog_output_0": "DOUBLE",
+    "standard_analog_output_1": "DOUBLE",
+    "input_bit_registers0_to_31": "UINT32",
+    "input_bit_registers32_to_63": "UINT32",
+    "external_force_torque": "VECTOR6D",
+    **{f"input_bit_register_{i}": "BOOL" for i in range(64, 128)},
+    **{f"input_int_register_{i}": "INT32" for i in range(REGISTERS)},
+    **{f"input_double_register_{i}": "DOUBLE" for i in range(REGISTERS)},
+}
+"""What can be written, with its type."""
+
+_DIGITAL = {"standard": 0, "configurable": 8, "tool": 16}
+
+
+def write(controller: Controller, values: dict[str, Any]) -> None:
+    """Take over what a client sent. Values that make no sense (NaN, say) are left out."""
+    registers, signals = controller.registers, controller.signals
+    for name, value in values.items():
+        controller.watchdogs.written(name)
+        if name.startswith("input_int_register_"):
+            registers.input_int[int(name[19:])] = value
+        elif name.startswith("input_double_register_"):
+            registers.input_double[int(name[22:])] = value
+        elif name.startswith("input_bit_registers"):
+            shift = 0 if name.endswith("31") else 32
+            registers.input_bits = registers.input_bits & ~(0xFFFFFFFF << shift) | value << shift
+        elif name.startswith("input_bit_register_"):
+            bit = 1 << int(name[19:])
+            registers.input_bits = registers.input_bits | bit if value else registers.input_bits & ~bit
+    for group, offset in _DIGITAL.items():
+        mask = values.get(f"{group}_digital_output_mask", 0)
+        if mask:
+            signals.set_outputs(mask, values.get(f"{group}_digital_output", 0), offset)
+    fraction = values.get("speed_slider_fraction", 0.0)
+    if values.get("speed_slider_mask", 0) & 1 and 0.0 <= fraction <= 1.0:
+        controller.robot.mover.slider = fraction
+    mask = values.get("standard_analog_output_mask", 0)
+    for i in range(2):
+        level = values.get(f"standard_analog_output_{i}", 0.0)
+        if mask >> i & 1 and 0.0 <= level <= 1.0:
+            signals.analog_out[i] = level
+            signals.analog_voltage[i] = bool(values.get("standard_analog_output_type", 0) >> i & 1)

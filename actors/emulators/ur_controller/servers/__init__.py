@@ -1,0 +1,1 @@
+"""The TCP interfaces of the emulated controller."""

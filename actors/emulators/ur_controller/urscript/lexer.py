@@ -1,0 +1,142 @@
+"""From text to words. Also tells where a program ends in a stream of text.
+
+What is wrong with a program, and where in its text.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+
+class ScriptError(Exception):
+    """A program can't be read or can't go on.
+
+    Args:
+        text: what is wrong.
+        line: in the program's text, from 1; 0 where unknown.
+    """
+
+    def __init__(self, text: str, line: int = 0) -> None:
+        super().__init__(f"line {line}: {text}" if line else text)
+        self.text = text
+        self.line = line
+
+
+LONGEST = 1_000_000
+"""Characters that a program may have."""
+
+KEYWORDS = frozenset(
+    (
+        *("def", "thread", "sec", "end", "if", "elif", "else", "while", "return", "break", "continue", "halt", "pass"),
+        *("global", "local", "run", "kill", "join", "enter_critical", "exit_critical", "and", "or", "xor", "not"),
+        *("True", "False", "true", "false", "TRUE", "FALSE"),
+    )
+)
+
+OPENERS = frozenset({"def", "thread", "sec", "if", "while"})
+"""Words that an `end` belongs to."""
+
+_WORD = re.compile(
+    r"""(?P<space>[ \t\r\f\v]+)
+      | (?P<newline>\n)
+      | (?P<comment>\#[^\n]*)
+      | (?P<number>(?:0[xX][0-9A-Fa-f]+)|(?:\d+\.?\d*(?:[eE][+-]?\d+)?)|(?:\.\d+(?:[eE][+-]?\d+)?))
+      | (?P<name>[A-Za-z_][A-Za-z_0-9]*)
+      | (?P<string>"[^"\n]*"|'[^'\n]*')
+      | (?P<op><=|>=|==|!=|[-+*/%<>=()\[\]{},:.;])
+      """,
+    re.VERBOSE,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ScriptToken:
+    """One word of a program.
+
+    Attributes:
+        kind: 'number', 'name', 'keyword', 'string', 'op', or 'end of text'.
+        text: as written; of a string, without its quotes.
+        line: from 1.
+        fresh: it is the first of its line.
+    """
+
+    kind: str
+    text: str
+    line: int
+    fresh: bool
+
+
+def words(text: str) -> list[ScriptToken]:
+    """All words of a program, closed by one of the kind 'end of text'.
+
+    Raises:
+        ScriptError: a character that no word begins with.
+    """
+    found: list[ScriptToken] = []
+    line, fresh, place = 1, True, 0
+    while place < len(text):
+        match = _WORD.match(text, place)
+        if match is None:
+            raise ScriptError(f"{text[place]!r} means nothing here", line)
+        place = match.end()
+        kind, word = match.lastgroup or "", match.group()
+        if kind == "newline":
+            line, fresh = line + 1, True
+        elif kind not in ("space", "comment"):
+            if kind == "name" and word in KEYWORDS:
+                kind = "keyword"
+            if kind == "string":
+                word = word[1:-1]
+            found.append(ScriptToken(kind, word, line, fresh))
+            fresh = False
+    found.append(ScriptToken("end of text", "", line, True))
+    return found
+
+
+_STRUCTURE = re.compile(r"""\#[^\n]*|"[^"\n]*"|'[^'\n]*'|[A-Za-z_][A-Za-z_0-9]*""")
+
+
+class Splitter:
+    """Cuts a stream of text into programs: from `def`, `sec` to their `end`; other lines are programs of their own.
+
+    Args:
+        limit: longest text without an end that is kept [characters].
+    """
+
+    def __init__(self, limit: int = LONGEST) -> None:
+        self._limit = limit
+        self._rest = ""
+        self._lines: list[str] = []
+        self._size = 0
+        self._depth = 0
+
+    def feed(self, text: str) -> list[str]:
+        """Take the next piece of the stream.
+
+        Returns:
+            Programs that are complete now.
+
+        Raises:
+            ScriptError: too much text without an end; what was kept is dropped.
+        """
+        *lines, self._rest = (self._rest + text).split("\n")
+        programs = []
+        for line in lines:
+            opened = self._depth > 0
+            for match in _STRUCTURE.finditer(line):
+                if match.group() in OPENERS:
+                    self._depth += 1
+                    opened = True
+                elif match.group() == "end" and self._depth:
+                    self._depth -= 1
+            if opened or line.strip():
+                self._lines.append(line)
+                self._size += len(line) + 1
+            if self._depth == 0 and self._lines:
+                programs.append("\n".join(self._lines) + "\n")
+                self._lines, self._size = [], 0
+        if self._size + len(self._rest) > self._limit:
+            self._lines, self._size, self._depth, self._rest = [], 0, 0, ""
+            raise ScriptError(f"more than {self._limit} characters without an end")
+        return programs

@@ -1,0 +1,242 @@
+"""A running program: its threads, each advanced once per control cycle until it gives way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping
+from typing import Any
+
+import psutil
+
+from actors.emulators.ur_controller.urscript import script_values as values
+from actors.emulators.ur_controller.urscript.lexer import ScriptError
+from actors.emulators.ur_controller.urscript.translator import Translated
+
+WORK_PER_CYCLE = 100_000
+"""Work in one control cycle after which a program counts as stuck, as on a controller. It is counted in parts of
+expressions, which take some 0.3 µs each."""
+
+COMMAND_WORK = 30
+"""What calling a command costs beside the entries of lists that it is given and gives back."""
+
+LOOK_AT_MEMORY = 1_000_000
+"""Work between two looks at how much memory the process holds."""
+
+MOST_MEMORY = 300_000_000
+"""What the process may grow by while a program runs [bytes]."""
+
+MOST_THREADS = 50
+
+_PROCESS = psutil.Process()
+
+Steps = Generator[None, None, Any]
+
+
+class _HaltedError(Exception):
+    """The program asked for its own end."""
+
+
+class Command:
+    """What a program may call.
+
+    Args:
+        function: a generator function if it `waits`.
+        waits: whether it gives way.
+        work: what a call costs beside its lists, in parts of expressions.
+    """
+
+    def __init__(self, function: Callable[..., Any], *, waits: bool = False, work: int = COMMAND_WORK) -> None:
+        self.function = function
+        self.waits = waits
+        self.work = work
+
+
+def waiting(commands: Mapping[str, Command]) -> frozenset[tuple[str, bool]]:
+    """What the translator has to know of commands: their names, and whether they give way."""
+    return frozenset((name, command.waits) for name, command in commands.items())
+
+
+class Program:
+    """One uploaded program. Made whole or not at all; run by `tick`.
+
+    Args:
+        translated: the program, by `translate`.
+        commands: what it may call.
+
+    Attributes:
+        name: from its first line.
+        secondary: it was sent as `sec`: it runs beside the main program, may not move the arm, and ends soon.
+
+    """
+
+    def __init__(self, translated: Translated, commands: Mapping[str, Command]) -> None:
+        self.name = translated.name
+        self.secondary = translated.secondary
+        self._lines = translated.lines
+        self._work = 0
+        self._unseen = 0
+        self._memory = _PROCESS.memory_info().rss
+        self._threads: dict[int, Steps] = {}
+        self._started = 0
+        self._critical: int | None = None
+        self._current = 0
+        space: dict[str, Any] = {
+            "__builtins__": {},
+            "_add": values.add,
+            "_sub": values.subtract,
+            "_mul": values.multiply,
+            "_div": values.divide,
+            "_mod": values.modulo,
+            "_xor": values.exclusive_or,
+            "_neg": values.negate,
+            "_copy": self._copy,
+            "_list": self._list,
+            "_entry": self._list,
+            "_same": self._same,
+            "_index": values.index,
+            "_pose": values.pose,
+            "_spend": self._spend,
+            "_run": self._run,
+            "_kill": self._kill,
+            "_join": self._join,
+            "_halt": self._halt,
+            "_enter_critical": self._enter_critical,
+            "_exit_critical": self._exit_critical,
+        }
+        space.update({f"c_{name}": self._counted(command) for name, command in commands.items()})
+        exec(translated.code, space)
+        self._threads[0] = space["main"]()
+
+    @property
+    def current(self) -> int:
+        """Number of the thread that is being advanced."""
+        return self._current
+
+    def tick(self) -> bool:
+        """Advance all threads by one control cycle.
+
+        Returns:
+            Whether the program goes on.
+
+        Raises:
+            ScriptError: it can't go on.
+        """
+        self._work = WORK_PER_CYCLE
+        for number in list(self._threads):
+            if self._critical is not None and self._critical != number and self._critical in self._threads:
+                continue
+            steps = self._threads.get(number)
+            if steps is None:
+                continue
+            self._current = number
+            try:
+                next(steps)
+            except StopIteration:
+                self._threads.pop(number, None)
+                if number == 0:
+                    return False
+            except _HaltedError:
+                return False
+            except ScriptError as error:
+                raise ScriptError(error.text, error.line or self._line_of_error(error)) from error
+            except Exception as error:
+                raise ScriptError(_explain(error), self._line_of_error(error)) from error
+        return True
+
+    def line_of(self, number: int) -> int:
+        """Line of the text that a thread has got to; 0 if there is no such thread."""
+        line, steps = 0, self._threads.get(number)
+        while steps is not None:
+            frame = getattr(steps, "gi_frame", None)
+            if frame is not None and frame.f_code.co_filename == "<program>":
+                line = self._text_line(frame.f_lineno)
+            steps = getattr(steps, "gi_yieldfrom", None)
+        return line
+
+    def _line_of_error(self, error: BaseException) -> int:
+        line, trace = 0, error.__traceback__
+        while trace is not None:
+            if trace.tb_frame.f_code.co_filename == "<program>":
+                line = self._text_line(trace.tb_lineno)
+            trace = trace.tb_next
+        return line
+
+    def _text_line(self, code_line: int) -> int:
+        return self._lines[min(code_line, len(self._lines)) - 1]
+
+    # ---- bounds of time and memory
+
+    def _spend(self, work: int) -> None:
+        self._work -= work
+        if self._work < 0:
+            raise ScriptError("too much in one cycle without sync(): the runtime is too much behind")
+        self._unseen += work
+        if self._unseen > LOOK_AT_MEMORY:
+            self._unseen = 0
+            if _PROCESS.memory_info().rss - self._memory > MOST_MEMORY:
+                raise ScriptError(f"the program holds more than {MOST_MEMORY // 1_000_000} MB")
+
+    def _copy(self, value: Any) -> Any:
+        if not isinstance(value, list):
+            return value
+        self._spend(values.size(value))
+        return values.copy(value)
+
+    def _list(self, value: Any) -> Any:
+        if isinstance(value, list):
+            self._spend(values.size(value))
+        return value
+
+    def _same(self, a: Any, b: Any) -> bool:
+        if isinstance(a, list) and isinstance(b, list):
+            self._spend(values.size(a))
+        return bool(a == b)
+
+    def _counted(self, command: Command) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            self._spend(command.work + sum(len(a) for a in arguments if isinstance(a, list)))
+            return self._list(command.function(*arguments, **named))
+
+        return call
+
+    # ---- what programs say that concerns threads
+
+    def _run(self, function: Callable[..., Any], *arguments: Any) -> int:
+        if len(self._threads) >= MOST_THREADS:
+            raise ScriptError(f"more than {MOST_THREADS} threads")
+        steps = function(*arguments)
+        self._started += 1
+        self._threads[self._started] = steps
+        return self._started
+
+    def _kill(self, number: Any) -> None:
+        if number == 0 or number not in self._threads:
+            return
+        if number == self._current:
+            raise ScriptError("a thread can't kill itself")
+        self._threads.pop(number).close()
+
+    def _join(self, number: Any) -> Steps:
+        while number in self._threads and number != self._current:
+            yield
+
+    def _halt(self) -> None:
+        raise _HaltedError
+
+    def _enter_critical(self) -> None:
+        self._critical = self._current
+
+    def _exit_critical(self) -> None:
+        self._critical = None
+
+
+def _explain(error: Exception) -> str:
+    if isinstance(error, NameError):
+        name = (error.name or "").removeprefix("v_").removeprefix("f_")
+        return f"'{name}' has no value yet"
+    if isinstance(error, RecursionError):
+        return "functions call each other without end"
+    if isinstance(error, IndexError):
+        return "a list has no such entry"
+    if isinstance(error, ZeroDivisionError | OverflowError | ValueError):
+        return f"can't be computed: {error}"
+    return f"wrong use of a value or function: {error}".replace("v_", "").replace("f_", "").replace("c_", "")

@@ -1,0 +1,162 @@
+"""What a program computes with: numbers, strings, lists and poses, with a controller's arithmetic.
+
+Whole numbers have 32 bits and nothing grows: a hostile program can't fill memory with one long list or number.
+"""
+
+from __future__ import annotations
+
+from math import fmod, isfinite
+from typing import Any
+
+from actors.emulators.ur_controller.urscript.lexer import ScriptError
+
+LONGEST_STRING = 1023
+"""Characters that a string may have, as on a controller."""
+
+MOST_ENTRIES = 10_000
+"""Entries that a list may have, those of lists within it included."""
+
+DEEPEST_LIST = 20
+"""Levels of lists within lists."""
+
+
+class UrPose(list[float]):
+    """p[x, y, z, rx, ry, rz]. A list that motion commands know for a pose."""
+
+    __slots__ = ()
+
+
+def pose(items: list[Any]) -> UrPose:
+    """A pose of six numbers."""
+    return UrPose(number(item) for item in items)
+
+
+def number(value: Any) -> float:
+    """A finite number.
+
+    Raises:
+        ScriptError: it is none.
+    """
+    if not isinstance(value, int | float) or not isfinite(value):
+        raise ScriptError(f"expected a number, found {show(value)}")
+    return float(value)
+
+
+def numbers(value: Any, count: int) -> list[float]:
+    """So many finite numbers.
+
+    Raises:
+        ScriptError: it is not a list of that length, or not of numbers.
+    """
+    if not isinstance(value, list) or len(value) != count:
+        raise ScriptError(f"expected {count} numbers, found {show(value)}")
+    return [number(item) for item in value]
+
+
+def copy(value: Any) -> Any:
+    """Lists are values: what is given on is a copy."""
+    if isinstance(value, list):
+        fresh = [copy(item) if isinstance(item, list) else item for item in value]
+        return UrPose(fresh) if isinstance(value, UrPose) else fresh
+    return value
+
+
+def size(value: Any, depth: int = 0) -> int:
+    """Entries of a value, those of lists within lists included; 0 for what is not a list.
+
+    Raises:
+        ScriptError: there are too many, or the lists are nested too deeply.
+    """
+    if not isinstance(value, list):
+        return 0
+    if depth >= DEEPEST_LIST:
+        raise ScriptError(f"lists within lists, more than {DEEPEST_LIST} levels deep")
+    count = len(value)
+    for item in value:
+        if isinstance(item, list):
+            count += size(item, depth + 1)
+            if count > MOST_ENTRIES:
+                break
+    if count > MOST_ENTRIES:
+        raise ScriptError(f"a list of more than {MOST_ENTRIES} entries")
+    return count
+
+
+def index(value: Any) -> int:
+    """A list's index.
+
+    Raises:
+        ScriptError: no whole number, or negative.
+    """
+    if not isinstance(value, int) or value < 0:
+        raise ScriptError(f"{show(value)} is not an index")
+    return int(value)
+
+
+def show(value: Any) -> str:
+    """As a message or log would have it."""
+    if isinstance(value, list):
+        text = "[" + ", ".join(show(item) for item in value[:50]) + "]"
+        return "p" + text if isinstance(value, UrPose) else text
+    if isinstance(value, float):
+        return f"{value:.7g}"
+    return str(value)[:LONGEST_STRING]
+
+
+def _whole(value: Any) -> Any:
+    """Wrapped to 32 bits if it is a whole number."""
+    if isinstance(value, int) and not -0x80000000 <= value <= 0x7FFFFFFF:
+        return (value + 0x80000000) % 0x100000000 - 0x80000000
+    return value
+
+
+def _pair(a: Any, b: Any, operator: str) -> None:
+    if not isinstance(a, int | float) or not isinstance(b, int | float):
+        raise ScriptError(f"can't compute {show(a)} {operator} {show(b)}")
+
+
+def add(a: Any, b: Any) -> Any:
+    """a + b."""
+    _pair(a, b, "+")
+    return _whole(a + b)
+
+
+def subtract(a: Any, b: Any) -> Any:
+    """a − b."""
+    _pair(a, b, "-")
+    return _whole(a - b)
+
+
+def multiply(a: Any, b: Any) -> Any:
+    """a · b."""
+    _pair(a, b, "*")
+    return _whole(a * b)
+
+
+def divide(a: Any, b: Any) -> Any:
+    """a / b, never rounded."""
+    _pair(a, b, "/")
+    if b == 0:
+        raise ScriptError("division by zero")
+    return a / b
+
+
+def modulo(a: Any, b: Any) -> Any:
+    """a % b with the sign of a."""
+    _pair(a, b, "%")
+    if b == 0:
+        raise ScriptError("division by zero")
+    if isinstance(a, int) and isinstance(b, int):
+        return int(fmod(a, b))
+    return fmod(a, b)
+
+
+def negate(a: Any) -> Any:
+    """−a."""
+    _pair(a, 0, "-")
+    return _whole(-a)
+
+
+def exclusive_or(a: Any, b: Any) -> bool:
+    """a xor b."""
+    return bool(a) != bool(b)

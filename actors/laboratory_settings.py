@@ -1,0 +1,97 @@
+"""Settings of a laboratory: the pool of simulators, and the bench if there is one. Plain values.
+
+Settings of the virtual bench. Plain values.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from actors.arm.arm_settings import ArmSpec
+from actors.balance.balance_settings import BalanceSpec
+from actors.interfaces import OperatorSpec
+from sim_engine.liquids import SimulationParameters
+from sim_engine.scene import PoseError
+from sim_engine.settings.model import FREE
+
+
+@dataclass(frozen=True)
+class VirtualBenchSpec:
+    """The virtual bench: what is hidden from calibration, and how fast time runs.
+
+    Attributes:
+        liquid: hidden θ of the 'real' liquid.
+        pose_error: systematic error of grip and placement.
+        pose_noise: standard deviation of the same, drawn anew for each pour.
+        time_scale: bench seconds per wall second; 0 waits for nothing.
+        operator_time: refilling, placing, wiping [s of bench time].
+        balance_resolution, balance_noise, balance_drift: [kg], [kg], [kg/s]; settling_time [s].
+    """
+
+    liquid: SimulationParameters
+    pose_error: PoseError = field(default_factory=PoseError)
+    pose_noise: PoseError = field(default_factory=lambda: PoseError(speed_factor=0.0))
+    time_scale: float = 30.0
+    operator_time: float = 85.0
+    balance_resolution: float = 1e-4
+    balance_noise: float = 1e-4
+    balance_drift: float = 0.0
+    settling_time: float = 1.5
+
+
+@dataclass(frozen=True)
+class RaySpec:
+    """A Ray cluster that runs already.
+
+    Attributes:
+        address: of its head, host:port.
+        bench_resource: custom resource of the node that arm, balance and bench run on.
+    """
+
+    address: str
+    bench_resource: str = "decant_bench"
+
+
+@dataclass(frozen=True)
+class LaboratorySpec:
+    """Where a campaign runs.
+
+    What belongs to the machine, or to who stands beside it, decides nothing of a campaign.
+
+    Attributes:
+        simulators: size of the pool; 0: one per core, of this machine or of the cluster.
+        bench: what is hidden on a virtual bench; None on hardware, and where the laboratory can't pour.
+        mode: 'virtual' or 'hardware'.
+        in_process: everything in threads of one process, without Ray.
+        object_store_mb: a private Ray's shared memory for results [MiB]; Ray takes no less than 80.
+        ray: the cluster to join; None for a private Ray on this machine.
+        arm: of any kind, virtual or not; None for a bench of numbers, or none.
+        balance: beside the arm; its time scale is the bench's.
+        operator: beside the arm.
+        accepted_checksum: of the safety settings of hardware that people have accepted; '' if nobody has. Filled in
+            for a run, not part of a file.
+    """
+
+    name: str
+    simulators: Annotated[int, FREE] = 0
+    bench: VirtualBenchSpec | None = None
+    mode: str = "virtual"
+    in_process: Annotated[bool, FREE] = False
+    object_store_mb: Annotated[int, FREE] = 160
+    ray: Annotated[RaySpec | None, FREE] = None
+    arm: ArmSpec | None = None
+    balance: BalanceSpec | None = None
+    operator: Annotated[OperatorSpec, FREE] = field(default_factory=lambda: OperatorSpec(answers="virtual"))
+    accepted_checksum: Annotated[str, FREE] = ""
+
+    @property
+    def pours(self) -> bool:
+        """Whether there is a bench."""
+        return self.arm is not None or self.bench is not None
+
+
+def simulator_count(spec: LaboratorySpec) -> int:
+    """Size of the pool on this machine: as stated, or one per core."""
+    return spec.simulators or os.cpu_count() or 1

@@ -1,0 +1,149 @@
+"""Where to look next: lower confidence bound, local penalisation of busy places, and the search for its minimum."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from actors.optimizer.feasible_region import Feasibility, Region
+from actors.optimizer.gaussian_process import Surrogate
+
+Array = NDArray[np.float64]
+Score = Callable[[Array], Array]
+
+
+def lower_confidence_bound(surrogate: Surrogate, kappa: float) -> Score:
+    """m(x) − κ s(x), to be minimised.
+
+    Source: Srinivas et al. 2010 (as upper bound of a reward), with a constant κ as in the CoRL 2017 paper.
+    """
+
+    def score(points: Array) -> Array:
+        mean, deviation = surrogate.predict(points)
+        return mean - kappa * deviation
+
+    return score
+
+
+def penalised(
+    score: Score, surrogate: Surrogate, busy: Array, candidates: Array, feasibility: Feasibility | None = None
+) -> Score:
+    """A score that also stays away from points whose answers are still out, and from likely refusals and failures.
+
+    Around each busy point lies a ball in which, judging by the surrogate's steepest slope, the minimum can't be; the
+    score is divided by the probability of being outside it, and by that of not being refused. No cost has to be
+    invented for the busy points, nor for the refused ones.
+
+    Args:
+        score: to be minimised.
+        surrogate: of the cost.
+        busy: (b, dimension).
+        candidates: (m, dimension), from which slope, lowest mean and the score's range are estimated.
+        feasibility: of requests; None while nothing was refused.
+
+    Returns:
+        A new score to be minimised: −log(softplus(−score)) − Σ log φ_j − log P, score in units of its spread.
+
+    Source: González et al., Batch Bayesian Optimization via Local Penalization, AISTATS 2016.
+    """
+    if len(busy) == 0 and feasibility is None:
+        return score
+    base = score(candidates)
+    centre, spread = float(np.median(base)), max(float(np.std(base)), 1e-12)
+    outside = _outside(surrogate, busy, candidates) if len(busy) else None
+
+    def divided(points: Array) -> Array:
+        reward = np.logaddexp(0.0, -(score(points) - centre) / spread)  # softplus: positive, as a product needs
+        result = -np.log(np.maximum(reward, 1e-300))
+        if outside is not None:
+            result = result - outside(points)
+        if feasibility is not None:
+            result = result - feasibility.log_probability(points)
+        return np.asarray(result)
+
+    return divided
+
+
+def _outside(surrogate: Surrogate, busy: Array, candidates: Array) -> Score:
+    """Logarithm of the probability of being outside all balls."""
+    mean, deviation = surrogate.predict(busy)
+    all_means = surrogate.predict(candidates)[0]
+    lowest = min(float(all_means.min()), float(mean.min()))
+    slope = _steepest_slope(surrogate, candidates[:: max(1, len(candidates) // 64)])
+    relief = float(all_means.max()) - lowest
+    slope = max(slope, relief / np.sqrt(candidates.shape[1]), 1e-9)
+    # where the surrogate is sure of itself the ball would vanish, and two identical trials be asked for
+    deviation = np.maximum(deviation, max(0.05 * relief, 1e-9))
+
+    def log_probability(points: Array) -> Array:
+        distance = np.linalg.norm(points[:, None, :] - busy[None, :, :], axis=2)
+        return np.asarray(log_ndtr((slope * distance - (mean - lowest)[None, :]) / deviation[None, :]).sum(axis=1))
+
+    return log_probability
+
+
+def spread_out(
+    count: int, taken: Array, region: Region, rng: np.random.Generator, feasibility: Feasibility | None = None
+) -> Array:
+    """(count, dimension) Sobol points; where points are taken already (k, dimension), those farthest from them.
+
+    With refusals the distance counts by the probability of not being refused.
+    """
+    if len(taken) == 0:
+        return region.draw(count, rng, even=True)
+    candidates = region.draw(max(64, 4 * count), rng, even=True)
+    weight = 1.0 if feasibility is None else np.exp(feasibility.log_probability(candidates))
+    chosen: list[Array] = []
+    distance = _round_the_cube(candidates, taken).min(axis=1)
+    for _ in range(count):
+        point = candidates[int(np.argmax(distance * weight))]
+        chosen.append(point)
+        distance = np.minimum(distance, _round_the_cube(candidates, point[None, :])[:, 0])
+    return np.array(chosen).reshape(count, candidates.shape[1])
+
+
+def _round_the_cube(points: Array, others: Array) -> Array:
+    """(m, k) distances where opposite faces of the cube touch: else the farthest points would all be corners."""
+    gap = np.abs(points[:, None, :] - others[None, :, :])
+    return np.asarray(np.linalg.norm(np.minimum(gap, 1.0 - gap), axis=2))
+
+
+def search_candidates(region: Region, dimension: int, around: Sequence[Array], rng: np.random.Generator) -> Array:
+    """Places to score first: a Sobol cover of the region, and clouds around known good points. (m, dimension)."""
+    cover = region.draw(512 if dimension <= 2 else 1024, rng, even=True)
+    clouds = [_cloud(region, point, spread, 16, rng) for point in around for spread in (0.1, 0.02)]
+    return np.concatenate([cover, *clouds])
+
+
+def minimise(score: Score, candidates: Array, region: Region, rng: np.random.Generator) -> Array:
+    """Minimiser of a score over the region: the best candidates, then shrinking clouds around them. (dimension,)."""
+    values = score(candidates)
+    leaders = candidates[np.argsort(values, kind="stable")[:3]]
+    best, lowest = leaders[0], float(values.min())
+    for spread in (0.04, 0.015, 0.005, 0.0015):
+        cloud = np.concatenate([_cloud(region, leader, spread, 24, rng) for leader in leaders])
+        if len(cloud) == 0:
+            continue
+        values = score(cloud)
+        if float(values.min()) < lowest:
+            best, lowest = cloud[int(np.argmin(values))], float(values.min())
+        leaders = np.concatenate([best[None, :], cloud[np.argsort(values, kind="stable")[:2]]])
+    return np.asarray(best)
+
+
+def _cloud(region: Region, point: Array, spread: float, count: int, rng: np.random.Generator) -> Array:
+    """At most `count` allowed points around one."""
+    cloud = region.snap(np.clip(point + spread * rng.standard_normal((count, len(point))), 0.0, 1.0))
+    return cloud[region.allows(cloud)]
+
+
+def _steepest_slope(surrogate: Surrogate, points: Array, step: float = 1e-3) -> float:
+    """Largest slope of the posterior mean at some points [cost per unit of the cube], by forward differences."""
+    m, dimension = points.shape
+    moved = (points[:, None, :] + step * np.eye(dimension)[None, :, :]).reshape(-1, dimension)
+    means = surrogate.predict(np.concatenate([points, moved]))[0]
+    slopes = (means[m:].reshape(m, dimension) - means[:m, None]) / step
+    return float(np.linalg.norm(slopes, axis=1).max())

@@ -1,1 +1,0 @@
-"""The optimiser itself: pure functions of a question, without Ray."""

@@ -1,0 +1,488 @@
+"""Gaussian-process surrogates of a noisy cost on the unit cube: fitted by MAP, bounded, always finite.
+
+Hyperparameters by maximum a posteriori: likelihood, log-priors, their gradient, and a bounded search.
+
+The band of a single observation: the shortest interval that holds it with a given probability.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack, solve_triangular
+from scipy.optimize import minimize
+from scipy.special import ndtr
+
+from actors.optimizer.covariance import Covariance, HyperPrior
+
+Array = NDArray[np.float64]
+
+_IMPOSSIBLE = 1e12
+ITERATIONS = 40
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The best hyperparameters that were found.
+
+    Attributes:
+        theta: (p,).
+        L: (n, n), lower Cholesky factor of the observations' covariance.
+        alpha: (n,), its inverse times the residuals.
+        log_likelihood: of the residuals, without the priors.
+    """
+
+    theta: Array
+    L: Array
+    alpha: Array
+    log_likelihood: float
+
+
+def maximum_a_posteriori(
+    covariance: Covariance, residuals: Array, starts: Sequence[Array], iterations: int = ITERATIONS
+) -> Fitted:
+    """Fit.
+
+    Args:
+        covariance: of the observations.
+        residuals: (n,), costs less their prior mean, in units of the scale.
+        starts: of the search, (p,) each, at least one.
+        iterations: of the search from each; 0 takes the first start as it is.
+
+    Raises:
+        ValueError: no start gave a covariance that can be factorised.
+
+    Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, chapter 5.
+    """
+    bounds: Any = covariance.bounds
+
+    def loss(theta: Array) -> tuple[float, Array]:
+        z = (theta - covariance.centre) / covariance.deviation
+        value, gradient = negative_log_likelihood(covariance, residuals, theta)
+        return value + 0.5 * float(z @ z), gradient + z / covariance.deviation
+
+    best, lowest = np.clip(starts[0] if iterations == 0 else covariance.centre, bounds[:, 0], bounds[:, 1]), math.inf
+    for start in starts if iterations else ():
+        found: Any = minimize(
+            loss,
+            np.clip(start, bounds[:, 0], bounds[:, 1]),
+            jac=True,
+            bounds=bounds,
+            method="L-BFGS-B",
+            options={"maxiter": iterations, "ftol": 1e-6, "gtol": 1e-3},
+        )
+        if math.isfinite(found.fun) and found.fun < lowest:
+            best, lowest = found.x, float(found.fun)
+    K, _ = covariance.observed(best)
+    L, trouble = lapack.dpotrf(K, lower=1)
+    if trouble:
+        raise ValueError(f"{len(residuals)} observations give no covariance that can be factorised")
+    alpha = lapack.dpotrs(L, residuals, lower=1)[0].ravel()
+    return Fitted(best, L, alpha, -_value(L, alpha, residuals))
+
+
+def negative_log_likelihood(covariance: Covariance, residuals: Array, theta: Array) -> tuple[float, Array]:
+    """−log p of residuals (n,) at hyperparameters θ (p,), and its gradient (p,)."""
+    K, pullback = covariance.observed(theta)
+    L, trouble = lapack.dpotrf(K, lower=1)
+    if trouble:
+        return _IMPOSSIBLE, np.zeros(len(theta))  # not positive definite: back towards the prior
+    alpha = lapack.dpotrs(L, residuals, lower=1)[0].ravel()
+    inverse = lapack.dpotri(L, lower=1)[0]
+    inverse = np.tril(inverse) + np.tril(inverse, -1).T
+    value, gradient = _value(L, alpha, residuals), 0.5 * pullback(inverse - np.outer(alpha, alpha))
+    if not (math.isfinite(value) and np.all(np.isfinite(gradient))):
+        return _IMPOSSIBLE, np.zeros(len(theta))
+    return value, gradient
+
+
+def _value(L: Array, alpha: Array, residuals: Array) -> float:
+    return 0.5 * float(residuals @ alpha) + float(np.log(np.diagonal(L)).sum()) + 0.5 * len(L) * math.log(2 * math.pi)
+
+
+Mean = Callable[[Array], Array]
+
+
+class Surrogate(Protocol):
+    """What an acquisition needs to know of a model of the cost."""
+
+    def predict(self, points: Array) -> tuple[Array, Array]:
+        """Posterior mean and standard deviation of the noise-free cost.
+
+        Args:
+            points: (m, dimension), in the unit cube.
+
+        Returns:
+            Means (m,) and deviations (m,), in the cost's unit.
+        """
+        ...
+
+
+CONSTANT_PRIOR = HyperPrior()
+RESIDUAL_PRIOR = HyperPrior(signal=(0.4, 0.7), noise=(0.07, 1.0))
+"""Prior of what reality adds to the simulation: smaller than the cost itself, but free to be as large."""
+
+POOLED_PRIOR = HyperPrior(noise=(0.05, 0.4), simulated_noise=(0.3, 1.0))
+"""Pours have little noise, simulations much: where they contradict each other the simulations must give way."""
+
+SCALED_PRIOR = HyperPrior(rho=(1.0, 1.0), delta_signal=(0.6, 0.7))
+"""Wide, so that a simulation that is the wrong way round can be found out."""
+
+SMALLEST_SCALE = 1e-60
+"""Smallest unit of costs; fourth powers of a smaller one (products of covariances) leave the range of floats."""
+
+VARYING_FROM = 20
+"""Observations below which the noise is taken for constant: fewer can't tell."""
+
+
+class GaussianProcess:
+    """GP regression with Matérn 5/2 ARD kernel, fitted noise and a given prior mean; hyperparameters by MAP.
+
+    Attributes:
+        points: (n, dimension) of the observations.
+        lengths: (dimension,) fitted lengthscales.
+        signal: fitted standard deviation of the signal, in the cost's unit.
+        noise: fitted standard deviation of the real observations, in the cost's unit; where it varies, its
+            geometric mean over them.
+        simulated_noise: the same of simulations; where there is only one kind of observation, that one's.
+        evidence: by how much the log-likelihood is above that of noise around the prior mean and nothing else.
+        hyperparameters: what else was fitted, by name.
+
+    Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, chapters 2 and 5.
+    """
+
+    def __init__(
+        self,
+        costs: Array,
+        covariance: Covariance,
+        *,
+        mean: Mean,
+        scale: float,
+        growth: NoiseGrowth | None = None,
+        start: Array | None = None,
+        iterations: int = ITERATIONS,
+    ) -> None:
+        """Fit.
+
+        Args:
+            costs: (n,), finite, n ≥ 1.
+            covariance: of the observations, in units of scale².
+            mean: prior mean of the cost at points (m, dimension) → (m,).
+            scale: unit in which the priors are meant, in the cost's unit.
+            growth: what the covariance's noise grows with.
+            start: hyperparameters to start from; None: their priors' centre, and more noise than that.
+            iterations: of the search for better ones.
+
+        Raises:
+            ValueError: the start has another number of hyperparameters.
+        """
+        self.points, self.mean, self.scale, self.growth = covariance.points, mean, scale, growth
+        starts = [start]
+        if start is not None and len(start) != len(covariance.names):
+            raise ValueError(f"a start of {len(start)} hyperparameters for a model of {len(covariance.names)}")
+        if start is None:
+            noisy = covariance.centre.copy()
+            noisy[[i for i, name in enumerate(covariance.names) if name in ("length", "noise")]] += 0.5
+            noisy[covariance.names.index("noise")] += 1.0
+            starts = [covariance.centre, noisy]
+        residuals = (costs - mean(self.points)) / scale
+        fitted = maximum_a_posteriori(covariance, residuals, [s for s in starts if s is not None], iterations)
+        self._covariance, self._fitted = covariance, fitted
+        theta = fitted.theta
+        self.lengths: Array = covariance.lengths(theta)
+        self.signal = covariance.value(theta, "signal") * scale
+        self.noise = covariance.value(theta, "noise") * scale
+        self.log_likelihood = fitted.log_likelihood
+        self.evidence = fitted.log_likelihood - _of_noise_alone(residuals)
+        self.theta = theta
+        self.simulated_noise = self.noise
+        if "simulated_noise" in covariance.names:
+            self.simulated_noise = covariance.value(theta, "simulated_noise") * scale
+        self.hyperparameters: dict[str, float] = {
+            name: covariance.value(theta, name) * (1.0 if name in ("rho", "delta_length") else scale)
+            for name in ("simulated_noise", "offset", "rho", "delta_signal", "delta_length")
+            if name in covariance.names
+        }
+
+    def predict(self, points: Array) -> tuple[Array, Array]:
+        """See `Surrogate.predict`. The deviation leaves the observations' noise out."""
+        K = self._covariance.cross(self._fitted.theta, points)
+        V = solve_triangular(self._fitted.L, K.T, lower=True, check_finite=False)
+        prior = self._covariance.variance(self._fitted.theta, points)
+        variance = prior - np.einsum("ij,ij->j", V, V)
+        mean = self.mean(points) + self.scale * (K @ self._fitted.alpha)
+        return mean, self.scale * np.sqrt(np.maximum(variance, 1e-12))
+
+    def projected(self, points: Array) -> tuple[Array, Array]:
+        """What posterior moments at points (m, d) are made of: means (m,), and V (n, m); the posterior covariance
+        is `prior_covariance` − Vᵀ V, in the cost's unit (squared)."""
+        K = self.cross(points)
+        return self.expected(points, K), self.explained(K)
+
+    def cross(self, points: Array) -> Array:
+        """Prior covariances of the cost at points (m, d) with the observations: (m, n), in units of `scale`²."""
+        return self._covariance.cross(self._fitted.theta, points)
+
+    def expected(self, points: Array, cross: Array) -> Array:
+        """Posterior means (m,) at points (m, d) from their `cross` (m, n)."""
+        return np.asarray(self.mean(points) + self.scale * (cross @ self._fitted.alpha))
+
+    def explained(self, cross: Array) -> Array:
+        """V (n, m) of rows of `cross`, or of weighted sums of them (m, n): VᵀV is the covariance that the observations
+        explain, in the cost's unit squared."""
+        return np.asarray(self.scale * solve_triangular(self._fitted.L, cross.T, lower=True, check_finite=False))
+
+    def prior_covariance(self, points: Array) -> Array:
+        """Covariance of the noise-free cost between points (m, d): (m, m), in its unit squared."""
+        return np.asarray(self.scale**2 * self._covariance.between(self._fitted.theta, points, points))
+
+    def joint_covariance(self, simulated: Array, real: Array) -> Array:
+        """Posterior covariance of the noise-free simulated cost at points (a, d) and the real one at points (m, d):
+        (a + m, a + m), in the cost's unit squared."""
+        theta, covariance = self._fitted.theta, self._covariance
+        K = np.concatenate([covariance.cross_simulated(theta, simulated), covariance.cross(theta, real)])
+        V = solve_triangular(self._fitted.L, K.T, lower=True, check_finite=False)
+        mixed = covariance.between_simulated(theta, simulated, real, real=True)
+        own = covariance.between_simulated(theta, simulated, simulated, real=False)
+        prior = np.block([[own, mixed], [mixed.T, covariance.between(theta, real, real)]])
+        return np.asarray(self.scale**2 * (prior - V.T @ V))
+
+    def noise_at(self, points: Array) -> Array:
+        """Standard deviations of single real observations at points (m, dimension): (m,), in the cost's unit."""
+        if self.growth is None or len(points) == 0:
+            return np.full(len(points), self.noise)
+        return self.noise * np.exp(self.growth.features(points) @ self._covariance.growth(self.theta))
+
+    def covariance(self, first: Array, second: Array) -> Array:
+        """Posterior covariance of the noise-free cost between points (m, d) and (k, d): (m, k), in its unit squared."""
+        theta, L = self._fitted.theta, self._fitted.L
+        V = solve_triangular(L, self._covariance.cross(theta, first).T, lower=True, check_finite=False)
+        W = V
+        if second is not first:
+            W = solve_triangular(L, self._covariance.cross(theta, second).T, lower=True, check_finite=False)
+        return np.asarray(self.scale**2 * (self._covariance.between(theta, first, second) - V.T @ W))
+
+
+@dataclass(frozen=True)
+class NoiseGrowth:
+    """What the logarithm of the noise may grow with: the expected cost, linearly, and its nearness to the middle.
+
+    A pour that surely spills nothing scatters least, and one that surely spills all less than one on the brink. The
+    coefficients can't be negative: noise that is larger in the valley was only ever seen to stand for a wall too steep
+    for the kernel.
+
+    Attributes:
+        process: of the cost, fitted with constant noise.
+        low, high: range of its means at the observations.
+    """
+
+    process: GaussianProcess
+    low: float
+    high: float
+
+    def features(self, points: Array) -> Array:
+        """(m, 2) at points (m, dimension), each about −½ … ½."""
+        mean = self.process.predict(points)[0]
+        z = np.clip((mean - self.low) / max(self.high - self.low, 1e-300), 0.0, 1.0) - 0.5
+        return np.stack([z, 0.5 - 4.0 * z * z], axis=1)
+
+
+def with_varying_noise(process: GaussianProcess, costs: Array, prior: HyperPrior, **terms: Any) -> GaussianProcess:
+    """The same model with a noise that depends on the action, if the observations speak for it; else `process`.
+
+    The noise grows with the mean of `process`, as a plug-in: the first step of Kersting et al. with a parametric
+    noise. Evidence: the likelihood must gain more than what Schwarz' criterion charges for the coefficients.
+
+    Args:
+        process: fitted with constant noise.
+        costs: (n,), those of `process`.
+        prior: over the hyperparameters.
+        terms: of `Covariance`, those of `process`.
+
+    Source: Kersting et al., Most likely heteroscedastic Gaussian process regression, ICML 2007; Schwarz, Estimating
+        the dimension of a model, 1978.
+    """
+    real = terms.get("real")
+    mask = np.ones(len(costs), dtype=np.bool_) if real is None else real
+    count = int(mask.sum())
+    if count < VARYING_FROM:
+        return process
+    means = process.predict(process.points[mask])[0]
+    growth = NoiseGrowth(process, float(means.min()), float(means.max()))
+    features = growth.features(process.points)
+    features[~mask] = 0.0
+    covariance = Covariance(process.points, prior, growth=features, **terms)
+    start = np.concatenate([process.theta, np.zeros(features.shape[1])])
+    varied = GaussianProcess(costs, covariance, mean=process.mean, scale=process.scale, growth=growth, start=start)
+    charge = 0.5 * features.shape[1] * math.log(count)
+    return varied if varied.log_likelihood > process.log_likelihood + charge else process
+
+
+@dataclass(frozen=True)
+class HyperparameterSearch:
+    """How hyperparameters are looked for; see `GaussianProcess`."""
+
+    start: Array | None = None
+    iterations: int = ITERATIONS
+
+
+AFRESH = HyperparameterSearch()
+
+
+def constant_mean_process(
+    points: Array, costs: Array, *, varying: bool = False, search: HyperparameterSearch = AFRESH
+) -> GaussianProcess:
+    """GP whose prior mean is the mean of the data: (n, dimension), (n,)."""
+    centre = float(costs.mean())
+    return _fitted(points, costs, _constant(centre), _scale(costs - centre, costs), varying, search=search)
+
+
+def zero_mean_process(
+    points: Array, costs: Array, *, varying: bool = False, search: HyperparameterSearch = AFRESH
+) -> GaussianProcess:
+    """GP with prior mean zero, as in the paper: unexplored means 'spills nothing'.
+
+    Limitations: on a cost in [0, 1] that is minimised by a lower confidence bound, it explores corners for ever and
+    loses to random search. For replication.
+    """
+    return _fitted(points, costs, _constant(0.0), _scale(costs, costs), varying, search=search)
+
+
+def simulated_mean_process(
+    simulated: GaussianProcess,
+    points: Array,
+    costs: Array,
+    *,
+    varying: bool = False,
+    search: HyperparameterSearch = AFRESH,
+) -> GaussianProcess:
+    """GP of the real cost around a surrogate of the simulated one: f_r = f_s + δ, f_s ~ `simulated`'s posterior.
+
+    The prior mean is the simulated surrogate's posterior mean, the prior covariance its posterior covariance plus that
+    of δ, so that a pour also corrects the surrogate where too few simulations were run.
+
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D3); Kennedy & O'Hagan 2000 with ρ = 1.
+    """
+    scale = max(simulated.scale, 1e-9)
+    terms = {"known": simulated, "unit": scale}
+    process = _fitted(points, costs, lambda x: simulated.predict(x)[0], scale, varying, RESIDUAL_PRIOR, search, **terms)
+    process.simulated_noise = simulated.noise
+    return process
+
+
+def joint_process(
+    simulated: Array,
+    simulated_costs: Array,
+    points: Array,
+    costs: Array,
+    *,
+    scaled: bool,
+    varying: bool = False,
+    widening: float = 1.0,
+    search: HyperparameterSearch = AFRESH,
+) -> GaussianProcess:
+    """GP of the real cost from simulations and real observations at once.
+
+    Pooled, simulations are observations of the same cost but for a constant, with a noise of their own that also holds
+    their discrepancy: f_r = f_s + β. Scaled, f_r = ρ f_s + β + δ, with ρ and δ fitted. See `covariance.py`.
+
+    Args:
+        simulated: (k, dimension), k ≥ 1, and their costs (k,).
+        points: (n, dimension), n ≥ 0, and their costs (n,).
+        scaled: which of the two.
+        varying: whether the noise of real observations may vary.
+        widening: factor on the median of the prior of the simulations' noise.
+        search: for the hyperparameters.
+
+    Source: Kennedy & O'Hagan, Predicting the output from a complex computer code when fast approximations are
+        available, Biometrika 2000.
+    """
+    both, values = np.concatenate([simulated, points]), np.concatenate([simulated_costs, costs])
+    centre = float(simulated_costs.mean())
+    terms = {"real": np.arange(len(both)) >= len(simulated), "scaled": scaled}
+    scale = _scale(values - centre, values)
+    prior = SCALED_PRIOR if scaled else POOLED_PRIOR
+    if widening != 1.0:
+        median, deviation = prior.simulated_noise
+        prior = replace(prior, simulated_noise=(widening * median, deviation))
+    return _fitted(both, values, _constant(centre), scale, varying, prior, search, **terms)
+
+
+def _fitted(
+    points: Array,
+    costs: Array,
+    mean: Mean,
+    scale: float,
+    varying: bool,
+    prior: HyperPrior = CONSTANT_PRIOR,
+    search: HyperparameterSearch = AFRESH,
+    **terms: Any,
+) -> GaussianProcess:
+    covariance = Covariance(points, prior, **terms)
+    process = GaussianProcess(
+        costs, covariance, mean=mean, scale=scale, start=search.start, iterations=search.iterations
+    )
+    return with_varying_noise(process, costs, prior, **terms) if varying else process
+
+
+def _of_noise_alone(residuals: Array) -> float:
+    """Log-likelihood of residuals (n,) as independent normal noise of the deviation that suits them best."""
+    variance = max(float(np.mean(residuals**2)), 1e-12)
+    return -0.5 * len(residuals) * (math.log(2 * math.pi * variance) + 1.0)
+
+
+def _constant(value: float) -> Mean:
+    return lambda points: np.full(len(points), value)
+
+
+def _scale(residuals: Array, costs: Array) -> float:
+    """Unit of the priors: the residuals' size, but on a plateau a tenth of the costs', so that doubt remains.
+
+    Costs below `SMALLEST_SCALE` count as zero, and zero costs have the unit 1.
+    """
+    size = float(np.sqrt(np.mean(residuals**2)))
+    floor = 0.1 * float(np.max(np.abs(costs)))
+    scale = max(size, floor)
+    return scale if scale >= SMALLEST_SCALE else 1.0
+
+
+ENDS = 64
+"""Lower ends that are tried, evenly by the probability below them."""
+
+HALVINGS = 50
+
+
+def highest_density_intervals(weights: Array, means: Array, deviations: Array, level: float) -> Array:
+    """Bands (m, 2) of y = clip(z, 0, 1), z of a mixture of normal distributions.
+
+    Where y may well be 0 the band begins there, and holds no more for that: an interval between two quantiles would
+    leave out the least likely end only.
+
+    Args:
+        weights: (J,), sum 1.
+        means, deviations: (J, m).
+        level: probability, between 0 and 1.
+    """
+    below = np.linspace(0.0, 1.0 - level, ENDS)
+    lows = _quantiles(weights, means, deviations, below)
+    highs = _quantiles(weights, means, deviations, below + level)
+    best = np.argmin(highs - lows, axis=0)
+    each = np.arange(means.shape[1])
+    return np.stack([lows[best, each], highs[best, each]], axis=1)
+
+
+def _quantiles(weights: Array, means: Array, deviations: Array, shares: Array) -> Array:
+    """(k, m) for shares (k,), by bisection."""
+    low, high = np.zeros((len(shares), means.shape[1])), np.ones((len(shares), means.shape[1]))
+    none = weights @ ndtr(-means / deviations) >= shares[:, None]
+    all_of_it = weights @ ndtr((1.0 - means) / deviations) <= shares[:, None]
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        under = np.einsum("j,jkm->km", weights, ndtr((middle - means[:, None, :]) / deviations[:, None, :]))
+        low, high = np.where(under < shares[:, None], middle, low), np.where(under < shares[:, None], high, middle)
+    return np.where(none, 0.0, np.where(all_of_it, 1.0, 0.5 * (low + high)))

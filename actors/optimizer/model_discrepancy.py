@@ -1,0 +1,365 @@
+"""Averaging over the ways in which a simulator can be wrong, each weighed by the observations.
+
+Hypothesis j says that the bench does at action x what the simulator does at a displaced one, nearer to or farther from
+its best action x̂, more or less of it, and something more that nobody simulated:
+
+    f(x) = μ_j(x) + δ(x),    μ_j(x) = clip(e^{g_j} f̂_s(z_j(x)), 0, 1),    δ ~ GP(0, v_j(x) v_j(x′) M_{ℓ_j}(x, x′))
+    z_j(x) = x̂ + e^{h_j} (A_j x + s_j − x̂),    v_j² = σ_j² + e^{2 g_j} s_s²(z_j(x))
+    y = f(x) + ε,    ε ~ N(0, (n_j + 0.15 μ_j(x))²)
+
+f̂_s and s_s are posterior mean and deviation of a GP of the simulations, costs in units of the largest one. h makes the
+valley wider or narrower than it was simulated, as walls and lips do that are not the simulator's. n, by which pours of
+one action differ, belongs to the hypothesis, too: a few pours nearby tell it. Two last ones, of equal prior weight, do
+not trust the simulator: it says the contrary, μ_j = clip(e^{g_j} (1 − f̂_s(z_j(x))), 0, 1); or it says nothing of this
+bench, and f is a GP around 0.6, more towards corners. The posterior weights are prior times marginal likelihood of the
+observations. So nothing is forgotten: a hypothesis that fails fades, and the weight of these two, ignorance, says how
+far the simulator is to be trusted.
+
+Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001.
+Limitations: the hypotheses are a fixed set; predictions come from at most 32 draws of them, and ignorance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.spatial.distance import cdist
+from scipy.special import ndtr, ndtri
+from scipy.stats import qmc
+
+from actors.optimizer.gaussian_process import GaussianProcess, highest_density_intervals
+from actors.optimizer.questions import ModelDiscrepancy
+
+Array = NDArray[np.float64]
+
+HYPOTHESES = 2048
+KEPT = 32
+"""Draws from the posterior weights that predictions are made from, evenly by weight: at most as many hypotheses."""
+GAIN = 0.3
+"""Standard deviation of g."""
+WIDTH = 0.25
+"""Standard deviation of h."""
+RESTS = (0.02, 0.3)
+"""Smallest and largest σ, in units of the largest cost; evenly by its logarithm, as ℓ."""
+LENGTHS = (0.15, 0.6)
+FARTHER = (0.4, 3.0)
+"""Factors on a displacement's deviations, evenly by their logarithm: tails for a bench that is far off."""
+NOISES, NOISE_GROWTH = (0.002, 0.05), 0.15
+"""Smallest and largest deviation of one observation where nothing is lost, evenly by its logarithm; and what it grows
+by where everything is lost."""
+IGNORANT_MEAN, IGNORANT_SIGNAL = 0.6, 0.4
+IGNORANT_EDGE = 0.3
+"""How much more ignorance expects in the corners than in the middle: a box is drawn around what may be good."""
+IGNORANT_LENGTHS = np.repeat((0.15, 0.3, 0.6), 3)
+IGNORANT_NOISES = np.tile((0.003, 0.01, 0.03), 3)
+"""ℓ and n of what ignorance consists of: were its scatter fixed, pours that hardly scatter would speak against it."""
+CONTRARY, CONTRARY_REST = 128, 0.15
+"""How many hypotheses take the simulator for the wrong way round, half of the ignorance beforehand being theirs; and
+their smallest σ: were they sure that all is lost where nothing was simulated to be, any pour that went wrong would
+speak for them."""
+KNOWN_SHARE = 0.75
+"""Share of the hypotheses around displacements that were found before, where some were."""
+KNOWN_SPREAD = 0.25
+"""Deviation of what is added to those, in that of the play."""
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Ways in which the simulator can be wrong.
+
+    Attributes:
+        scales, shifts: (J, dimension) of the displacements.
+        widths: (J,), logarithms of the factors on distances to the centre.
+        gains: (J,), logarithms.
+        rests: (J,), σ.
+        lengths: (J,), ℓ.
+        noises: (J,), n.
+        contrary: (J,), whether it takes the simulator for the wrong way round.
+        centre: (dimension,), the simulated best.
+    """
+
+    scales: Array
+    shifts: Array
+    widths: Array
+    gains: Array
+    rests: Array
+    lengths: Array
+    noises: Array
+    contrary: NDArray[np.bool_]
+    centre: Array
+
+    @classmethod
+    def of(cls, mismatch: ModelDiscrepancy, centre: Array) -> Hypotheses:
+        """Draw, the same for the same question: quasi-random, so that few cover much."""
+        dimension = len(mismatch.play)
+        rows = qmc.Sobol(2 * dimension + 7, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES)
+        rows = np.clip(np.concatenate([rows, rows[:CONTRARY]]), 1e-6, 1.0 - 1e-6)
+        z = ndtri(rows[:, : 2 * dimension])
+        width, gain, rest, length, far, known, noise = rows[:, 2 * dimension :].T
+        spread, contrary = _evenly(FARTHER, far), np.arange(len(rows)) >= HYPOTHESES
+        scales, shifts = np.ones((len(rows), dimension)), np.zeros((len(rows), dimension))
+        if mismatch.drawn:
+            index = np.minimum((known / KNOWN_SHARE * len(mismatch.drawn)).astype(int), len(mismatch.drawn) - 1)
+            around = known < KNOWN_SHARE
+            spread = np.where(around, KNOWN_SPREAD, spread)
+            scales[around] = np.array([one.scales for one in mismatch.drawn])[index[around]]
+            shifts[around] = np.array([one.shifts for one in mismatch.drawn])[index[around]]
+        shift, factor, origin = (
+            np.array([getattr(play, name) for play in mismatch.play]) for name in ("shift", "factor", "origin")
+        )
+        factors = np.exp(spread[:, None] * factor * z[:, dimension:])
+        moved = spread[:, None] * shift * z[:, :dimension] + (factors - 1.0) * origin
+        return cls(
+            factors * scales,
+            factors * shifts + moved,
+            WIDTH * ndtri(width),
+            GAIN * ndtri(gain),
+            np.where(contrary, _evenly((CONTRARY_REST, RESTS[1]), rest), _evenly(RESTS, rest)),
+            _evenly(LENGTHS, length),
+            _evenly(NOISES, noise),
+            contrary,
+            centre,
+        )
+
+    def only(self, kept: NDArray[np.int_]) -> Hypotheses:
+        """Some of them."""
+        names = "scales", "shifts", "widths", "gains", "rests", "lengths", "noises", "contrary"
+        return replace(self, **{name: getattr(self, name)[kept] for name in names})
+
+    def moved(self, points: Array) -> Array:
+        """(J, m, dimension): where each puts points (m, dimension) in the simulator."""
+        there = self.scales[:, None, :] * points[None, :, :] + self.shifts[:, None, :]
+        return np.asarray(self.centre + np.exp(self.widths)[:, None, None] * (there - self.centre))
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """What hypotheses (J) say of points (m) before any observation: means, deviations of δ, noises; (J, m) each."""
+
+    means: Array
+    spreads: Array
+    noises: Array
+
+
+class ModelAveragedProcess:
+    """The real cost, averaged over hypotheses; see the module. Its `predict` is a `Surrogate`'s.
+
+    Attributes:
+        simulated: surrogate of the simulations.
+        weights: posterior weights (J + ignorant ones,); of the last `len(IGNORANT_LENGTHS)` the simulator says nothing.
+        ignorance: their sum and that of the contrary ones.
+    """
+
+    def __init__(self, simulated: GaussianProcess, points: Array, costs: Array, mismatch: ModelDiscrepancy) -> None:
+        """Weigh the hypotheses.
+
+        Args:
+            simulated: of the same cost.
+            points: (n, dimension), real observations, n ≥ 0.
+            costs: (n,).
+            mismatch: of the question.
+        """
+        self.simulated, self.points, self.worst = simulated, points, mismatch.worst
+        self._costs = np.clip(costs / mismatch.worst, 0.0, 1.0)
+        self._all = Hypotheses.of(mismatch, _least(simulated))
+        informed = self._evidences(self._informed(self._all, points), self._all.lengths)
+        ignorant = self._evidences(self._ignorant(points, self._costs), IGNORANT_LENGTHS)
+        half = 0.5 * mismatch.ignorance
+        prior = np.where(self._all.contrary, half / CONTRARY, (1.0 - mismatch.ignorance) / HYPOTHESES)
+        logs = np.concatenate([informed + np.log(prior), ignorant + np.log(half / len(ignorant))])
+        weights = np.exp(logs - logs.max())
+        self.weights = weights / weights.sum()
+        told, alone = self.weights[: len(informed)], self.weights[len(informed) :]
+        self._trusting = np.where(self._all.contrary, 0.0, told)
+        self.ignorance = float(told[self._all.contrary].sum() + alone.sum())
+        kept, times = np.unique(_evenly_drawn(told, KEPT), return_counts=True)
+        self._kept = self._all.only(kept)
+        self.mixture = np.concatenate([times / KEPT * told.sum(), alone])
+        self._lengths = np.concatenate([self._kept.lengths, IGNORANT_LENGTHS])
+        self._least_noises = np.concatenate([self._kept.noises, IGNORANT_NOISES])
+        self._at_data = self._prior(points, self._costs)
+        self._factors = self._factorised(self._at_data, self._lengths, points)
+
+    # -- what the hypotheses say before any observation ------------------------------------------------------------
+
+    def _informed(self, hypotheses: Hypotheses, points: Array) -> _Prior:
+        J, m = len(hypotheses.gains), len(points)
+        if m == 0:
+            return _Prior(*(np.empty((J, 0)) for _ in range(3)))
+        mean, deviation = (
+            part.reshape(J, m) for part in self.simulated.predict(hypotheses.moved(points).reshape(J * m, -1))
+        )
+        gain = np.exp(hypotheses.gains)[:, None] / self.worst
+        means = np.clip(gain * np.where(hypotheses.contrary[:, None], self.worst - mean, mean), 0.0, 1.0)
+        spreads = np.hypot(hypotheses.rests[:, None], gain * deviation)
+        return _Prior(means, spreads, hypotheses.noises[:, None] + NOISE_GROWTH * means)
+
+    def _ignorant(self, points: Array, seen: Array | float) -> _Prior:
+        shape = len(IGNORANT_LENGTHS), len(points)
+        edge = ((2.0 * points - 1.0) ** 2).mean(axis=1)
+        means = np.broadcast_to(IGNORANT_MEAN + IGNORANT_EDGE * np.clip(edge, 0.0, 1.0), shape)
+        noises = IGNORANT_NOISES[:, None] + NOISE_GROWTH * np.broadcast_to(seen, shape)  # by what was seen, if anything
+        return _Prior(means, np.full(shape, IGNORANT_SIGNAL), noises)
+
+    def _prior(self, points: Array, seen: Array | float = IGNORANT_MEAN) -> _Prior:
+        parts = self._informed(self._kept, points), self._ignorant(points, seen)
+        return _Prior(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("means", "spreads", "noises")))
+
+    # -- what the observations say ---------------------------------------------------------------------------------
+
+    def _evidences(self, prior: _Prior, lengths: Array) -> Array:
+        """Log marginal likelihoods (J,)."""
+        if not len(self._costs):
+            return np.zeros(len(lengths))
+        L = self._factorised(prior, lengths, self.points)
+        residuals = np.linalg.solve(L, (self._costs - prior.means)[:, :, None])[:, :, 0]
+        logs = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
+        return np.asarray(-0.5 * (residuals**2).sum(axis=1) - logs)
+
+    def _factorised(self, prior: _Prior, lengths: Array, points: Array) -> Array:
+        """Lower Cholesky factors (J, n, n) of the observations' covariances."""
+        n = len(points)
+        if n == 0:
+            return np.zeros((len(lengths), 0, 0))
+        K = _correlation(points, points, lengths) * prior.spreads[:, :, None] * prior.spreads[:, None, :]
+        K[:, np.arange(n), np.arange(n)] += prior.noises**2
+        return np.asarray(np.linalg.cholesky(K))
+
+    def components(self, points: Array) -> tuple[Array, Array, Array]:
+        """Posterior means, deviations and noises (components, m) at points (m, dimension), in units of the worst."""
+        prior = self._prior(points)
+        if not len(self.points):
+            return prior.means, prior.spreads, prior.noises
+        cross = self._cross(prior, points)
+        means, variances = np.empty_like(prior.means), np.empty_like(prior.means)
+        for j, L in enumerate(self._factors):
+            V = solve_triangular(L, cross[j].T, lower=True, check_finite=False)
+            residuals = solve_triangular(L, self._costs - self._at_data.means[j], lower=True, check_finite=False)
+            means[j] = prior.means[j] + V.T @ residuals
+            variances[j] = prior.spreads[j] ** 2 - np.einsum("ij,ij->j", V, V)
+        return means, np.sqrt(np.maximum(variances, 1e-10)), self._noises(means)
+
+    def _noises(self, means: Array) -> Array:
+        return np.asarray(self._least_noises[:, None] + NOISE_GROWTH * np.clip(means, 0.0, 1.0))
+
+    def covariances(self, first: Array, second: Array) -> Array:
+        """Posterior covariances (components, m, k) of f between points (m, dimension) and others (k, dimension)."""
+        at_first, at_second = self._prior(first), self._prior(second)
+        found = _correlation(first, second, self._lengths)
+        found *= at_first.spreads[:, :, None] * at_second.spreads[:, None, :]
+        if len(self.points):
+            crosses = self._cross(at_first, first), self._cross(at_second, second)
+            for j, L in enumerate(self._factors):
+                V, W = (solve_triangular(L, cross[j].T, lower=True, check_finite=False) for cross in crosses)
+                found[j] -= V.T @ W
+        return np.asarray(found)
+
+    def differences(self, points: Array, place: Array) -> Array:
+        """Posterior deviations (components, m) of f(points) − f(place), place (dimension,)."""
+        own = self.covariances(points, place[None, :])[:, :, 0]
+        deviations, at_place = self.components(points)[1], self.components(place[None, :])[1]
+        return np.sqrt(np.maximum(deviations**2 + at_place**2 - 2.0 * own, 1e-12))
+
+    def _cross(self, prior: _Prior, points: Array) -> Array:
+        correlation = _correlation(points, self.points, self._lengths)
+        return np.asarray(correlation * prior.spreads[:, :, None] * self._at_data.spreads[:, None, :])
+
+    # -- what follows for the cost ---------------------------------------------------------------------------------
+
+    def predict(self, points: Array) -> tuple[Array, Array]:
+        """See `Surrogate.predict`: moments of the cost, which is between 0 and the worst."""
+        means, deviations, _ = self.components(points)
+        first, second = clipped_moments(means, deviations)
+        mean = self.mixture @ first
+        return self.worst * mean, self.worst * np.sqrt(np.maximum(self.mixture @ second - mean**2, 1e-12))
+
+    def noise_at(self, points: Array) -> Array:
+        """Standard deviations of single real observations at points (m, dimension): (m,), in the cost's unit."""
+        if not len(points):
+            return np.empty(0)
+        return self.worst * np.sqrt(self.mixture @ self.components(points)[2] ** 2)
+
+    def exceedance(self, points: Array, loss: float) -> Array:
+        """Probabilities (m,) that an observation at points (m, dimension) is above a loss."""
+        means, deviations, noises = self.components(points)
+        return np.asarray(self.mixture @ ndtr((means - loss / self.worst) / np.hypot(deviations, noises)))
+
+    def bands(self, points: Array, level: float) -> Array:
+        """Shortest intervals (m, 2), in the cost's unit, that hold single observations at points (m, dimension)."""
+        means, deviations, noises = self.components(points)
+        return self.worst * highest_density_intervals(self.mixture, means, np.hypot(deviations, noises), level)
+
+    # -- for people and pictures -----------------------------------------------------------------------------------
+
+    @property
+    def hyperparameters(self) -> dict[str, float]:
+        """What the hypotheses are, by name."""
+        noise = self.worst * float(self.mixture @ self._least_noises)
+        return {"noise": noise, "simulated_noise": self.simulated.noise, "ignorance": self.ignorance}
+
+    def displaced(self) -> tuple[Array, Array, float]:
+        """Shift of the cube's centre (dimension,), its deviation, and the median factor on the cost."""
+        weights = self._trusting / max(self._trusting.sum(), 1e-300)
+        shifts = 0.5 * (self._all.scales - 1.0) + self._all.shifts
+        mean = weights @ shifts
+        deviation = np.sqrt(np.maximum(weights @ (shifts - mean) ** 2, 0.0))
+        order = np.argsort(self._all.gains, kind="stable")
+        median = order[np.searchsorted(np.cumsum(weights[order]), 0.5).clip(max=len(order) - 1)]
+        return np.asarray(mean), np.asarray(deviation), float(np.exp(self._all.gains[median]))
+
+    def drawn(self, count: int) -> tuple[Array, Array]:
+        """Scales and shifts (count, dimension) of displacements drawn from the posterior, evenly by their weight."""
+        chosen = _evenly_drawn(self._trusting, count)
+        return self._all.scales[chosen], self._all.shifts[chosen]
+
+    @property
+    def heaviest(self) -> tuple[Hypotheses, Array]:
+        """The hypotheses that predictions come from, and their weights."""
+        return self._kept, self.mixture[: len(self._kept.gains)]
+
+
+def _least(simulated: GaussianProcess) -> Array:
+    """The simulated place (dimension,) that is expected to cost least."""
+    return np.asarray(simulated.points[int(np.argmin(simulated.predict(simulated.points)[0]))])
+
+
+def clipped_moments(means: Array, deviations: Array) -> tuple[Array, Array]:
+    """E clip(f, 0, 1) and E clip(f, 0, 1)² of normal f."""
+    low, high = -means / deviations, (1.0 - means) / deviations
+    inside = ndtr(high) - ndtr(low)
+    p, q = _density(low), _density(high)
+    above = ndtr(-high)
+    first = means * inside + deviations * (p - q) + above
+    second = (means**2 + deviations**2) * inside + deviations * (means * p - (means + 1.0) * q) + above
+    return np.clip(first, 0.0, 1.0), np.clip(second, 0.0, 1.0)
+
+
+def shortfall(level: Array | float, means: Array, deviations: Array) -> Array:
+    """E (level − f)⁺ of normal f."""
+    u = (level - means) / deviations
+    return np.asarray((level - means) * ndtr(u) + deviations * _density(u))
+
+
+def _density(u: Array) -> Array:
+    return np.asarray(np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi))
+
+
+def _evenly_drawn(weights: Array, count: int) -> NDArray[np.int_]:
+    """Hypotheses (count,), drawn at even steps of their weights (J,), heaviest first."""
+    order = np.argsort(-weights, kind="stable")
+    levels = (np.arange(count) + 0.5) / count * weights.sum()
+    return np.asarray(order[np.searchsorted(np.cumsum(weights[order]), levels).clip(max=len(order) - 1)])
+
+
+def _evenly(bounds: tuple[float, float], u: Array) -> Array:
+    low, high = bounds
+    return np.asarray(low * (high / low) ** u)
+
+
+def _correlation(first: Array, second: Array, lengths: Array) -> Array:
+    """Matérn 5/2 correlations (J, m, k) for each of the lengthscales (J,)."""
+    s = np.sqrt(5.0) * cdist(first, second)[None, :, :] / lengths[:, None, None]
+    return np.asarray((1.0 + s + s**2 / 3.0) * np.exp(-s))

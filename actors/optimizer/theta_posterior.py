@@ -1,0 +1,198 @@
+"""What weighed pours say about θ: a region of the unit cube and not a point. Sampled on a surrogate; numpy only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+from scipy.stats import qmc
+
+from actors.optimizer.covariance import matern
+from actors.optimizer.gaussian_process import GaussianProcess
+
+Array = NDArray[np.float64]
+
+WALKERS = 32
+"""At least; a stretch move needs more than twice as many as there are dimensions."""
+STEPS, BURN_IN = 300, 100
+STRETCH = 2.0
+STARTS = 256
+"""Even places of which the walkers begin at the likeliest, drawn by their likelihood."""
+
+DISCREPANCY_PRIOR = (0.02, 1.0)
+"""Median and sd of the logarithm of what the best θ still lacks, in the cost's unit: 2 % of what is poured."""
+DISCREPANCY_LENGTH = 0.4
+"""Lengthscale over actions of what the best θ lacks, in the unit cube: without it a bias that all pours share would
+count as many independent errors, and θ would seem far better known than it is."""
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """Equally weighted draws.
+
+    Attributes:
+        points: (count, dimension), in the unit cube.
+        discrepancies: (count,) sampled standard deviations of what θ still lacks, in the cost's unit.
+        effective: how many independent draws the chain is worth.
+    """
+
+    points: Array
+    discrepancies: Array
+    effective: float
+
+
+def sample_posterior(
+    process: GaussianProcess,
+    contexts: Array,
+    offsets: Array,
+    *,
+    noise: float,
+    count: int,
+    snap: Callable[[Array], Array],
+    rng: np.random.Generator,
+    prior: Array | None = None,
+) -> Sampled:
+    """Draw θ from p(θ | pours) ∝ p(θ) N(e(θ); 0, S(θ) + n² I + σ_δ² M), θ in the cube.
+
+    e_i(θ) = m(θ, a_i) + o_i is weighed minus simulated spillage of pour i; S(θ) the surrogate's posterior covariance
+    over the pours; n² the variances of a weighing and of simulations around the surrogate, which hold what it can't
+    follow (a kink); σ_δ² M what even the best θ lacks, a Matérn 5/2 over actions. σ_δ is sampled with θ. The
+    chain is an affine-invariant ensemble, at home on the long narrow ridges along which θ make up for each other.
+
+    Args:
+        process: of signed differences c_r − c_s over (θ, a).
+        contexts: (n, c) actions of the pours, in their unit cube.
+        offsets: (n,) weighed spillage minus the regressed one that the differences were formed with.
+        noise: standard deviation of a weighed pour.
+        count: of draws to return.
+        snap: rounds integer axes of points (m, dimension).
+        prior: p(θ), (dimension, 2) centres and deviations of normals in the cube; along axes with a deviation of 0, and
+            along all of them without any row, it is uniform.
+
+    Source: Kennedy & O'Hagan, Bayesian calibration of computer models, 2001; Goodman & Weare, Ensemble samplers with
+        affine invariance, 2010.
+    Limitations: the surrogate's hyperparameters and M's lengthscale are taken for known.
+    """
+    n, dimension = len(contexts), process.points.shape[1] - contexts.shape[1]
+    likelihood = _Likelihood(process, contexts, offsets, noise, dimension, snap)
+    walkers = max(WALKERS, 4 * (dimension + 1))
+    median, width = DISCREPANCY_PRIOR
+    centres, deviations = (np.zeros((dimension, 2)) if prior is None or not len(prior) else prior).T
+    precision = np.divide(1.0, deviations, out=np.zeros(dimension), where=deviations > 0.0)
+
+    def density(x: Array) -> Array:
+        inside = np.all((x[:, :dimension] >= 0.0) & (x[:, :dimension] <= 1.0), axis=1)
+        values = np.full(len(x), -np.inf)
+        if inside.any():
+            logs = x[inside, dimension]
+            values[inside] = likelihood(x[inside, :dimension], np.exp(logs))
+            values[inside] -= 0.5 * ((logs - math.log(median)) / width) ** 2
+            values[inside] -= 0.5 * (((x[inside, :dimension] - centres) * precision) ** 2).sum(axis=1)
+        return values
+
+    assert n > 0
+    starts = qmc.Sobol(dimension + 1, rng=rng).random(STARTS)
+    starts[:, dimension] = math.log(median) + width * (2.0 * starts[:, dimension] - 1.0)
+    at_starts = density(starts)
+    weights = np.exp(at_starts - at_starts.max())
+    # At least as many different ones as walkers span all directions: an ensemble never leaves the plane it begins in.
+    best = np.argsort(-at_starts, kind="stable")[: walkers // 2]
+    drawn = rng.choice(STARTS, walkers - len(best), p=weights / weights.sum())
+    x = starts[np.concatenate([best, drawn])]
+    x = x + 1e-3 * rng.standard_normal(x.shape)
+    x[:, :dimension] = np.clip(x[:, :dimension], 1e-6, 1.0 - 1e-6)
+    chain = _stretched(x, density, rng)
+    kept = chain[BURN_IN:]
+    flat = kept.reshape(-1, dimension + 1)
+    chosen = flat[np.linspace(0, len(flat) - 1, count).round().astype(int)]
+    return Sampled(snap(chosen[:, :dimension]), np.exp(chosen[:, dimension]), _effective(kept))
+
+
+def drawn_beforehand(count: int, dimension: int, prior: Array, rng: np.random.Generator) -> Array:
+    """Draws (count, dimension) of θ before anything is weighed: even in the cube, along the axes of `prior` normal."""
+    points = qmc.Sobol(dimension, rng=rng).random(2 ** math.ceil(math.log2(max(count, 2))))[:count]
+    for i, (centre, deviation) in enumerate(prior):
+        if deviation > 0.0:
+            low, high = ndtr((np.array([0.0, 1.0]) - centre) / deviation)
+            points[:, i] = np.clip(centre + deviation * ndtri(low + points[:, i] * (high - low)), 0.0, 1.0)
+    return np.asarray(points)
+
+
+class _Likelihood:
+    """log N(e(θ); 0, C(θ)) for many θ at once."""
+
+    def __init__(
+        self,
+        process: GaussianProcess,
+        contexts: Array,
+        offsets: Array,
+        noise: float,
+        dimension: int,
+        snap: Callable[[Array], Array],
+    ) -> None:
+        self._process, self._contexts, self._offsets, self._snap = process, contexts, offsets, snap
+        n = len(contexts)
+        # Within one θ the prior covariance of a stationary process depends on the actions alone.
+        at_one = np.concatenate([np.full((n, dimension), 0.5), contexts], axis=1)
+        self._prior = process.prior_covariance(at_one)
+        self._scatter = (noise**2 + process.noise**2 + 1e-10) * np.eye(n)
+        lengths = np.full(contexts.shape[1], DISCREPANCY_LENGTH)
+        self._lack = matern(contexts, contexts, lengths)[0]
+
+    def __call__(self, thetas: Array, discrepancies: Array) -> Array:
+        """(m, dimension), (m,) → (m,)."""
+        m, n = len(thetas), len(self._contexts)
+        joint = np.concatenate([np.repeat(self._snap(thetas), n, axis=0), np.tile(self._contexts, (m, 1))], axis=1)
+        means, V = self._process.projected(joint)
+        errors = means.reshape(m, n) + self._offsets
+        V = V.reshape(len(V), m, n).transpose(1, 2, 0)
+        C = self._prior - V @ V.transpose(0, 2, 1) + self._scatter + discrepancies[:, None, None] ** 2 * self._lack
+        C = C + 1e-9 * np.trace(self._prior) / n * np.eye(n)
+        L = np.linalg.cholesky(C)
+        white = np.linalg.solve(L, errors[:, :, None])[:, :, 0]
+        logs = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
+        return np.asarray(-0.5 * (white**2).sum(axis=1) - logs)
+
+
+def _stretched(x: Array, density: Callable[[Array], Array], rng: np.random.Generator) -> Array:
+    """The chain of an ensemble (walkers, d): (STEPS, walkers, d)."""
+    walkers, d = x.shape
+    halves = np.arange(walkers) % 2
+    values = density(x)
+    chain = np.empty((STEPS, walkers, d))
+    for step in range(STEPS):
+        for half in (0, 1):
+            moving, still = np.flatnonzero(halves == half), np.flatnonzero(halves != half)
+            z = ((STRETCH - 1.0) * rng.random(len(moving)) + 1.0) ** 2 / STRETCH
+            others = x[rng.choice(still, len(moving))]
+            proposed = others + z[:, None] * (x[moving] - others)
+            there = density(proposed)
+            accepted = np.log(rng.random(len(moving))) < (d - 1) * np.log(z) + there - values[moving]
+            x[moving[accepted]], values[moving[accepted]] = proposed[accepted], there[accepted]
+        chain[step] = x
+    return chain
+
+
+def _effective(chain: Array) -> float:
+    """Independent draws that a chain (steps, walkers, d) is worth: of its slowest coordinate.
+
+    Source: Geyer's initial positive sequence on the walkers' mean autocovariance.
+    """
+    steps, walkers, d = chain.shape
+    worst = 1.0
+    for i in range(d):
+        x = chain[:, :, i] - chain[:, :, i].mean()
+        covariances = np.array([np.mean(x[: steps - lag] * x[lag:]) for lag in range(steps // 2)])
+        if covariances[0] <= 0.0:
+            continue
+        time = 1.0
+        for correlation in covariances[1:] / covariances[0]:
+            if correlation < 0.05:
+                break
+            time += 2.0 * float(correlation)
+        worst = max(worst, time)
+    return float(steps * walkers / worst)

@@ -1,0 +1,310 @@
+"""Child processes: the only module of the product that starts other programs.
+
+    child = ChildProcess(python_module("actors.emulators.ur_controller", "--address", address))
+    ready = child.read_line(deadline=40.0)
+    …
+    child.close()
+
+Every child has:
+
+- an explicit copy of the environment. Without one, the system reads the C array of this process while another thread
+  may change `os.environ`; the start then fails with EFAULT ('Bad address').
+- a session of its own. Ctrl-C in the terminal reaches this program only, which ends its children in order.
+- a way to notice the end of this program, however it ends: its standard input ends, or its connection does.
+
+`ConnectedProcess` exchanges Python objects with its child. `run` and `run_async` start a program and wait for its end.
+
+This module does not restart anything: the owner of a child decides that.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from multiprocessing.connection import Connection
+from typing import IO, Literal
+
+Completed = subprocess.CompletedProcess[str]
+"""What `run` returns: `returncode`, `stdout`, `stderr`."""
+
+GRACE = 10.0
+"""Default time for a child to end by itself [s]."""
+
+_ERRORS_KEPT = 2000
+_PR_SET_PDEATHSIG = 1
+
+
+def child_environment(changes: Mapping[str, str | None] | None = None) -> dict[str, str]:
+    """A copy of this process's environment for a child. Other threads may change `os.environ` meanwhile.
+
+    Args:
+        changes: variables to add or replace; None removes one.
+    """
+    while True:
+        try:
+            wanted: dict[str, str | None] = {**dict(os.environ), **(changes or {})}
+            return {name: value for name, value in wanted.items() if value is not None}
+        except KeyError:  # another thread removed a variable between listing the names and reading the values
+            continue
+
+
+def python_module(module: str, *arguments: str) -> list[str]:
+    """The command that runs a module with this interpreter."""
+    return [sys.executable, "-m", module, *arguments]
+
+
+class ChildProcess:
+    """A running program with pipes to it.
+
+    Args:
+        command: program and arguments.
+        environment: variables that differ from this process's.
+        input: whether its standard input is a pipe; else it is empty.
+        output: whether its standard output is a pipe; else it goes where the errors go.
+        errors: its standard error: 'kept' for `errors_kept`, 'shown' on this process's, 'dropped', or a file.
+        inherited: file descriptors that it gets.
+        dies_with_parent: Linux kills it when this process ends, even by SIGKILL. Only for a process with one thread:
+            code between fork and exec must not wait for another thread's lock, and the kernel means the *thread* that
+            started the child.
+
+    Raises:
+        OSError: it does not start.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        *,
+        environment: Mapping[str, str | None] | None = None,
+        input: bool = True,  # noqa: A002 - subprocess calls it so
+        output: bool = True,
+        errors: Literal["kept", "shown", "dropped"] | IO[bytes] = "kept",
+        inherited: Sequence[int] = (),
+        dies_with_parent: bool = False,
+    ) -> None:
+        self._errors: IO[bytes] | None = None
+        target: IO[bytes] | int | None
+        if errors == "kept":
+            # A file: a pipe that is not read fills up, and its writer waits for ever.
+            target = self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with this object
+        else:
+            target = {"shown": None, "dropped": subprocess.DEVNULL}[errors] if isinstance(errors, str) else errors
+        self._received = b""
+        self._process: subprocess.Popen[bytes] = subprocess.Popen(
+            list(command),
+            stdin=subprocess.PIPE if input else subprocess.DEVNULL,
+            stdout=subprocess.PIPE if output else target,
+            stderr=target,
+            env=child_environment(environment),
+            pass_fds=tuple(inherited),
+            start_new_session=True,
+            preexec_fn=_tied_to_parent() if dies_with_parent else None,  # noqa: PLW1509 - see `dies_with_parent`
+        )
+        self.pid = self._process.pid
+        """Its process id."""
+
+    @property
+    def status(self) -> int | None:
+        """Its exit status, minus the number of the signal that ended it; None while it runs."""
+        return self._process.poll()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it runs."""
+        return self.status is None
+
+    @property
+    def errors_kept(self) -> str:
+        """The end of its standard error (and of its output, if that is no pipe), where these are kept."""
+        if self._errors is None:
+            return ""
+        with contextlib.suppress(OSError, ValueError):  # closed
+            size = os.fstat(self._errors.fileno()).st_size
+            data = os.pread(self._errors.fileno(), _ERRORS_KEPT, max(0, size - _ERRORS_KEPT))
+            return data.decode("utf-8", "replace").strip()
+        return ""
+
+    @property
+    def last_error(self) -> str:
+        """The last line of `errors_kept`, or nothing."""
+        return (self.errors_kept.splitlines() or [""])[-1].strip()
+
+    def write(self, data: bytes) -> None:
+        """Write to its standard input.
+
+        Raises:
+            OSError: it has ended.
+            ValueError: its input is closed.
+        """
+        assert self._process.stdin is not None
+        self._process.stdin.write(data)
+        self._process.stdin.flush()
+
+    def read_line(self, deadline: float | None = None) -> bytes:
+        """The next line of its standard output, with its end.
+
+        Args:
+            deadline: longest wait [s]; 0: only what has come already; None: no limit.
+
+        Raises:
+            TimeoutError: no whole line in time; what came of it is kept for the next call.
+            EOFError: it has closed its output, by ending as a rule.
+        """
+        assert self._process.stdout is not None
+        end = None if deadline is None else time.monotonic() + deadline
+        while b"\n" not in self._received:
+            left = None if end is None else max(end - time.monotonic(), 0.0)
+            if not select.select([self._process.stdout], [], [], left)[0]:
+                raise TimeoutError(f"no line within {deadline:g} s")
+            piece = os.read(self._process.stdout.fileno(), 65536)
+            if not piece:
+                raise EOFError("its output has ended")
+            self._received += piece
+        line, newline, self._received = self._received.partition(b"\n")
+        return line + newline
+
+    def close_input(self) -> None:
+        """End its standard input, by which most children end. May be called again."""
+        with contextlib.suppress(OSError):  # what was not flushed is lost with a child that has ended
+            if self._process.stdin is not None:
+                self._process.stdin.close()
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for its end; whether it has come."""
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def terminate(self) -> None:
+        """Send SIGTERM."""
+        self._process.terminate()
+
+    def kill(self, patience: float = 5.0) -> None:
+        """Send SIGKILL and wait for the end. May be called again.
+
+        Args:
+            patience: longest wait [s]; the kernel may delay the end, e.g. during a disk access.
+        """
+        self._process.kill()
+        self.wait(patience)
+
+    def close(self, grace: float = GRACE, *, terminate: bool = False) -> None:
+        """End it: end its input, wait, kill it if it goes on, release the pipes. May be called again.
+
+        Args:
+            grace: time to end by itself [s].
+            terminate: send SIGTERM as well, for a program that does not end with its input.
+        """
+        self.close_input()
+        if terminate:
+            self.terminate()
+        if not self.wait(grace):
+            self.kill()
+        self.release()
+
+    def release(self) -> None:
+        """Close the pipes and what is kept, whether it has ended or not. May be called again."""
+        self.close_input()
+        for file in (self._process.stdout, self._errors):
+            if file is not None:
+                file.close()
+
+
+class ConnectedProcess(ChildProcess):
+    """`python -m MODULE FD`: a child that exchanges Python objects with this process.
+
+    Its output and its errors are kept. It ends when this process closes `connection` or ends.
+
+    Args:
+        module: to run; its argument is the file descriptor of its end of the connection.
+
+    Attributes:
+        connection: to the child.
+    """
+
+    def __init__(self, module: str) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            command = python_module(module, str(theirs.fileno()))
+            super().__init__(command, input=False, output=False, inherited=(theirs.fileno(),))
+        self.connection = Connection(ours.detach())
+
+
+def run(command: Sequence[str], *, timeout: float, environment: Mapping[str, str | None] | None = None) -> Completed:
+    """Run a program to its end, with empty input. Returns its status, output and errors.
+
+    Raises:
+        TimeoutError: it took longer than `timeout` [s] and was killed.
+        OSError: it does not start.
+    """
+    try:
+        return subprocess.run(
+            list(command),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=timeout,
+            env=child_environment(environment),
+        )
+    except subprocess.TimeoutExpired as error:
+        raise TimeoutError(str(error)) from None
+
+
+async def run_async(command: Sequence[str], data: bytes, *, timeout: float) -> bytes:
+    """Run a program to its end from an event loop.
+
+    Args:
+        command: program and arguments.
+        data: for its standard input.
+        timeout: longest time for it [s]; then it is killed.
+
+    Returns:
+        Its output.
+
+    Raises:
+        TimeoutError: it took too long.
+        OSError: it does not start.
+    """
+    process = await asyncio.create_subprocess_exec(
+        *command,
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.DEVNULL,
+        env=child_environment(),
+    )
+    try:
+        return (await asyncio.wait_for(process.communicate(data), timeout))[0]
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+
+
+def _tied_to_parent() -> Callable[[], None] | None:
+    """For `preexec_fn`: the kernel kills the child when this thread ends. None where there is no such call.
+
+    Source: prctl(2), PR_SET_PDEATHSIG.
+    """
+    if not sys.platform.startswith("linux"):
+        return None
+    prctl, parent = ctypes.CDLL(None, use_errno=True).prctl, os.getpid()
+
+    def tie() -> None:
+        prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # it ended before the request
+            os._exit(1)
+
+    return tie

@@ -1,1 +1,0 @@
-"""Simulators as a pool: in processes of their own, or in this one."""

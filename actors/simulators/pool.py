@@ -1,0 +1,544 @@
+"""A pool of simulators in processes of their own that survives its members' deaths.
+
+What a pool knows of one of its simulators: whether it is up, and the jobs that were sent to it.
+
+The members of a pool: started, greeted, replaced when they are lost, and ended.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
+from actors.runtime.cluster_nodes import Versions
+from actors.simulators.ray_worker import CONTROL, Greeting, WorkerReply, simulator_actor
+from actors.simulators.simulation_task import RETRIES, Account, PoolStatistics, Simulator, pour_simulator
+from actors.simulators.task_transfer import Packer
+from sim_engine.outcome import SimulatedPour
+from sim_engine.scene import PourTask
+
+
+@dataclass(eq=False)
+class SimulationJob:
+    """A simulation that somebody waits for.
+
+    Attributes:
+        task: packed, without paths.
+        meshes: Ray's references of its meshes.
+        future: gets the result, or the reason why there is none.
+        deaths: simulators that died over it.
+    """
+
+    task: PourTask
+    meshes: Sequence[Any]
+    future: asyncio.Future[SimulatedPour]
+    deaths: int = 0
+
+    def fail(self, error: Exception) -> None:
+        """Say why there is no result."""
+        if not self.future.done():
+            self.future.set_exception(error)
+
+
+@dataclass(eq=False)
+class SentJob:
+    """A job at a simulator.
+
+    Attributes:
+        number: of this sending; no two have the same.
+        recalled: nobody wants this answer any more: cancelled, or given to another simulator.
+    """
+
+    job: SimulationJob
+    number: int
+    recalled: bool = False
+
+
+@dataclass(eq=False)
+class Member:
+    """A simulator actor. A number is used once, so that the dead are not taken for the living.
+
+    Attributes:
+        greeted: done when its process is up, or will not be.
+        sent: jobs in the order in which it does them; the first one is under way.
+        overdue: fires when the first job takes too long.
+        begun: when the first job began, by the event loop's clock [s].
+    """
+
+    number: int
+    actor: Any
+    greeted: asyncio.Future[Greeting]
+    sent: deque[SentJob] = field(default_factory=deque)
+    overdue: asyncio.TimerHandle | None = None
+    begun: float = 0.0
+
+    @property
+    def greeting(self) -> Greeting | None:
+        """None unless its process is up."""
+        done = self.greeted.done() and not self.greeted.cancelled() and self.greeted.exception() is None
+        return self.greeted.result() if done else None
+
+    @property
+    def spare(self) -> SentJob | None:
+        """The last job, if it can't have begun and is still wanted."""
+        return self.sent[-1] if len(self.sent) > 1 and not self.sent[-1].recalled else None
+
+    def drop_timer(self) -> None:
+        """The first job is no longer timed."""
+        if self.overdue is not None:
+            self.overdue.cancel()
+            self.overdue = None
+
+
+def look_away(answer: asyncio.Future[Any]) -> None:
+    """Take note of a late answer, so that asyncio does not complain that nobody did."""
+    if not answer.cancelled():
+        answer.exception()
+
+
+RESTART_PAUSE = 20.0
+"""After a member's process failed to start, another one is tried so much later [s]: the cause may be lasting."""
+
+_TELLING_PAUSE = 1.0
+"""Losses within so much time are reported together [s]: a lost node takes many with it."""
+
+
+class WorkerPool:
+    """Keeps a number of simulator actors alive. Those that can't be placed (a node was lost) are waited for.
+
+    Args:
+        size: number of members.
+        start: starts an actor.
+        expected: versions that members must have; None where they can't differ.
+        changed: called when a member has come up, or can't.
+        tell: told of losses, in words for people.
+    """
+
+    def __init__(
+        self,
+        size: int,
+        start: Callable[[], Any],
+        *,
+        expected: Versions | None,
+        changed: Callable[[], None],
+        tell: Callable[[str], None],
+    ) -> None:
+        self._start, self._expected, self._changed, self._tell = start, expected, changed, tell
+        self._loop = asyncio.get_running_loop()
+        self._members: dict[int, Member] = {}
+        self._numbers = 0
+        self._losses: list[tuple[str, int]] = []
+        self._closed = False
+        self.size = size
+        self.problem = ""
+        for _ in range(size):
+            self._add()
+
+    @property
+    def up(self) -> list[Member]:
+        """Members whose processes have started."""
+        return [member for member in self._members.values() if member.greeting is not None]
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether no member is up or starting."""
+        return not self._members
+
+    def __contains__(self, member: Member) -> bool:
+        return member.number in self._members
+
+    async def greeted(self) -> list[Greeting]:
+        """What the members say of themselves; waits for those that are starting."""
+        if self._members:
+            await asyncio.wait([member.greeted for member in self._members.values()])
+        return [member.greeting for member in self.up if member.greeting is not None]
+
+    def grow(self, size: int) -> None:
+        """Have at least so many members."""
+        while self.size < size and not self._closed:
+            self.size += 1
+            self._add()
+
+    def lose(self, member: Member, orphans: int) -> None:
+        """A member is gone, or has to go; a new one takes its place.
+
+        Args:
+            member: which.
+            orphans: how many jobs it leaves to others.
+        """
+        self._remove(member)
+        if not self._losses:
+            self._loop.call_later(_TELLING_PAUSE, self._tell_losses)
+        self._losses.append(("" if member.greeting is None else member.greeting.host, orphans))
+        self._add()
+
+    async def close(self, deadline: float) -> None:
+        """Have the members write their compiled kernels, then end their processes.
+
+        Args:
+            deadline: longest time for the writing [s].
+        """
+        self._closed = True
+        members = list(self._members.values())
+        up = self.up
+        self._members = {}
+        closing = {asyncio.wrap_future(member.actor.close.remote().future()) for member in up}
+        if closing:
+            await asyncio.wait(closing, timeout=deadline)
+        for answer in closing:
+            answer.add_done_callback(look_away)
+        for member in members:
+            _kill(member)
+
+    def _add(self) -> None:
+        if self._closed:
+            return
+        self._numbers += 1
+        actor = self._start()
+        member = Member(self._numbers, actor, asyncio.wrap_future(actor.greet.remote().future()))
+        self._members[member.number] = member
+        member.greeted.add_done_callback(partial(self._greeted, member))
+
+    def _greeted(self, member: Member, greeted: asyncio.Future[Greeting]) -> None:
+        """A member's process is up, or does not start."""
+        error = None if greeted.cancelled() else greeted.exception()
+        if member not in self:
+            return
+        if (greeting := member.greeting) is None:
+            if "error raised in its creation task" in str(error):
+                self._refuse(member, f"a simulator's process does not start: {_last_line(error)}")
+            else:
+                self.lose(member, 0)
+        elif self._expected is not None and (difference := self._expected.difference(greeting.versions)):
+            self._refuse(member, f"the simulator on {greeting.host} is not like this machine's: {difference}")
+        self._changed()
+
+    def _refuse(self, member: Member, problem: str) -> None:
+        """A member that would fail again, or deceive; another one is tried later."""
+        self._remove(member)
+        if problem != self.problem:
+            self.problem = problem
+            self._tell(problem)
+        self._loop.call_later(RESTART_PAUSE, self._add)
+
+    def _remove(self, member: Member) -> None:
+        self._members.pop(member.number, None)
+        _kill(member)
+
+    def _tell_losses(self) -> None:
+        losses, self._losses = self._losses, []
+        if self._closed:
+            return
+        hosts = ", ".join(sorted({host for host, _ in losses if host}))
+        self._tell(
+            f"{len(losses)} simulator(s) lost{f' on {hosts}' if hosts else ''}: "
+            f"{sum(count for _, count in losses)} simulation(s) are repeated by others; "
+            f"{len(self.up)} of {self.size} are up"
+        )
+
+
+def _kill(member: Member) -> None:
+    import ray
+
+    with contextlib.suppress(Exception):
+        ray.kill(member.actor)
+
+
+def _last_line(error: BaseException | None) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else repr(error)
+
+
+DEADLINE = 1800.0
+"""Longest time for one job on one member [s]: half an hour means dead, not slow."""
+
+START_DEADLINE = 120.0
+"""Longest time that jobs wait while no member is up [s]."""
+
+DRAIN_DEADLINE = 10.0
+"""Time a cancelled job has to stop [s]; then its member is replaced."""
+
+CLOSE_DEADLINE = 10.0
+"""Time a member has to write its kernels at the end [s]."""
+
+AHEAD = 1
+"""Jobs that wait at a busy member, so that it begins the next one without asking."""
+
+
+class RaySimulatorPool:
+    """`SimulatorPool` over Ray actors. Jobs begin in the order in which they came, as far as members' deaths allow.
+
+    Each busy member has the next job with it already. Where a member runs out of work while another one still has a
+    job waiting, the job is taken back and given to the idle one. Simulations are idempotent, so a job whose member
+    died is done again by another one. Needs a running Ray (`actors.runtime.ray_runtime`), and is made inside an event loop.
+
+    Args:
+        size: number of members.
+        make: makes a member's simulator, inside its process.
+        retries: how often a job is tried again after a death.
+        deadline: longest time for one job [s].
+        cpus: cores that Ray counts for a member.
+        placement: Ray's options that say where members run.
+        expected: versions that members must have; None where they can't differ.
+        tell: told of losses, in words for people.
+    """
+
+    def __init__(
+        self,
+        size: int,
+        *,
+        make: Callable[[], Simulator] = pour_simulator,
+        retries: int = RETRIES,
+        deadline: float = DEADLINE,
+        cpus: float = 1.0,
+        placement: Mapping[str, Any] | None = None,
+        expected: Versions | None = None,
+        tell: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self._retries, self._deadline = retries, deadline
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[SimulationJob] = deque()
+        self._sendings = 0
+        self._packer = Packer()
+        self._meshes: dict[Path, Any] = {}
+        self._account = Account(size)
+        self._hopeless: asyncio.TimerHandle | None = None
+        self._abandoned: LaboratoryError | None = None
+        self._closed = False
+        start = partial(simulator_actor, make, cpus=cpus, placement=placement or {})
+        self._crew = WorkerPool(size, start, expected=expected, changed=self._dispatch, tell=tell)
+
+    @property
+    def size(self) -> int:
+        """Number of members, those included that are waited for."""
+        return self._crew.size
+
+    @property
+    def separate(self) -> bool:
+        """In processes of their own."""
+        return True
+
+    def statistics(self) -> PoolStatistics:
+        """What the pool has done so far."""
+        return self._account.statistics()
+
+    def grow(self, size: int) -> None:
+        """Have at least so many members from now on."""
+        self._crew.grow(size)
+        self._account.resize(self._crew.size)
+
+    async def pids(self) -> list[int]:
+        """Process ids of the members; waits for those that are starting."""
+        return [greeting.pid for greeting in await self._crew.greeted()]
+
+    async def simulate(self, task: PourTask) -> SimulatedPour:
+        """See `SimulatorPool.simulate`.
+
+        Raises:
+            LaboratoryError: no simulator is up, and none comes up; or whatever the pool was abandoned with.
+        """
+        if self._closed:
+            raise SimulationError("the pool of simulators is closed")
+        if self._abandoned is not None:
+            raise self._abandoned
+        packed, parcels = self._packer.pack(task)
+        for parcel in parcels:
+            if parcel.key not in self._meshes:
+                import ray
+
+                self._meshes[parcel.key] = ray.put(parcel)
+        job = SimulationJob(packed, [self._meshes[parcel.key] for parcel in parcels], self._loop.create_future())
+        self._waiting.append(job)
+        self._dispatch()
+        try:
+            return await job.future
+        except asyncio.CancelledError:
+            self._give_up(job)
+            raise
+
+    def _dispatch(self) -> None:
+        """Give waiting jobs to members; where there are none, share out those that wait at busy members."""
+        while self._waiting and (member := self._next_member()) is not None:
+            self._send(self._waiting.popleft(), member)
+        if not self._waiting:
+            self._level()
+        self._keep_hope()
+
+    def _next_member(self) -> Member | None:
+        """The one that will come to another job first, as far as anybody knows."""
+        free = [member for member in self._crew.up if len(member.sent) <= AHEAD]
+        return min(free, key=lambda member: (len(member.sent), member.begun), default=None)
+
+    def _level(self) -> None:
+        members = self._crew.up
+        for idle in [member for member in members if not member.sent]:
+            busy = next((member for member in members if member.spare is not None), None)
+            if busy is None or (spare := busy.spare) is None:
+                return
+            _recall(busy, spare)
+            self._send(spare.job, idle)
+
+    def _send(self, job: SimulationJob, member: Member) -> None:
+        self._sendings += 1
+        sent = SentJob(job, self._sendings)
+        ref = member.actor.simulate.remote(sent.number, job.task, *job.meshes)
+        member.sent.append(sent)
+        if len(member.sent) == 1:
+            self._begin(member)
+        answer = asyncio.wrap_future(ref.future())
+        answer.add_done_callback(partial(self._answered, member, sent))
+
+    def _begin(self, member: Member) -> None:
+        """A member's first job is under way."""
+        self._account.begin(member.number)
+        member.begun = self._loop.time()
+        member.overdue = self._loop.call_later(self._deadline, self._overdue, member)
+
+    def _end(self, member: Member, worked: float | None = None) -> None:
+        member.drop_timer()
+        self._account.end(member.number, worked)
+
+    def _answered(self, member: Member, sent: SentJob, answer: asyncio.Future[WorkerReply]) -> None:
+        import ray
+
+        error = answer.exception()
+        if member not in self._crew:
+            return  # its jobs are with others
+        if isinstance(error, ray.exceptions.RayActorError):
+            self._lose(member)
+            return
+        was_first = member.sent[0] is sent
+        member.sent.remove(sent)
+        if was_first:
+            self._end(member, None if error is not None else answer.result().seconds)
+            if member.sent:
+                self._begin(member)
+        if not sent.recalled:
+            self._account.jobs += 1
+            _settle(sent.job, answer)
+        self._dispatch()
+
+    def _overdue(self, member: Member) -> None:
+        """The first job has taken too long."""
+        sent = member.sent[0]
+        if not sent.recalled:
+            sent.recalled = True
+            sent.job.fail(SimulationError(f"no result within {self._deadline:g} s; its simulator was replaced"))
+        self._lose(member)
+
+    def _give_up(self, job: SimulationJob) -> None:
+        """Nobody waits for it any more."""
+        self._account.cancelled += 1
+        if job in self._waiting:
+            self._waiting.remove(job)
+            return
+        for member in self._crew.up:
+            for sent in member.sent:
+                if sent.job is job and not sent.recalled:
+                    _recall(member, sent)
+                    self._loop.call_later(DRAIN_DEADLINE, self._still_draining, member, sent)
+
+    def _still_draining(self, member: Member, sent: SentJob) -> None:
+        if member in self._crew and member.sent and member.sent[0] is sent:
+            self._lose(member)
+
+    def _lose(self, member: Member) -> None:
+        """A member is gone, or has to go: its jobs are for others. The one it was at has cost a life."""
+        self._account.deaths += 1
+        self._end(member)
+        orphans = [sent.job for sent in member.sent if not sent.recalled]
+        if member.sent and not member.sent[0].recalled:
+            first = orphans[0]
+            first.deaths += 1
+            if first.deaths > self._retries:
+                particles = first.task.parameters.particles
+                first.fail(
+                    SimulationError(
+                        f"{first.deaths} simulators died over this job; they may lack memory (particles: {particles})"
+                    )
+                )
+                del orphans[0]
+        self._waiting.extendleft(reversed(orphans))
+        self._crew.lose(member, len(orphans))
+        self._dispatch()
+
+    def _keep_hope(self) -> None:
+        """Jobs that wait while no member is up don't wait for ever, and not at all if none is even starting."""
+        if not self._waiting or self._crew.up:
+            if self._hopeless is not None:
+                self._hopeless.cancel()
+                self._hopeless = None
+        elif self._crew.hopeless:
+            self._fail_waiting()
+        elif self._hopeless is None:
+            self._hopeless = self._loop.call_later(START_DEADLINE, self._fail_waiting)
+
+    def _fail_waiting(self) -> None:
+        """This is the laboratory's fault, and says nothing about any simulation."""
+        self._hopeless = None
+        reason = self._crew.problem or (
+            f"no simulator was up for {START_DEADLINE:g} s; is there a free core, and memory, for one?"
+        )
+        while self._waiting:
+            self._waiting.popleft().fail(LaboratoryError(reason))
+
+    def abandon(self, error: LaboratoryError) -> None:
+        """All jobs fail, now and from now on: their simulators can't come back.
+
+        Args:
+            error: why.
+        """
+        self._abandoned = error
+        for member in self._crew.up:
+            self._waiting.extend(sent.job for sent in member.sent if not sent.recalled)
+            for sent in member.sent:
+                sent.recalled = True
+        while self._waiting:
+            self._waiting.popleft().fail(error)
+
+    async def close(self) -> None:
+        """Write the members' compiled kernels, and end their processes; jobs that are left have no result."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._hopeless is not None:
+            self._hopeless.cancel()
+        busy = [member for member in self._crew.up if member.sent]
+        for member in busy:
+            member.drop_timer()
+            for sent in [sent for sent in member.sent if not sent.recalled]:
+                _recall(member, sent)
+                self._waiting.append(sent.job)
+        while self._waiting:
+            self._waiting.popleft().fail(SimulationError("the pool of simulators is closed"))
+        patience = CLOSE_DEADLINE + (DRAIN_DEADLINE if busy else 0.0)
+        await self._crew.close(0.0 if self._abandoned is not None else patience)
+
+
+def _recall(member: Member, sent: SentJob) -> None:
+    """A job that has not begun never will; one that has begun notices between its steps."""
+    sent.recalled = True
+    with contextlib.suppress(Exception):
+        member.actor.recall.options(concurrency_group=CONTROL).remote(sent.number)
+
+
+def _settle(job: SimulationJob, answer: asyncio.Future[WorkerReply]) -> None:
+    """Give a job its result, or the reason why there is none."""
+    import ray
+
+    error = answer.exception()
+    if error is None:
+        if not job.future.done():
+            job.future.set_result(answer.result().result.copied())
+    elif isinstance(error, ray.exceptions.RayTaskError):
+        known = isinstance(error.cause, InvalidActionError | SimulationError)
+        job.fail(error.cause if known else SimulationError(f"the simulator failed: {error.cause!r}"))
+    else:
+        job.fail(SimulationError(f"the simulator's answer was lost: {error}"))

@@ -1,0 +1,117 @@
+"""Tasks on their way to another machine: meshes travel as bytes, since a path means nothing there.
+
+The sender packs, the receiver unpacks into its own cache directory. Both sides then have the same content, and all that
+is derived from it (distance grids, outcomes) has the same keys.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.interfaces import SimulationError
+from sim_engine.resources import cache_directory
+from sim_engine.scene import PourTask
+from sim_engine.vessel.shapes import MeshShape, VesselSpec
+
+FOLDER = "meshes"
+"""In the cache directory: meshes that came from elsewhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class SerializedMesh:
+    """One mesh file.
+
+    Attributes:
+        key: digest of the content, then the file's own name, which messages show: the path below `FOLDER`.
+        content: (n,) uint8; an array travels through shared memory without being copied.
+    """
+
+    key: Path
+    content: NDArray[np.uint8]
+
+
+class Packer:
+    """Makes tasks independent of this machine's files. A mesh is read once, when it is first seen."""
+
+    def __init__(self) -> None:
+        self._parcels: dict[MeshShape, SerializedMesh] = {}
+
+    def pack(self, task: PourTask) -> tuple[PourTask, list[SerializedMesh]]:
+        """The task without paths, and the meshes that belong to it.
+
+        Args:
+            task: as the campaign has it.
+
+        Raises:
+            SimulationError: a mesh can't be read.
+        """
+        parcels: list[SerializedMesh] = []
+
+        def packed(vessel: VesselSpec) -> VesselSpec:
+            if not isinstance(vessel.shape, MeshShape):
+                return vessel
+            parcel = self._parcel(vessel.shape)
+            parcels.append(parcel)
+            return _with_path(vessel, vessel.shape, parcel.key)
+
+        return _with_vessels(task, packed(task.scene.pourer), packed(task.scene.receiver)), parcels
+
+    def _parcel(self, shape: MeshShape) -> SerializedMesh:
+        if shape not in self._parcels:
+            try:
+                content = shape.path.read_bytes()
+            except OSError as error:
+                raise SimulationError(f"{shape.path}: the mesh can't be read: {error.strerror}") from error
+            key = Path(hashlib.sha256(content).hexdigest()[:24]) / shape.path.name
+            self._parcels[shape] = SerializedMesh(key, np.frombuffer(content, np.uint8))
+        return self._parcels[shape]
+
+
+def unpack(task: PourTask, parcels: Sequence[SerializedMesh]) -> PourTask:
+    """A packed task with its meshes as files of this machine.
+
+    Args:
+        task: as `Packer.pack` made it.
+        parcels: its meshes.
+
+    Raises:
+        OSError: the cache directory can't be written.
+    """
+    if not parcels:
+        return task
+    paths = {parcel.key: _laid_out(parcel) for parcel in parcels}
+
+    def unpacked(vessel: VesselSpec) -> VesselSpec:
+        shape = vessel.shape
+        return _with_path(vessel, shape, paths[shape.path]) if isinstance(shape, MeshShape) else vessel
+
+    return _with_vessels(task, unpacked(task.scene.pourer), unpacked(task.scene.receiver))
+
+
+def _laid_out(parcel: SerializedMesh) -> Path:
+    """The mesh as a file; others on this machine may be writing the same one."""
+    path = cache_directory() / FOLDER / parcel.key
+    if not path.exists() or path.stat().st_size != parcel.content.size:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+            file.write(parcel.content.tobytes())
+        Path(file.name).replace(path)
+    return path
+
+
+def _with_path(vessel: VesselSpec, shape: MeshShape, path: Path) -> VesselSpec:
+    return vessel.model_copy(update={"shape": shape.model_copy(update={"path": path})})
+
+
+def _with_vessels(task: PourTask, pourer: VesselSpec, receiver: VesselSpec) -> PourTask:
+    if pourer is task.scene.pourer and receiver is task.scene.receiver:
+        return task
+    return dataclasses.replace(task, scene=dataclasses.replace(task.scene, pourer=pourer, receiver=receiver))

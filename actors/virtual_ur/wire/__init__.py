@@ -1,1 +1,0 @@
-"""Wire formats: bytes to values and back. No sockets, no robot."""

@@ -1,0 +1,270 @@
+"""A run that has ended, or stands still: what it learnt, its pours, decisions and curves as tables, its figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.run_record import CampaignResult, RequestOutcome, Row, answers, pour_row, read_result
+from orchestrator.journal.stage_results import Results
+from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated
+from orchestrator.results.loss_units import loss_of_pour
+from orchestrator.results.publishing import Published, report_on
+from orchestrator.results.publishing import publish as write
+from orchestrator.results.stage_views import deployments_of, gain_of, predictions_of, recommended_theta_of, theta_of
+from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
+from orchestrator.strategies.calibration.calibration_scores import CalibrationGain
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.deployment.deployment_result import Recommended
+from orchestrator.strategies.stage_result import displayed_action
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import normalised_spillage
+from sim_engine.prediction_band import SampleStatistics
+from sim_engine.resources import require
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run. Its tables are pandas.DataFrames, made when they are asked for.
+
+    Attributes:
+        campaign: what it does.
+        result: state, counts, times, and what each stage learnt.
+        published: what was written about it; None where it was opened as it stood.
+    """
+
+    campaign: CampaignPlan
+    result: CampaignResult
+    published: Published | None = None
+
+    @property
+    def directory(self) -> Path:
+        """Its folder."""
+        return self.result.directory
+
+    @property
+    def results(self) -> Results:
+        """What each closed stage learnt, by its name."""
+        return self.result.results
+
+    @property
+    def calibrated(self) -> CalibratedTheta | None:
+        """θ*, what is expected of it and which other θ fit; None where nothing was calibrated."""
+        return theta_of(self.results)
+
+    @property
+    def theta(self) -> SimulationParameters | None:
+        """The θ to simulate with: θ*, or the uncalibrated one if the pours do not justify θ*.
+
+        None without a calibration.
+        """
+        return recommended_theta_of(self.results)
+
+    @property
+    def calibration_gain(self) -> CalibrationGain | None:
+        """Whether the weighed pours justify θ*, in numbers and words (`text`); None where that was not compared."""
+        return gain_of(self.results)
+
+    @property
+    def recommended(self) -> dict[str, Recommended]:
+        """The action to use from now on, by receiver."""
+        names = _receivers(self.campaign)
+        found = {names.get(scene, scene): one.recommended for scene, one in deployments_of(self.results).items()}
+        return {name: one for name, one in found.items() if one is not None}
+
+    @property
+    def predictions(self) -> dict[str, dict[str, SampleStatistics]]:
+        """What fresh seeds of the recommended actions came to, by receiver and quantity."""
+        names = _receivers(self.campaign)
+        return {names.get(scene, scene): one.over_seeds for scene, one in predictions_of(self.results).items()}
+
+    @property
+    def pours(self) -> pd.DataFrame:
+        """One row for each pour: action in display units, masses [g], spillage r, loss in its own unit."""
+        return _frame(self._pours())
+
+    @property
+    def simulations(self) -> pd.DataFrame:
+        """One row for each simulation: action in display units, θ, fractions of the load, CPU seconds."""
+        return _frame(self._simulations())
+
+    @property
+    def decisions(self) -> pd.DataFrame:
+        """Why the strategies asked for what they asked for, in words and numbers."""
+        return _frame(self._decisions())
+
+    @property
+    def curves(self) -> pd.DataFrame:
+        """How far each stage had come: the loss of every pour and the discrepancy of every θ, with the best so far."""
+        return _frame(self._curves())
+
+    @property
+    def outflows(self) -> pd.DataFrame:
+        """Outflow of every simulation in time: fractions of the load that have been poured and spilled."""
+        return _frame(self._outflows())
+
+    def figures(self) -> dict[str, Figure]:
+        """All figures that its results allow, by name."""
+        from orchestrator.results.campaign_figures import figures_of
+
+        return figures_of(self.campaign, self.results)
+
+    def report(self, path: Path | str | None = None) -> Path:
+        """Write the page about the run, one HTML file that needs nothing beside it, with figures drawn anew.
+
+        Args:
+            path: of the page; 'report.html' in the run's folder unless given.
+
+        Raises:
+            OSError: it can't be written.
+            RunError: the journal can't be read.
+        """
+        return report_on(self.campaign, self.result, None if path is None else Path(path).expanduser())[0]
+
+    def save_tables(self, directory: Path | str | None = None) -> list[Path]:
+        """Write all tables as Parquet files.
+
+        Args:
+            directory: 'tables' in the run's folder unless given.
+
+        Raises:
+            MissingExtraError: pyarrow is not installed.
+        """
+        require("pyarrow", "Parquet")
+        folder = self.directory / "tables" if directory is None else Path(directory).expanduser()
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = []
+        for name in ("pours", "simulations", "decisions", "curves", "outflows"):
+            path = folder / f"{name}.parquet"
+            getattr(self, name).to_parquet(path)
+            paths.append(path)
+        return paths
+
+    # -- rows --------------------------------------------------------------------------------------------------------
+
+    def _answers(self, kind: type[Request]) -> Iterator[RequestOutcome]:
+        with JournalReader(self.directory / JOURNAL_NAME) as journal:
+            yield from answers(journal, kind)
+
+    def _pours(self) -> Iterator[Row]:
+        names = _receivers(self.campaign)
+        for one in self._answers(Pour):
+            request, outcome = one.request, one.outcome
+            assert isinstance(request, Pour)
+            row: Row = {"stage": one.stage, "id": one.id, "receiver": names.get(request.scene, request.scene)}
+            row |= pour_row(request, outcome)
+            if isinstance(outcome, Poured):
+                row["loss"] = loss_of_pour(self.campaign, request, outcome.measurement)
+            yield {**row, "seconds": one.seconds}
+
+    def _simulations(self) -> Iterator[Row]:
+        names = _receivers(self.campaign)
+        for one in self._answers(Simulate):
+            request = one.request
+            assert isinstance(request, Simulate)
+            row: Row = {"stage": one.stage, "id": one.id, "receiver": names.get(request.scene, request.scene)}
+            row |= {"purpose": request.purpose, "seed": request.seed, **displayed_action(request.action.values())}
+            row |= {f"theta_{name}": value for name, value in request.parameters.model_dump().items()}
+            match one.outcome:
+                case Simulated(found):
+                    fractions = found.fractions
+                    row |= {"poured": fractions.poured, "spilled": fractions.spilled, "retained": fractions.retained}
+                    row |= {"spillage": normalised_spillage(fractions), "cpu_s": found.cpu_s}
+                    row["failed"] = found.invalid
+                case Failed(kind, reason):
+                    row["failed"] = f"{kind}: {reason}"
+            yield row
+
+    def _decisions(self) -> Iterator[Row]:
+        with JournalReader(self.directory / JOURNAL_NAME) as journal:
+            for entry in journal.entries(kinds=[Kind.DECISION]):
+                values = {f"value_{name}": value for name, value in (entry.body.get("values") or {}).items()}
+                yield {"time": entry.t, "stage": entry.stage, "text": entry.body["text"], **values}
+
+    def _curves(self) -> Iterator[Row]:
+        for stage, result in self.results.items():
+            if isinstance(result, Calibrated):
+                best: float | None = None
+                for number, trial in enumerate(result.trials, start=1):
+                    best = _least(best, trial.discrepancy)
+                    yield {
+                        "stage": stage,
+                        "what": "discrepancy",
+                        "number": number,
+                        "value": trial.discrepancy,
+                        "best": best,
+                    }
+        for result in deployments_of(self.results).values():
+            best = None
+            for number, simulated in enumerate(result.simulated, start=1):
+                best = _least(best, simulated.loss)
+                row = {"stage": result.scene, "what": "simulated loss", "number": number}
+                yield {**row, "value": simulated.loss, "best": best}
+            best = None
+            for pour in result.pours:
+                best = _least(best, pour.loss)
+                row = {"stage": result.scene, "what": "loss", "number": pour.number, "value": pour.loss, "best": best}
+                yield {**row, "predicted": pour.predicted, "predicted_deviation": pour.predicted_deviation}
+
+    def _outflows(self) -> Iterator[Row]:
+        for one in self._answers(Simulate):
+            if isinstance(one.outcome, Simulated):
+                found = one.outcome.outcome
+                for time, poured, spilled in zip(
+                    found.curve_times, found.curve_poured, found.curve_spilled, strict=True
+                ):
+                    yield {"stage": one.stage, "id": one.id, "time_s": time, "poured": poured, "spilled": spilled}
+
+
+def open_run(directory: Path | str, campaign: CampaignPlan | None = None) -> Run:
+    """Open a run's folder, of a run that has ended, stands still, or is being written.
+
+    Args:
+        directory: of the run.
+        campaign: what it does; read from the folder unless given.
+
+    Raises:
+        FileNotFoundError: there is no run in that folder.
+        JournalError: its journal can't be read.
+        ConfigError: its campaign can't be read.
+    """
+    folder = Path(directory).expanduser()
+    if not (folder / JOURNAL_NAME).is_file():
+        raise FileNotFoundError(f"{folder}: there is no run in this folder (no {JOURNAL_NAME})")
+    plan = load_campaign(folder / "resolved.json") if campaign is None else campaign
+    with JournalReader(folder / JOURNAL_NAME) as journal:
+        return Run(plan, read_result(journal, folder))
+
+
+def publish(run: Run) -> Published:
+    """Write a run's figures, `theta.json`, `summary.json` and report into its folder, as `decant run` does at its end.
+
+    Raises:
+        OSError: a file can't be written.
+    """
+    return write(run.campaign, run.result)
+
+
+def _receivers(campaign: CampaignPlan) -> Mapping[str, str]:
+    from orchestrator.results.stage_views import receiver_names
+
+    return receiver_names(campaign)
+
+
+def _least(best: float | None, value: float | None) -> float | None:
+    return best if value is None else value if best is None else min(best, value)
+
+
+def _frame(rows: Iterator[Row]) -> pd.DataFrame:
+    require("pandas", "A table")
+    import pandas as pd
+
+    return pd.DataFrame(list(rows))

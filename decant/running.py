@@ -1,0 +1,289 @@
+"""Campaigns that run: whole ones, calibration on a table of weighed pours, plans for a vessel.
+
+Coroutines from plain functions, also in a notebook, whose thread has a loop already.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import tempfile
+import warnings
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from actors.laboratory import check_laboratory, open_laboratory
+from actors.laboratory_settings import LaboratorySpec
+from decant.campaigns import build_campaign
+from decant.run_results import Run
+from orchestrator.config.file_loading import load_vessel
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.live_view.live_server import recorder_of
+from orchestrator.results.publishing import not_simulated, publish
+from orchestrator.results.stage_views import evaluation_of
+from orchestrator.runs.events import Event, Watcher
+from orchestrator.runs.run_engine import run_campaign
+from orchestrator.runs.run_folder import create_run
+from orchestrator.runs.run_tasks import PREDICTION_SEEDS, GivenTheta, check_job, job, planned, read_theta
+from orchestrator.runs.stages import (
+    POSTERIOR_DRAWS,
+    StageDefinition,
+    deployment_stages,
+    posterior_draws,
+    prediction_stages,
+    stages_of,
+)
+from orchestrator.strategies.calibration.calibration_scores import shift_left_over
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.errors import InvalidArgumentError
+from sim_engine.liquids import SimulationParameters
+from sim_engine.vessel.shapes import VesselSpec
+
+T = TypeVar("T")
+
+
+def run_coroutine(work: Coroutine[Any, Any, T]) -> T:
+    """Run a coroutine to its end: here, or where a loop is running, in a thread of its own.
+
+    Interrupted from the keyboard in a plain program, it is cancelled, and with it the campaign comes to rest.
+    """
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return asyncio.run(work)
+    with ThreadPoolExecutor(1, thread_name_prefix="decant") as thread:
+        return thread.submit(asyncio.run, work).result()
+
+
+Watch = Callable[[Event], object]
+
+
+def run(
+    campaign: CampaignPlan,
+    *,
+    watch: Sequence[Watch] = (),
+    resume: Path | str | None = None,
+    in_process: bool = True,
+) -> Run:
+    """Run a campaign on its virtual bench, or go on with a run of it, and publish it.
+
+    Args:
+        campaign: what to do.
+        watch: called with every event (`decant.events`), in the order in which things happen. They must not wait.
+        resume: folder of the run to go on with; a new one is begun otherwise.
+        in_process: everything in this process, without Ray; else simulations run side by side.
+
+    What is suspicious about the campaign, or not simulated, is issued as `UserWarning` before it begins. A recording
+    is written if the campaign has `outputs: {rrd: true}` and Rerun is installed.
+
+    Raises:
+        ValueError: the vessels or motions can't be used, draws of θ are missing, or the laboratory is hardware, which
+            the command line arms (`RunError` or `InvalidArgumentError`, both a `DecantError`).
+        LaboratoryError: the laboratory can't be opened.
+        RunError: the run can't begin, go on or end; the text says what is kept, and what to do.
+    """
+    stages = stages_of(campaign)
+    _check(campaign, stages, in_process)
+    directory = create_run(campaign) if resume is None else Path(resume).expanduser()
+    return _begun(campaign, stages, watch, directory, in_process, resume=resume is not None)
+
+
+def calibrate(
+    campaign: CampaignPlan,
+    pours: Any,
+    *,
+    watch: Sequence[Watch] = (),
+    in_process: bool = True,
+) -> Run:
+    """Calibrate the simulator on weighed pours, as the campaign says: strategy, searched θ, scene and motion are its.
+
+    Args:
+        campaign: with a calibration.
+        pours: a table: a pandas.DataFrame, or a list of dicts. The columns are those of a file of weighed pours:
+            'angular_velocity_deg_s' and the other searched dimensions with their units, 'poured_g', 'spilled_g',
+            'retained_g' and 'split' ('train', 'test').
+        watch: see `run`.
+        in_process: see `run`.
+
+    Raises:
+        ConfigError: a column or a value of the table is wrong; the text says which.
+        ValueError, LaboratoryError, RunError: see `run`.
+    """
+    if campaign.calibration is None or campaign.resolved.get("calibration") is None:
+        raise InvalidArgumentError(f"campaign '{campaign.name}' has no calibration")
+    rows = _rows(pours)
+    with tempfile.TemporaryDirectory(prefix="decant-") as folder:  # a table that is refused leaves no run behind
+        table = Path(folder) / "pours.csv"
+        _write_table(table, rows)
+        try:
+            checked = _calibration_of(campaign, table)
+        except ConfigError as error:
+            shown = Path("pours.csv")
+            raise ConfigError(
+                replace(one, path=shown) if one.path == table else one for one in error.problems
+            ) from None
+        _check(checked, job(checked, "calibrate").stages, in_process)
+    directory = create_run(campaign)
+    _write_table(directory / table.name, rows)
+    work = job(_calibration_of(campaign, directory / table.name), "calibrate")
+    return _begun(work.plan, work.stages, watch, directory, in_process)
+
+
+def _calibration_of(campaign: CampaignPlan, table: Path) -> CampaignPlan:
+    """The campaign's calibration, on the pours of a table."""
+    content = {key: value for key, value in campaign.resolved.items() if key != "deployment"}
+    section: dict[str, Any] = dict(content["calibration"])
+    kept = {key: value for key, value in dict(section["pours"]).items() if key in ("lip_radius", "split")}
+    section["pours"] = {**kept, "from": str(table)}
+    return build_campaign({**content, "calibration": section}, campaign.source.parent)
+
+
+def plan(
+    campaign: CampaignPlan,
+    receiver: VesselSpec | Path | str | None = None,
+    *,
+    theta: SimulationParameters | Run | Path | str | None = None,
+    iterations: int | None = None,
+    seeds: int = PREDICTION_SEEDS,
+    watch: Sequence[Watch] = (),
+    in_process: bool = True,
+) -> Run:
+    """Find the action to pour with in simulation alone (D1), and what to expect of it with fresh seeds.
+
+    Args:
+        campaign: with a deployment: it says which actions may be planned, and what is minimised.
+        receiver: another vessel than the campaign's, or its file.
+        theta: parameters to plan with; the campaign's unless given. A run that has calibrated, or its `theta.json`,
+            also gives what a campaign with `risk: {theta: posterior}` needs, the draws of the posterior.
+        iterations: actions that are tried, 1 or more; as the campaign says unless given.
+        seeds: number of fresh seeds, 1 or more, that the recommended action is simulated with.
+        watch: see `run`.
+        in_process: see `run`.
+
+    Returns:
+        The run: `recommended` has the action of each receiver, `predictions` what the fresh seeds came to.
+
+    Raises:
+        ConfigError: the file of `theta` or of the receiver is wrong.
+        ValueError, LaboratoryError, RunError: see `run`.
+    """
+    for name, value in (("seeds", seeds), ("iterations", 1 if iterations is None else iterations)):
+        if value < 1:
+            raise InvalidArgumentError(f"{name}={value!r}: should be 1 or more")
+    vessel = load_vessel(Path(receiver).expanduser()) if isinstance(receiver, str | Path) else receiver
+    given = _given(theta, campaign)
+    found = planned(campaign, given.theta, vessel, iterations, given.draws, given.left_over)
+    deployment = found.deployment
+    assert deployment is not None
+    stages = [*deployment_stages(found, deployment), *prediction_stages(found, deployment, seeds)]
+    _check(found, stages, in_process, as_written=receiver is None)
+    return _begun(found, stages, watch, create_run(found), in_process)
+
+
+def _given(theta: SimulationParameters | Run | Path | str | None, campaign: CampaignPlan) -> GivenTheta:
+    """θ to plan with, and what else its calibration found."""
+    if theta is None:
+        return GivenTheta(campaign.parameters)
+    if isinstance(theta, SimulationParameters):
+        return GivenTheta(theta)
+    if not isinstance(theta, Run):
+        return read_theta(Path(theta).expanduser(), campaign)
+    found, recommended = theta.calibrated, theta.theta
+    if found is None or recommended is None:
+        raise InvalidArgumentError(f"theta: run {theta.directory} has found no θ*; give one that has calibrated")
+    scores = evaluation_of(theta.results)
+    return GivenTheta(
+        recommended,
+        posterior_draws(found, POSTERIOR_DRAWS),
+        None if scores is None else shift_left_over(scores, len(found.searched)),
+    )
+
+
+def _check(
+    campaign: CampaignPlan, stages: Sequence[StageDefinition], in_process: bool, *, as_written: bool = True
+) -> None:
+    """Refuse what can't be run, and warn of what is suspicious, before a run folder is made."""
+    if campaign.laboratory.mode == "hardware":
+        raise InvalidArgumentError(
+            f"laboratory {campaign.laboratory.name} is hardware, which is armed from the command line alone: "
+            f"decant run {campaign.source} --arm"
+        )
+    found: list[str] = []
+    check_job(campaign, as_written=as_written, warn=lambda problem: found.append(str(problem)))
+    found.append("\n".join(not_simulated(campaign, found.append)))
+    for text in filter(None, dict.fromkeys(found)):
+        _warn(text)
+    check_laboratory(_laboratory(campaign, in_process), need_bench=any(stage.pours for stage in stages))
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, UserWarning, stacklevel=4)
+
+
+def _laboratory(campaign: CampaignPlan, in_process: bool) -> LaboratorySpec:
+    return replace(campaign.laboratory, in_process=in_process or campaign.laboratory.in_process)
+
+
+def _begun(
+    campaign: CampaignPlan,
+    stages: Sequence[StageDefinition],
+    watch: Sequence[Watch],
+    directory: Path,
+    in_process: bool,
+    *,
+    resume: bool = False,
+) -> Run:
+    """Run what was checked, record it, and publish it."""
+    need_bench = any(stage.pours for stage in stages)
+    monitor = recorder_of(campaign, directory, _warn)
+    watchers: list[Watcher] = [_watcher(one) for one in watch]
+    try:
+        work = run_campaign(
+            campaign,
+            open_laboratory(_laboratory(campaign, in_process), need_bench=need_bench),
+            directory,
+            resume=resume,
+            watchers=watchers if monitor is None else [*watchers, monitor],
+            stages=stages,
+        )
+        result = run_coroutine(work)
+    finally:
+        if monitor is not None:
+            monitor.close()
+    return Run(campaign, result, publish(campaign, result, monitor))
+
+
+def _watcher(watch: Watch) -> Watcher:
+    def watcher(event: Event) -> None:
+        watch(event)
+
+    return watcher
+
+
+def _rows(table: Any) -> list[dict[str, Any]]:
+    """The rows of a table.
+
+    Raises:
+        InvalidArgumentError: it is none.
+    """
+    rows = table.to_dict("records") if hasattr(table, "to_dict") else table
+    if not isinstance(rows, Iterable) or isinstance(rows, str | bytes | Mapping):
+        raise InvalidArgumentError(
+            f"pours: should be a pandas.DataFrame or a list of dicts, not {type(table).__name__}"
+        )
+    found = list(rows)
+    if wrong := [row for row in found if not isinstance(row, Mapping)]:
+        raise InvalidArgumentError(f"pours: every row should be a dict from column to value, not {wrong[0]!r}")
+    return [dict(row) for row in found]
+
+
+def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """A table as a file of weighed pours."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(rows)

@@ -1,0 +1,103 @@
+"""One action in the simulator of this process: what comes of it over several seeds, and its picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orchestrator.config.action_assignments import assigned_action
+from orchestrator.config.campaign_checks import check_vessels
+from orchestrator.config.file_loading import load_vessel
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.errors import InvalidArgumentError, InvalidSceneError
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import SimulatedPour
+from sim_engine.prediction_band import SampleStatistics, spreads
+from sim_engine.scene import PourTask
+from sim_engine.vessel.shapes import VesselSpec
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FRAME_RATE = 20.0
+"""Frames of the first seed that are kept for the picture [1/s]."""
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """One action, simulated with several seeds.
+
+    Attributes:
+        task: the first seed's.
+        pours: what came of each; the first one has its frames.
+    """
+
+    task: PourTask
+    pours: tuple[SimulatedPour, ...]
+
+    @property
+    def prediction(self) -> dict[str, SampleStatistics]:
+        """Mean and standard deviation over the seeds, by quantity: 'received', 'spilled', 'retained', 'spillage' …"""
+        return spreads([pour.outcome for pour in self.pours])
+
+    def figure(self) -> Figure:
+        """Four moments of the first seed from the side, and where the liquid was at every time."""
+        from orchestrator.results import figure_style as style
+        from orchestrator.results.pour_figures import simulation_png
+
+        with style.unsaved() as figures:
+            simulation_png(Path("pour.png"), self.task, self.pours[0])
+        return figures[0]
+
+
+def simulate(
+    campaign: CampaignPlan,
+    action: Mapping[str, str | float] | None = None,
+    *,
+    receiver: VesselSpec | Path | str | None = None,
+    theta: SimulationParameters | None = None,
+    seed: int = 0,
+    seeds: int = 1,
+) -> Simulation:
+    """Simulate an action in a campaign's scene. Vessels whose shape may be off have another one with each seed.
+
+    Args:
+        campaign: whose vessels, liquid and motion these are: its first deployment's scene, else calibration's.
+        action: dimensions with units, '40 deg/s'; plain numbers are in display units (deg/s, deg, mm, s). What the
+            campaign fixes need not be given.
+        receiver: another vessel, or its file.
+        theta: simulation parameters; the campaign's unless given.
+        seed: of the first pour's initial positions; those that follow have the next ones.
+        seeds: how many, 1 or more.
+
+    Raises:
+        ConfigError: the receiver's file is wrong.
+        ValueError: `seeds` is below 1, the action is not complete, or the vessels touch, don't hold the load, or can't
+            be built (each is a `DecantError`).
+    """
+    from orchestrator.cli.pour_prediction import scene_to_simulate
+    from sim_engine.simulator import PourSimulator
+
+    if seeds < 1:
+        raise InvalidArgumentError(f"seeds={seeds!r}: should be 1 or more")
+    scene, space = scene_to_simulate(campaign)
+    if receiver is not None:
+        vessel = receiver if isinstance(receiver, VesselSpec) else load_vessel(Path(receiver).expanduser())
+        scene = replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
+    chosen = assigned_action(
+        [f"{name}={value}" for name, value in (action or {}).items()], fixed=scene.fixed, space=space
+    )
+    if problems := check_vessels(scene, campaign.source):
+        raise InvalidSceneError("\n".join(map(str, problems)))
+    parameters = campaign.parameters if theta is None else theta
+    tasks = [
+        PourTask(scene.drawn(seed + i), chosen, parameters, seed + i, FRAME_RATE if i == 0 else 0.0)
+        for i in range(seeds)
+    ]
+    simulator = PourSimulator()
+    try:
+        return Simulation(tasks[0], tuple(simulator.simulate(task) for task in tasks))
+    finally:
+        simulator.close()

@@ -1,0 +1,275 @@
+"""`decant run`, `decant calibrate`, `decant plan`: the verbs that run stages in a laboratory."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, print_json
+from orchestrator.cli.foreground_run import (
+    Finished,
+    check_campaign_can_run,
+    check_laboratory_answers,
+    read_campaign,
+    run_in_front_of_people,
+)
+
+if TYPE_CHECKING:
+    from orchestrator.runs.stages import StageDefinition
+    from orchestrator.strategies.campaign_plan import CampaignPlan
+
+
+_TOLD = {
+    "prediction",
+    "prediction_band",
+    "at_bounds",
+    "predicted_delivered_g",
+    "predicted_delivered_ml",
+    "risk",
+    "window",
+    "not_covered",
+}
+"""Fields of a receiver's summary that a plan for it prints beside the action."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """What `run` and `calibrate` are given on the command line beside their campaign."""
+
+    resume: bool = False
+    run_id: str | None = None
+    """With resume: which run; None is the newest unfinished one."""
+    answer: str | None = None
+    """With resume: what came of the pour that was under way; None lets a person be asked."""
+    in_process: bool = False
+    laboratory: Path | None = None
+    """In place of the campaign's."""
+    seed: int | None = None
+    """In place of the campaign's."""
+    as_json: bool = False
+    arm: bool = False
+    """Hardware may move in this run."""
+    live: bool = False
+    """A live view is served while it runs …"""
+    live_at: str | None = None
+    """… at this ADDRESS[:PORT], where one is given."""
+
+
+def run(path: Path, options: RunOptions) -> None:
+    """The whole campaign."""
+    from orchestrator.results.run_summary import summary_json
+
+    plan = read_campaign(path, options.laboratory, options.seed)
+    check_campaign_can_run(plan)
+    finished = _run(plan, "run", path, options)
+    if options.as_json:
+        summary = summary_json(finished.published.summary)
+        print_json({"run": finished.result.directory.name, "report": finished.published.report, **summary})
+
+
+def calibrate(path: Path, options: RunOptions) -> None:
+    """Only what finds θ*, and how good it is beside its rivals."""
+    from orchestrator.runs.run_tasks import RunTaskError, job
+
+    try:
+        work = job(read_campaign(path, options.laboratory, options.seed), "calibrate")
+    except RunTaskError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    check_campaign_can_run(work.plan)
+    finished = _run(work.plan, "calibrate", path, options, list(work.stages))
+    if options.as_json:
+        print_json(calibration_json(finished))
+
+
+def calibration_json(finished: Finished) -> dict[str, Any]:
+    """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see `CalibrationEvaluation`."""
+    from orchestrator.journal.stage_results import result_of
+    from orchestrator.results.stage_views import rival_scores
+    from orchestrator.runs.stages import CALIBRATION, EVALUATION, calibrated_theta, deployed_theta
+    from orchestrator.strategies.calibration.calibration_base import Calibrated
+    from orchestrator.strategies.calibration.calibration_scores import CALIBRATED, Scores
+
+    results = finished.result.results
+    theta, calibration = calibrated_theta(results).theta, result_of(results, CALIBRATION, Calibrated)
+    evaluation = result_of(results, EVALUATION, Scores)
+    ours = evaluation.discrepancy[CALIBRATED]
+    rivals = rival_scores(evaluation)
+    data: dict[str, Any] = {
+        "theta": deployed_theta(results).model_dump(),
+        "calibrated_theta": theta.model_dump(),
+        "calibration_gain": None if evaluation.gain is None else evaluation.gain.model_dump(mode="json"),
+    }
+    for split in ("train", "test", "transfer"):
+        data[f"{split}_discrepancy"] = ours.get(split)
+        if split != "train":
+            data |= {f"{split}_discrepancy_{name}": values.get(split) for name, values in rivals.items()}
+    return {
+        **data,
+        "simulations": finished.result.simulations,
+        "calibration_simulations": calibration.simulations,
+        "cpu_s": finished.result.cpu_s,
+        "run": str(finished.result.directory),
+        "figures": finished.published.figures,
+        "recording": finished.published.recording,
+        "report": finished.published.report,
+    }
+
+
+def plan_pour(
+    path: Path,
+    *,
+    parameters: Path | None,
+    receiver: Path | None,
+    iterations: int | None,
+    seed: int | None,
+    seeds: int,
+    thetas: int | None,
+    laboratory: Path | None,
+    in_process: bool,
+    as_json: bool,
+) -> None:
+    """D1 for one receiver: the action that the calibrated simulator would pour with, and what to expect of it."""
+    from orchestrator.cli.prediction_inputs import foretelling
+    from orchestrator.journal.stage_results import result_of
+    from orchestrator.runs.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
+    from orchestrator.strategies.deployment.deployment_result import Deployed
+    from orchestrator.strategies.repeated_simulation import Foreseen
+
+    plan = planning_plan(read_campaign(path, laboratory, seed), parameters, receiver, iterations)
+    check_campaign_can_run(plan, as_written=receiver is None)
+    assert plan.deployment is not None
+    planning = deployment_stages(plan, plan.deployment)
+    known = foretelling(plan, parameters, thetas, seeds)
+    count = max(seeds, len(known.drawn))
+    stages = [*planning, *prediction_stages(plan, plan.deployment, count, known.drawn)]
+    check_laboratory_answers(plan, stages, in_process=in_process, brief=True)
+    directory = run_directory(plan, resume=False, run_id=None)
+    if parameters is None:
+        mention(
+            f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})"
+        )
+    finished = run_in_front_of_people(
+        plan,
+        directory,
+        resume=False,
+        stages=stages,
+        in_process=in_process,
+        brief=True,
+        again=f"Plan anew: decant plan {path}",
+        not_resumed="this planning is not resumed; what was simulated",
+    )
+    answers = []
+    for stage in planning:
+        result = result_of(finished.result.results, stage.name, Deployed)
+        recommended = result.recommended
+        if recommended is None:
+            raise RefusalError(f"{stage.name}: no action could be planned; every simulation failed. See {directory}")
+        receiver_name = stage.name.removeprefix(DEPLOYMENT)
+        repeated = result_of(finished.result.results, PREDICTION + receiver_name, Foreseen).over_seeds
+        spillage = repeated.get("spillage")
+        told = finished.published.summary.receivers[result.scene]
+        answers.append(
+            {
+                "receiver": receiver_name,
+                "action": recommended.action,
+                "action_si": recommended.action_si,
+                "predicted_loss": recommended.predicted_loss,
+                "predicted_spillage": None if spillage is None else spillage.mean,
+                "predicted_spillage_deviation": None if spillage is None else spillage.deviation,
+                "predicted_deviation": recommended.predicted_deviation,
+                "loss": plan.deployment.loss_name,
+                **told.model_dump(mode="json", include=_TOLD),
+            }
+        )
+    theta = plan.parameters.model_dump()
+    if as_json:
+        totals = {"simulations": finished.result.simulations, "cpu_s": finished.result.cpu_s, "run": str(directory)}
+        first = answers[0]
+        print_json({**first, "theta": theta, **totals, **({"plans": answers} if len(answers) > 1 else {})})
+
+
+def planning_plan(
+    plan: CampaignPlan,
+    parameters: Path | None,
+    receiver: Path | None,
+    iterations: int | None,
+) -> CampaignPlan:
+    """A campaign turned into D1 without pours, and its record.
+
+    Args:
+        parameters: file of the θ to plan with; the campaign's unless given.
+        receiver: file of another vessel than the campaign's.
+        iterations: as the campaign says unless given.
+
+    Raises:
+        RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
+    """
+    from orchestrator.config.file_loading import load_vessel
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.runs.run_tasks import GivenTheta, RunTaskError, planned, read_theta
+
+    with Refused(ConfigError, RunTaskError):
+        given = GivenTheta(plan.parameters) if parameters is None else read_theta(parameters, plan)
+        vessel = None if receiver is None else load_vessel(receiver)
+        return planned(plan, given.theta, vessel, iterations, given.draws, given.left_over)
+
+
+def _run(
+    plan: CampaignPlan, verb: str, path: Path, options: RunOptions, stages: list[StageDefinition] | None = None
+) -> Finished:
+    from orchestrator.cli.foreground_run import check_somebody_is_there
+    from orchestrator.cli.live_option import live_view
+    from orchestrator.cli.motion_approval import arm_campaign
+    from orchestrator.runs.stages import stages_of
+
+    if options.answer is not None and not options.resume:
+        raise RefusalError(
+            f"--answer {options.answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT
+        )
+    chosen = stages_of(plan) if stages is None else stages
+    checksum = arm_campaign(plan, chosen, armed=options.arm, verb=verb)
+    if any(stage.pours for stage in chosen):
+        check_somebody_is_there(plan.laboratory)
+    check_laboratory_answers(plan, chosen, in_process=options.in_process)
+    live = live_view(plan, live=options.live, at=options.live_at)
+    directory = run_directory(plan, resume=options.resume, run_id=options.run_id)
+    flag = "" if options.laboratory is None else f" --laboratory {options.laboratory}"
+    flag += "" if options.seed is None else f" --seed {options.seed}"
+    flag += " --arm" if plan.laboratory.mode == "hardware" else ""
+    again = f"decant {verb} {path} --resume --run {directory.name}{flag}"
+    finished = run_in_front_of_people(
+        plan,
+        directory,
+        resume=options.resume,
+        stages=stages,
+        in_process=options.in_process,
+        again=again,
+        answer=options.answer,
+        checksum=checksum,
+        live=live,
+    )
+    if finished.published.theta is not None:
+        mention(f"the parameters to use are in {finished.published.theta}; give them with --parameters")
+    return finished
+
+
+def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:
+    """A new run's directory, or the one to go on with.
+
+    Raises:
+        RefusalError: there is none, or it can't be made (exit code 2).
+    """
+    from orchestrator.run_errors import RunError
+    from orchestrator.runs.run_folder import create_run, find_run
+
+    if run_id is not None and not resume:
+        raise RefusalError(f"--run {run_id}: goes with --resume; without it a new run is begun", BAD_INPUT)
+    try:
+        directory = find_run(plan, run_id) if resume else create_run(plan)
+    except RunError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    except OSError as error:
+        raise RefusalError(f"{plan.outputs.directory}: can't be written: {error.strerror}", BAD_INPUT) from None
+    return directory

@@ -1,0 +1,114 @@
+"""`decant validate`: files are read, vessels built and actions tried; nothing is started.
+
+`decant init`: files to begin with, in a folder of one's own.
+
+`decant plugins`: what installed packages add, and what of it can't be used.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, WaitingIndicator, mention, print_json, say
+from orchestrator.installed_plugins import broken, installed
+from orchestrator.shipped import starting_set
+
+
+def validate(paths: list[Path]) -> None:
+    """Check files; every problem of every file, exit code 2 if there is one. What makes little sense is a warning."""
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from sim_engine.vessel.shapes import VesselError
+
+    bad = 0
+    for path in paths:
+        try:
+            with WaitingIndicator() as doing:
+                note, problems = _checked(path, doing)
+        except ConfigError as error:
+            problems = [str(error)]
+        except VesselError as error:
+            problems = [f"{path}: {error}"]
+        if problems:
+            bad += 1
+            say("\n".join(problems))
+        else:
+            print(f"{path}: ok ({note})", flush=True)
+    if bad:
+        raise RefusalError(f"{bad} of {len(paths)} file(s) can't be used", BAD_INPUT)
+
+
+def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
+    """What a good file is, in a few words; and what is wrong with it.
+
+    Raises:
+        ConfigError, VesselError: it can't be used.
+    """
+    from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
+    from orchestrator.config.yaml.file_access import resolved
+    from orchestrator.config.yaml.yaml_source import Document, kind_of
+
+    doing(f"reading {path}")
+    match kind_of(Document.read(resolved(path)).data):
+        case "vessel":
+            from sim_engine.vessel.vessel import build_vessel
+
+            return f"vessel, holds {1e6 * build_vessel(load_vessel(path)).capacity:.4g} mL to the brim", []
+        case "laboratory":
+            return f"laboratory, {load_laboratory(path).mode}", []
+        case "study":
+            from orchestrator.study.cells import cells_of
+            from orchestrator.study.study_file import load_study
+
+            study = load_study(path)
+            return f"study, {len(cells_of(study))} cells, seed {study.seed}", []
+        case _:
+            from orchestrator.config.campaign_checks import check_campaign
+
+            plan = load_campaign(path)
+            warned: list[str] = []
+            problems = check_campaign(plan, warn=lambda problem: warned.append(f"warning: {problem}"), doing=doing)
+            for text in dict.fromkeys(warned):
+                mention(text)
+            return f"campaign, seed {plan.seed}", [str(problem) for problem in problems]
+
+
+def init(directory: Path) -> None:
+    """Copy the shipped campaigns and what they refer to.
+
+    Raises:
+        RefusalError: the folder is not empty, or can't be written (exit code 2).
+    """
+    try:
+        campaigns = starting_set(directory)
+    except FileExistsError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    except OSError as error:
+        raise RefusalError(f"{directory}: can't be written: {error.strerror}", BAD_INPUT) from None
+    for path in campaigns:
+        print(path)
+
+
+def plugins(*, as_json: bool) -> None:
+    """List strategies, objectives, balances, arms and sources of vessels by the names that files use.
+
+    Args:
+        as_json: one line of JSON in place of the table.
+
+    Raises:
+        RefusalError: a package registers something that can't be used (exit code 1).
+    """
+    found, unusable = installed(), broken()
+    if as_json:
+        print_json(
+            {
+                "plugins": [dataclasses.asdict(plugin) for plugin in found],
+                "broken": [dataclasses.asdict(one) for one in unusable],
+            }
+        )
+    else:
+        width = [max(len(row) for row in column) for column in zip(*((p.group, p.name) for p in found), strict=True)]
+        for plugin in found:
+            print(f"{plugin.group:<{width[0]}}  {plugin.name:<{width[1]}}  {plugin.package}")
+    if unusable:
+        raise RefusalError("\n".join(map(str, unusable)), FAILED)

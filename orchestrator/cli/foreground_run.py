@@ -1,0 +1,443 @@
+"""What all verbs share: reading a campaign, running one in front of a person.
+
+What a run that was interrupted or broke off leaves behind, and what to do about it, in words.
+
+Who answers while a command runs: the person at the terminal, or nobody.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import signal
+import sys
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orchestrator.cli.console import (
+    BAD_INPUT,
+    FAILED,
+    INTERRUPTED,
+    RefusalError,
+    Refused,
+    WaitingIndicator,
+    is_quiet,
+    mention,
+    say,
+    stdout_for_results,
+)
+
+if TYPE_CHECKING:
+    from actors.interfaces import Laboratory, Operator
+    from actors.laboratory_settings import LaboratorySpec
+    from orchestrator.journal.run_record import CampaignResult
+    from orchestrator.live_view.live_server import LiveView
+    from orchestrator.live_view.rerun_subscriber import RerunMonitor
+    from orchestrator.results.publishing import Published
+    from orchestrator.runs.stages import StageDefinition
+    from orchestrator.runs.unknown_pours import AskOperator
+    from orchestrator.strategies.campaign_plan import CampaignPlan
+
+
+def read_campaign(path: Path, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
+    """A campaign's plan, on another laboratory or with another seed if one is given.
+
+    Raises:
+        RefusalError: with all problems of its files, exit code 2.
+    """
+    from orchestrator.config.file_loading import load_campaign
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+
+    with Refused(ConfigError):
+        return load_campaign(path, laboratory, seed)
+
+
+def check_campaign_can_run(plan: CampaignPlan, *, as_written: bool = True) -> None:
+    """Vessels (those of the campaign's file, or others), loads and motions, before anything starts.
+
+    Raises:
+        RefusalError: with everything that is wrong, exit code 2.
+    """
+    from orchestrator.runs.run_tasks import RunTaskError, check_job
+
+    warned: list[str] = []
+    try:
+        with Refused(RunTaskError), WaitingIndicator() as doing:
+            check_job(
+                plan, as_written=as_written, warn=lambda problem: warned.append(f"warning: {problem}"), doing=doing
+            )
+    finally:
+        for text in dict.fromkeys(warned):
+            mention(text)
+
+
+def check_laboratory_answers(
+    plan: CampaignPlan, stages: Sequence[StageDefinition], *, in_process: bool, brief: bool = False
+) -> None:
+    """What the laboratory needs, here and from other machines, before anything starts.
+
+    Args:
+        plan: with its laboratory.
+        stages: that are to run.
+        in_process: everything in this process: no other machine is needed.
+        brief: see `actors.laboratory.open_laboratory`.
+
+    Raises:
+        RefusalError: with what is missing, exit code 2.
+    """
+    from actors.interfaces import LaboratoryError
+    from actors.laboratory import check_laboratory
+
+    laboratory = replace(plan.laboratory, in_process=in_process or plan.laboratory.in_process)
+    if laboratory.ray is not None and not laboratory.in_process:
+        mention(f"looking at the Ray cluster at {laboratory.ray.address} …")
+    with Refused(LaboratoryError):
+        check_laboratory(laboratory, need_bench=any(stage.pours for stage in stages), brief=brief)
+
+
+def check_output(path: Path | None, option: str, suffix: str) -> None:
+    """A file that a command is to write, before hours are spent on what goes into it.
+
+    Raises:
+        RefusalError: it can't be written there, or has the wrong suffix (exit code 2).
+    """
+    from orchestrator.config.yaml.file_access import why_unreadable
+
+    if path is None:
+        return
+    folder = path.absolute().parent
+    if why_unreadable(path) == "is a directory; name a file in it":
+        problem = "is a folder; name a file in it"
+    elif path.suffix.lower() != suffix:
+        problem = f"should end in {suffix}"
+    elif not folder.is_dir():
+        problem = "its folder does not exist"
+    elif (why := _why_not_opened(path)) is not None:
+        problem = f"can't be written: {why}"
+    else:
+        return
+    raise RefusalError(f"{option} {path}: {problem}", BAD_INPUT)
+
+
+def _why_not_opened(path: Path) -> str | None:
+    """Found out by opening it: permissions don't tell of full disks, names too long, and folders of the system."""
+    from orchestrator.config.yaml.file_access import why_unreadable
+
+    there = why_unreadable(path) != "no such file"
+    try:
+        with path.open("ab"):
+            pass
+        if not there:
+            path.unlink()
+    except (OSError, ValueError) as error:
+        return getattr(error, "strerror", None) or str(error)
+    return None
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A campaign that ran to its end, and what was written about it."""
+
+    result: CampaignResult
+    published: Published
+
+
+def run_in_front_of_people(
+    plan: CampaignPlan,
+    directory: Path,
+    *,
+    resume: bool,
+    stages: Sequence[StageDefinition] | None = None,
+    in_process: bool = False,
+    brief: bool = False,
+    again: str,
+    not_resumed: str = "",
+    answer: str | None = None,
+    checksum: str | None = None,
+    live: LiveView | None = None,
+) -> Finished:
+    """Run a campaign with a live display, a recording, figures and a summary.
+
+    Args:
+        directory: of the run.
+        stages: in place of the plan's.
+        in_process: everything in this process, without Ray (slower; for debugging).
+        brief: see `actors.laboratory.open_laboratory`.
+        again: the command that resumes, for the message after an interruption; or that begins anew …
+        not_resumed: … where nothing resumes: what is not, and what of it is kept.
+        answer: what came of a pour that was under way when the run died; else a person at the terminal is asked.
+        checksum: of the safety settings that people have accepted for the controller of hardware.
+        live: view to open while it runs.
+
+    Raises:
+        RefusalError: it failed, was interrupted, or needs a person.
+    """
+    from actors.interfaces import LaboratoryError
+    from actors.laboratory import open_laboratory
+    from orchestrator.live_view.live_server import can_record, recorder_of
+    from orchestrator.progress.console_progress import ProgressDisplay
+    from orchestrator.results.console_view import print_summary
+    from orchestrator.results.publishing import not_simulated, publish
+    from orchestrator.run_errors import RunError
+    from orchestrator.runs.events import Watcher
+    from orchestrator.runs.run_engine import run_campaign
+    from orchestrator.runs.stages import stages_of
+
+    chosen = tuple(stages_of(plan) if stages is None else stages)
+    pouring = any(stage.pours for stage in chosen)
+    spec = replace(
+        plan.laboratory, in_process=in_process or plan.laboratory.in_process, accepted_checksum=checksum or ""
+    )
+    mention(f"run {directory}  ({spec.mode} bench)" if pouring else f"run {directory}")
+    if not resume:
+        for line in not_simulated(plan, say):
+            mention(line)
+    monitor: RerunMonitor | None = None
+    result: CampaignResult | None = None
+    try:
+        display = ProgressDisplay(plan, quiet=is_quiet())
+        operator = person_at_the_terminal(spec, display.paused) if pouring else None
+        laboratory = open_laboratory(spec, need_bench=pouring, brief=brief, operator=operator)
+        if live is not None and can_record(plan):
+            mention(f"live view: {live.open()}")
+        monitor = recorder_of(plan, directory, say, live)
+        with display:
+            watchers: list[Watcher] = [display, *([monitor] if monitor is not None else [])]
+
+            async def work(laboratory: Laboratory) -> CampaignResult:
+                return await run_campaign(
+                    plan,
+                    laboratory,
+                    directory,
+                    resume=resume,
+                    watchers=watchers,
+                    ask_operator=asked_about_unknown_pours(answer),
+                    stages=chosen,
+                )
+
+            with stdout_for_results():
+                result = asyncio.run(_until_signalled(lambda: work(laboratory), resumable=not not_resumed))
+    except (RunError, LaboratoryError) as error:
+        problem = getattr(error, "problem", error) if not_resumed else error
+        way_on = _way_on(directory, again, not_resumed)
+        raise RefusalError(f"{problem}{way_on}", getattr(error, "exit_code", FAILED)) from None
+    except OSError as error:
+        if error.errno is None:
+            raise  # not a file's: a defect, which wants its traceback
+        raise RefusalError(f"{file_trouble(error, directory)}{_way_on(directory, again, not_resumed)}") from None
+    except (asyncio.CancelledError, KeyboardInterrupt):
+        if done := finished_without_report(directory):
+            way_on = done
+        elif not_resumed:
+            unknown = "".join(
+                f" while {pour} was under way: what it poured is unknown" for pour in given_up_pours(directory)
+            )
+            way_on = unknown + _way_on(directory, again, not_resumed)
+        else:
+            way_on = interruption(directory, plan, again)
+        raise RefusalError(f"interrupted{way_on}", INTERRUPTED) from None
+    finally:
+        if result is None:
+            if monitor is not None:
+                monitor.close()
+            if live is not None:
+                live.close()
+            if (page := report_of_what_stands(plan, directory)) is not None:
+                mention(f"report of what stands  {page}")
+    try:
+        if monitor is not None:
+            monitor.close()
+        if live is not None:
+            live.close()
+        published = publish(plan, result, monitor)
+        print_summary(plan, published.summary)
+    except KeyboardInterrupt:
+        raise RefusalError(f"interrupted{finished_without_report(directory)}", INTERRUPTED) from None
+    if published.report is not None:
+        mention(f"report  {published.report}")
+    return Finished(result, published)
+
+
+def _way_on(directory: Path, again: str, not_resumed: str) -> str:
+    from orchestrator.journal.journal import JOURNAL_NAME
+
+    if not (directory / JOURNAL_NAME).is_file():
+        return "\nnothing had begun"
+    return f"\n{not_resumed} is in {directory}. {again}" if not_resumed else f"\nwhat is done so far is kept: {again}"
+
+
+async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], *, resumable: bool) -> CampaignResult:
+    """Run; a first SIGINT, SIGTERM or SIGHUP pauses at the next safe point, a second gives up what is under way."""
+    begun = "a pour that has begun"
+    task = asyncio.ensure_future(work())
+    asked = 0
+
+    def stop() -> None:
+        nonlocal asked
+        asked += 1
+        if asked == 1:
+            doing = "pausing" if resumable else "ending"
+            say(f"\n{doing}: {begun} is finished and weighed first; once more to give it up")
+        else:
+            left = (
+                "will have to be accounted for on resume" if resumable else "stays unknown: weigh by hand what can be"
+            )
+            say(f"\nstopping now; {begun} {left}")
+        task.cancel()
+
+    loop = asyncio.get_running_loop()
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last one: its terminal was closed
+    for number in numbers:
+        loop.add_signal_handler(number, stop)
+    try:
+        return await task
+    finally:
+        for number in numbers:
+            loop.remove_signal_handler(number)
+
+
+def interruption(directory: Path, plan: CampaignPlan, again: str) -> str:
+    """Follows 'interrupted': that nothing is lost, or what may be.
+
+    Args:
+        directory: of the run, which can be resumed.
+        plan: of its campaign.
+        again: the command that resumes.
+    """
+    pours = given_up_pours(directory)
+    if not pours:
+        return f"; nothing is lost. Go on with: {again}"
+    what = " and ".join(pours)
+    if plan.laboratory.mode != "virtual":
+        rescue = (
+            "What it poured is lost unless you weigh it now: wait until the arm stands still, move nothing else, and "
+            "weigh what was spilled and what is left in the pourer. Resuming asks what came of it: "
+            "'weighed SPILLED RETAINED' (in grams) or 'lost'"
+        )
+    elif plan.on_unknown == "repeat":
+        rescue = "Resuming pours it again with the same chance, as 'on_unknown: repeat' says"
+    else:
+        rescue = "Resuming asks what came of it: on a virtual bench 'repeat' pours it again with the same chance"
+    return (
+        f" while {what} was under way: it was given up, and nobody knows what came of it. {rescue}. Everything "
+        f"before it is kept. Go on with: {again}"
+    )
+
+
+def finished_without_report(directory: Path) -> str:
+    """Follows 'interrupted' if all stages of a run are done and its results may not be published; empty otherwise."""
+    from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+    from orchestrator.journal.journal_file import JournalError
+    from orchestrator.states import State
+
+    with contextlib.suppress(JournalError), JournalReader(directory / JOURNAL_NAME) as journal:
+        if journal.state() is State.FINISHED:
+            return (
+                " after the last stage, while the results were written; the run is finished, and nothing is lost. "
+                f"Write its summary, figures and report with: decant report {directory}"
+            )
+    return ""
+
+
+def given_up_pours(directory: Path) -> list[str]:
+    """Pours of a run that had begun and have no outcome: 'pour 3 of stage deployment:narrow'."""
+    from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+    from orchestrator.journal.journal_file import JournalError
+    from orchestrator.requests import Pour
+    from orchestrator.runs.replay import read_history
+
+    found: list[str] = []
+    with contextlib.suppress(JournalError), JournalReader(directory / JOURNAL_NAME) as journal:
+        for stage in [entry.stage for entry in journal.entries(kinds=[Kind.STAGE_OPENED])]:
+            history = read_history(journal, stage)
+            for key in history.unknown_pours():
+                request = history.request(key)
+                assert isinstance(request, Pour)
+                found.append(f"pour {request.number} of stage {stage}")
+    return found
+
+
+def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
+    """Write the report of a run that was interrupted or broke off; None where there is nothing to report on.
+
+    Whatever goes wrong with it, a further Ctrl-C too, is no reason to say less about the run itself.
+    """
+    from orchestrator.journal.codec import digest
+    from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+    from orchestrator.journal.run_record import read_result
+    from orchestrator.results.campaign_figures import draw_figures
+    from orchestrator.results.html_report import REPORT_NAME
+    from orchestrator.results.publishing import FIGURES, summary_of, write_report
+    from orchestrator.runs.fingerprint import fingerprint
+
+    with contextlib.suppress(Exception, KeyboardInterrupt), JournalReader(directory / JOURNAL_NAME) as journal:
+        if digest(journal.header.fingerprint) != digest(fingerprint(plan)):
+            return None  # it was refused, since this is another campaign
+        result = read_result(journal, directory)
+        figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
+        return write_report(directory / REPORT_NAME, plan, summary_of(plan, result, figures), directory)
+    return None
+
+
+def file_trouble(error: OSError, directory: Path) -> str:
+    """What went wrong with a file of a run: which one, and how much room there should be where the disk is full."""
+    from orchestrator.journal.disk_reserve import MB, TO_BEGIN, free_space
+
+    where = error.filename or directory
+    text = f"{where}: {error.strerror}"
+    if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        return text
+    return (
+        f"{text}; {free_space(directory) / MB:.1f} MB are free there. A run needs {TO_BEGIN / MB:.0f} MB to begin, and "
+        "more for long ones with recordings"
+    )
+
+
+def person_at_the_terminal(
+    spec: LaboratorySpec, paused: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext
+) -> Operator | None:
+    """Who answers the bench's questions; None where a virtual operator does.
+
+    Args:
+        spec: of the laboratory.
+        paused: entered while a question is open.
+    """
+    from actors.bench.bench_factory import needs_person
+    from orchestrator.cli.terminal_operator import TerminalOperator
+
+    if not needs_person(spec) or spec.arm is None:
+        return None
+    return TerminalOperator(spec.operator, paused=paused)
+
+
+def check_somebody_is_there(spec: LaboratorySpec) -> None:
+    """A bench that asks a person needs a terminal to ask at.
+
+    Raises:
+        RefusalError: there is none (exit code 2).
+    """
+    from actors.bench.bench_factory import needs_person
+    from orchestrator.cli.terminal_operator import somebody_at_the_terminal
+
+    if needs_person(spec) and not somebody_at_the_terminal():
+        raise RefusalError(
+            f"laboratory {spec.name} asks a person (operator: answers: person), and there is no terminal to ask at; "
+            "run this in a terminal, with nothing piped into it",
+            BAD_INPUT,
+        )
+
+
+def asked_about_unknown_pours(answer: str | None) -> AskOperator | None:
+    """Who is asked about a pour whose outcome is unknown: the command line, the terminal, or nobody."""
+    if answer is not None:
+        return lambda question, options: answer
+    return _ask_on_terminal if sys.stdin.isatty() else None
+
+
+async def _ask_on_terminal(question: str, options: Sequence[str]) -> str:
+    say(f"\n{question}\n  answer with one of: {' | '.join(options)}")
+    return (await asyncio.to_thread(input, "> ")).strip()

@@ -1,0 +1,421 @@
+"""`decant pour`: one pour that a person has chosen; planned only, with an empty pourer and slowly, or for real.
+
+The whole cycle of a pour with an empty pourer, slowly, nothing weighed: what one tries before any liquid.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from actors.arm.arm_interface import PathReport, PlannedPour
+from actors.interfaces import LaboratoryError
+from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, mention, print_json, say
+from orchestrator.cli.foreground_run import check_output, read_campaign
+from orchestrator.cli.hands_on import connected, reached, stoppable, typed_line
+from orchestrator.cli.motion_approval import accepted, confirm, report_lines, require_flag
+from orchestrator.cli.pour_prediction import scene_to_simulate, wanted_in
+
+if TYPE_CHECKING:
+    from actors.arm.arm_interface import Arm, Executed
+    from orchestrator.runs.stages import StageDefinition
+    from orchestrator.strategies.campaign_plan import CampaignPlan
+    from orchestrator.strategies.single_pour import WeighedPour
+    from sim_engine.action import Action
+    from sim_engine.scene import Scene
+
+STAGE = "pour"
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """One pour, planned.
+
+    Attributes:
+        plan: the campaign that it is taken from.
+        path: of the arm; None on a bench of numbers.
+    """
+
+    plan: CampaignPlan
+    scene: Scene
+    action: Action
+    path: PlannedPour | None
+
+
+def pour(
+    path: Path,
+    *,
+    assignments: list[str] | None,
+    scene: str | None,
+    dry_run: bool,
+    connect: bool,
+    png: Path | None,
+    empty: bool,
+    slow: float,
+    arm: bool,
+    laboratory: Path | None,
+    in_process: bool,
+    as_json: bool,
+) -> None:
+    """One pour.
+
+    Args:
+        path: campaign.
+        assignments: of the action, `name=value`.
+        scene: 'calibration', 'transfer' or a receiver's name; the first receiver if not given.
+        dry_run: plan and check the whole path, and move nothing.
+        connect: with `dry_run`: also read where the arm stands.
+        png: picture of the path.
+        empty: the whole cycle with an empty pourer, nothing weighed.
+        slow: with `empty`, fraction of the planned speed.
+        arm: whether `--arm` was given.
+        laboratory: file in place of the campaign's.
+        in_process: without Ray.
+        as_json: print the result as JSON.
+
+    Raises:
+        RefusalError: it can't be made (exit code 2), or did not go as it should (1).
+    """
+    _check_options(dry_run=dry_run, connect=connect, empty=empty, slow=slow)
+    check_output(png, "--png", ".png")
+    chosen = _chosen(path, laboratory, assignments or [], scene)
+    bench = chosen.plan.laboratory
+    if chosen.path is None and (dry_run or empty or png is not None):
+        raise RefusalError(
+            f"laboratory {bench.name} has no arm whose path could be planned; its bench is made of numbers",
+            BAD_INPUT,
+        )
+    if png is not None:
+        _draw(chosen, png)
+    if dry_run:
+        _dry_run(chosen, connect=connect, as_json=as_json)
+        return
+    verb = f"decant pour {path}" + ("" if laboratory is None else f" --laboratory {laboratory}")
+    require_flag(bench, armed=arm, again=f"{verb} … --arm")
+    if empty:
+        assert chosen.path is not None
+        pour_empty(chosen.plan, chosen.action, chosen.path.slowed(slow), slow=slow, as_json=as_json)
+        return
+    _pour(chosen, in_process=in_process, again=f"Another pour: {verb} …", as_json=as_json)
+
+
+def _check_options(*, dry_run: bool, connect: bool, empty: bool, slow: float) -> None:
+    if connect and not dry_run:
+        raise RefusalError("--connect: goes with --dry-run; any other pour connects anyway", BAD_INPUT)
+    if dry_run and empty:
+        raise RefusalError("--dry-run moves nothing, --empty moves the arm: choose one", BAD_INPUT)
+    if slow != 1.0 and not empty:
+        raise RefusalError(
+            "--slow: goes with --empty; a pour with liquid is as fast as its action says: choose a slower action",
+            BAD_INPUT,
+        )
+
+
+def _chosen(path: Path, laboratory: Path | None, assignments: list[str], scene_name: str | None) -> Chosen:
+    """The pour that is asked for, its path planned and checked.
+
+    Raises:
+        RefusalError: it can't be made (exit code 2).
+    """
+    from actors.interfaces import InvalidActionError
+    from orchestrator.config.action_assignments import assigned_action
+    from orchestrator.config.campaign_checks import check_vessels
+
+    plan = read_campaign(path, laboratory)
+    scene, space = scene_to_simulate(plan, scene_name)
+    with Refused(ValueError, at="--set: "):
+        action = assigned_action(assignments, fixed=scene.fixed, space=space)
+    problems = check_vessels(scene, plan.source, wanted_in(plan, scene, scene_name))
+    if problems:
+        raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
+    if not plan.laboratory.pours:
+        raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
+    planned = None
+    if plan.laboratory.arm is not None:
+        try:
+            planned = plan.laboratory.arm.plan(scene, action)
+        except (InvalidActionError, ValueError) as error:
+            raise RefusalError(f"{action.display()}: {error}", BAD_INPUT) from None
+    return Chosen(plan, scene, action, planned)
+
+
+def report_json(report: PathReport) -> dict[str, Any]:
+    """SI units."""
+    return dataclasses.asdict(report)
+
+
+def _draw(chosen: Chosen, png: Path) -> None:
+    from actors.arm.arm_settings import UrArmSpec
+    from actors.arm.planned_pour import PourPath
+    from orchestrator.results.arm_path_figures import path_png
+    from sim_engine.vessel.vessel import build_vessel
+
+    arm = chosen.plan.laboratory.arm
+    if not isinstance(chosen.path, PourPath) or not isinstance(arm, UrArmSpec):
+        raise RefusalError("--png: draws the joints of an arm, and this arm's path has none", BAD_INPUT)
+    pourer, receiver = build_vessel(chosen.scene.pourer), build_vessel(chosen.scene.receiver)
+    drawn = path_png(
+        png,
+        chosen.path,
+        arm,
+        pourer,
+        receiver,
+        title=f"{chosen.scene.pourer.name} into {chosen.scene.receiver.name}, laboratory {chosen.plan.laboratory.name}",
+        note=chosen.action.display(),
+    )
+    mention(f"picture: {drawn}")
+
+
+def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
+    planned, laboratory = chosen.path, chosen.plan.laboratory
+    assert planned is not None
+    assert laboratory.arm is not None
+    mention(f"{chosen.scene.name}: {chosen.action.display()}; laboratory {laboratory.name}, {laboratory.mode}")
+    home = _stands_at_home(chosen) if connect else None
+    if as_json:
+        print_json(
+            {
+                "mode": laboratory.mode,
+                "action": chosen.action.values(),
+                "report": report_json(planned.report),
+                "phases": [{"name": n, "start": a, "end": b} for n, a, b in planned.phases],
+                "at_home": home,
+            }
+        )
+    else:
+        for line in [*report_lines(planned.report), *_way_lines(planned)]:
+            print(line)
+    say("nothing was moved")
+
+
+def _way_lines(planned: PlannedPour) -> list[str]:
+    tilts = "  ".join(f"{name} {end - start:.2f} s" for name, start, end in planned.phases)
+    return [
+        f"approach       {planned.approach_time:.1f} s",
+        f"pour           {planned.pour_time:.1f} s: {tilts}",
+        f"retreat        {planned.retreat_time:.1f} s",
+    ]
+
+
+def _stands_at_home(chosen: Chosen) -> bool:
+    """Read where the arm stands.
+
+    Raises:
+        RefusalError: it can't be read.
+    """
+    from actors.interfaces import LaboratoryError
+    from orchestrator.cli.hands_on import reached
+
+    with Refused(LaboratoryError, code=FAILED), reached(chosen.plan.laboratory) as ready:
+        assert ready.arm is not None
+        check = ready.arm.look().at_home()
+    say(f"the arm stands {check.found}" + (f" → {check.advice}" if check.advice else ""))
+    return check.state == "ok"
+
+
+def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> None:
+    """As a small run of its own: journalled, with the operator's questions, weighed."""
+    from orchestrator.cli.campaign_commands import run_directory
+    from orchestrator.cli.foreground_run import (
+        check_laboratory_answers,
+        check_somebody_is_there,
+        run_in_front_of_people,
+    )
+    from orchestrator.journal.stage_results import result_of
+    from orchestrator.runs.stages import StageDefinition
+    from orchestrator.strategies.single_pour import OnePour, OnePoured
+
+    plan = dataclasses.replace(
+        _only(chosen),
+        name=f"{chosen.plan.name}-pour",
+        outputs=dataclasses.replace(chosen.plan.outputs, figures=False),
+    )
+    build: Callable[..., OnePour] = lambda results, seed: OnePour(chosen.scene, chosen.action, seed)  # noqa: E731
+    stages: list[StageDefinition] = [StageDefinition(STAGE, build, pours=True)]
+    checksum = None
+    if plan.laboratory.mode == "hardware":
+        assert chosen.path is not None
+        checksum = accepted(chosen.plan)
+        confirm(plan.laboratory, ["pours          1", *report_lines(chosen.path.report)])
+    check_somebody_is_there(plan.laboratory)
+    check_laboratory_answers(plan, stages, in_process=in_process)
+    directory = run_directory(plan, resume=False, run_id=None)
+    finished = run_in_front_of_people(
+        plan,
+        directory,
+        resume=False,
+        stages=stages,
+        in_process=in_process,
+        again=again,
+        not_resumed="this pour is not resumed; what was weighed of it",
+        checksum=checksum,
+    )
+    result = result_of(finished.result.results, STAGE, OnePoured)
+    if result.weighed is None:
+        raise RefusalError(result.failed or "nothing was poured", FAILED)
+    if as_json:
+        about = {"run": str(directory), "mode": plan.laboratory.mode, "action": chosen.action.values()}
+        print_json({**about, **result.weighed.model_dump()})
+    else:
+        print(told(result.weighed))
+
+
+def _only(chosen: Chosen) -> CampaignPlan:
+    """The campaign without everything that this pour isn't of."""
+    plan = chosen.plan
+    if plan.deployment is not None and chosen.scene in plan.deployment.scenes:
+        deployment = dataclasses.replace(plan.deployment.with_settings(pours=1), scenes=(chosen.scene,))
+        return dataclasses.replace(plan, calibration=None, deployment=deployment)
+    return dataclasses.replace(plan, deployment=None)
+
+
+def told(weighed: WeighedPour) -> str:
+    """What was weighed, in a line."""
+    spillage = weighed.spillage
+    r = (
+        "too little was poured to speak of spillage"
+        if spillage is None
+        else f"spillage {100 * spillage:.2f} % of poured"
+    )
+    parts = {"loaded": weighed.loaded, "spilled": weighed.spilled, "retained": weighed.retained}
+    masses = ", ".join(f"{name} {1e3 * mass:.1f} g" for name, mass in parts.items())
+    return f"{masses}, delivered {weighed.delivered_g:.1f} g ({weighed.delivered_ml:.1f} mL); {r}"
+
+
+RECORD = "pour.json"
+
+
+def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: float, as_json: bool) -> None:
+    """Approach, tilt, return, retreat.
+
+    Args:
+        plan: campaign.
+        action: that the path was planned for.
+        path: slowed already.
+        slow: by what.
+        as_json: print the record.
+
+    Raises:
+        RefusalError: refused (exit code 2), or stopped on the way (1).
+    """
+    from orchestrator.runs.run_folder import create_run
+
+    laboratory = plan.laboratory
+    assert laboratory.arm is not None
+    hardware = laboratory.mode == "hardware"
+    if hardware and not sys.stdin.isatty():
+        raise RefusalError("--empty asks a person before the arm moves: run it in a terminal", BAD_INPUT)
+    checksum = accepted(plan) if hardware else None
+    lines = [f"one cycle      with an EMPTY pourer, at {100 * slow:g} % of its speed", *report_lines(path.report)]
+    if hardware:
+        confirm(laboratory, lines)
+    else:
+        say(f"laboratory {laboratory.name}, virtual: nothing moves but numbers\n" + "\n".join(lines))
+    try:
+        directory = create_run(dataclasses.replace(plan, name=f"{plan.name}-empty"))
+        with reached(laboratory) as ready:
+            assert ready.arm is not None
+            # this command announces each movement itself, by counting down before it lets the arm move
+            driver = dataclasses.replace(ready, arm=ready.arm.announced(0.0))
+            with connected(driver, checksum) as (arm, facts):
+                cycle = _Cycle(arm, path, ready.arm.on_clock(laboratory.arm.announcement), ask=hardware)
+                executed = cycle.run()
+    except LaboratoryError as error:
+        raise RefusalError(str(error), FAILED) from None
+    except OSError as error:
+        raise RefusalError(f"{plan.outputs.directory}: can't be written: {error.strerror}", BAD_INPUT) from None
+    record = {
+        "mode": laboratory.mode,
+        "laboratory": laboratory.name,
+        "date": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "robot": {"model": facts.model, "serial": facts.serial, "version": facts.version, "checksum": facts.checksum},
+        "action": action.values(),
+        "slow": slow,
+        "planned": dataclasses.asdict(path.report),
+        "tracking": dict(executed.tracking),
+        "executed_s": float(executed.times[-1]),
+    }
+    (directory / RECORD).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    if as_json:
+        print_json({"run": str(directory), **record})
+    else:
+        print(_told(executed))
+    say(f"record: {directory / RECORD}")
+
+
+class _Cycle:
+    """One cycle, with a person's consent to each movement where there is hardware."""
+
+    def __init__(self, arm: Arm, path: PlannedPour, announcement: float, *, ask: bool) -> None:
+        self._arm, self._path, self._announcement, self._ask = arm, path, announcement, ask
+
+    def run(self) -> Executed:
+        """Raises LaboratoryError where it is refused, or stopped."""
+        self._arm.hands_in()
+        self._consent(
+            "Put the EMPTY pourer into the gripper, and take hands and tools out of the cell. Emergency stop in hand?"
+        )
+        self._moving("approach", lambda: self._arm.move_to_start(self._path))
+        try:
+            executed: Executed = self._moving("pour", lambda: self._arm.execute(self._path))
+        except LaboratoryError as error:
+            self._upright(error)
+            raise
+        self._moving("retreat", lambda: self._arm.retreat(self._path))
+        return executed
+
+    def _moving(self, name: str, motion: Callable[[], Any]) -> Any:
+        say(f"{name} …")
+        return stoppable(self._arm, motion)
+
+    def _upright(self, error: LaboratoryError) -> None:
+        """After a stop with the pourer tilted: upright and home, if somebody says so."""
+        say(str(error))
+        if not self._ask:
+            return
+        if not _yes("Find the cause and mend it. Shall the arm bring the pourer upright, slowly, and go home?"):
+            return
+        with contextlib.suppress(LaboratoryError):
+            self._arm.release()
+            say(f"ready again: {self._arm.recover() or 'nothing had to be done'}")
+        self._released()
+        self._moving("upright", self._arm.untilt)
+        self._released()
+        self._moving("retreat", lambda: self._arm.retreat(self._path))
+
+    def _consent(self, text: str) -> None:
+        if self._ask and not _yes(text):
+            raise LaboratoryError("not confirmed; nothing has moved")
+        self._released()
+
+    def _released(self) -> None:
+        left = self._announcement
+        while left > 0.0:
+            say(f"the arm moves in {left:.0f} s; Ctrl-C stops it" if left >= 0.5 else "the arm moves")
+            time.sleep(min(left, 1.0))
+            left -= 1.0
+        self._arm.release()
+
+
+def _yes(text: str) -> bool:
+    say(f"\n{text}")
+    return typed_line("type 'yes' to go on > ").strip().lower() == "yes"
+
+
+def _told(executed: Executed) -> str:
+    tracking = executed.tracking
+    parts = [f"the cycle was completed; the pour took {executed.times[-1]:.1f} s"]
+    if "rms_angle" in tracking:
+        parts.append(
+            f"joints followed within {math.degrees(tracking['rms_angle']):.2f} deg rms, "
+            f"{math.degrees(tracking['max_angle']):.2f} deg at most"
+        )
+    return "; ".join(parts)

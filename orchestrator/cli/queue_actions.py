@@ -1,0 +1,346 @@
+"""What the daemon's verbs do: `decant serve`, and those that talk to it over HTTP."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, print_json, say
+from sim_engine.resources import MissingExtraError, require
+
+if TYPE_CHECKING:
+    from orchestrator.daemon.daemon_client import Client
+
+At = tuple[str | None, Path | None]
+"""Address and state directory of the daemon, as given."""
+
+
+def serve(path: Path | None, *, state: Path | None, port: int | None, simulators: int | None, in_process: bool) -> None:
+    """Serve until told to end.
+
+    Raises:
+        RefusalError: it can't begin.
+    """
+    from orchestrator.config.yaml.file_access import resolved
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.run_errors import RunError
+
+    _require_extra()
+    from orchestrator.daemon.daemon_settings import load_settings
+    from orchestrator.daemon.server_process import log_lines, serve
+
+    try:
+        settings = load_settings(
+            path,
+            state=None if state is None else resolved(state),
+            port=port,
+            simulators=simulators,
+            in_process=in_process or None,
+        )
+        log_lines()
+        serve(
+            settings, lambda url: say(f"serving {url}; state in {settings.state}. 'decant submit CAMPAIGN' queues one")
+        )
+    except ConfigError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    except RunError as error:
+        raise RefusalError(str(error), error.exit_code) from None
+    except OSError as error:
+        where = error.filename or "state directory"
+        cure = "--state or $DECANT_STATE names another folder"
+        raise RefusalError(f"{where}: {error.strerror}; {cure}", BAD_INPUT) from None
+
+
+def _require_extra() -> None:
+    for module in ("fastapi", "uvicorn", "httpx", "prometheus_client", "pythonjsonlogger"):
+        with Refused(MissingExtraError):
+            require(module, "the daemon")
+
+
+@contextmanager
+def talking(at: At) -> Iterator[Client]:
+    """A client of the daemon there. Its refusals are this command's."""
+    _require_extra()
+    from orchestrator.daemon.daemon_client import Client
+    from orchestrator.run_errors import RunError
+
+    try:
+        with Client(*at) as client:
+            yield client
+    except RunError as error:
+        raise RefusalError(str(error), error.exit_code) from None
+
+
+def submit(
+    path: Path,
+    *,
+    wanted: str,
+    rig: str,
+    priority: int,
+    laboratory: Path | None,
+    seed: int | None,
+    parameters: Path | None = None,
+    receiver: Path | None = None,
+    iterations: int | None = None,
+    at: At,
+    as_json: bool,
+) -> None:
+    """Pack a campaign here, and have it queued there.
+
+    Raises:
+        RefusalError: it can't be used, here or there.
+    """
+    from orchestrator.cli.foreground_run import read_campaign
+    from orchestrator.daemon.submission_bundle import pack
+
+    plan = read_campaign(path, laboratory, seed)
+    if (parameters, receiver, iterations) != (None, None, None):
+        from orchestrator.cli.campaign_commands import planning_plan
+
+        if wanted != "plan":
+            raise RefusalError("--parameters, --receiver and --iterations go with --verb plan", BAD_INPUT)
+        plan = planning_plan(plan, parameters, receiver, iterations)
+    try:
+        text, files = pack(plan, parameters)
+    except OSError as error:
+        raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
+    with talking(at) as client:
+        body = {"text": text, "files": files, "verb": wanted, "rig": rig, "priority": priority}
+        found = client.post("/campaigns", body)
+    if as_json:
+        print_json(found)
+        return
+    print(found["id"])
+    mention(f"queued for {found['rig']}; follow it with: decant logs -f {found['id']}")
+    if found["needs_arming"]:
+        say(f"hardware: it waits until somebody has armed it: decant arm {found['id']}")
+
+
+def list_campaigns(*, at: At, as_json: bool) -> None:
+    """Everything at a glance."""
+    with talking(at) as client:
+        status, campaigns = client.get("/status"), client.get("/campaigns", limit=50)
+        questions = client.get("/questions")
+    if as_json:
+        print_json({"status": status, "campaigns": campaigns, "questions": questions})
+        return
+    stops = [("", status["emergency"]), *((f" of {rig['name']}", rig["emergency"]) for rig in status["rigs"])]
+    for of, stop in stops:
+        if stop:
+            say(f"EMERGENCY STOP{of} by {stop['by']}, {_clock(stop['time'])}: {stop['reason'] or 'no reason given'}")
+    for problem in status["problems"]:
+        say(f"problem: {problem}")
+    if status["queue_paused"]:
+        say("the queue is paused: decant resume")
+    rows = [("CAMPAIGN", "STATE", "RIG", "SUBMITTED", "")]
+    for one in campaigns:
+        rows.append((one["id"], one["state"], one["rig"], _clock(one["created"]), _standing(one)))
+    widths = [max(len(row[i]) for row in rows) for i in range(4)]
+    for row in rows:
+        print("  ".join([*(text.ljust(width) for text, width in zip(row[:4], widths, strict=True)), row[4]]).rstrip())
+    for question in questions:
+        _print_question(question)
+
+
+def _standing(one: dict[str, Any]) -> str:
+    progress = one["progress"]
+    if one["needs_arming"]:
+        return f"waits for: decant arm {one['id']}"
+    if progress is None:
+        return str(one["reason"]).split("\n", maxsplit=1)[0][:100]
+    parts = [f"{progress['stage']} ({progress['stage_index']}/{progress['stage_count']})"] if progress["stage"] else []
+    if progress["of_pours"]:
+        parts.append(f"{progress['pours']}/{progress['of_pours']} pours")
+    if progress["of_simulations"]:
+        parts.append(f"{progress['simulations']}/{progress['of_simulations']} simulations")
+    parts += [progress["checkpoint_words"]] if progress["checkpoint_words"] else []
+    return " · ".join(parts)
+
+
+def show(key: str, *, at: At, as_json: bool) -> None:
+    """One campaign."""
+    with talking(at) as client:
+        found = client.get(f"/campaigns/{key}")
+    if as_json:
+        print_json(found)
+        return
+    print(f"{found['id']}: {found['state']}  ({found['verb']} on {found['rig']}, {found['mode']})")
+    for name in ("reason", "run", "live"):
+        if found[name]:
+            print(f"  {name:10s} {found[name]}")
+    print(f"  submitted  {_clock(found['created'])} by {found['by']}")
+    if found["progress"] is not None:
+        print(f"  now        {_standing(found)}")
+        print(f"             {found['progress']['line']}")
+    for pour in found["pours_made"]:
+        told = pour["measured"] or {"unknown": "UNKNOWN"}.get(pour["state"], pour["state"])
+        told += f" ({pour['loss']})" if pour["state"] == "weighed" else ""
+        predicted = f"  predicted {pour['predicted']}" if pour["predicted"] else ""
+        print(f"  pour {pour['number']:<3d} into {pour['receiver']}  {pour['action']}{predicted}  → {told}")
+    for deed in found["deeds"]:
+        print(f"  {_clock(deed['t'])}  {deed['by']}: {deed['what']} {deed['detail']}".rstrip())
+
+
+def logs(key: str | None, *, follow: bool, as_json: bool, at: At) -> None:
+    """Events, as lines."""
+    with talking(at) as client:
+        only = None if key is None else client.get(f"/campaigns/{key}")["id"]
+        try:
+            for told in client.events(0, only, follow=follow):
+                line = json.dumps({"id": told.id, **told.data}, ensure_ascii=False) if as_json else _line(told.data)
+                if line:
+                    print(line, flush=True)
+        except KeyboardInterrupt:
+            return
+
+
+_PASSING = ("PourProgressed", "StrategyProgressed", "MadeAhead", "RequestStarted", "StageClosed")
+
+
+def _line(event: dict[str, Any]) -> str | None:
+    """What people want to read of an event; None: nothing."""
+    kind = event["type"]
+    match kind:
+        case _ if kind in _PASSING:
+            return None
+        case "LogLine":
+            text = f"{event['level']}: {event['text']}"
+        case "CampaignStateChanged":
+            text = f"{event['before']} → {event['after']}" + (f": {event['reason']}" if event["reason"] else "")
+        case "CampaignRests":
+            text = f"rests: {event['state']}" + (f": {event['reason']}" if event["reason"] else "")
+        case "StageOpened":
+            text = f"stage {event['stage']} ({event['index']}/{event['count']})"
+        case "RequestFinished":
+            text = _finished(event)
+        case "DecisionMade":
+            text = event["decision"]["text"]
+        case "QuestionAsked" | "QuestionAnswered" | "QuestionClosed":
+            question = event["question"]
+            said = f" → {question['answer']} ({question['by']})" if question["answer"] else ""
+            text = f"question {question['id']}: {question['text']}{said}"
+        case "Deed":
+            text = f"{event['by']}: {event['what']} {event['detail']}".rstrip()
+        case _:
+            text = " ".join([kind, *(str(event[k]) for k in ("text", "rig", "state") if event.get(k))])
+    return f"{_clock(event['time'])}  {event['campaign'] or 'daemon'}  {text}"
+
+
+def _finished(event: dict[str, Any]) -> str:
+    request, outcome = event["request"], event["outcome"]
+    what = f"pour {request['number']}" if request["type"] == "Pour" else request["type"].lower()
+    match outcome["type"]:
+        case "Poured":
+            masses = outcome["measurement"]
+            return f"{what}: {1e3 * masses['spilled']:.1f} g spilled of {1e3 * masses['loaded']:.1f} g"
+        case "Simulated":
+            return f"{what}: {100 * outcome['outcome']['spilled']:.2f} % spilled"
+        case "Failed":
+            return f"{what}: failed: {outcome['reason']}"
+    return f"{what}: {outcome['type'].lower()}"
+
+
+def act(key: str | None, what: str, *, at: At) -> None:
+    """Pause, resume or stop a campaign; without one the queue."""
+    with talking(at) as client:
+        found = client.post(f"/queue/{what}" if key is None else f"/campaigns/{key}/{what}")
+    if key is None:
+        print("queue paused" if found["queue_paused"] else "queue goes on")
+    else:
+        print(f"{found['id']}: {found['state']}, wanted: {found['wish']}")
+
+
+def abort(key: str | None, *, everything: bool, clear: bool, rig: str | None, at: At) -> None:
+    """Stop the motion of one campaign, of one rig, or of all of them."""
+    if sum((key is not None, everything, clear or rig is not None)) != 1:
+        raise RefusalError(
+            "name one campaign, or --all for the emergency stop, or --rig for that of one rig, or --clear to end one",
+            BAD_INPUT,
+        )
+    with talking(at) as client:
+        if key is not None:
+            found = client.post(f"/campaigns/{key}/abort")
+            print(f"{found['id']}: {found['state']}, wanted: {found['wish']}")
+            return
+        client.post("/emergency-stop/clear" if clear else "/emergency-stop", {"rig": rig or ""})
+    of = f" of {rig}" if rig else ""
+    option = f" --rig {rig}" if rig else ""
+    if clear:
+        print(f"emergency stop{of} cleared: what was given up rests until it is resumed")
+    else:
+        print(f"EMERGENCY STOP{of}: the work is given up; nothing begins there before 'decant abort --clear{option}'")
+
+
+def answer(number: int | None, text: str, *, at: At) -> None:
+    """Answer a question, or list those that are open."""
+    with talking(at) as client:
+        if number is None:
+            questions = client.get("/questions")
+            for question in questions:
+                _print_question(question)
+            if not questions:
+                say("no question is open")
+            return
+        if not text:
+            raise RefusalError(f"question {number}: what is the answer? 'decant answer' lists the questions", BAD_INPUT)
+        found = client.post(f"/questions/{number}/answer", {"answer": text})
+    print(f"question {found['id']}: {found['answer']}")
+
+
+def _print_question(question: dict[str, Any]) -> None:
+    print(f"\nquestion {question['id']} ({question['campaign']}, {question['rig']}), {_clock(question['asked'])}")
+    if question["problem"]:
+        print(f"  {question['problem']}")
+    print(f"  {question['text']}")
+    for name, value in question["details"].items():
+        print(f"    {name}: {value}")
+    wanted = " | ".join(question["options"]) or {"done": "done", "yes or no": "yes | no"}.get(
+        question["wants"], "a weight, such as '203.4 g'"
+    )
+    print(f"  decant answer {question['id']} …   ({wanted})")
+
+
+def arm(key: str, *, at: At) -> None:
+    """Show what hardware would do, and have its laboratory's name typed."""
+    from orchestrator.cli.motion_approval import announce
+
+    if not sys.stdin.isatty():
+        raise RefusalError(
+            "hardware is armed by somebody who reads what it will do and types its name: that needs a terminal",
+            BAD_INPUT,
+        )
+    with talking(at) as client:
+        say("planning paths from all over the actions …")
+        moves = client.get(f"/campaigns/{key}/arming")
+        announce(moves["laboratory"], moves["arm"], moves["lines"])
+        print("> ", end="", file=sys.stderr, flush=True)
+        found = client.post(f"/campaigns/{key}/arm", {"laboratory": sys.stdin.readline().strip()})
+    say(f"armed for the coming part of its run: {found['id']}")
+
+
+def move(key: str, *, before: str | None, priority: int | None, at: At) -> None:
+    """Another place in the queue."""
+    if before is None and priority is None:
+        raise RefusalError("where to? --first, --before CAMPAIGN_ID or --priority N", BAD_INPUT)
+    with talking(at) as client:
+        client.post(f"/campaigns/{key}/move", {"before": before, "priority": priority})
+        queue = client.get("/campaigns", state="queued")
+    for place, one in enumerate(queue, start=1):
+        print(f"{place:3d}  {one['id']}  (priority {one['priority']})")
+
+
+def shutdown(*, at: At) -> None:
+    """End the daemon."""
+    with talking(at) as client:
+        client.post("/shutdown")
+    print("ending at the next safe point; its queue is kept")
+
+
+def _clock(t: float) -> str:
+    same_day = time.strftime("%Y%m%d", time.localtime(t)) == time.strftime("%Y%m%d")
+    return time.strftime("%H:%M:%S" if same_day else "%Y-%m-%d %H:%M", time.localtime(t))

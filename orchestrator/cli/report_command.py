@@ -1,0 +1,130 @@
+"""`decant report`: the page about a run or a study, made again from its folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from orchestrator.cli.command_options import Json, Quiet, call, examples
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, print_json, say
+
+EXAMPLES = examples(
+    "decant report quickstart-20300131-1              # a run of the folder runs/",
+    "decant report runs/quickstart-20300131-1 --pdf -o for-the-lab-meeting.html",
+    "decant report configs/studies/quick.yaml         # or the study's folder",
+)
+
+RUNS = Path("runs")
+"""Where a name without a folder is looked for."""
+
+
+def report(
+    what: Annotated[
+        Path,
+        typer.Argument(
+            help="A run's folder, or its name in runs/; a study's folder, or its file.",
+            metavar="RUN|STUDY",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Another file than report.html in the run's folder.", show_default=False),
+    ] = None,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Write every figure of a run as PDF, too, for LaTeX.")] = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make the page about a run or a study: one HTML file that needs nothing beside it and prints well.
+
+    What was asked, what was done, θ* with its region, every pour, figures, cost, and in plain words what to do from now
+    on, how far it may be missed, and what nobody knows. Also of runs that are paused, failed or unknown: it says so.
+    """
+    call(_report, what, output=output, pdf=pdf, as_json=as_json)
+
+
+def _report(what: Path, *, output: Path | None, pdf: bool, as_json: bool) -> None:
+    from orchestrator.cli.foreground_run import check_output
+    from orchestrator.journal.journal import JOURNAL_NAME
+    from orchestrator.study.study_folder import SETTINGS
+
+    check_output(output, "--output", ".html")
+    folder = what if what.exists() or len(what.parts) > 1 else RUNS / what
+    if (folder / JOURNAL_NAME).is_file():
+        page, figures = _of_run(folder, output, (".svg", ".pdf") if pdf else (".svg",))
+    elif (folder / SETTINGS).is_file() or folder.suffix in (".yaml", ".yml"):
+        if output is not None or pdf:
+            raise RefusalError(f"{folder}: is a study; its page and figures (PNG, SVG) go to its folder", BAD_INPUT)
+        page, figures = _of_study(folder), []
+    else:
+        raise RefusalError(_nothing_there(folder), BAD_INPUT)
+    mention(f"report  {page}")
+    if as_json:
+        print_json({"report": page, "figures": figures})
+
+
+def _nothing_there(folder: Path) -> str:
+    from orchestrator.journal.journal import JOURNAL_NAME
+    from orchestrator.journal.journal_check import check_journal, has_begun
+
+    if has_begun(folder / JOURNAL_NAME):
+        return f"{folder}: {check_journal(folder / JOURNAL_NAME).verdict}"
+    near = sorted(path.parent.name for path in folder.absolute().parent.glob(f"*/{JOURNAL_NAME}"))
+    known = f"; runs there: {', '.join(near)}" if near else ""
+    return (
+        f"{folder}: neither a run nor a study is here; name a run's folder (with its {JOURNAL_NAME}), a study's "
+        f"folder, or a study's file{known}"
+    )
+
+
+def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
+    from orchestrator.config.file_loading import load_campaign
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+    from orchestrator.journal.journal_check import check_journal
+    from orchestrator.journal.run_record import read_result
+    from orchestrator.results.html_report import REPORT_NAME
+    from orchestrator.results.publishing import publish_if_missing, report_on, write_reduced_report
+    from orchestrator.run_errors import RunError
+    from orchestrator.runs.run_folder import RESOLVED, missing_plugins, read_versions
+
+    check = check_journal(folder / JOURNAL_NAME)
+    for problem in check.problems:
+        say(f"warning: {problem}")
+    try:
+        try:
+            plan = load_campaign(folder / RESOLVED)
+            with JournalReader(folder / JOURNAL_NAME) as journal:
+                result = read_result(journal, folder)
+        except (ConfigError, RunError) as error:
+            reason = f"Its campaign or its results can't be read: {error}"
+            if missing := missing_plugins(read_versions(folder)):
+                reason = f"Not installed here: {'; '.join(missing)}. Install what is missing for the whole report."
+            say(f"warning: the report is reduced to what the journal has. {reason}")
+            return write_reduced_report(output or folder / REPORT_NAME, folder, reason), []
+        mention("drawing the figures …")
+        if publish_if_missing(plan, result):
+            mention("summary.json and theta.json were missing, and are written now")
+        page, figures = report_on(plan, result, output, formats)
+    except RunError as error:
+        raise RefusalError(str(error)) from None
+    except OSError as error:
+        raise RefusalError(f"{error.filename or folder}: {error.strerror}") from None
+    except (LookupError, TypeError, ValueError, AttributeError):
+        if not check.problems:
+            raise
+        raise RefusalError(f"{folder}: no report can be made of damaged records; {check.verdict}") from None
+    return page, list(figures.values())
+
+
+def _of_study(what: Path) -> Path:
+    from orchestrator.cli.study_command import read_study
+    from orchestrator.study.report.study_page import write_report
+    from orchestrator.study.study_folder import StudyError, check_settings, file_of
+
+    with Refused(StudyError):
+        plan = read_study(what if what.is_file() else file_of(what))
+        check_settings(plan)
+        return write_report(plan, plan.folder)

@@ -1,0 +1,160 @@
+"""`decant study`: a whole comparison from one file, resumable, with figures, tables and a page at the end."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.cli.console import INTERRUPTED, RefusalError, Refused, mention, print_json
+
+if TYPE_CHECKING:
+    from orchestrator.study.cells import StudyCell
+    from orchestrator.study.study_plan import StudyPlan
+    from orchestrator.study.study_runner import CellStatus
+
+SHOWN_FAILURES = 5
+
+
+def study(path: Path, *, jobs: int | None, dry_run: bool, report_only: bool, as_json: bool) -> None:
+    """Run what is left of a study, and report on what is there.
+
+    Raises:
+        RefusalError: the file can't be used (2), a cell failed (1), or it was interrupted (130).
+    """
+    from orchestrator.study.cells import cells_of
+    from orchestrator.study.study_folder import StudyError, check_settings, opened
+
+    plan = read_study(path)
+    cells = cells_of(plan)
+    with Refused(StudyError):
+        if dry_run:
+            check_settings(plan)
+            _tell_what_is_left(plan, cells, as_json)
+            return
+        with opened(plan) as folder:
+            status = None if report_only else _run(plan, folder, jobs or os.cpu_count() or 1, path)
+            page = _report(plan, folder)
+    if as_json:
+        finished = len(status.finished) if status is not None else None
+        print_json({"study": plan.name, "folder": folder, "page": page, "cells": len(cells), "finished": finished})
+    if status is not None and status.failed:
+        shown = list(status.failed.items())[:SHOWN_FAILURES]
+        lines = [f"{len(status.failed)} of {len(cells)} cells failed, {len(status.skipped)} need one of them:"]
+        lines += [f"  {name}: {why}" for name, why in shown]
+        lines.append(f"what is done is kept; mend that and go on with: decant study {path}")
+        raise RefusalError("\n".join(lines))
+
+
+def read_study(path: Path) -> StudyPlan:
+    """A study's plan, its vessels built and its actions tried.
+
+    Raises:
+        RefusalError: with all problems of its files, exit code 2.
+    """
+    from dataclasses import replace
+
+    from orchestrator.cli.foreground_run import check_campaign_can_run
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.study.study_file import load_study
+
+    with Refused(ConfigError):
+        plan = load_study(path)
+    deployment = None
+    if plan.deployments:  # the cells take draws of θ from the cells of calibrations
+        deployment = replace(plan.deployments[0].plan, thetas=(plan.base.parameters,))
+    check_campaign_can_run(replace(plan.base, source=plan.source, deployment=deployment))
+    return plan
+
+
+def _tell_what_is_left(plan: StudyPlan, cells: tuple[StudyCell, ...], as_json: bool) -> None:
+    from orchestrator.study.cells import estimated_seconds
+    from orchestrator.study.study_folder import is_finished
+
+    left = [cell for cell in cells if not is_finished(plan.folder, cell.id)]
+    simulations, pours = sum(cell.simulations for cell in left), sum(cell.pours for cell in left)
+    hours = sum(estimated_seconds(plan, cell) for cell in left) / 3600
+    if as_json:
+        print_json(
+            {
+                "cells": [cell.id for cell in cells],
+                "left": len(left),
+                "simulations": simulations,
+                "pours": pours,
+                "cpu_hours": round(hours, 3),
+            }
+        )
+        return
+    groups: dict[str, list[StudyCell]] = {}
+    for cell in cells:
+        groups.setdefault(" ".join(filter(None, (cell.kind, cell.level, cell.arm))), []).append(cell)
+    missing = {cell.id for cell in left}
+    for name, members in groups.items():
+        todo = [cell for cell in members if cell.id in missing]
+        text = f"{len(members) - len(todo)} of {len(members)} finished"
+        if todo:
+            text += f", left: {sum(c.simulations for c in todo)} simulations, {sum(c.pours for c in todo)} pours"
+        print(f"{name:34} {text}")
+    print(
+        f"{len(cells)} cells, {len(left)} left: at most {simulations} simulations and {pours} pours, some "
+        f"{hours:.2g} CPU hours (an estimate, good to a factor of two). Nothing was started."
+    )
+
+
+def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> CellStatus:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    from orchestrator.study.cells import cells_of
+    from orchestrator.study.study_folder import finished_results, warning
+    from orchestrator.study.study_runner import run_cells
+
+    cells = cells_of(plan)
+    finished = finished_results(folder, cells)
+    if len(finished) < len(cells) and (text := warning(finished)) is not None:
+        mention(text)
+    mention(f"study {folder}, {jobs} at a time")
+    columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[left]}")]
+    try:
+        with Progress(*columns, console=Console(stderr=True)) as bar, _ending_like_ctrl_c():
+            task = bar.add_task("cells", left="")
+
+            def watch(status: CellStatus) -> None:
+                known = len(status.finished) + len(status.failed) + len(status.skipped)
+                text = f"about {_duration(status.seconds_left(jobs))} left" if status.running else ""
+                bar.update(task, total=status.cells, completed=known, left=text)
+
+            return run_cells(plan, folder, jobs=jobs, watch=watch)
+    except KeyboardInterrupt:
+        raise RefusalError(f"interrupted; nothing is lost. Go on with: decant study {path}", INTERRUPTED) from None
+
+
+@contextlib.contextmanager
+def _ending_like_ctrl_c() -> Iterator[None]:
+    """While cells run, SIGTERM and SIGHUP end them as Ctrl-C does."""
+
+    def interrupt(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _duration(seconds: float) -> str:
+    minutes = round(seconds / 60)
+    return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{max(minutes, 1)} min"
+
+
+def _report(plan: StudyPlan, folder: Path) -> Path:
+    from orchestrator.study.report.study_page import write_report
+
+    page = write_report(plan, folder)
+    mention(f"figures, tables and a page: {page}")
+    return page

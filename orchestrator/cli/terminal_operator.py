@@ -1,0 +1,242 @@
+"""The person at the bench, asked in the terminal that `decant run` was started from.
+
+Lines are read as they come, without a thread: a question can be given up, and the program can end, while nobody types.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import os
+import sys
+import termios
+import textwrap
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import TextIO
+
+from actors.balance.readings import typed_weight
+from actors.interfaces import LaboratoryError, OperatorQuestion, OperatorSpec
+
+GIVE_UP = "give up"
+
+_EXPECTED = {
+    "done": f"type 'done' when it is done, or '{GIVE_UP}'",
+    "weight": f"type the weight with its unit, for example '203.4 g', or '{GIVE_UP}'",
+    "yes or no": f"type 'yes' or 'no', or '{GIVE_UP}'",
+}
+_WORDS = {
+    "done": {"done": "done", "d": "done"},
+    "yes or no": {"yes": "yes", "y": "yes", "no": "no", "n": "no"},
+}
+_WIDTH = 100
+_ENDS_OF_INPUT = 3
+"""Ctrl-D once is a slip; so many in a row mean that the terminal is gone."""
+
+
+class TerminalOperator:
+    """`Operator` at a terminal. Only whole words count: Enter alone, or keys pressed too early, confirm nothing.
+
+    Args:
+        spec: how long an answer may take.
+        paused: entered while a question is open: holds a live display that would draw over it.
+        stdin: file descriptor of the terminal.
+        out: where questions are written; by default stderr, so that stdout stays for results.
+    """
+
+    def __init__(
+        self,
+        spec: OperatorSpec,
+        *,
+        paused: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext,
+        stdin: int = 0,
+        out: TextIO | None = None,
+    ) -> None:
+        self._spec = spec
+        self._paused = paused
+        self._stdin = stdin
+        self._out = out
+        self._one_question = asyncio.Lock()
+        self._reminded = 0.0
+        self._counting: asyncio.Task[None] | None = None
+
+    async def ask(self, question: OperatorQuestion) -> str:
+        """See `Operator.ask`.
+
+        Raises:
+            LaboratoryError: nobody is there, nobody answered in time, or the pour is given up.
+        """
+        async with self._one_question:
+            with self._paused(), _Lines(self._stdin) as lines:
+                if self._counting is not None:
+                    self._counting.cancel()  # whatever was announced is over: somebody is asked again
+                self._write(f"\a\n{_worded(question)}\n{self._expected(question)}\n> ")
+                self._reminded = asyncio.get_running_loop().time()
+                return await self._answer(question, lines)
+
+    async def announce(self, text: str, seconds: float) -> None:
+        """See `Operator.announce`. It is counted down."""
+        self._write(f"{text}\n")
+        self._counting = asyncio.create_task(self._count_down(seconds))
+
+    def _remind(self, question: OperatorQuestion, left: float) -> None:
+        """Ring, and ask again; `left` is what is left until the question is given up [s]."""
+        self._reminded = asyncio.get_running_loop().time()
+        self._write(f"\a\nstill waiting, {_time(left)} left: {question.text}\n{_EXPECTED[question.wants]}\n> ")
+
+    async def _count_down(self, seconds: float) -> None:
+        end = asyncio.get_running_loop().time() + seconds
+        for left in range(math.ceil(seconds) - 1, 0, -1):
+            await asyncio.sleep(max(end - left - asyncio.get_running_loop().time(), 0.0))
+            self._write(f"\a  {left} …\n")
+        await asyncio.sleep(max(end - asyncio.get_running_loop().time(), 0.0))
+        self._write("\a  now\n")
+
+    async def _answer(self, question: OperatorQuestion, lines: _Lines) -> str:
+        loop = asyncio.get_running_loop()
+        begin = loop.time()
+        ends = 0
+        while True:
+            left = begin + self._spec.deadline - loop.time()
+            if left <= 0.0:
+                self._write("\n")
+                raise LaboratoryError(
+                    f"nobody answered within {_time(self._spec.deadline)}: {question.text} Nothing moves until the run "
+                    "is resumed"
+                )
+            wait = min(left, max(self._reminded + self._spec.reminder - loop.time(), 0.0))
+            try:
+                line = await lines.next(wait)
+            except TimeoutError:
+                left = begin + self._spec.deadline - loop.time()
+                if left > 0.0 and loop.time() >= self._reminded + self._spec.reminder:
+                    self._remind(question, left)
+                continue
+            except EOFError:
+                ends += 1
+                if ends >= _ENDS_OF_INPUT:
+                    what = question.text.rstrip(".")
+                    raise LaboratoryError(f"the terminal was closed; nobody can answer: {what}") from None
+                self._write(f"\nThe question is still open: {self._expected(question)}\n> ")
+                continue
+            ends = 0
+            if line.strip():
+                self._reminded = loop.time()  # somebody is there
+            understood = self._understood(question, line)
+            if understood is not None:
+                return understood
+
+    def _understood(self, question: OperatorQuestion, line: str) -> str | None:
+        """The answer that a line is; else None, and what would be one is printed."""
+        said = " ".join(line.lower().split())
+        if said == GIVE_UP:
+            raise LaboratoryError(f"given up by the operator at: {question.text.rstrip('.')}")
+        if question.wants == "weight":
+            try:
+                weight = typed_weight(line)
+            except ValueError as error:
+                self._write(f"{error}\n> ")
+                return None
+            digits = max(0, round(-math.log10(1e3 * weight.step)))
+            self._write(f"  {1e3 * weight.mass:.{digits}f} g\n")
+            return line.strip()
+        answer = _WORDS[question.wants].get(said)
+        if answer is None:
+            unknown = f"'{line.strip()}' is not an answer; " if said else ""
+            self._write(f"{unknown}{_EXPECTED[question.wants]}\n> ")
+        return answer
+
+    def _expected(self, question: OperatorQuestion) -> str:
+        return (
+            f"{_EXPECTED[question.wants]}; nothing moves before that" if question.hands else _EXPECTED[question.wants]
+        )
+
+    def _write(self, text: str) -> None:
+        out = self._out or sys.stderr
+        with contextlib.suppress(OSError, ValueError):  # a terminal that is gone is noticed where it is read
+            out.write(text)
+            out.flush()
+
+
+class _Lines:
+    """Lines of a terminal from now on; what was typed before the question is thrown away.
+
+    Args:
+        terminal: file descriptor.
+
+    Raises:
+        LaboratoryError: it isn't a terminal.
+    """
+
+    def __init__(self, terminal: int) -> None:
+        self._terminal = terminal
+        self._read = b""
+        self._ended = False
+        self._news = asyncio.Event()
+
+    def __enter__(self) -> _Lines:
+        if not _is_terminal(self._terminal):
+            raise LaboratoryError(
+                "a person has to answer, but there is no terminal to ask at; run Decant in a terminal, with nothing "
+                "piped into it"
+            )
+        termios.tcflush(self._terminal, termios.TCIFLUSH)
+        asyncio.get_running_loop().add_reader(self._terminal, self._take)
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        asyncio.get_running_loop().remove_reader(self._terminal)
+
+    def _take(self) -> None:
+        try:
+            piece = os.read(self._terminal, 4096)
+        except OSError:
+            piece = b""
+        self._ended = not piece
+        self._read += piece
+        self._news.set()
+
+    async def next(self, wait: float) -> str:
+        """The next line, without its end.
+
+        Raises:
+            TimeoutError: none came.
+            EOFError: the terminal says that nothing more comes.
+        """
+        async with asyncio.timeout(wait):
+            while b"\n" not in self._read:
+                self._news.clear()
+                await self._news.wait()
+                if self._ended:
+                    self._ended = False
+                    raise EOFError
+        line, _, self._read = self._read.partition(b"\n")
+        return line.decode("utf-8", "replace")
+
+
+def somebody_at_the_terminal(stdin: int = 0) -> bool:
+    """Whether a question can be asked and answered here."""
+    return _is_terminal(stdin)
+
+
+def _is_terminal(descriptor: int) -> bool:
+    try:
+        return os.isatty(descriptor)
+    except OSError:
+        return False
+
+
+def _worded(question: OperatorQuestion) -> str:
+    """The question as it stands on the screen: what was wrong, what to do, numbers that belong to it."""
+    rows = []
+    if question.problem:
+        rows.append(textwrap.fill(f"Problem: {question.problem}", _WIDTH))
+    rows.append(textwrap.fill(question.text, _WIDTH))
+    for name, value in question.details.items():
+        rows.append(f"  {name}: {value:.4g}" if isinstance(value, float) else f"  {name}: {value}")
+    return "\n".join(rows)
+
+
+def _time(seconds: float) -> str:
+    return f"{round(seconds)} s" if seconds < 120.0 else f"{round(seconds / 60.0)} min"

@@ -1,0 +1,62 @@
+"""The verb `decant vessel`, as the command line has it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from orchestrator.cli.command_options import Json, Quiet, call, examples, given
+
+
+def vessel(
+    out: Annotated[Path, typer.Argument(help="Vessel file to write (YAML).", metavar="OUT", show_default=False)],
+    height: Annotated[str | None, typer.Option(help="Depth inside, from floor to rim: '95 mm'.")] = None,
+    diameters: Annotated[
+        str | None,
+        typer.Option(help="Inner diameters at heights above the inner floor: '5 mm: 60 mm, 95 mm: 72 mm'."),
+    ] = None,
+    photo: Annotated[Path | None, typer.Option(help="Photograph of its side, on a plain background.")] = None,
+    known_height: Annotated[str | None, typer.Option(help="Outer height, for its scale.")] = None,
+    known_width: Annotated[str | None, typer.Option(help="Largest outer width, for its scale.")] = None,
+    points: Annotated[Path | None, typer.Option(help="Points of its surface: PLY, XYZ, or CSV with x, y, z.")] = None,
+    depth: Annotated[Path | None, typer.Option(help="Depth image from its side: PNG of 16 bits, or NPY.")] = None,
+    focal: Annotated[float | None, typer.Option(help="Focal length of the depth camera [pixels].", min=1.0)] = None,
+    centre: Annotated[
+        str | None, typer.Option(help="Column and row of its axis: '318.2, 241.5'; the image's middle unless given.")
+    ] = None,
+    mesh: Annotated[Path | None, typer.Option(help="Mesh to be mended: STL, OBJ, PLY or GLB.")] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of points, mesh or depths: m, cm, mm, in; depths: mm.")] = None,
+    up: Annotated[str, typer.Option(help="Axis of points or mesh that points out of the opening.")] = "z",
+    fill: Annotated[Path | None, typer.Option(help="CSV of levels and what was in it then: level_mm, mass_g.")] = None,
+    tilt: Annotated[Path | None, typer.Option(help="CSV of tilts and what it still held: tilt_deg, mass_g.")] = None,
+    brimful: Annotated[str | None, typer.Option(help="What it holds brimful, as weighed: '322 g'; a check.")] = None,
+    density: Annotated[str, typer.Option(help="Density of what was weighed.")] = "998 kg/m^3",
+    wall: Annotated[str | None, typer.Option(help="Thickness of the wall: '3 mm'.")] = None,
+    floor: Annotated[str | None, typer.Option(help="Thickness of the floor; as the wall's unless given.")] = None,
+    name: Annotated[str | None, typer.Option(help="Its name; the file's unless given.")] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a vessel file from what you can measure: callipers, photograph, points, depths, a mesh, fill or tilt tables.
+
+    Sources for a turned vessel can be joined: each says what it knows, with its own uncertainty. Beside the file there
+    is a picture with the section, its band and what was measured. What was measured is written into the file.
+    """
+    sources = given(locals(), "out", "name", "as_json")
+    from orchestrator.cli import vessel_measurement as verb
+
+    call(verb.vessel, out, verb.Sources(**sources), name=name, as_json=as_json)
+
+
+EXAMPLES = examples(
+    "decant vessel cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
+    "decant vessel cup.yaml --photo side.png --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
+    "decant vessel mug.yaml --mesh scan.stl --wall '3 mm'",
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb."""
+    app.command(epilog=EXAMPLES)(vessel)

@@ -1,0 +1,266 @@
+"""What `decant vessel` reads: pairs of lengths, tables of two columns, points, a photograph, a depth image."""
+
+from __future__ import annotations
+
+import csv
+import math
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused
+from sim_engine.settings.quantity import QuantityError, parse_quantity
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from sim_engine.vessel.shapes import LengthUnit
+
+    Floats = NDArray[np.float64]
+
+LARGEST_FILE = 200_000_000
+"""Bytes of a file that is read whole."""
+
+MOST_ROWS = 10_000
+
+FEWEST_ROWS = 3
+
+NARROWEST_MM, WIDEST_MM = 4.0, 1000.0
+"""Mean inner diameters of vessels [mm]."""
+
+MOST_PIXELS = 60_000_000
+
+
+def read_diameters(text: str, height: float) -> tuple[Floats, Floats]:
+    """Heights and diameters of '5 mm: 60 mm, 95 mm: 72 mm' [m].
+
+    Raises:
+        RefusalError: a pair is not one, or lies outside of the vessel (exit code 2).
+    """
+    import numpy as np
+
+    heights, widths = [], []
+    for pair in filter(None, (part.strip() for part in text.split(","))):
+        at, colon, wide = pair.partition(":")
+        try:
+            if not colon:
+                raise QuantityError("should be a height and a diameter, such as '95 mm: 72 mm'")
+            heights.append(parse_quantity(at.strip(), "m", "95 mm"))
+            widths.append(parse_quantity(wide.strip(), "m", "72 mm"))
+        except QuantityError as error:
+            raise RefusalError(f"--diameters: '{pair}': {error}", BAD_INPUT) from None
+        if not 0.0 <= heights[-1] <= height + 1e-9:
+            raise RefusalError(
+                f"--diameters: '{pair}': that is not between the inner floor (0 mm) and the rim ({1e3 * height:g} mm)",
+                BAD_INPUT,
+            )
+        if not 0.0 < widths[-1] < 1.0:
+            raise RefusalError(f"--diameters: '{pair}': a diameter should be above 0 and below 1 m", BAD_INPUT)
+    if not heights:
+        raise RefusalError("--diameters: has no pair; write for example '5 mm: 60 mm, 95 mm: 72 mm'", BAD_INPUT)
+    return np.array(heights), np.array(widths)
+
+
+def read_fill_table(
+    path: Path, *, height: float, density: float, ruler: float, balance: float
+) -> tuple[Floats, Floats]:
+    """Levels above the inner floor [mm], ascending, and the masses below them [g].
+
+    Args:
+        height: of the rim [mm].
+        density: of what was weighed [g/mm³].
+        ruler, balance: standard deviations of a level [mm] and of a mass [g].
+
+    Raises:
+        RefusalError: with the file, the line, and what would be right (exit code 2).
+    """
+    rows = _read_rows(path, "level_mm", upper=height)
+    rows.sort(key=lambda row: row[1:])
+    table = _monotonic(path, rows, "a higher level holds more", 1.0, ruler, balance)
+    for line, level, mass in rows:
+        diameter = math.sqrt(4.0 * mass / density / (math.pi * level))
+        if not NARROWEST_MM <= diameter <= WIDEST_MM:
+            raise RefusalError(
+                f"{path}:{line}: {mass:g} g below {level:g} mm make a vessel of {diameter:.3g} mm in diameter; should "
+                f"be {NARROWEST_MM:g} to {WIDEST_MM:g} mm. Are the levels in mm above the inner floor, the masses in g "
+                "of the liquid alone?",
+                BAD_INPUT,
+            )
+    return table
+
+
+def read_tilt_table(path: Path, *, angle: float, balance: float) -> tuple[Floats, Floats]:
+    """Tilts [deg], ascending, and the masses that the vessel still held there [g].
+
+    Args:
+        angle, balance: standard deviations of a tilt [deg] and of a mass [g].
+
+    Raises:
+        RefusalError: with the file, the line, and what would be right (exit code 2).
+    """
+    rows = _read_rows(path, "tilt_deg", upper=90.0)
+    rows.sort(key=lambda row: (row[1], -row[2]))
+    return _monotonic(path, rows, "a vessel that is tilted further holds less", -1.0, angle, balance)
+
+
+def _monotonic(
+    path: Path, rows: list[tuple[int, float, float]], rule: str, sign: float, reading: float, balance: float
+) -> tuple[Floats, Floats]:
+    """The columns of sorted rows, whose masses rise (sign 1) or fall (-1) but for the errors of reading them."""
+    import numpy as np
+
+    table = np.array([row[1:] for row in rows])
+    values, masses = table[:, 0], table[:, 1]
+    if (different := len(np.unique(values))) < FEWEST_ROWS:
+        raise RefusalError(
+            f"{path}: has {different} different value(s); at least {FEWEST_ROWS} say something about a shape", BAD_INPUT
+        )
+    steepness = float(np.ptp(masses) / np.ptp(values))
+    # three standard deviations of a difference of two
+    allowed = 3.0 * math.sqrt(2.0) * math.hypot(balance, steepness * reading)
+    best = 0
+    for k in range(1, len(rows)):
+        back = sign * (masses[best] - masses[k])
+        repeated = values[k] == values[k - 1] and abs(masses[k] - masses[k - 1]) > allowed
+        if back > allowed or repeated:
+            other = k - 1 if repeated else best
+            raise RefusalError(
+                f"{path}:{rows[k][0]}: mass_g is {masses[k]:g} at {values[k]:g}, and {masses[other]:g} at "
+                f"{values[other]:g} (line {rows[other][0]}); {rule}",
+                BAD_INPUT,
+            )
+        best = k if back <= 0.0 else best
+    return values, masses
+
+
+def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, float, float]]:
+    """Lines of a table with the value of a column and the mass in each [g]; see `read_fill_table`."""
+    _check_size(path)
+    found: list[tuple[int, float, float]] = []
+    with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+        rows = csv.DictReader(file)
+        missing = [name for name in (column, "mass_g") if name not in (rows.fieldnames or ())]
+        if missing:
+            raise RefusalError(f"{path}:1: the column '{missing[0]}' is missing; write '{column},mass_g'", BAD_INPUT)
+        for row in rows:
+            at = f"{path}:{rows.line_num}"
+            try:
+                value, mass = float(row[column]), float(row["mass_g"])
+            except (TypeError, ValueError):
+                raise RefusalError(f"{at}: should be two numbers, {column} and mass_g", BAD_INPUT) from None
+            if not 0.0 < value <= upper * (1.0 + 1e-9):
+                raise RefusalError(f"{at}: {column} is {value:g}; should be above 0 and at most {upper:g}", BAD_INPUT)
+            if not 0.0 <= mass < 1e5:
+                raise RefusalError(f"{at}: mass_g is {mass:g}; should be at least 0", BAD_INPUT)
+            found.append((rows.line_num, value, mass))
+            if len(found) > MOST_ROWS:
+                raise RefusalError(f"{at}: more than {MOST_ROWS:,} rows", BAD_INPUT)
+    if len(found) < FEWEST_ROWS:
+        raise RefusalError(
+            f"{path}: has {len(found)} row(s); at least {FEWEST_ROWS} say something about a shape", BAD_INPUT
+        )
+    return found
+
+
+def read_points(path: Path, unit: LengthUnit | None, up: str) -> Floats:
+    """Points of a surface, z up, shape (n, 3) [m].
+
+    Raises:
+        RefusalError: they can't be read, or their unit is not clear (exit code 2).
+    """
+    import numpy as np
+
+    from sim_engine.vessel.mesh import UNITS, to_z
+    from sim_engine.vessel.shapes import VesselError
+    from sim_engine.vessel_acquisition.mesh_repair import likely_unit
+
+    _check_size(path)
+    if up not in ("x", "y", "z", "-x", "-y", "-z"):
+        raise RefusalError(f"--up {up!r}: should be x, y or z, or one of them with a minus", BAD_INPUT)
+    try:
+        points = _loaded(path)
+    except Exception as error:  # readers raise whatever the broken byte led to
+        raise RefusalError(f"{path}: can't be read as points ({error})", BAD_INPUT) from None
+    if points.ndim != 2 or points.shape[1] < 3 or not np.isfinite(points[:, :3]).all():
+        raise RefusalError(f"{path}: should have x, y, z in each row, all of them finite numbers", BAD_INPUT)
+    points = points[:, :3]
+    with Refused(VesselError):
+        scale = UNITS[unit or likely_unit(float(np.ptp(points, axis=0).max()), path)]
+    result: Floats = points @ to_z(up).T * scale
+    return result
+
+
+def _loaded(path: Path) -> Any:
+    import numpy as np
+
+    if path.suffix.lower() == ".ply":
+        import trimesh
+
+        return np.asarray(trimesh.load(path, process=False).vertices, dtype=float)
+    if path.suffix.lower() == ".npy":
+        return np.load(path, allow_pickle=False).astype(float)
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    first = text.lstrip().split("\n", 1)[0]
+    comma = "," in first
+    header = any(character.isalpha() for character in first.replace("e", "").replace("E", ""))
+    return np.loadtxt(text.splitlines(), delimiter="," if comma else None, skiprows=int(header), ndmin=2)
+
+
+def read_photograph(path: Path) -> Floats:
+    """Brightness of a picture as viewers show it, rows from the top, shape (rows, columns).
+
+    Raises:
+        RefusalError: it is not a picture that can be read (exit code 2).
+    """
+    import numpy as np
+    from PIL import Image, ImageOps, UnidentifiedImageError
+
+    _check_size(path)
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # of large pictures: see below
+            if picture.width * picture.height > MOST_PIXELS:
+                raise RefusalError(f"{path}: {picture.width} × {picture.height} pixels; make it smaller", BAD_INPUT)
+            upright = ImageOps.exif_transpose(picture)  # cameras store the sensor's rows and how they were held
+            return np.asarray(upright.convert("L"), dtype=float)
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError) as error:  # cut off, damaged
+        raise RefusalError(f"{path}: is not a picture that can be read ({error})", BAD_INPUT) from None
+
+
+def read_depth(path: Path, unit: LengthUnit | None) -> Floats:
+    """A depth image, rows from the top, shape (rows, columns) [m]; 0 where nothing was seen.
+
+    Raises:
+        RefusalError: it is not one, or its unit is not clear (exit code 2).
+    """
+    import numpy as np
+    from PIL import Image, UnidentifiedImageError
+
+    from sim_engine.vessel.mesh import UNITS
+
+    _check_size(path)
+    try:
+        if path.suffix.lower() == ".npy":
+            depth = np.load(path, allow_pickle=False)
+        else:
+            with Image.open(path) as picture:
+                depth = np.asarray(picture)
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
+        raise RefusalError(f"{path}: is not a depth image that can be read ({error})", BAD_INPUT) from None
+    if depth.ndim != 2 or depth.dtype.kind not in "uif" or depth.dtype.itemsize < 2:
+        raise RefusalError(
+            f"{path}: should be a grey image of 16 bits, or an array of rows and columns, with distances in it; a "
+            "picture in colours or of 8 bits shows them, and has none",
+            BAD_INPUT,
+        )
+    result: Floats = np.nan_to_num(depth.astype(float), posinf=0.0, neginf=0.0) * UNITS[unit or "mm"]
+    return result
+
+
+def _check_size(path: Path) -> None:
+    if path.is_dir():
+        raise RefusalError(f"{path}: is a folder; name a file in it", BAD_INPUT)
+    if not path.is_file():
+        raise RefusalError(f"{path}: there is no such file", BAD_INPUT)
+    if (size := path.stat().st_size) > LARGEST_FILE:
+        raise RefusalError(f"{path}: {size / 1e6:.0f} MB; at most {LARGEST_FILE / 1e6:.0f} MB are read", BAD_INPUT)

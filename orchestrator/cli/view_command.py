@@ -1,0 +1,187 @@
+"""`decant view`: recordings opened in a browser, one or several beside each other; a pour simulated again."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from orchestrator.cli.command_options import LiveAt, Quiet, call, examples
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, say
+
+if TYPE_CHECKING:
+    from orchestrator.strategies.campaign_plan import CampaignPlan
+
+EXAMPLES = examples(
+    "decant view quickstart-20300131-1                    # a run of the folder runs/",
+    "decant view runs/first runs/second                   # beside each other",
+    "decant view runs/first --pour 7 --particles 5000     # pour 7 simulated again, with all its particles",
+)
+
+
+def view(
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Runs' folders, their names in runs/, or recordings (.rrd).", metavar="RUN…", show_default=False
+        ),
+    ],
+    pour: Annotated[
+        int | None,
+        typer.Option(min=1, help="Simulate this pour of the run again, as the arm moved, with the run's θ*."),
+    ] = None,
+    particles: Annotated[
+        int | None,
+        typer.Option(min=200, max=50_000, help="With --pour: so many particles in place of θ*'s.", show_default=False),
+    ] = None,
+    stage: Annotated[
+        str | None,
+        typer.Option(help="With --pour: the stage that the pour belongs to, where several count theirs from 1."),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write the recording here, and end.", show_default=False)
+    ] = None,
+    at: LiveAt = None,
+    quiet: Quiet = False,
+) -> None:
+    """Open recordings in a browser: the address is printed, and served until Ctrl-C. Needs no display.
+
+    Several runs are shown beside each other, on the timeline of their films. With --pour the liquid of one pour is
+    simulated again, from what the journal has of it; -o keeps that recording.
+    """
+    call(_view, recordings, pour=pour, particles=particles, stage=stage, output=output, at=at)
+
+
+def _view(
+    recordings: list[Path],
+    *,
+    pour: int | None,
+    particles: int | None,
+    stage: str | None,
+    output: Path | None,
+    at: str | None,
+) -> None:
+    from orchestrator.cli.foreground_run import check_output
+    from sim_engine.resources import installed
+
+    if not installed("rerun"):
+        raise RefusalError("view: needs Rerun, which is not installed: pip install 'decant[live]'", BAD_INPUT)
+    if pour is None and (particles is not None or stage is not None):
+        raise RefusalError("--particles and --stage go with --pour", BAD_INPUT)
+    if pour is not None and len(recordings) != 1:
+        raise RefusalError("--pour takes one run", BAD_INPUT)
+    check_output(output, "--output", ".rrd")
+    with tempfile.TemporaryDirectory(prefix="decant-view-") as scratch:
+        if pour is not None:
+            shown = _again(recordings[0], pour, particles, stage, output or Path(scratch) / "pour.rrd")
+        elif len(recordings) > 1:
+            shown = _beside(recordings, output or Path(scratch) / "beside.rrd")
+        else:
+            shown = _recording_of(recordings[0])
+        if output is not None:
+            mention(f"recording  {shown}")
+            return
+        _serve(shown, at)
+
+
+def _serve(shown: Path, at: str | None) -> None:
+    from orchestrator.cli.live_option import parsed
+    from orchestrator.live_view.live_server import LOOPBACK, LiveError, LiveView
+
+    address, port = parsed(at) if at is not None else (LOOPBACK, None)
+    stopped = False
+
+    def stop(number: int, frame: object) -> None:
+        nonlocal stopped
+        stopped = True
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with LiveView(address=address, web_port=port, shown=(shown,)) as live:
+            say(f"{live.url}\nCtrl-C ends it.")
+            while not stopped and live.alive:
+                time.sleep(0.2)
+            if not stopped:
+                raise RefusalError("the viewer's server has ended")
+    except LiveError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _again(what: Path, number: int, particles: int | None, stage: str | None, path: Path) -> Path:
+    from orchestrator.cli.console import waiting_for
+    from orchestrator.live_view.repeated_pour import NoSuchPourError, find_pour, task_of
+    from orchestrator.live_view.simulation_view import simulation_rrd
+    from orchestrator.run_errors import RunError
+    from sim_engine.simulator import PourSimulator
+
+    run = _run_of(what)
+    plan = _plan_of(run)
+    try:
+        pour = find_pour(run, number, stage)
+    except NoSuchPourError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    except RunError as error:
+        raise RefusalError(str(error)) from None
+    task = task_of(plan, run, pour, particles)
+    simulator, begin = PourSimulator(), time.monotonic()
+    with contextlib.closing(simulator), waiting_for(lambda: f"simulating, {time.monotonic() - begin:.0f} s so far"):
+        result = simulator.simulate(task)
+    said = f"{1e3 * task.scene.liquid.mass * result.outcome.spilled:.1f} g spilled in this simulation"
+    mention(f"{pour.title}; {said}, {result.outcome.particles} particles")
+    return simulation_rrd(path, task, result, pour.title)
+
+
+def _beside(what: list[Path], path: Path) -> Path:
+    from orchestrator.live_view.blueprints import put_beside
+    from orchestrator.results.figure_style import safe_name
+
+    named: dict[str, Path] = {}
+    for each in what:
+        file = _recording_of(each)
+        name = safe_name(file.parent.name if file.name == "campaign.rrd" else file.stem)
+        while name in named:
+            name += "_"
+        named[name] = file
+    return put_beside(named, path)
+
+
+def _recording_of(what: Path) -> Path:
+    """The recording to be opened.
+
+    Raises:
+        RefusalError: there is none (exit code 2).
+    """
+    if what.suffix == ".rrd" and what.is_file():
+        return what
+    run = _run_of(what)
+    found = sorted(run.glob("campaign*.rrd"), key=lambda path: path.stat().st_mtime)
+    found = [path for path in found if "optimising" not in path.name]
+    if not found:
+        raise RefusalError(f"{run}: has no recording; was it run with 'outputs: {{rrd: false}}'?", BAD_INPUT)
+    return found[-1]
+
+
+def _run_of(what: Path) -> Path:
+    from orchestrator.journal.journal import JOURNAL_NAME
+
+    run = what if what.exists() or len(what.parts) > 1 else Path("runs") / what
+    if not (run / JOURNAL_NAME).is_file():
+        raise RefusalError(f"{run}: is not the folder of a run: it has no {JOURNAL_NAME}", BAD_INPUT)
+    return run
+
+
+def _plan_of(run: Path) -> CampaignPlan:
+    from orchestrator.config.file_loading import load_campaign
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.runs.run_folder import RESOLVED
+
+    with Refused(ConfigError, at="the run's own campaign can't be read:\n"):
+        return load_campaign(run / RESOLVED)

@@ -1,1 +1,0 @@
-"""Campaigns as written in files, and the plans that are made of them."""

@@ -1,0 +1,533 @@
+"""What a campaign file can't show by itself: whether its vessels exist as solids, hold the liquid, and stay clear.
+
+What can be run and makes little sense: warned of, with the part of the box of actions that would.
+
+Finding it costs no pour: a stream that can't hit its receiver (a free jet's range), and tilts that are faster
+than the laboratory's arm may turn.
+
+Which parameters a campaign searches, and what is known of them beforehand: what only makes sense together.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from actors.arm.arm_settings import ArmSpec
+from actors.bench.pour_feasibility import vessel as built
+from actors.interfaces import InvalidActionError, UnreachablePlaceError
+from orchestrator.config.action_ranges import EXAMPLES
+from orchestrator.config.campaign_file import CampaignFile
+from orchestrator.config.parameter_ranges import ParameterRangeSection, ParametersBase
+from orchestrator.config.yaml.file_access import why_not_writable
+from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
+from orchestrator.config.yaml.yaml_source import Document, Loc, Place, Report
+from orchestrator.strategies.calibration.action_prior import actions_all_over
+from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
+from orchestrator.strategies.strategy_registry import calibrations
+from sim_engine.action import ACTION_DIMENSIONS, Action
+from sim_engine.collision import contact_during, describe_contact
+from sim_engine.hydrostatics import level
+from sim_engine.lip_flow import flow_course
+from sim_engine.motion import plan_motion
+from sim_engine.scene import Scene
+from sim_engine.search_space import Axis, Space
+from sim_engine.vessel.shapes import MeshShape, VesselError, VesselSpec
+from sim_engine.vessel.vessel import Vessel, check_holds
+
+BESIDE = 0.015
+"""How far beside the opening the middle of a stream may pass and still bring something into it [m]."""
+
+LEAST = 1.0 / 3.0
+"""Part of a range of offsets from which a stream has to hit: below it most pours of a campaign are wasted."""
+
+MOST_TRIED = 9
+"""Pours of a box, other than in x_offset, whose streams are worked out."""
+
+Senseless = tuple[tuple[Loc, ...], str]
+"""Keys where it may stand, the most particular first, and what to say."""
+
+
+def senseless(
+    plan: CalibrationPlan | DeploymentPlan,
+    scene: Scene,
+    pourer: Vessel,
+    receiver: Vessel,
+    arm: ArmSpec | None,
+    known: dict[tuple[object, ...], float | None],
+) -> list[Senseless]:
+    """What makes little sense about the actions of a stage in one of its scenes.
+
+    Args:
+        plan: of the stage.
+        scene: one of its scenes.
+        pourer, receiver: geometry of the scene's vessels, which hold its load.
+        arm: of the laboratory, if it has one.
+        known: landings that were worked out before; they don't depend on the receiver. Filled here.
+    """
+    told = [_misses(plan.actions, scene, pourer, receiver, known)]
+    if arm is not None and arm.tilt_speed_limit is not None:
+        told += [
+            _too_fast(plan.actions, scene, name, arm.tilt_speed_limit)
+            for name in ("angular_velocity", "return_velocity")
+        ]
+    return [one for one in told if one is not None]
+
+
+def _misses(
+    actions: Space, scene: Scene, pourer: Vessel, receiver: Vessel, known: dict[tuple[object, ...], float | None]
+) -> Senseless | None:
+    """An x_offset from which the stream passes beside the receiver."""
+    half, hits, beside, below = receiver.opening_radius + BESIDE, [], 0.0, False
+    for values in _spread(tuple(axis for axis in actions.axes if axis.name != "x_offset")):
+        try:
+            action = scene.action({"x_offset": 0.0, **values})
+        except ValueError:
+            continue  # no such action, which is reported elsewhere
+        key = (scene.pourer, scene.liquid, scene.pivot, scene.hold_cap, action)
+        if key not in known:
+            known[key] = _landing(scene, action, pourer, receiver)
+        landing = known[key]
+        if landing is not None and math.isnan(landing):
+            below = True
+        elif landing is not None and abs(action.y_offset) < half:
+            chord = math.sqrt(half**2 - action.y_offset**2)
+            hits.append((landing - chord, landing + chord))
+        elif landing is not None:
+            beside = min(beside or math.inf, abs(action.y_offset))
+    if not hits and below:
+        text = (
+            f"the liquid leaves the lip below the rim of '{scene.receiver.name}'; a larger height would bring it above"
+        )
+        return _where(actions, "height"), text
+    if not hits:
+        if not beside:
+            return None  # nothing leaves, which is reported elsewhere
+        return (
+            _where(actions, "y_offset"),
+            f"the stream passes {1e3 * beside:.0f} mm beside the axis of '{scene.receiver.name}', whose opening has a "
+            f"radius of {1e3 * receiver.opening_radius:.0f} mm",
+        )
+    low, high = min(low for low, _ in hits), max(high for _, high in hits)
+    axis = next((axis for axis in actions.axes if axis.name == "x_offset"), None)
+    fixed = scene.fixed.get("x_offset")
+    if axis is not None:
+        part = max(0.0, min(high, axis.upper) - max(low, axis.lower)) / (axis.upper - axis.lower)
+        if part >= LEAST:
+            return None
+        share = (
+            "from no x_offset in this range can a stream hit"
+            if part == 0.0
+            else f"only from {100 * part:.0f} % of this range can a stream hit"
+        )
+    elif fixed is not None and not low <= fixed <= high:
+        share = "from this x_offset no stream can hit"
+    else:
+        return None
+    ends = f"{math.ceil(1e3 * low):d} … {math.floor(1e3 * high):d} mm"
+    return (
+        _where(actions, "x_offset"),
+        f"{share} '{scene.receiver.name}': a free jet comes down in it from an x_offset of {ends}",
+    )
+
+
+def _landing(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> float | None:
+    """Where the stream comes down if the pourer stands over the receiver's axis [m]; None if nothing leaves.
+
+    Not a number if most of it leaves below the receiver's rim.
+    """
+    try:
+        course = flow_course(plan_motion(scene, action, pourer, receiver), scene.liquid, pourer, receiver)
+    except ValueError:
+        return None  # a motion that can't be made, which is reported elsewhere
+    if course is None:
+        return None
+    return course.landing() if course.quantile(course.fall, 0.5) > 0.0 else math.nan
+
+
+def _too_fast(actions: Space, scene: Scene, name: str, most: float) -> Senseless | None:
+    """A range of speeds whose fastest part the arm refuses."""
+    axis = next((axis for axis in actions.axes if axis.name == name), None)
+    if axis is None or axis.upper <= most * (1.0 + 1e-9):
+        return None
+    middle = {other.name: other.decode(0.5) for other in actions.axes}
+    try:
+        action = scene.action({**middle, name: axis.upper})
+    except ValueError:
+        return None
+    peak = axis.upper
+    if action.angular_acceleration is not None:  # a short turn doesn't get that fast
+        peak = min(peak, math.sqrt(action.max_angle * action.angular_acceleration))
+    if peak <= most * (1.0 + 1e-4):
+        return None
+    unit = ACTION_DIMENSIONS[name]
+    return (
+        _where(actions, name),
+        f"goes up to {axis.upper / unit.factor:.4g} {unit.display_unit}, and the arm turns the pourer at "
+        f"{most / unit.factor:.4g} {unit.display_unit} at most (arm.limits.tilt_speed): faster actions are refused one "
+        "by one. End the range there",
+    )
+
+
+def _where(actions: Space, name: str) -> tuple[Loc, ...]:
+    """Keys that an action dimension may have its values from."""
+    return (("actions", name), ("actions",)) if name in actions.names else (("motion", name),)
+
+
+def _spread(axes: tuple[Axis, ...]) -> list[dict[str, float]]:
+    """The middle, and as many corners as may be."""
+    corners = itertools.islice(itertools.product((0.0, 1.0), repeat=len(axes)), MOST_TRIED - 1)
+    points = [(0.5,) * len(axes), *corners] if axes else [()]
+    return [{axis.name: axis.decode(u) for axis, u in zip(axes, point, strict=True)} for point in points]
+
+
+CORNERS, DRAWN = 64, 16
+"""Actions of a space that are tried beside its middle before saying that all of it touches."""
+
+
+@dataclass(frozen=True)
+class _Role:
+    """A scene's part in a campaign.
+
+    Attributes:
+        text: for messages.
+        section: of the file, which overrides what stands at its top.
+        receiver: where the receiver may be named, the most particular place first.
+    """
+
+    text: str
+    section: Loc = ()
+    receiver: tuple[Loc, ...] = ()
+
+    def places(self, *keys: Loc) -> tuple[Loc, ...]:
+        """Where keys may stand, the most particular place first; the section itself where they don't."""
+        return (*(self.section + key for key in keys), *keys, self.section)
+
+
+CheckedPlace = tuple[float, float, float]
+
+
+def _place(action: Action) -> CheckedPlace:
+    """Where a pour begins: what the way there depends on."""
+    return action.x_offset, action.y_offset, action.height
+
+
+def _nothing(told: object) -> None:
+    """Where nobody listens."""
+
+
+@dataclass
+class _Checker:
+    source: Path
+    arm: ArmSpec | None = None
+    document: Document | None = None
+    warn: Callable[[Problem], None] = _nothing
+    doing: Callable[[str], None] = _nothing
+    problems: list[Problem] = field(default_factory=list)
+    vessels: dict[VesselSpec, Vessel | None] = field(default_factory=dict)
+    landings: dict[tuple[object, ...], float | None] = field(default_factory=dict)
+
+    def add(self, places: tuple[Loc, ...], text: str) -> None:
+        """Note a problem at the first of some places that the campaign's file has."""
+        self.problems.append(self.problem(places, text))
+
+    def problem(self, places: tuple[Loc, ...], text: str) -> Problem:
+        """A problem at the first of some places that the campaign's file has."""
+        document = self.document
+        found = None if document is None else next((loc for loc in places if loc in document.marks), None)
+        if document is None or found is None:
+            return Problem(self.source, 0, 0, "", text)
+        return document.problem(found, text)
+
+    def vessel(self, spec: VesselSpec, places: tuple[Loc, ...]) -> Vessel | None:
+        if spec not in self.vessels:
+            try:
+                self.vessels[spec] = built(spec)
+            except (VesselError, OSError) as error:
+                where = f" ({spec.shape.path})" if isinstance(spec.shape, MeshShape) else ""
+                self.add(places, f"vessel '{spec.name}'{where}: {error}")
+                self.vessels[spec] = None
+        return self.vessels[spec]
+
+    def scene(self, scene: Scene, role: _Role, wanted: float | None = None) -> tuple[Vessel, Vessel] | None:
+        """The scene's vessels, if both exist and hold the liquid.
+
+        Args:
+            wanted: volume that the receiver has to hold [m³]; the whole load unless given.
+        """
+        places = {"pourer": role.places(("pourer",)), "receiver": (*role.receiver, *role.places(("receiver",)))}
+        pourer = self.vessel(scene.pourer, places["pourer"])
+        receiver = self.vessel(scene.receiver, places["receiver"])
+        if pourer is None or receiver is None:
+            return None
+        ok = True
+        load = f"the {scene.liquid.name} ({scene.liquid.mass * 1e3:g} g)"
+        less = wanted is not None and wanted < scene.liquid.volume
+        for vessel, name in ((pourer, "pourer"), (receiver, "receiver")):
+            what, volume = (
+                (load, scene.liquid.volume) if wanted is None or vessel is pourer else ("what is asked for", wanted)
+            )
+            try:
+                check_holds(vessel, volume)
+            except VesselError as error:
+                ok = False
+                self.add(places[name], f"{role.text}: {name} can't hold {what if less else load}: {error}")
+        if ok and less and scene.liquid.volume > receiver.capacity:
+            text = (
+                f"{role.text}: the receiver holds {1e6 * receiver.capacity:.4g} mL, enough for what is asked for, not "
+                f"for {load}: a pour that misses its target may run over"
+            )
+            self.warn(self.problem(places["receiver"], text))
+        return (pourer, receiver) if ok else None
+
+    def reachable(self, plan: CalibrationPlan | DeploymentPlan, scene: Scene, role: _Role) -> None:
+        """Some action of the space must pour, not touch, and be one that the arm can make."""
+        wanted = plan.wanted(scene) if isinstance(plan, DeploymentPlan) else None
+        vessels = self.scene(scene, role, wanted)
+        self._payload(scene)
+        actions = plan.actions
+        trials = actions_all_over(actions, plan.constraints, corners=CORNERS, drawn=DRAWN)
+        if vessels is None or self._never_pours(scene, trials, vessels[0], role):
+            return
+        first = beyond = ""
+        barred: set[CheckedPlace] = set()
+        for i, chosen in enumerate(trials, start=1):
+            if i > 1:
+                self.doing(f"{role.text}: {len(trials)} actions are tried, none of {i - 1} can be made")
+            try:
+                action = scene.action(chosen)
+                if _place(action) in barred:
+                    continue
+                contact = touch(scene, action, *vessels)
+            except ValueError as error:  # an action out of bounds, or a motion that can't be made
+                contact = str(error)
+            if contact is None:
+                problem = self._for_the_arm(scene, action, actions, barred)
+                if not problem:
+                    for places, text in senseless(plan, scene, *vessels, self.arm, self.landings):
+                        self.warn(self.problem(role.places(*places), f"{role.text}: {text}"))
+                    return
+                beyond = beyond or problem
+            else:
+                first = first or contact
+        if beyond:
+            text = f"{role.text}: the arm can make none of {len(trials)} actions that were tried; for example {beyond}"
+            self.add(role.places(("actions",)), text)
+            return
+        text = (
+            f"{role.text}: the vessels touch at every action that was tried; for example {first}. "
+            f"A larger x_offset or height would clear them"
+        )
+        self.add(role.places(("actions",)), text)
+
+    def _payload(self, scene: Scene) -> None:
+        """What the arm believes to carry can't weigh less than the liquid alone."""
+        carries = None if self.arm is None else self.arm.payload_limit
+        if carries is None or carries >= scene.liquid.mass:
+            return
+        text = (
+            f"the arm is set to carry {carries * 1e3:g} g (arm.payload), less than the {scene.liquid.name} "
+            f"alone, {scene.liquid.mass * 1e3:g} g; the payload is gripper and filled pourer, in the laboratory's file "
+            "and on the pendant"
+        )
+        self.add((("liquid", "mass"), ("liquid",)), text)
+
+    def _never_pours(self, scene: Scene, trials: Sequence[dict[str, float]], pourer: Vessel, role: _Role) -> bool:
+        """Whether the liquid stays below the lip at the largest tilt of the space; warned of if not."""
+        tilts = []
+        for chosen in trials:
+            try:
+                tilts.append(scene.action(chosen).max_angle)
+            except ValueError:
+                continue  # no such action, which `touch` will tell
+        volume = scene.liquid.volume
+        if not tilts or level(pourer, volume, max(tilts)) > 0.0:
+            return False
+        steps = np.radians(np.arange(math.ceil(math.degrees(max(tilts))), 181))
+        lip = next((math.degrees(tilt) for tilt in steps if level(pourer, volume, float(tilt)) > 0.0), None)
+        when = "never reaches the lip" if lip is None else f"reaches the lip at {lip:.0f} deg; raise max_angle"
+        text = (
+            f"{role.text}: no action that was tried pours anything: max_angle is at most "
+            f"{math.degrees(max(tilts)):.4g} deg, and the {scene.liquid.name} ({scene.liquid.mass * 1e3:g} g) {when}"
+        )
+        self.add(role.places(("actions", "max_angle"), ("motion", "max_angle")), text)
+        return True
+
+    def _for_the_arm(self, scene: Scene, action: Action, actions: Space, barred: set[CheckedPlace]) -> str:
+        """Why the laboratory's arm, if it has one, can't make it; '' if it can.
+
+        Args:
+            barred: places that the arm can't get to from home, whatever it does there. Filled here.
+        """
+        if self.arm is None:
+            return ""
+        try:
+            self.arm.plan(scene, action)
+        except InvalidActionError as error:
+            if isinstance(error, UnreachablePlaceError):
+                barred.add(_place(action))
+            return f"{action.display(*actions.names)}: {error}"
+        return ""
+
+    def recorded(self, scene: Scene, recorded: list[Action], role: _Role, place: Loc) -> None:
+        """Weighed pours have been poured: if their vessels touch, the scene is described wrongly."""
+        vessels = self.scene(scene, role)
+        if vessels is None:
+            return
+        # The slowest to vary is the place: pours of one place and one largest tilt go through the same poses.
+        seen = set()
+        for action in recorded:
+            at = (action.x_offset, action.y_offset, action.height)
+            tilts = [a.max_angle for a in recorded if (a.x_offset, a.y_offset, a.height) == at]
+            if at in seen or action.max_angle < max(tilts):
+                continue
+            seen.add(at)
+            contact = touch(scene, action, *vessels)
+            if contact is not None:
+                shown = action.display("x_offset", "height", "max_angle")
+                text = (
+                    f"{role.text}: a recorded pour ({shown}) could not have been made: {contact}. Is the scene right?"
+                )
+                self.add((place, role.section), text)
+                return
+
+
+def check_campaign(
+    plan: CampaignPlan,
+    *,
+    as_written: bool = True,
+    warn: Callable[[Problem], None] = _nothing,
+    doing: Callable[[str], None] = _nothing,
+) -> list[Problem]:
+    """Build the vessels of a campaign and try its actions.
+
+    Runs must find a folder. Checked for every scene: both vessels can be built and hold the liquid; some action of the
+    space tilts far enough for the liquid to leave, and one lets the vessels stay clear of each other and can be made by
+    the laboratory's arm (middle, corners and a few drawn at random are tried); recorded pours stay clear.
+
+    Args:
+        plan: of the campaign.
+        as_written: whether its vessels are those of its file; places in it would else mislead.
+        warn: called with what can be run and makes little sense.
+        doing: called with what is being tried, where that takes long.
+
+    Returns:
+        What is wrong, with its place as far as the campaign's file has one; empty when the campaign can start.
+    """
+    try:
+        document = Document.read(plan.source) if as_written else None
+    except ConfigError:
+        document = None  # a plan that was never a file
+    checker = _Checker(plan.source, plan.laboratory.arm, document, warn, doing)
+    at: Loc
+    if (problem := why_not_writable(plan.outputs.directory)) is not None:
+        checker.add((("outputs", "directory"),), problem)
+    if plan.calibration is not None:
+        calibration, section = plan.calibration, ("calibration",)
+        if calibration.records is None:
+            for scene in calibration.poured:
+                checker.reachable(calibration, scene, _Role("calibration", section))
+        else:
+            pours, at = calibration.records.pours, ("calibration", "pours")
+            checker.recorded(calibration.scene, [p.action for p in pours], _Role("calibration.pours", section), at)
+        if calibration.transfer is not None:
+            transfer, at = calibration.transfer, ("calibration", "pours", "transfer")
+            role = _Role("calibration.pours.transfer", section, ((*at, "receiver"),))
+            checker.recorded(transfer.scene, [p.action for p in transfer.pours], role, at)
+    if plan.deployment is not None:
+        for i, scene in enumerate(plan.deployment.scenes):
+            receiver = (("deployment", "receiver"), ("deployment", "receivers", i), ("receivers", i))
+            role = _Role(f"deployment into '{scene.receiver.name}'", ("deployment",), receiver)
+            checker.reachable(plan.deployment, scene, role)
+    return list(dict.fromkeys(checker.problems))
+
+
+def check_vessels(scene: Scene, source: Path, wanted: float | None = None) -> list[Problem]:
+    """Build the vessels of one scene.
+
+    Args:
+        scene: any.
+        source: the campaign's file.
+        wanted: volume that the receiver has to hold [m³]; the whole load unless given.
+
+    Returns:
+        What is wrong: a vessel that is none, or can't hold the load.
+    """
+    checker = _Checker(source)
+    checker.scene(scene, _Role(f"{scene.pourer.name} into {scene.receiver.name}"), wanted)
+    return checker.problems
+
+
+def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str | None:
+    """Where the vessels touch during an action, in words; None when they stay clear.
+
+    Raises:
+        ValueError: the motion can't be made.
+    """
+    motion = plan_motion(scene, action, pourer, receiver)
+    found = contact_during(motion, pourer, receiver)
+    if found is None:
+        return None
+    contact, tilt = found
+    return describe_contact(
+        contact, tilt=tilt, pourer=f"pourer '{scene.pourer.name}'", receiver=f"receiver '{scene.receiver.name}'"
+    )
+
+
+def check_ranges(file: CampaignFile, root: Place, report: Report) -> None:
+    """Complain of ranges that nothing searches, calibrations without any, and measured values that are incomplete."""
+    parameters: ParametersBase | None = file.simulator.parameters
+    place = root.at("simulator", "parameters")
+    sections = {} if parameters is None else parameters.ranges()
+    for name, section in sections.items():
+        _check(section, place.at(name), report)
+    if file.calibration is None and not report.is_broken(root.at("calibration")):
+        for name in sections:
+            if not report.is_broken(place.at(name)):
+                report.add(
+                    place.at(name),
+                    "is a range, and nothing searches it; write one value, or add a 'calibration' section",
+                )
+    in_parameters = any(loc[:2] == place.loc for _, loc in report.broken)
+    if file.calibration is not None and not sections and not in_parameters:
+        report.add(
+            root.at("calibration"),
+            "has nothing to search; give a range to at least one of simulator.parameters, "
+            "for example 'cohesion: [0 N/m, 0.1 N/m]'",
+            key=True,
+        )
+    if file.calibration is not None and not file.calibration.settings.has_prior:
+        owners = " and ".join(name for name, settings in calibrations().items() if settings.has_prior)
+        for name, section in sections.items():
+            if section.measured is not None:
+                strategy = file.calibration.settings.strategy
+                text = f"belongs to {owners}; {strategy} takes all values for alike. Write a range"
+                report.add(place.at(name, "measured"), text, key=True)
+
+
+def _check(section: ParameterRangeSection, at: Place, report: Report) -> None:
+    """A measured value has a tolerance, and lies in the range beside it."""
+    if any(loc[: len(at.loc)] == at.loc for _, loc in report.broken):
+        return
+    info, value, tolerance = section.info, section.measured, section.tolerance
+    unit = "" if info.shown == "1" else f" {info.shown}"
+    if section.range is None and value is None and tolerance is None:
+        report.add(at, "names nothing to search; add a 'range', or what was 'measured' with its 'tolerance'", key=True)
+    elif value is None and tolerance is not None:
+        report.add(at, f"has a tolerance of nothing; add for example 'measured: {EXAMPLES[info.name]}'", key=True)
+    elif value is not None and tolerance is None:
+        usual = f"{(info.tolerance or (info.upper - info.lower) / 20.0) / info.factor:.2g}{unit}"
+        text = f"has no 'tolerance'; add for example 'tolerance: {usual}', or write the value alone to fix it"
+        report.add(at, text, key=True)
+    elif section.scale == "log" and tolerance is not None:
+        report.add(at.at("scale"), "a tolerance is the same to both sides, and needs the scale 'linear'")
+    elif value is not None and section.range is not None and not section.range[0] <= value <= section.range[1]:
+        low, high = (f"{end / info.factor:g}" for end in section.range)
+        report.add(
+            at.at("measured"), f"{value / info.factor:g}{unit} is outside the range beside it, {low} … {high}{unit}"
+        )

@@ -1,0 +1,230 @@
+"""Campaigns, vessels, laboratories and parameters from files. Everything that is wrong comes as one `ConfigError`."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from itertools import accumulate
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import create_model
+
+from actors.laboratory_settings import LaboratorySpec
+from orchestrator.config.campaign_file import CampaignFile
+from orchestrator.config.campaign_resolution import resolve_campaign
+from orchestrator.config.laboratory_file import LaboratoryFile, resolve_laboratory
+from orchestrator.config.parameter_ranges import parameter_quantity
+from orchestrator.config.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
+from orchestrator.config.yaml.file_access import resolved
+from orchestrator.config.yaml.references import References
+from orchestrator.config.yaml.section_validation import validate
+from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
+from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.liquids import SimulationParameters
+from sim_engine.settings.model import MADE, Section
+from sim_engine.settings.quantity import Quantity
+from sim_engine.vessel.shapes import VesselSpec
+
+
+def load_campaign(path: Path | str, laboratory: Path | str | None = None, seed: int | None = None) -> CampaignPlan:
+    """The plan of a campaign file, with everything that it refers to.
+
+    Args:
+        path: of the file.
+        laboratory: of a file in place of the campaign's own.
+        seed: in place of the campaign's own.
+
+    Raises:
+        ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
+    """
+    other = None if laboratory is None else Path(laboratory)
+    return campaign_from(Document.read(resolved(Path(path))), other, seed)
+
+
+def campaign_from(document: Document, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
+    """The plan of a campaign that was read already; relative paths in it start from the folder of its path.
+
+    Raises:
+        ConfigError: as `load_campaign`.
+    """
+    if laboratory is not None:
+        load_laboratory(laboratory)  # what is wrong with it is not the campaign's fault
+    report = Report()
+    place = Place(document)
+    if (other := wrong_kind(place.document, "campaign")) is not None:
+        raise ConfigError([other])
+    section = validate(CampaignFile, place, report)
+    if section is not None and laboratory is not None:
+        section = section.model_copy(update={"laboratory": str(resolved(laboratory))})
+    if section is not None and seed is not None:
+        section = section.model_copy(update={"seed": seed})
+    plan = None if section is None else resolve_campaign(section, place, report)
+    report.raise_if_any()
+    assert plan is not None, "a campaign without problems has a plan"
+    return plan
+
+
+def load_vessel(path: Path | str) -> VesselSpec:
+    """The vessel of a file (its shape is built and checked by `sim_engine.vessel`).
+
+    Raises:
+        ConfigError: anything is wrong with it.
+    """
+    report, path = Report(), Path(path)
+    if path.suffix.lower() in MESH_SUFFIXES:
+        message = f"is a mesh; describe the vessel in a YAML file: {{name: {path.stem}, mesh: {path.name}, unit: mm}}"
+        raise ConfigError([Problem(resolved(path), 0, 0, "", message)])
+    found = References(report).file(resolved(path), VesselFile)
+    vessel = None if found is None else resolve_vessel(*found, report)
+    report.raise_if_any()
+    assert vessel is not None, "a vessel without problems has a spec"
+    return vessel
+
+
+def load_laboratory(path: Path) -> LaboratorySpec:
+    """The laboratory of a file.
+
+    Raises:
+        ConfigError: anything is wrong with it.
+    """
+    report = Report()
+    found = References(report).file(resolved(path), LaboratoryFile)
+    laboratory = None if found is None else resolve_laboratory(*found, report)
+    report.raise_if_any()
+    assert laboratory is not None, "a laboratory without problems has a spec"
+    return laboratory
+
+
+class _LooseQuantity(Quantity):
+    """A quantity in which a bare number is in SI units: as programs write them."""
+
+    def parse(self, value: Any) -> float | str:
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and self.unit != "1":
+            return super().parse(f"{value!r} {self.unit}")
+        return super().parse(value)
+
+
+class _ThetaBase(Section):
+    """Parameters as `decant calibrate` writes them: numbers in SI, or quantities with units."""
+
+
+def _theta_model() -> type[_ThetaBase]:
+    fields: Any = {}
+    for name in SimulationParameters.info():
+        q = parameter_quantity(name)
+        loose = _LooseQuantity(q.unit, q.example, q.lower, q.upper, whole=q.whole)
+        fields[name] = (Annotated[float, loose] | None, None)
+    model: type[_ThetaBase] = create_model("Theta", __base__=_ThetaBase, __cls_kwargs__=MADE, **fields)
+    return model
+
+
+_Theta = _theta_model()
+
+THETA_KEYS = ("theta", "parameters")
+POSTERIOR_KEY, RECOMMENDED_KEY = "posterior", "recommended"
+DISCREPANCY_KEY, SHIFT_KEY = "remaining_discrepancy", "shift"
+
+
+def predicts_with_posterior(path: Path) -> bool:
+    """Whether predictions with a file of θ draw from its posterior: it has one, and θ is the calibrated one.
+
+    Raises:
+        ConfigError: it is not YAML or JSON.
+    """
+    data = Document.read(resolved(path)).data
+    return isinstance(data, dict) and POSTERIOR_KEY in data and data.get(RECOMMENDED_KEY) != "uncalibrated"
+
+
+def load_discrepancy(path: Path) -> float | None:
+    """The shift that a calibration left over (`sim_engine.prediction_band`), from a run's `theta.json`; None if it has none.
+
+    Raises:
+        ConfigError: what stands there is not a number from 0 on.
+    """
+    document = Document.read(resolved(path))
+    found = document.data.get(DISCREPANCY_KEY) if isinstance(document.data, dict) else None
+    if found is None:
+        return None
+    value = found.get(SHIFT_KEY) if isinstance(found, dict) else None
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < math.inf:
+        report = Report()
+        report.add(
+            Place(document).at(DISCREPANCY_KEY), f"needs a '{SHIFT_KEY}' from 0 on, as decant calibrate writes it"
+        )
+        report.raise_if_any()
+        return None
+    return float(value)
+
+
+def load_posterior(
+    path: Path, count: int, base: SimulationParameters | None = None
+) -> tuple[SimulationParameters, ...]:
+    """`count` of the weighted θ that a run's `theta.json` has under `posterior`, each as likely as its weight says.
+
+    Drawn evenly along the cumulated weights: the same file gives the same θ.
+
+    Args:
+        path: the file.
+        count: ≥ 1.
+        base: values of the parameters that the file does not name.
+
+    Raises:
+        ConfigError: it has no posterior, or anything is wrong with it.
+    """
+    report = Report()
+    document = Document.read(resolved(path))
+    place = Place(document)
+    rows = document.data.get(POSTERIOR_KEY) if isinstance(document.data, dict) else None
+    weights: list[float] = []
+    thetas: list[SimulationParameters] = []
+    if not isinstance(rows, list) or not rows:
+        report.add(place, f"has no '{POSTERIOR_KEY}'; C4 writes one into a run's theta.json, θ* alone has none")
+        report.raise_if_any()
+    for i, row in enumerate(rows or []):
+        at = place.at(POSTERIOR_KEY, i)
+        weight = row.get("weight") if isinstance(row, dict) else None
+        if not isinstance(weight, int | float) or isinstance(weight, bool) or not 0.0 < weight < math.inf:
+            report.add(at, "needs a 'theta' and a 'weight' above 0")
+            continue
+        section = validate(_Theta, at.at("theta"), report)
+        if section is not None:
+            given = {name: v for name in section.written_keys() if (v := section.value(name)) is not None}
+            thetas.append(SimulationParameters.from_values((base or SimulationParameters()).model_dump() | given))
+            weights.append(float(weight))
+    report.raise_if_any()
+    total = list(accumulate(weights))
+    return tuple(thetas[bisect_right(total, (i + 0.5) / count * total[-1])] for i in range(count))
+
+
+def load_parameters(path: Path, base: SimulationParameters | None = None) -> SimulationParameters:
+    """θ from a file: what `decant calibrate --json` prints, or written by hand.
+
+    The file is JSON or YAML: a mapping of parameter names, or one that has such a mapping under `theta` (or
+    `parameters`) beside whatever else. Values are numbers in SI units (cohesion in N/m, viscosity in 1/s) or quantities
+    with units.
+
+    Args:
+        path: the file.
+        base: values of the parameters that the file does not name; the simulator's defaults unless given.
+
+    Raises:
+        ConfigError: anything is wrong with it.
+    """
+    report = Report()
+    document = Document.read(resolved(path))
+    place = Place(document)
+    if isinstance(document.data, dict):
+        place = next((place.at(key) for key in THETA_KEYS if key in document.data), place)
+    if place.loc:
+        report.problems.extend(document.problems)
+    section = validate(_Theta, place, report)
+    values: dict[str, float] = (base or SimulationParameters()).model_dump()
+    if section is not None:
+        given = {name: v for name in section.written_keys() if (v := section.value(name)) is not None}
+        if not given and not report.problems:
+            report.add(place, f"names no parameter; known are {', '.join(values)}")
+        values |= given
+    report.raise_if_any()
+    return SimulationParameters.from_values(values)

@@ -1,0 +1,74 @@
+"""JSON schemas of the files people write, for editors that complete and check, and of `summary.json` for programs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from orchestrator.config.campaign_file import CampaignFile
+from orchestrator.config.laboratory_file import LaboratoryFile
+from orchestrator.config.vessel_file import VesselFile
+from orchestrator.study.study_file import StudyFile
+from sim_engine.settings.model import SchemaGenerator, Section
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+
+def campaign_schema() -> dict[str, Any]:
+    """Schema of campaign files."""
+    return _schema(CampaignFile, "Campaign")
+
+
+def vessel_schema() -> dict[str, Any]:
+    """Schema of vessel files."""
+    return _schema(VesselFile, "Vessel")
+
+
+def laboratory_schema() -> dict[str, Any]:
+    """Schema of laboratory files."""
+    return _schema(LaboratoryFile, "Laboratory")
+
+
+def study_schema() -> dict[str, Any]:
+    """Schema of study files."""
+    return _schema(StudyFile, "Study")
+
+
+def result_schema() -> dict[str, Any]:
+    """Schema of a run's `summary.json`, with every kind of result."""
+    from orchestrator.results.run_summary import summary_schema
+
+    return {"$schema": DIALECT, **summary_schema()}
+
+
+SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
+    "campaign": campaign_schema,
+    "vessel": vessel_schema,
+    "laboratory": laboratory_schema,
+    "study": study_schema,
+    "result": result_schema,
+}
+"""By the names of their files."""
+
+
+def write_schemas(directory: Path) -> list[Path]:
+    """Write all schemas into a directory, each as NAME.json; the paths written."""
+    directory.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, schema in SCHEMAS.items():
+        path = directory / f"{name}.json"
+        path.write_text(schema_text(schema()), encoding="utf-8")
+        paths.append(path)
+    return paths
+
+
+def schema_text(schema: dict[str, Any]) -> str:
+    """The schema as it stands in its file."""
+    return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+
+
+def _schema(model: type[Section], title: str) -> dict[str, Any]:
+    schema = model.model_json_schema(by_alias=True, schema_generator=SchemaGenerator)
+    return {"$schema": DIALECT, **schema, "title": title}

@@ -1,1 +1,0 @@
-"""Laboratories as written in files: simulators, arm, balance, operator, cluster."""

@@ -1,1 +1,0 @@
-"""Studies as written in files."""

@@ -1,0 +1,399 @@
+"""Weighed pours from CSV files; every error names the file, the line and the column.
+
+Records of a campaign: weighed pours with the scene they were poured in, checked against what is searched.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orchestrator.config.action_ranges import MotionBase
+from orchestrator.config.campaign_file import PoursSection
+from orchestrator.config.scene_builder import SceneBuilder
+from orchestrator.config.yaml.file_access import UnreadableError, missing_file, read_text, resolved
+from orchestrator.config.yaml.yaml_errors import Problem, did_you_mean, dotted
+from orchestrator.config.yaml.yaml_source import Place
+from orchestrator.strategies.campaign_plan import RecordedPour, RecordSet
+from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
+from sim_engine.scene import Scene
+from sim_engine.search_space import Space
+from sim_engine.settings.model import MOST_POURS
+from sim_engine.vessel.shapes import ProfileShape, VesselSpec
+
+if TYPE_CHECKING:
+    import _csv
+
+MASS_COLUMNS = ("poured_g", "spilled_g", "retained_g")
+SPLITS = ("train", "test", "transfer")
+LIP_COLUMN = "lip_to_receiver_axis_mm"
+
+MASS_TOLERANCE = 0.01
+"""Largest relative difference between poured + retained and the load; spills and drips make a weighing no better."""
+
+NOISE, NOISE_OF_LOAD = 0.3, 1e-3
+"""How far below zero a weighed mass may come to lie: in grams, or as a part of the load where that is more."""
+
+MOST_ALIKE = 5
+"""Lines that are the same in all their numbers: pours that were made differ in the last digit."""
+
+_NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
+
+
+def column_name(dimension: Dimension) -> str:
+    """Column of an action dimension: its name and unit, e.g. 'angular_velocity_deg_s'."""
+    return f"{dimension.name}_{dimension.display_unit.replace('/', '_').replace('^', '')}"
+
+
+DIMENSION_COLUMNS = {column_name(dimension): dimension for dimension in ACTION_DIMENSIONS.values()}
+
+
+@dataclass
+class RecordTable:
+    """A CSV file of weighed pours.
+
+    Attributes:
+        rows: action dimensions [SI], masses [kg] and split of every good line.
+        dimensions: action dimensions that have a column.
+        problems: everything found wrong.
+    """
+
+    rows: list[PourRecordRow] = field(default_factory=list)
+    dimensions: tuple[str, ...] = ()
+    problems: list[Problem] = field(default_factory=list)
+
+    def varying(self) -> set[str]:
+        """Dimensions that have more than one value."""
+        return {name for name in self.dimensions if len({row.action[name] for row in self.rows}) > 1}
+
+    def constants(self) -> dict[str, float]:
+        """Dimensions that have the same value in all pours."""
+        return {name: self.rows[0].action[name] for name in self.dimensions if name not in self.varying()}
+
+
+@dataclass(frozen=True)
+class PourRecordRow:
+    """One line: action dimensions [SI], masses [kg]."""
+
+    line: int
+    action: dict[str, float]
+    poured: float
+    spilled: float
+    retained: float
+    split: str
+
+    def pour(self, fixed: Mapping[str, float | None]) -> RecordedPour:
+        """The record, with the dimensions that have no column.
+
+        Raises:
+            ValueError: the action is not complete or out of bounds.
+        """
+        action = Action.compose(fixed, self.action)
+        return RecordedPour(action, self.poured, self.spilled, self.retained, self.split)
+
+
+def read_records(
+    path: Path,
+    *,
+    loaded: float,
+    lip_radius: float | None = None,
+    columns: Mapping[str, str] | None = None,
+    split: str | None = None,
+) -> RecordTable:
+    """Read weighed pours.
+
+    Columns: `poured_g`, `spilled_g`, `retained_g`, `split` (train, test or transfer), and one per action dimension that
+    varies, named after it and its unit (`angular_velocity_deg_s`, `max_angle_deg`, `x_offset_mm` …). In place of
+    `x_offset_mm` there may be `lip_to_receiver_axis_mm`, the distance from the pourer's inner lip to the receiver's
+    axis: `lip_radius` is added to it.
+
+    Args:
+        path: the CSV file, UTF-8, comma-separated, with a header.
+        loaded: mass in the pourer before each pour [kg].
+        lip_radius: the pourer's inner radius at the lip [m].
+        columns: names that the file has in place of the above, {above: in the file}.
+        split: of all pours where the file has no such column; it must have one unless given.
+
+    Returns:
+        The table; its `problems` say what is wrong with the file.
+    """
+    table = RecordTable()
+    try:
+        text = read_text(path, encoding="utf-8-sig")
+    except UnreadableError as error:
+        table.problems.append(Problem(path, 0, 0, "", str(error)))
+        return table
+    if not text.strip():
+        table.problems.append(Problem(path, 0, 0, "", "is empty; it needs a header and a line for each pour"))
+        return table
+    lines = list(io.StringIO(text, newline=""))
+    reader = csv.reader(lines)
+    try:
+        _read_table(table, path, reader, lines, loaded, lip_radius, columns or {}, split)
+    except csv.Error as error:
+        message = f"is not CSV: {error}; is a quote still open?"
+        table.problems.append(Problem(path, reader.line_num, 1, "", message))
+    if not table.rows and not table.problems:
+        table.problems.append(Problem(path, 1, 1, "", "has no pours; add a line for each below the header"))
+    return table
+
+
+def _read_table(
+    table: RecordTable,
+    path: Path,
+    reader: _csv.Reader,
+    lines: list[str],
+    loaded: float,
+    lip_radius: float | None,
+    columns: Mapping[str, str],
+    split: str | None,
+) -> None:
+    header = [cell.strip() for cell in next(reader, [])]
+    names = {theirs: ours for ours, theirs in columns.items()}
+    header = [names.get(cell, cell) for cell in header]
+    _check_header(table, path, header, lines[0], lip_radius, needs_split=split is None)
+    if table.problems:
+        return
+    table.dimensions = tuple(
+        name
+        for name, dimension in ACTION_DIMENSIONS.items()
+        if column_name(dimension) in header or (name == "x_offset" and LIP_COLUMN in header)
+    )
+    alike: dict[tuple[str, ...], list[int]] = {}
+    for cells in reader:
+        if not any(cell.strip() for cell in cells):
+            continue
+        number = reader.line_num
+        if len(table.rows) == MOST_POURS:
+            message = f"has more than {MOST_POURS} pours, which no calibration can use; keep the best of them"
+            table.problems.append(Problem(path, number, 1, "", message))
+            return
+        alike.setdefault(tuple(cell.strip() for cell in cells), []).append(number)
+        row = _read_row(table, path, header, cells, number, lines[number - 1], loaded, lip_radius, split)
+        if row is not None:
+            table.rows.append(row)
+    for numbers in alike.values():
+        if len(numbers) > MOST_ALIKE:
+            message = (
+                f"the same pour stands in {len(numbers)} lines; pours that were really made differ in the last digit. "
+                "Keep the line once"
+            )
+            line = lines[numbers[1] - 1]
+            table.problems.append(Problem(path, numbers[1], 1, "", message, line))
+
+
+def _check_header(
+    table: RecordTable, path: Path, header: list[str], line: str, lip_radius: float | None, *, needs_split: bool
+) -> None:
+    separator = next((s for s in ";\t" if s in line and "," not in line), None)
+    if separator is not None:
+        name = "semicolons" if separator == ";" else "tabs"
+        message = f"cells are separated by {name}; save it with commas, and numbers with a decimal point"
+        table.problems.append(Problem(path, 1, line.index(separator) + 1, "", message, line))
+        return
+    known = (*DIMENSION_COLUMNS, LIP_COLUMN, *MASS_COLUMNS, "split")
+
+    def add(name: str, message: str) -> None:
+        column = line.find(name) + 1 if name and name in line else 1
+        table.problems.append(Problem(path, 1, column, name, message, line))
+
+    for name in dict.fromkeys(header):
+        if name not in known:
+            guess = did_you_mean(name, known)
+            hint = f"did you mean '{guess}'?" if guess else f"known columns: {', '.join(known)}"
+            add(name, f"unknown column; {hint}")
+        elif header.count(name) > 1:
+            add(name, "stands twice in the header; keep one")
+    for name in (*MASS_COLUMNS, *(["split"] if needs_split else [])):
+        if name not in header:
+            add("", f"column '{name}' is missing")
+    if not any(name in DIMENSION_COLUMNS or name == LIP_COLUMN for name in header):
+        add("", "no column of an action dimension, such as 'angular_velocity_deg_s'")
+    if LIP_COLUMN in header:
+        if "x_offset_mm" in header:
+            add(LIP_COLUMN, "says the same as 'x_offset_mm'; keep one of them")
+        if lip_radius is None:
+            add(LIP_COLUMN, "needs 'lip_radius' beside 'from' in the campaign, the pourer's inner radius at the lip")
+
+
+def _read_row(
+    table: RecordTable,
+    path: Path,
+    header: list[str],
+    cells: list[str],
+    number: int,
+    line: str,
+    loaded: float,
+    lip_radius: float | None,
+    usual_split: str | None,
+) -> PourRecordRow | None:
+    before = len(table.problems)
+
+    def add(name: str, message: str) -> None:
+        # The caret stands under the cell: cells are unquoted numbers in all but the oddest files.
+        index = header.index(name) if name in header else 0
+        column = sum(len(cell) + 1 for cell in cells[:index]) + 1
+        table.problems.append(Problem(path, number, column, name, message, line))
+
+    if len(cells) != len(header):
+        open_quote = "; is a quote still open?" if any("\n" in cell for cell in cells) else ""
+        add("", f"has {len(cells)} cell{'s' * (len(cells) > 1)}, the header {len(header)}{open_quote}")
+        return None
+    values: dict[str, float] = {}
+    for name, cell in zip(header, cells, strict=True):
+        if name == "split":
+            continue
+        text = cell.strip()
+        if _NUMBER.fullmatch(text) and math.isfinite(float(text)):
+            values[name] = float(text)
+        elif not text:
+            add(name, "is empty; every pour needs a value")
+        else:
+            add(name, f"{text!r} is not a number; write it like 12.5")
+    split = cells[header.index("split")].strip() if "split" in header else str(usual_split)
+    if split not in SPLITS:
+        add("split", f"{split!r} is not known; should be one of {', '.join(SPLITS)}")
+    action: dict[str, float] = {}
+    for name, value in values.items():
+        dimension = ACTION_DIMENSIONS["x_offset"] if name == LIP_COLUMN else DIMENSION_COLUMNS.get(name)
+        if dimension is None:
+            continue
+        # Rounded to a picometre, so that 44 mm + 40 mm is 84 mm.
+        si = round(value * 1e-3 + (lip_radius or 0.0), 12) if name == LIP_COLUMN else value * dimension.factor
+        if not dimension.lower <= si <= dimension.upper:
+            k = dimension.factor
+            bounds = f"{dimension.lower / k:g} … {dimension.upper / k:g} {dimension.display_unit}"
+            add(name, f"{value:g} makes {dimension.name} {si / k:g}, outside {bounds}")
+        action[dimension.name] = si
+    if all(name in values for name in MASS_COLUMNS):
+        _check_masses([values[name] for name in MASS_COLUMNS], loaded * 1e3, add)
+    if len(table.problems) > before:
+        return None
+    poured, spilled, retained = (values[name] * 1e-3 for name in MASS_COLUMNS)
+    return PourRecordRow(number, action, poured, spilled, retained, split)
+
+
+def _check_masses(masses: list[float], loaded: float, add: Callable[[str, str], None]) -> None:
+    poured, spilled, retained = masses
+    slack = MASS_TOLERANCE * loaded
+    noise = max(NOISE, NOISE_OF_LOAD * loaded)
+    for name, mass in zip(MASS_COLUMNS, masses, strict=True):
+        if mass < -noise:
+            add(name, f"{mass:g} g is less than nothing, by more than a balance's noise of {noise:g} g")
+    if abs(poured + retained - loaded) > slack:
+        add(
+            "poured_g",
+            f"poured {poured:g} g + retained {retained:g} g = {poured + retained:g} g, "
+            f"but {loaded:g} g were loaded (the campaign's liquid.mass)",
+        )
+    if spilled > poured + slack:
+        add("spilled_g", f"spilled {spilled:g} g, more than the {poured:g} g that were poured")
+
+
+Motions = tuple[tuple[MotionBase | None, Place], ...]
+
+LIP_RADIUS_TOLERANCE = 1e-3
+"""Largest difference [m] between a stated lip radius and the rim of a pourer's profile: more is a slip of the pen."""
+
+
+def resolve_records(
+    pours: PoursSection,
+    place: Place,
+    builder: SceneBuilder,
+    table: RecordTable | None,
+    actions: Space | None,
+    scene: Scene | None,
+    pourer: VesselSpec | None,
+    motions: Motions,
+) -> tuple[RecordSet | None, RecordSet | None]:
+    """Calibration's records and those of the transfer scene; None where something is wrong or not asked for."""
+    report = builder.report
+    _check_lip_radius(pours, place, builder, pourer)
+    records = transfer = None
+    if table is not None and actions is not None:
+        for name in sorted(table.varying() - set(actions.names)):
+            report.add(
+                place.at("from"),
+                f"{name} varies in the file and is not searched; add it to {dotted(place.loc[:-1])}.actions",
+            )
+        for name in actions.names:
+            if name not in table.dimensions:
+                column = LIP_COLUMN if name == "x_offset" else column_name(ACTION_DIMENSIONS[name])
+                report.add(
+                    place.at("from"), f"{name} is searched and the file has no column '{column}'; fix it under motion"
+                )
+        splits = {row.split for row in table.rows}
+        if "train" not in splits:
+            report.add(place.at("from"), "has no pour with split 'train' to calibrate on")
+        if "transfer" in splits:
+            report.add(place.at("from"), "has pours with split 'transfer'; they belong to 'transfer: {from: ...}'")
+    if table is not None and scene is not None:
+        records = _record_set(table, scene, place.at("from"), pours, pours.source, builder)
+    section, at = pours.transfer, place.at("transfer")
+    if section is not None:
+        receiver = None if section.receiver is None else builder.references.vessel(section.receiver, at.at("receiver"))
+        other = read_table(pours, section.source, at.at("from"), builder)
+        if other is not None:
+            where = (*motions, (section.motion, at.at("motion")))
+            if any(row.split != "transfer" for row in other.rows):
+                report.add(at.at("from"), "should only have pours with split 'transfer': they are scored, never fitted")
+            moved = builder.scene(
+                "transfer",
+                pourer,
+                receiver,
+                where,
+                tuple(other.varying()),
+                at,
+                recorded=True,
+                constants=other.constants(),
+                constants_win=True,
+            )
+            if moved is not None:
+                transfer = _record_set(other, moved, at.at("from"), pours, section.source, builder)
+    return records, transfer
+
+
+def read_table(pours: PoursSection, source: str | None, place: Place, builder: SceneBuilder) -> RecordTable | None:
+    """A CSV file of weighed pours; None where there is none or something is wrong with it."""
+    if source is None or builder.liquid is None:
+        return None
+    path = _path(source, place)
+    if (missing := missing_file(path)) is not None:
+        builder.report.add(place, missing)
+        return None
+    table = read_records(path, loaded=builder.liquid.mass, lip_radius=pours.lip_radius, columns=pours.columns)
+    builder.report.problems.extend(table.problems)
+    return None if table.problems else table
+
+
+def _path(source: str, place: Place) -> Path:
+    return resolved(place.directory / source)
+
+
+def _record_set(
+    table: RecordTable, scene: Scene, place: Place, pours: PoursSection, source: str | None, builder: SceneBuilder
+) -> RecordSet | None:
+    try:
+        records = tuple(row.pour(scene.fixed) for row in table.rows)
+    except ValueError as error:
+        builder.report.add(place, str(error))
+        return None
+    return RecordSet(scene, records, _path(str(source), place), pours.lip_radius, dict(pours.columns))
+
+
+def _check_lip_radius(pours: PoursSection, place: Place, builder: SceneBuilder, pourer: VesselSpec | None) -> None:
+    if pours.lip_radius is None or pourer is None or not isinstance(pourer.shape, ProfileShape):
+        return
+    rim = pourer.shape.inner[-1][0]
+    if abs(rim - pours.lip_radius) > LIP_RADIUS_TOLERANCE:
+        builder.report.add(
+            place.at("lip_radius"),
+            f"is {pours.lip_radius * 1e3:g} mm, but the rim of pourer '{pourer.name}' has an inner radius of "
+            f"{rim * 1e3:g} mm",
+        )

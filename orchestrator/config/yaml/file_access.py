@@ -1,0 +1,166 @@
+"""Files and folders that people name: what they turn out to be, and their text up to a limit."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import stat
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
+from pathlib import Path
+
+from orchestrator.config.yaml.yaml_errors import did_you_mean
+
+SIZE_LIMIT = 500_000
+"""Largest file that is read [bytes]: a campaign has 2,000, a theta.json with its posterior 15,000."""
+
+
+_roots: ContextVar[tuple[Path, ...] | None] = ContextVar("roots", default=None)
+
+
+class UnreadableError(Exception):
+    """A file can't be read; the message says why, without its name."""
+
+
+@contextlib.contextmanager
+def confined(roots: Sequence[Path]) -> Iterator[None]:
+    """As long as this lasts no file is read but these, and those in these folders: for campaigns of strangers.
+
+    Args:
+        roots: absolute, behind links.
+    """
+    token = _roots.set(tuple(roots))
+    try:
+        yield
+    finally:
+        _roots.reset(token)
+
+
+def out_of_bounds(path: Path) -> str | None:
+    """Why a path may not be looked at; None where it may. What is behind it decides, not how it is written."""
+    roots = _roots.get()
+    if roots is None:
+        return None
+    there = resolved(path)
+    if any(there == root or root in there.parents for root in roots):
+        return None
+    return "lies outside of the folders that this campaign may refer to"
+
+
+def resolved(path: Path) -> Path:
+    """The absolute path behind links, for any path: of links that lead in a circle the first one is kept."""
+    try:
+        return Path(os.path.realpath(path))
+    except (OSError, ValueError):
+        return path.absolute()
+
+
+def in_home(text: str) -> str:
+    """A path with the home directory for a leading `~`, as a shell writes it; other paths as they are.
+
+    Raises:
+        ValueError: `~name` and there is no such user, or `~` and this user has no home directory.
+    """
+    if not text.startswith("~"):
+        return text
+    try:
+        return str(Path(text).expanduser())
+    except RuntimeError:
+        user = text.partition("/")[0]
+        raise ValueError(
+            f"'{user}' is not the home directory of any user; write the whole path, or './{text}' for a name with a ~"
+        ) from None
+
+
+def why_unreadable(path: Path) -> str | None:
+    """What is wrong with a path that should be that of a file; None where it is one."""
+    if (outside := out_of_bounds(path)) is not None:
+        return outside
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        match error.errno:
+            case errno.ENOENT | errno.ENOTDIR:
+                return "no such file"
+            case errno.ELOOP:
+                return "is a link that leads back to itself; let it point to a file"
+            case _:
+                return f"can't be read: {error.strerror}"
+    except ValueError:
+        return "no file can have such a name"
+    if stat.S_ISDIR(mode):
+        return "is a directory; name a file in it"
+    if stat.S_ISFIFO(mode):
+        return "is a pipe, which is not waited for; name a file"
+    if not stat.S_ISREG(mode):
+        return "is a device or a socket; name a file"
+    return None
+
+
+def missing_file(path: Path) -> str | None:
+    """What to say where a file is named that can't be read; None where it can."""
+    why = why_unreadable(path)
+    if why is None:
+        return None
+    if why != "no such file":
+        return f"{path} {why}"
+    return f"no such file: {path}; {similar(path) or 'paths are relative to the directory of the file they stand in'}"
+
+
+def similar(path: Path) -> str | None:
+    """'did you mean …?' with a file of the same directory; None where none resembles it."""
+    try:
+        guess = did_you_mean(path.name, [p.name for p in path.parent.iterdir()])
+    except OSError:
+        return None
+    return f"did you mean '{guess}'?" if guess else None
+
+
+def why_not_writable(directory: Path) -> str | None:
+    """Why nothing could be kept in a directory, which need not exist; None where nothing speaks against it."""
+    for path in (directory, *directory.parents):
+        try:
+            mode = path.stat().st_mode
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except OSError as error:
+            return f"{directory} can't be written: {error.strerror}"
+        except ValueError:
+            return "no folder can have such a name"
+        if not stat.S_ISDIR(mode):
+            return f"{directory} can't be written: {path} is a file; name a folder"
+        if not os.access(path, os.W_OK | os.X_OK):
+            return f"{directory} can't be written: the permission is missing in {path}; name another folder"
+        return None
+    return None
+
+
+def read_text(path: Path, *, encoding: str = "utf-8", limit: int = SIZE_LIMIT) -> str:
+    """The text of a file.
+
+    Args:
+        path: of the file.
+        encoding: 'utf-8', or 'utf-8-sig' where a byte order mark may stand first.
+        limit: largest size [bytes].
+
+    Raises:
+        UnreadableError: it does not exist, is not a file, is too large, or is not text.
+    """
+    if (why := why_unreadable(path)) is not None:
+        hint = similar(path) if why == "no such file" else None
+        raise UnreadableError(f"{why}; {hint}" if hint else why)
+    try:
+        with path.open("rb") as file:
+            content = file.read(limit + 1)
+            size = max(os.fstat(file.fileno()).st_size, len(content))
+    except OSError as error:
+        raise UnreadableError(f"can't be read: {error.strerror}") from error
+    if size > limit:
+        raise UnreadableError(
+            f"is too large: {size / 1e6:.3g} MB, and {limit / 1e6:g} MB are read at most. Is it the right file?"
+        )
+    try:
+        return content.decode(encoding)
+    except UnicodeDecodeError as error:
+        raise UnreadableError(f"is not text in UTF-8 (byte {error.start}); save it as UTF-8") from None

@@ -1,0 +1,289 @@
+"""From plain data with places to sections: pydantic's errors in our words, as many at once as there are."""
+
+from __future__ import annotations
+
+import copy
+import typing
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from orchestrator.config.action_ranges import EXAMPLES
+from orchestrator.config.yaml.yaml_errors import did_you_mean
+from orchestrator.config.yaml.yaml_source import Loc, Place, Report
+from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.settings.model import Section
+from sim_engine.settings.quantity import FROM_FILE
+
+S = TypeVar("S", bound=Section)
+
+
+def validate(model: type[S], place: Place, report: Report) -> S | None:
+    """The section at a place; everything that is wrong with it goes to the report.
+
+    What is wrong is cut out and the rest validated again, so that the answer still has all that is right and later
+    checks can look at that. None only where nothing is left to look at.
+    """
+    document = place.document
+    if place.loc == ():
+        report.problems.extend(document.problems)
+    data = copy.deepcopy(document.get(place.loc))
+    if not isinstance(data, dict):
+        report.add(
+            place,
+            f"should be a mapping with keys such as {', '.join(list(model.written_keys())[:3])}, got {_name(data)}",
+        )
+        return None
+    _cut_empty(data, place, report)
+    guessed: set[Loc] = set()
+    while True:
+        try:
+            section = model.model_validate(data, context=FROM_FILE)
+        except ValidationError as error:
+            # Deepest first and last items first, so that cutting does not move what is still to be cut.
+            details = sorted(
+                error.errors(include_url=False), key=lambda e: (len(e["loc"]), str(e["loc"])), reverse=True
+            )
+            locs = [_loc_in(data, detail["loc"]) for detail in details]
+            cut = False
+            for detail, loc in zip(details, locs, strict=True):
+                if detail["type"] == "union_tag_invalid" and isinstance(detail["input"], dict):
+                    _guess_variant(_sections_at(model, loc, data), detail["input"], place.at(*loc), report)
+                    guessed.add(loc)
+                    cut = True
+                    continue
+                unknown = detail["type"] == "extra_forbidden"
+                if unknown and (owners := _owners(model, loc, data)):
+                    if loc[:-1] not in guessed:
+                        here = _variant(_sections_at(model, loc[:-1], data), _node(data, loc[:-1]))
+                        names = " and ".join(sorted({_tag(owner) for owner in owners}))
+                        text = f"belongs to {names}, not to {' or '.join(map(_tag, here))}; remove it"
+                        report.add(place.at(*loc), text, key=True)
+                else:
+                    report.add(place.at(*loc), _message(model, detail, loc, data), key=unknown)
+                    if unknown and (meant := _meant(model, loc, data)) is not None:
+                        # Nobody needs to hear that the key is also missing.
+                        report.broken.add((place.document.path, place.at(*loc[:-1], meant).loc))
+                cut = _cut(data, loc) or cut
+            if not cut:
+                return None
+            continue
+        _note_missing(section, place, report)
+        return section
+
+
+def _guess_variant(variants: set[type[Section]], data: dict[str, Any], place: Place, report: Report) -> None:
+    """Say that the key that tells variants apart is missing or wrong; go on with the one that has most of the keys."""
+    key, word = next(iter(variants)).tag, data.get(next(iter(variants)).tag)
+    words = sorted(map(_tag, variants))
+    if word is None:
+        examples = [section.required[key] for section in variants if key in section.required]
+        text = f"key '{key}' is missing; add for example '{key}: {sorted(examples)[-1]}'"
+        report.add(place, text, key=True)
+        report.broken.add((place.document.path, place.at(key).loc))
+    else:
+        expected = " or ".join([", ".join(map(repr, words[:-1])), repr(words[-1])])
+        said = next(iter(variants)).unknown_tag(word) if isinstance(word, str) else ""
+        report.add(place.at(key), said or _one_of(word, expected))
+    data[key] = max(words, key=lambda w: len(data.keys() & next(v for v in variants if _tag(v) == w).written_keys()))
+
+
+def _tag(section: type[Section]) -> str:
+    """The word that tells a variant apart from its siblings."""
+    return section.variant or str(section.model_fields[section.tag].default)
+
+
+def _variant(sections: set[type[Section]], data: Any) -> set[type[Section]]:
+    """Those of the sections that may stand somewhere that the data there are meant to be."""
+    if not isinstance(data, dict):
+        return sections
+    return {
+        section
+        for section in sections
+        if not section.tag
+        or (_tag(section) == data[section.tag] if section.tag in data else section.tag not in section.required)
+    }
+
+
+def _owners(model: type[Section], loc: Loc, data: Any) -> set[type[Section]]:
+    """The variants that have a key which the one that was written has not."""
+    variants = {section for section in _sections_at(model, loc[:-1], data) if section.tag}
+    if not variants and len(loc) > 1 and any(section.variant for section in _sections_at(model, loc[:-1], data)):
+        for parent in _sections_at(model, loc[:-2], data):
+            variants |= {s for info in parent.model_fields.values() for s in sections_in(info.annotation) if s.variant}
+    return {section for section in variants if loc[-1] in section.written_keys()}
+
+
+def _node(data: Any, loc: Loc) -> Any:
+    for part in loc:
+        data = data[part]
+    return data
+
+
+def _cut(data: Any, loc: Loc) -> bool:
+    """Take what stands at a location out of the data; False where that is everything, or gone already."""
+    # An item of a list can't be left out without changing the meaning of its neighbours: the list goes as a whole.
+    target = loc
+    while target and isinstance(target[-1], int):
+        target = target[:-1]
+    if not target or _loc_in(data, target) != target:
+        return False
+    node = data
+    for part in target[:-1]:
+        node = node[part]
+    del node[target[-1]]
+    return True
+
+
+def _loc_in(data: Any, loc: Loc) -> Loc:
+    """The location without union tags and filled-in keys, which the file does not have."""
+    known: list[str | int] = []
+    for part in loc:
+        in_mapping = isinstance(data, dict) and part in data
+        in_list = isinstance(data, list) and isinstance(part, int) and part < len(data)
+        if in_mapping or in_list:
+            data = data[part]
+            known.append(part)
+    return tuple(known)
+
+
+def _cut_empty(data: Any, place: Place, report: Report) -> None:
+    if isinstance(data, dict):
+        for key in [key for key, value in data.items() if value is None]:
+            report.add(place.at(key), "has no value; give one, or remove the key", key=True)
+            del data[key]
+        for key, value in data.items():
+            _cut_empty(value, place.at(key), report)
+    elif isinstance(data, list):
+        for i, value in enumerate(data):
+            _cut_empty(value, place.at(i), report)
+
+
+def _note_missing(section: Section, place: Place, report: Report) -> None:
+    for key, example in section.required.items():
+        if section.value(key) is None and not report.is_broken_within(place.at(key)):
+            shown = f"{key}: {example}"
+            report.add(place, f"key '{key}' is missing; add for example '{shown}'", key=True)
+    for key in section.written_keys():
+        value = section.value(key)
+        if isinstance(value, Section) and place.at(key).loc in place.document.marks:
+            _note_missing(value, place.at(key), report)
+        elif isinstance(value, (list, tuple)):
+            for i, item in enumerate(value):
+                if isinstance(item, Section):
+                    _note_missing(item, place.at(key, i), report)
+
+
+def _message(model: type[Section], detail: ErrorDetails, loc: Loc, data: Any) -> str:
+    context = detail.get("ctx", {})
+    value = detail["input"]
+    match detail["type"]:
+        case "extra_forbidden":
+            return _unknown_key(model, loc, data)
+        case "literal_error":
+            return _one_of(value, str(context["expected"]))
+        case "string_pattern_mismatch":
+            return f"{value!r} should consist of letters, digits, '.', '_' and '-' and begin with a letter or digit"
+        case "string_type":
+            return f"should be text, got {_name(value)}; put it in quotes if it is meant"
+        case "string_too_short":
+            return "is empty"
+        case "int_type":
+            return f"should be a whole number, got {_name(value)}"
+        case "float_type":
+            return f"should be a number, got {_name(value)}"
+        case "bool_type":
+            return f"should be true or false, got {_name(value)}"
+        case "greater_than_equal":
+            return f"{value} is too small; at least {_bound(context['ge'])}"
+        case "finite_number":
+            return f"should be a finite number, got {value}"
+        case "string_too_long":
+            return f"has {len(str(value))} characters; at most {context['max_length']}"
+        case "less_than_equal":
+            return f"{value} is too large; at most {_bound(context['le'])}"
+        case "list_type" | "tuple_type":
+            return f"should be a list [...], got {_name(value)}"
+        case "model_type" | "model_attributes_type" | "dict_type" | "union_tag_invalid":
+            return f"should be a mapping (key: value), got {_name(value)}"
+        case "missing":
+            return "has too few items; should be [r, z]" if loc and isinstance(loc[-1], int) else "is missing"
+        case "too_short":
+            return "is empty; name at least one, or remove the key"
+        case "too_long":
+            return f"has {context['actual_length']} items; should have {context['max_length']}"
+        case _:
+            return str(detail["msg"])
+
+
+def _bound(number: float) -> str:
+    return f"{number:,}" if isinstance(number, int) and number >= 10_000 else f"{number:g}"
+
+
+def _unknown_key(model: type[Section], loc: Loc, data: Any) -> str:
+    key = str(loc[-1])
+    guess = _meant(model, loc, data)
+    if guess is not None:
+        return f"unknown key; did you mean '{guess}'?"
+    if key in ACTION_DIMENSIONS:
+        return f"unknown key here; fix it under 'motion: {{{key}: {EXAMPLES[key]}}}' or search it under 'actions'"
+    if key in EXAMPLES:
+        return f"unknown key here; it belongs under 'simulator: {{parameters: {{{key}: {EXAMPLES[key]}}}}}'"
+    known = _keys(_variant(_sections_at(model, loc[:-1], data), _node(data, loc[:-1])))
+    return f"unknown key; known here: {', '.join(sorted(known))}"
+
+
+def _keys(sections: set[type[Section]]) -> set[str]:
+    return {name for section in sections for name in section.written_keys()}
+
+
+def _meant(model: type[Section], loc: Loc, data: Any) -> str | None:
+    """The key that a misspelt one resembles most: of the variant that was written, or of another one."""
+    variants = _sections_at(model, loc[:-1], data)
+    own = _keys(_variant(variants, _node(data, loc[:-1])))
+    return did_you_mean(str(loc[-1]), own) or did_you_mean(str(loc[-1]), _keys(variants))
+
+
+def _sections_at(model: type[Section], loc: Loc, data: Any) -> set[type[Section]]:
+    """The sections that may stand at a location of the data (several where a union is possible)."""
+    candidates: set[type[Section]] = {model}
+    for part in loc:
+        if not isinstance(part, int):
+            below: set[type[Section]] = set()
+            for candidate in _variant(candidates, data):
+                if part in candidate.written_keys():
+                    below |= sections_in(candidate.model_fields[candidate.written_keys()[part]].annotation)
+            candidates = below
+        data = data[part]
+    return candidates
+
+
+def sections_in(annotation: Any) -> set[type[Section]]:
+    """The sections that a field may hold."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return {annotation} if issubclass(annotation, Section) else set()
+    return {section for argument in typing.get_args(annotation) for section in sections_in(argument)}
+
+
+def _one_of(value: Any, expected: str) -> str:
+    words = [word.strip("' ") for word in expected.replace(" or ", ", ").split(",")]
+    guess = did_you_mean(str(value), words)
+    hint = f"did you mean '{guess}'?" if guess else f"should be {expected}"
+    return f"{value!r} is not known here; {hint}" if isinstance(value, str) else f"should be {expected}"
+
+
+def _name(value: Any) -> str:
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case None:
+            return "nothing"
+        case dict():
+            return "a mapping"
+        case list():
+            return "a list"
+        case str():
+            return f"the text {value!r}" if len(value) < 40 else "a text"
+        case _:
+            return f"the number {value}"

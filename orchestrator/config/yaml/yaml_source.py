@@ -1,0 +1,355 @@
+"""YAML as plain values that remember where they stood.
+
+The node graph of the parser is turned into plain data here, rather than by its constructor, because every duplicate
+key, tag and merge is to be reported at once and with its place.
+
+What a YAML file describes, by its keys: so that a file of another kind gets one error and not one per key.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer, MaxDepthExceededError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError, YAMLStreamError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from ruamel.yaml.reader import ReaderError
+
+from orchestrator.config.yaml.file_access import UnreadableError, read_text
+from orchestrator.config.yaml.yaml_errors import ConfigError, Problem, dotted
+from sim_engine.vessel.shapes import VESSELS
+
+Loc = tuple[str | int, ...]
+
+NODE_LIMIT = 20_000
+"""Nodes of a file after aliases are followed: a campaign has a few hundred; a loop or bomb of aliases has more."""
+
+DEPTH_LIMIT = 30
+"""Mappings and lists in each other: a campaign has eight."""
+
+
+@dataclass(frozen=True)
+class SourcePosition:
+    """Where something stands, from 1: its key (or list item) and its value; `inline` if the value is on one line."""
+
+    key: tuple[int, int]
+    value: tuple[int, int]
+    inline: bool
+
+
+@lru_cache(maxsize=16)
+def _known(text: str, path: Path) -> Document:
+    """Vessels and laboratories are named by many files. Nobody changes a document once it has been read."""
+    return Document.parse(text, path)
+
+
+@dataclass
+class Document:
+    """One YAML file.
+
+    Attributes:
+        path: the file.
+        lines: its text, for showing source lines.
+        data: plain dicts, lists, strings, numbers, booleans and None.
+        marks: place of everything in `data`.
+        problems: what was found while reading that does not prevent reading on (duplicate keys, tags, merges).
+    """
+
+    path: Path
+    lines: list[str] = field(default_factory=list)
+    data: Any = None
+    marks: dict[Loc, SourcePosition] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
+    _nodes: int = 0
+
+    @classmethod
+    def read(cls, path: Path) -> Document:
+        """Read a file.
+
+        Raises:
+            ConfigError: it can't be read, is not YAML, or is empty.
+        """
+        try:
+            return _known(read_text(path), path)
+        except UnreadableError as error:
+            raise ConfigError([Problem(path, 0, 0, "", str(error))]) from None
+
+    @classmethod
+    def parse(cls, text: str, path: Path) -> Document:
+        """Parse a text as if it were the file's.
+
+        Raises:
+            ConfigError: it is not YAML, or is empty.
+        """
+        document = cls(path, text.splitlines())
+        try:
+            root = _parser().compose(text)
+        except MaxDepthExceededError as error:
+            raise ConfigError([document._too_deep(_start_of(error.problem_mark))]) from None
+        except _TooManyNodesError as error:
+            raise ConfigError([document._too_many(_start_of(error.problem_mark), ())]) from None
+        except MarkedYAMLError as error:
+            raise ConfigError([document._syntax_problem(error)]) from None
+        except ReaderError as error:
+            # The parser counts characters of the text; people count lines.
+            before = text[: error.position]
+            line, column = before.count("\n") + 1, len(before) - before.rfind("\n")
+            message = f"not YAML: an unprintable character (code {ord(text[error.position])}); is this a text file?"
+            raise ConfigError([Problem(path, line, column, "", message)]) from None
+        except (YAMLError, YAMLStreamError) as error:
+            raise ConfigError([Problem(path, 0, 0, "", f"is not YAML: {error}")]) from None
+        if root is None:
+            raise ConfigError([Problem(path, 1, 1, "", "the file is empty", document.line(1))])
+        document.marks[()] = SourcePosition((1, 1), _start(root), False)
+        document.data = document._plain(root, ())
+        return document
+
+    def line(self, number: int) -> str:
+        """Text of a line, from 1; empty beyond the end."""
+        return self.lines[number - 1] if 1 <= number <= len(self.lines) else ""
+
+    def get(self, loc: Loc) -> Any:
+        """Plain data at a location."""
+        node = self.data
+        for part in loc:
+            node = node[part]
+        return node
+
+    def known_loc(self, loc: Loc) -> Loc:
+        """The location without the parts that the file does not have (union tags, filled-in keys)."""
+        known: Loc = ()
+        for part in loc:
+            if (*known, part) in self.marks:
+                known = (*known, part)
+        return known
+
+    def problem(self, loc: Loc, message: str, *, key: bool = False) -> Problem:
+        """A problem at a location, pointing at the value where that fits on a line, else (or with `key`) at the key."""
+        mark = self.marks[self.known_loc(loc)]
+        line, column = mark.value if mark.inline and not key else mark.key
+        return Problem(self.path, line, column, dotted(loc), message, self.line(line))
+
+    def _plain(self, node: Node, loc: Loc, active: frozenset[int] = frozenset()) -> Any:
+        self._nodes += 1
+        if len(loc) > DEPTH_LIMIT:  # by aliases within aliases
+            raise ConfigError([self._too_deep(_start(node))])
+        if self._nodes > NODE_LIMIT:
+            raise ConfigError([self._too_many(_start(node), loc)])
+        if id(node) in active:
+            line, column = _start(node)
+            raise ConfigError(
+                [Problem(self.path, line, column, dotted(loc), "an anchor that contains itself", self.line(line))]
+            )
+        inside = active | {id(node)}
+        match node:
+            case MappingNode():
+                return self._mapping(node, loc, inside)
+            case SequenceNode():
+                items = []
+                for i, child in enumerate(node.value):
+                    self.marks[(*loc, i)] = SourcePosition(_start(child), _start(child), True)
+                    items.append(self._plain(child, (*loc, i), inside))
+                return items
+            case _:
+                return self._scalar(node, loc)
+
+    def _mapping(self, node: MappingNode, loc: Loc, active: frozenset[int]) -> dict[str, Any]:
+        table: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            line, column = _start(key_node)
+            if not isinstance(key_node, ScalarNode) or str(key_node.tag).endswith(":merge"):
+                self._add(line, column, loc, "keys are plain words; merges (<<) and composed keys are not supported")
+                continue
+            key = str(key_node.value)
+            here: Loc = (*loc, key)
+            if key in table:
+                first = self.marks[here].key[0]
+                self._add(line, column, here, f"duplicate key; it stands in line {first} already, keep one of them")
+                continue
+            inline = isinstance(value_node, ScalarNode) or bool(value_node.flow_style)
+            value_place = _start(value_node) if not _is_empty(value_node) else (line, column)
+            self.marks[here] = SourcePosition((line, column), value_place, inline)
+            table[key] = self._plain(value_node, here, active)
+        return table
+
+    def _scalar(self, node: Node, loc: Loc) -> Any:
+        tag, text = str(node.tag), str(node.value)
+        try:
+            match tag.rsplit(":", 1)[-1]:
+                case "null":
+                    return None
+                case "bool":
+                    return text.lower() in ("true", "yes", "on")
+                case "int":
+                    return int(text, 0) if text.lstrip("+-")[:2].lower() in ("0x", "0o") else int(text)
+                case "float":
+                    return float(text.replace("_", "").replace(".inf", "inf").replace(".nan", "nan"))
+                case "str" | "timestamp":
+                    return text
+        except ValueError:
+            pass  # e.g. 0123: a number to the resolver, none to us; the text says more than a guess
+        if tag.startswith("tag:yaml.org,2002:") and tag.rsplit(":", 1)[-1] in ("int", "float"):
+            return text
+        line, column = _start(node)
+        self._add(line, column, loc, f"tag {tag!r} is not supported; write a plain value")
+        return text
+
+    def _add(self, line: int, column: int, loc: Loc, message: str) -> None:
+        self.problems.append(Problem(self.path, line, column, dotted(loc), message, self.line(line)))
+
+    def _too_deep(self, start: tuple[int, int]) -> Problem:
+        message = f"is nested more than {DEPTH_LIMIT} deep; is a bracket not closed, or is this another kind of file?"
+        return Problem(self.path, *start, "", message, self.line(start[0]))
+
+    def _too_many(self, start: tuple[int, int], loc: Loc) -> Problem:
+        message = f"more than {NODE_LIMIT} values; a campaign has some hundreds. Is this the right file?"
+        return Problem(self.path, *start, dotted(loc), message, self.line(start[0]))
+
+    def _syntax_problem(self, error: MarkedYAMLError) -> Problem:
+        mark = error.problem_mark or error.context_mark
+        line, column = (mark.line + 1, mark.column + 1) if mark is not None else (1, 1)
+        what = (error.problem or "unreadable").replace("<", "").replace(">", "")
+        source = self.line(line)
+        if "another document" in what:
+            hint = "a file holds one document; remove the '---' line"
+        elif "'\\t'" in what or source[: len(source) - len(source.lstrip())].count("\t"):
+            what, hint = "a tab", "YAML is indented with spaces"
+        elif "mapping values are not allowed" in what:
+            hint = (
+                "is the line indented further than the one above, or is there a second ':' in it (then quote the text)?"
+            )
+        elif "end of stream" in what or "expected ',' or" in what:
+            hint = "is a bracket, brace or quote still open?"
+        elif "block end" in what:
+            hint = "is the line indented like its neighbours?"
+        elif "cannot start any token" in what:
+            hint = "put text that begins with such a character in quotes"
+        else:
+            hint = (error.context or "check brackets, quotes and indentation").strip()
+        return Problem(self.path, line, column, "", f"not YAML: {what}; {hint}", source)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A location in a document; what referenced files and inline mappings have in common."""
+
+    document: Document
+    loc: Loc = ()
+
+    def at(self, *parts: str | int) -> Place:
+        """A place further down."""
+        return Place(self.document, (*self.loc, *parts))
+
+    @property
+    def directory(self) -> Path:
+        """Directory against which paths written here resolve."""
+        return self.document.path.parent
+
+
+@dataclass
+class Report:
+    """Collects the problems of a campaign file and of everything it refers to."""
+
+    problems: list[Problem] = field(default_factory=list)
+    broken: set[tuple[Path, Loc]] = field(default_factory=set)
+
+    def add(self, place: Place, message: str, *, key: bool = False) -> None:
+        """Note a problem; the place counts as broken from now on."""
+        self.problems.append(place.document.problem(place.loc, message, key=key))
+        self.broken.add((place.document.path, place.document.known_loc(place.loc)))
+
+    def is_broken(self, place: Place) -> bool:
+        """Whether a problem was noted at this very place."""
+        return (place.document.path, place.loc) in self.broken
+
+    def is_broken_within(self, place: Place) -> bool:
+        """Whether a problem was noted there or at anything in it."""
+        size = len(place.loc)
+        return any(path == place.document.path and loc[:size] == place.loc for path, loc in self.broken)
+
+    def raise_if_any(self) -> None:
+        """Raise everything collected, file by file and line by line.
+
+        Raises:
+            ConfigError: there are problems.
+        """
+        if not self.problems:
+            return
+        order = {problem.path: i for i, problem in reversed(list(enumerate(self.problems)))}
+        unique = dict.fromkeys(self.problems)
+        raise ConfigError(sorted(unique, key=lambda p: (order[p.path], p.line, p.column)))
+
+
+class _TooManyNodesError(MarkedYAMLError):
+    """Raised while reading, before everything has been read."""
+
+
+class _Composer(Composer):
+    nodes = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        self.nodes += 1
+        if self.nodes > NODE_LIMIT:
+            raise _TooManyNodesError(problem_mark=self.parser.peek_event().start_mark)
+        return super().compose_node(parent, index)
+
+
+def _parser() -> YAML:
+    """Without the comments, whose keeping takes a round-trip parser a minute where there are a million of them."""
+    parser = YAML(typ="safe", pure=True)
+    parser.Composer = _Composer
+    parser.max_depth = DEPTH_LIMIT
+    parser.composer.warn_double_anchors = False
+    return parser
+
+
+def _start(node: Node) -> tuple[int, int]:
+    return _start_of(node.start_mark)
+
+
+def _start_of(mark: Any) -> tuple[int, int]:
+    return mark.line + 1, mark.column + 1
+
+
+def _is_empty(node: Node) -> bool:
+    return isinstance(node, ScalarNode) and node.value == "" and node.style is None
+
+
+TELLING = {
+    "study": {"mismatch", "compared", "campaign"},
+    "campaign": {"calibration", "deployment", "seed", "liquid", "pourer", "receiver", "laboratory"},
+    "vessel": {"profile", "mesh", "inner", "wall", "up"},
+    "laboratory": {"bench", "mode", "simulators", "arm", "cell"},
+}
+"""Top-level keys that only one kind of file has, or that give away what was meant; looked for in this order."""
+
+NEEDED = {
+    "study": "a study has keys such as campaign, mismatch, calibration, deployment",
+    "campaign": "a campaign has keys such as laboratory, liquid, calibration, deployment",
+    "vessel": "a vessel has a name and a profile or mesh",
+    "laboratory": "a laboratory has keys such as mode, simulators, arm, bench",
+}
+
+
+def kind_of(data: Any) -> str | None:
+    """'study', 'campaign', 'vessel' or 'laboratory'; None if no key tells."""
+    keys = set(data) if isinstance(data, dict) else set()
+    return next((kind for kind in TELLING if keys & telling(kind)), None)
+
+
+def telling(kind: str) -> set[str]:
+    """Keys that tell a kind of file, with those that packages add."""
+    return TELLING[kind] | (set(VESSELS.names) if kind == "vessel" else set())
+
+
+def wrong_kind(document: Document, wanted: str) -> Problem | None:
+    """The problem with a file that plainly is of another kind than the one wanted; None otherwise."""
+    found = kind_of(document.data)
+    keys = set(document.data) if isinstance(document.data, dict) else set()
+    if found is None or found == wanted or keys & telling(wanted):
+        return None
+    return Problem(document.path, 0, 0, "", f"describes a {found}, but a {wanted} is needed here ({NEEDED[wanted]})")

@@ -1,0 +1,197 @@
+"""The daemon from the command line, on this machine or another: HTTP calls whose refusals are passed on as they are."""
+
+from __future__ import annotations
+
+import json
+import os
+import ssl
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from orchestrator.catalogue.run_registry import state_directory
+from orchestrator.daemon.access_control import Role, token_of
+from orchestrator.daemon.daemon_settings import PORT
+from orchestrator.run_errors import RunError
+
+V1 = "/api/v1"
+TIMEOUT = httpx.Timeout(60.0, connect=5.0)
+
+
+class DaemonError(RunError):
+    """The daemon can't be reached, or refuses; the text is what it says."""
+
+    def __init__(self, text: str, exit_code: int = 1) -> None:
+        super().__init__(text)
+        self.exit_code = exit_code
+
+
+@dataclass(frozen=True)
+class ServerReply:
+    """One event as it came."""
+
+    id: int
+    type: str
+    data: dict[str, Any]
+
+
+class Client:
+    """Calls to one daemon.
+
+    Args:
+        url: of the daemon; $DECANT_URL, what stands in the state directory, or the usual port of this machine.
+        state: the daemon's state directory, where its tokens are.
+        token: $DECANT_TOKEN, or one of the tokens in the state directory.
+
+    Raises:
+        DaemonError: no token is known.
+    """
+
+    def __init__(self, url: str | None = None, state: Path | None = None, token: str | None = None) -> None:
+        state = state or state_directory()
+        self.url = (url or os.environ.get("DECANT_URL") or _told(state) or f"http://127.0.0.1:{PORT}").rstrip("/")
+        token = token or os.environ.get("DECANT_TOKEN") or _token(state)
+        self._http = httpx.Client(
+            base_url=self.url, headers={"Authorization": f"Bearer {token}"}, timeout=TIMEOUT, trust_env=False,
+            verify=_trusted(self.url),
+        )  # fmt: skip
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._http.close()
+
+    def get(self, path: str, **query: Any) -> Any:
+        """Look."""
+        return self._call("GET", path, params=_given(query)).json()
+
+    def fetch(self, path: str, **query: Any) -> bytes:
+        """Have a file."""
+        return self._call("GET", path, params=_given(query)).content
+
+    def post(self, path: str, body: Any = None) -> Any:
+        """Do something."""
+        return self._call("POST", path, json=body).json()
+
+    def _call(self, method: str, path: str, **arguments: Any) -> httpx.Response:
+        try:
+            answer = self._http.request(method, V1 + path, **arguments)
+        except httpx.HTTPError as error:
+            raise self._unreachable(error) from None
+        _check(answer)
+        return answer
+
+    def _unreachable(self, error: httpx.HTTPError) -> DaemonError:
+        if "CERTIFICATE_VERIFY_FAILED" in str(error):
+            return DaemonError(
+                f"the certificate of {self.url} is not believed ({error}); name the authority that signed "
+                "it, or itself where it signed itself, in $DECANT_CA"
+            )
+        return DaemonError(
+            f"no daemon answers at {self.url} ({error}); start one with 'decant serve', or say where it is: --url, "
+            "--state"
+        )
+
+    def events(
+        self, after: int | None = None, campaign: str | None = None, *, follow: bool = True
+    ) -> Iterator[ServerReply]:
+        """Events, as they come; connections that break are made anew, and nothing is missed.
+
+        Args:
+            after: the last one seen; None: from now on; 0: all there are.
+            campaign: only what belongs to it.
+            follow: wait for those that come.
+        """
+        broken = 0
+        while True:
+            query = {"campaign": campaign, "after": after, "until": None if follow else "true"}
+            try:
+                with self._http.stream(
+                    "GET", f"{V1}/events", params=_given(query),
+                    timeout=httpx.Timeout(40.0, connect=5.0),
+                ) as answer:  # fmt: skip
+                    if answer.status_code >= 400:
+                        answer.read()
+                    _check(answer)
+                    for told in _told_in(answer.iter_lines()):
+                        after, broken = told.id, 0
+                        yield told
+            except httpx.HTTPError as error:
+                broken += 1
+                if broken > 3 or not follow:
+                    raise self._unreachable(error) from None
+            else:
+                if not follow:
+                    return
+                broken += 1
+                if broken > 3:
+                    raise DaemonError("the daemon has ended")
+            time.sleep(0.3 * broken)
+
+
+def _given(query: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in query.items() if value is not None}
+
+
+def _told_in(lines: Iterator[str]) -> Iterator[ServerReply]:
+    number, kind, data = 0, "", ""
+    for line in lines:
+        name, _, value = line.partition(":")
+        match name:
+            case "id":
+                number = int(value)
+            case "event":
+                kind = value.strip()
+            case "data":
+                data = value.strip()
+            case "" if not line and data:
+                yield ServerReply(number, kind, json.loads(data))
+                data = ""
+
+
+def _check(answer: httpx.Response) -> None:
+    if answer.status_code < 400:
+        return
+    try:
+        detail = answer.json()["detail"]
+    except (ValueError, KeyError, TypeError):
+        detail = answer.text[:500] or answer.reason_phrase
+    if isinstance(detail, list):  # what FastAPI says of fields
+        detail = "; ".join(f"{'.'.join(map(str, one['loc'][1:]))}: {one['msg']}" for one in detail)
+    code = 2 if answer.status_code in (400, 404, 413, 422) else 1
+    raise DaemonError(str(detail), code)
+
+
+def _trusted(url: str) -> ssl.SSLContext | bool:
+    """Whose certificates are believed: those of the authorities that this machine knows, or of $DECANT_CA."""
+    path = os.environ.get("DECANT_CA")
+    if not url.startswith("https") or not path:
+        return True
+    try:
+        return ssl.create_default_context(cafile=path)
+    except OSError as error:  # one that is not a certificate is an SSLError, which is an OSError
+        raise DaemonError(f"$DECANT_CA: {path}: can't be used as a certificate (PEM): {error}", 2) from None
+
+
+def _told(state: Path) -> str | None:
+    try:
+        return (state / "url").read_text(encoding="utf-8").strip() or None
+    except OSError:
+        return None
+
+
+def _token(state: Path) -> str:
+    path = state / "tokens"
+    found = token_of(path, Role.ADMIN) or token_of(path, Role.VIEWER) if path.exists() else None
+    if found is None:
+        raise DaemonError(
+            f"no token: {path} is not there. Say where the daemon keeps its state (--state, $DECANT_STATE), or set "
+            "$DECANT_TOKEN",
+            2,
+        )
+    return found

@@ -1,0 +1,302 @@
+"""Settings of the daemon: a YAML file, read as strictly as a campaign, and what is meant where there is none."""
+
+from __future__ import annotations
+
+import ssl
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+from pydantic import Field
+
+from actors.laboratory_settings import LaboratorySpec
+from orchestrator.catalogue.run_registry import state_directory
+from orchestrator.config.file_loading import load_laboratory
+from orchestrator.config.yaml.file_access import missing_file, resolved
+from orchestrator.config.yaml.section_validation import validate
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.config.yaml.yaml_source import Document, Place, Report
+from orchestrator.daemon.notifications import NotifySection, problem_of
+from sim_engine.settings.model import Count, FilePath, Name, PositiveCount, Section, Switch, Text
+from sim_engine.settings.quantity import Quantity
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+PORT = 8377
+ANY_RIG = "virtual"
+"""The rig of a daemon whose settings name none: each campaign's own laboratory, as long as it is virtual."""
+
+DESK = "desk"
+"""Where campaigns run that pour nothing: they need simulators and no rig."""
+
+Port = Annotated[int, Field(strict=True, ge=0, le=65535)]
+DAY = 86400.0
+
+
+class TlsSection(Section):
+    """A certificate, for addresses that other machines reach."""
+
+    required: ClassVar[dict[str, str]] = {"certificate": "decant.crt", "key": "decant.key"}
+
+    certificate: FilePath | None = None
+    """The server's certificate, with its chain (PEM)."""
+
+    key: FilePath | None = None
+    """Its private key (PEM)."""
+
+
+class ListenSection(Section):
+    """Where the API is served. Unless said otherwise only this machine reaches it."""
+
+    host: Text = "127.0.0.1"
+    """Address to listen at."""
+
+    port: Port = PORT
+    """TCP port; 0 takes a free one, which is written into the state directory."""
+
+    tls: TlsSection | None = None
+    """Encrypts; needed for other addresses than the loopback interface's."""
+
+    plain: Switch = False
+    """Serve another address without TLS all the same, because something in front of it encrypts."""
+
+    body: Annotated[float, Quantity("MB", "4 MB", 0.01, 1000.0)] = 4.0
+    """Largest request that is read: a campaign with the files that it refers to."""
+
+
+class LiveSection(Section):
+    """A live view of what runs, for browsers."""
+
+    host: Text = "127.0.0.1"
+    """Address to listen at. It has no password: whoever reaches it can look."""
+
+    port: Port | None = None
+    """TCP port of the viewer's page; the usual one, or the next free one, unless given."""
+
+
+class RecordingsSection(Section):
+    """Which recordings (`.rrd`) are kept. Journals, figures and summaries always are."""
+
+    keep: Count | None = None
+    """So many of the newest runs; all unless given."""
+
+    age: Annotated[float, Quantity("s", "30 days", 0.0, 3650.0 * DAY, positive=True)] | None = None
+    """Those of younger runs; any age unless given."""
+
+
+class DaemonFile(Section):
+    """A daemon's settings."""
+
+    state: FilePath | None = None
+    """Folder of everything that it keeps: queue, questions, events, tokens, runs."""
+
+    listen: ListenSection = ListenSection()
+    """Where the API is served."""
+
+    rigs: dict[Name, FilePath] | None = None
+    """Laboratories by name: each has an arm and a balance that one campaign at a time may use."""
+
+    roots: list[FilePath] | None = None
+    """Folders in which campaigns that are submitted by path may lie, with all they refer to; none unless given."""
+
+    simulators: Annotated[Count, Field(le=10_000)] = 0
+    """Simulators in the pool that all campaigns share; 0: one per core."""
+
+    in_process: Switch = False
+    """One simulator in the daemon's own process, without Ray: for trying it out."""
+
+    recordings: RecordingsSection = RecordingsSection()
+    """How long recordings are kept."""
+
+    live: LiveSection | None = None
+    """Serve a live view; none unless given."""
+
+    notify: NotifySection | None = None
+    """Who is told what happens; nobody unless given."""
+
+    keep_free: Annotated[float, Quantity("MB", "500 MB", 40.0, 1e7)] = 500.0
+    """Room on the disk below which no campaign is begun."""
+
+    events: PositiveCount = 50_000
+    """Events that are kept for those who ask for what they have missed."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A laboratory that campaigns lease, one at a time.
+
+    Attributes:
+        name: unique.
+        source: its file; None where each campaign brings its own.
+        spec: as read from it.
+    """
+
+    name: str
+    source: Path | None = None
+    spec: LaboratorySpec | None = None
+
+    @property
+    def mode(self) -> str:
+        """'virtual' or 'hardware'; 'none' for the desk."""
+        if self.name == DESK:
+            return "none"
+        return "virtual" if self.spec is None else self.spec.mode
+
+
+@dataclass(frozen=True)
+class DaemonSettings:
+    """What is in force; see `DaemonFile` for the meaning. Sizes are in bytes, times in seconds."""
+
+    state: Path
+    host: str = "127.0.0.1"
+    port: int = PORT
+    certificate: Path | None = None
+    key: Path | None = None
+    body_limit: int = 4_000_000
+    rigs: tuple[Rig, ...] = (Rig(ANY_RIG),)
+    roots: tuple[Path, ...] = ()
+    simulators: int = 0
+    in_process: bool = False
+    keep_recordings: int | None = None
+    recording_age: float | None = None
+    keep_free: int = 500_000_000
+    events: int = 50_000
+    live: tuple[str, int | None] | None = None
+    notify: NotifySection | None = None
+    quick_start: bool = field(default=True, compare=False)
+    """Whether simulators are started at once, or with the first campaign."""
+
+    @property
+    def runs(self) -> Path:
+        """Where runs get their folders."""
+        return self.state / "runs"
+
+    @property
+    def snapshots(self) -> Path:
+        """Where submitted campaigns are kept as they were."""
+        return self.state / "campaigns"
+
+    @property
+    def tokens(self) -> Path:
+        """File of the tokens."""
+        return self.state / "tokens"
+
+    @property
+    def address(self) -> Path:
+        """File that says where the running daemon is reached."""
+        return self.state / "url"
+
+    def rig(self, name: str) -> Rig:
+        """A rig by its name. Raises KeyError."""
+        return next(rig for rig in (*self.rigs, Rig(DESK)) if rig.name == name)
+
+
+def load_settings(path: Path | None, **given: Any) -> DaemonSettings:
+    """Settings of a file, and of the command line, which has the last word.
+
+    Args:
+        path: of the file; None: defaults.
+        given: fields of `Settings`; None where the command line says nothing.
+
+    Raises:
+        ConfigError: anything is wrong with the file, or with a rig's.
+    """
+    given = {name: value for name, value in given.items() if value is not None}
+    if path is None:
+        return replace(DaemonSettings(resolved(given.pop("state", state_directory()))), **given)
+    report = Report()
+    place = Place(Document.read(resolved(path)))
+    file = validate(DaemonFile, place, report)
+    settings = None if file is None else _resolve(file, place, report)
+    report.raise_if_any()
+    assert settings is not None, "settings without problems"
+    if "state" in given:
+        given["state"] = resolved(given["state"])
+    return replace(settings, **given)
+
+
+def _rig(name: str, source: Path, at: Place, report: Report) -> list[Rig]:
+    try:
+        spec = load_laboratory(source)
+    except ConfigError as error:
+        report.problems.extend(error.problems)
+        return []
+    if not spec.pours:
+        report.add(at, "has no bench; campaigns that pour nothing need no rig")
+    if spec.ray is not None:
+        report.add(at, "is on a Ray cluster; a daemon's simulators are on its own machine: leave 'ray' out")
+    return [Rig(name, source, spec)]
+
+
+def _check_tls(certificate: Path | None, key: Path | None, at: Place, report: Report) -> None:
+    assert certificate is not None
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
+    except OSError as error:  # of which those of SSL are
+        said = error.reason or "they can't be read" if isinstance(error, ssl.SSLError) else error.strerror
+        report.add(at, f"{certificate.name} and {key and key.name} are not a certificate and its key in PEM ({said})")
+
+
+def _check_receivers(section: NotifySection, at: Place, report: Report) -> None:
+    for i, receiver in enumerate(section.to or ()):
+        if (problem := problem_of(receiver)) is not None:
+            report.add(at.at("to", i), problem)
+
+
+def _resolve(file: DaemonFile, place: Place, report: Report) -> DaemonSettings:
+    def path(text: str | None, at: Place) -> Path | None:
+        return None if text is None else resolved(at.directory / text)
+
+    rigs = []
+    for name, text in (file.rigs or {}).items():
+        at = place.at("rigs", name)
+        source = resolved(place.directory / text)
+        if name == DESK:
+            report.add(at, f"'{DESK}' is where campaigns run that pour nothing; give the rig another name", key=True)
+        elif (missing := missing_file(source)) is not None:
+            report.add(at, missing)
+        else:
+            rigs += _rig(name, source, at, report)
+    roots = []
+    for index, text in enumerate(file.roots or ()):
+        root = resolved(place.directory / text)
+        roots.append(root)
+        if not root.is_dir():
+            report.add(place.at("roots", index), f"{root} is not a folder")
+    listen = place.at("listen")
+    tls = file.listen.tls
+    files = (None, None) if tls is None else (path(tls.certificate, listen), path(tls.key, listen))
+    if tls is not None:
+        for key, found in zip(("certificate", "key"), files, strict=True):
+            if found is not None and (missing := missing_file(found)) is not None:
+                report.add(listen.at("tls", key), missing)
+        if not any(report.is_broken(listen.at("tls", key)) for key in ("certificate", "key")) and None not in files:
+            _check_tls(*files, listen.at("tls"), report)
+    if file.listen.host not in LOOPBACK and tls is None and not file.listen.plain:
+        report.add(
+            listen.at("host"),
+            "other machines reach this address, and tokens would cross the network in plain text; add 'tls', or "
+            "'plain: true' where something in front of it encrypts",
+        )
+    if file.notify is not None:
+        _check_receivers(file.notify, place.at("notify"), report)
+    state = path(file.state, place)
+    if state is not None and state.exists() and not state.is_dir():
+        report.add(place.at("state"), f"{state} is not a folder")
+    return DaemonSettings(
+        state=state or state_directory(),
+        host=file.listen.host,
+        port=file.listen.port,
+        certificate=files[0],
+        key=files[1],
+        body_limit=round(file.listen.body * 1e6),
+        rigs=tuple(rigs) or (Rig(ANY_RIG),),
+        roots=tuple(roots),
+        simulators=file.simulators,
+        in_process=file.in_process,
+        keep_recordings=file.recordings.keep,
+        recording_age=file.recordings.age,
+        keep_free=round(file.keep_free * 1e6),
+        events=file.events,
+        live=None if file.live is None else (file.live.host, file.live.port),
+        notify=file.notify,
+    )

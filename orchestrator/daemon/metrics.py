@@ -1,0 +1,82 @@
+"""What is reported to Prometheus: counts of what there is, and of what happened."""
+
+from __future__ import annotations
+
+import os
+import resource
+import threading
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import GaugeMetricFamily, Metric
+
+from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.journal.disk_reserve import free_space
+
+
+class _Collector:
+    """Looks when it is asked: nothing is counted twice, and nothing has to be remembered."""
+
+    def __init__(self, daemon: Supervisor) -> None:
+        self._daemon = daemon
+
+    def collect(self) -> Iterable[Metric]:
+        """See prometheus_client's collectors."""
+        daemon = self._daemon
+        campaigns = GaugeMetricFamily("decant_campaigns", "Campaigns in each state.", labels=["state"])
+        for state, count in daemon.store.counts().items():
+            campaigns.add_metric([state], count)
+        yield campaigns
+        busy = GaugeMetricFamily("decant_rig_busy", "Whether a campaign has the rig.", labels=["rig"])
+        for name, lane in daemon.lanes.items():
+            busy.add_metric([name], float(lane.running is not None))
+        yield busy
+        words = GaugeMetricFamily("decant_words", "Messages to people elsewhere.", labels=["receiver", "outcome"])
+        for receiver, counts in daemon.words.items():
+            for outcome, count in asdict(counts).items():
+                words.add_metric([receiver, outcome], count)
+        yield words
+        single = {
+            "decant_questions_open": ("Questions that wait for an answer.", len(daemon.store.questions())),
+            "decant_emergency_stop": (
+                "Whether an emergency stop is latched.",
+                daemon.emergency is not None or bool(daemon.emergencies),
+            ),
+            "decant_queue_paused": ("Whether no campaign is begun.", daemon.queue_paused),
+            "decant_simulators": ("Simulators in the pool.", daemon.warm.size),
+            "decant_events_last": ("Number of the newest event.", daemon.feed.last),
+            "decant_readers": ("Readers of events.", daemon.feed.readers),
+            "decant_problems": ("Things that people should mend.", len(daemon.problems)),
+            "decant_disk_free_bytes": ("Room on the state directory's disk.", free_space(daemon.settings.state)),
+            "decant_threads": ("Threads of the daemon's process.", threading.active_count()),
+            "decant_open_files": ("Open files of the daemon's process.", _open_files()),
+            "decant_resident_bytes": ("Memory of the daemon's process.", _resident()),
+            "decant_cpu_seconds_total": ("CPU time of the daemon's process.", _cpu()),
+        }
+        for name, (text, value) in single.items():
+            yield GaugeMetricFamily(name, text, value=float(value))
+
+
+def measures(daemon: Supervisor) -> bytes:
+    """Everything, in Prometheus' text format."""
+    registry = CollectorRegistry()
+    registry.register(_Collector(daemon))
+    return generate_latest(registry)
+
+
+def _open_files() -> int:
+    return len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else 0  # noqa: PTH208  no Path is made
+
+
+def _resident() -> int:
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    except OSError:
+        return 0
+
+
+def _cpu() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime

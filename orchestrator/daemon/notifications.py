@@ -1,0 +1,337 @@
+"""Word to people who are elsewhere: an answer is needed, a campaign ended or failed, something hangs.
+
+Mail, webhooks and chats, through apprise, which knows a hundred of them by their URLs. Each receiver has a thread and a
+short queue of its own: one that is dead or slow keeps nobody waiting, neither the daemon nor the other receivers.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import queue
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar, Literal, Protocol
+
+from sim_engine.settings.model import Section, Text
+from sim_engine.settings.quantity import Quantity
+
+QUEUE = 50
+"""Messages that wait for one receiver; while so many wait, further ones are dropped and counted."""
+
+TRIES, PAUSES = 3, (2.0, 10.0)
+"""How often a message is tried, and how long is waited in between [s]."""
+
+ENVIRONMENT = "env:"
+
+Occasion = Literal["question", "ended", "failed", "silence", "emergency"]
+
+OCCASIONS: tuple[Occasion, ...] = ("question", "ended", "failed", "silence", "emergency")
+
+_BY_PEOPLE = ("", "stopped on request")
+"""Reasons of a campaign that rests because somebody wanted it to."""
+
+_TOLD = (
+    "CampaignLeased",
+    "CampaignOpened",
+    "CampaignRests",
+    "QuestionAsked",
+    "QuestionAnswered",
+    "QuestionClosed",
+    "Deed",
+)
+"""Events whose data are looked at; of all others it counts that they came."""
+
+_log = logging.getLogger(__name__)
+
+
+class NotifySection(Section):
+    """Who is told what happens, by mail, webhook or chat."""
+
+    required: ClassVar[dict[str, str]] = {"to": "['mailtos://user:password@smtp.example.org?to=me@example.org']"}
+
+    to: list[Text] | None = None
+    """Receivers, as URLs that apprise knows ([its list](https://appriseit.com/services/)); `env:NAME` reads one from
+    the environment, for URLs with secrets in them."""
+
+    about: list[Literal["question", "ended", "failed", "silence", "emergency"]] | None = None
+    """What is sent: all unless given. `question`: a person has to answer; `ended`: a campaign is finished or was
+    stopped; `failed`: it can't go on, or a pour is UNKNOWN; `silence`: nothing happens; `emergency`: an emergency
+    stop."""
+
+    silence: Annotated[float, Quantity("s", "15 min", 1.0, 86_400.0, positive=True)] = 900.0
+    """A running campaign without news for so long hangs; a question that is open for so long is reported once more."""
+
+    page: Text | None = None
+    """Address of the page as people elsewhere reach it: the link in messages."""
+
+
+@dataclass(frozen=True)
+class Notification:
+    """One message."""
+
+    occasion: Occasion
+    title: str
+    body: str
+
+
+@dataclass
+class Counts:
+    """Messages of one receiver so far."""
+
+    sent: int = 0
+    failed: int = 0
+    dropped: int = 0
+
+
+class NotifyError(ValueError):
+    """A receiver that apprise does not know; the text says which, without its secrets."""
+
+
+class Notifier:
+    """Sends word to all receivers. `note` is called with everything that happens; it returns at once and never raises.
+
+    Args:
+        receivers: URLs.
+        about: occasions that are reported.
+        silence: without news from a running campaign [s] before that is reported.
+        page: link for people.
+        clock: seconds, monotonic.
+
+    Raises:
+        NotifyError: a URL can't be used.
+    """
+
+    def __init__(
+        self,
+        receivers: Sequence[str],
+        *,
+        about: Sequence[Occasion] = OCCASIONS,
+        silence: float = 900.0,
+        page: str = "",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._about, self._silence, self._page, self._clock = frozenset(about), silence, page, clock
+        self._receivers = [_Receiver(number, url) for number, url in enumerate(receivers, start=1)]
+        self._heard: dict[str, _Heard] = {}
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._threads = [
+            threading.Thread(target=one.work, name=f"word to {one}", daemon=True) for one in self._receivers
+        ]
+        self._threads.append(threading.Thread(target=self._listen_for_silence, name="silence", daemon=True))
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def counts(self) -> dict[str, Counts]:
+        """Messages so far, by receiver; its name has no secrets in it."""
+        return {str(one): one.counts for one in self._receivers}
+
+    def note(self, kind: str, data: Mapping[str, Any], campaign: str = "") -> None:
+        """Something happened: the type of an event of the daemon's feed, and its data."""
+        try:
+            with self._lock:
+                word = self._word(kind, data, campaign)
+            if word is not None:
+                self._send(word)
+        except Exception:  # who is told is never a reason for anything to end
+            _log.exception("no word could be made of %s", kind)
+
+    def close(self, patience: float = 5.0) -> None:
+        """Send what waits, for at most so long [s], and end."""
+        self._ended.set()
+        for one in self._receivers:
+            one.end()
+        deadline = time.monotonic() + patience
+        for thread in self._threads:
+            thread.join(max(deadline - time.monotonic(), 0.0))
+
+    # ---- from what happens to words
+
+    def _word(self, kind: str, data: Mapping[str, Any], campaign: str) -> Notification | None:
+        heard = self._heard.get(campaign)
+        if heard is not None:
+            heard.at, heard.told = self._clock(), False
+        match kind:
+            case "CampaignLeased":
+                self._heard[campaign] = _Heard(self._clock(), rig=str(data.get("rig", "")))
+            case "CampaignOpened" if heard is not None:
+                heard.mode = str(data.get("mode", ""))
+            case "QuestionAsked":
+                question = data["question"]
+                if heard is not None:
+                    heard.question = str(question["text"])
+                lines = [str(question["text"]), str(question.get("problem") or "")]
+                if options := question.get("options"):
+                    lines.append("Answer with one of: " + ", ".join(map(str, options)))
+                return self._made("question", campaign, "an answer is needed", lines)
+            case "QuestionAnswered" | "QuestionClosed" if heard is not None:
+                heard.question = ""
+            case "CampaignRests":
+                word = self._rests(data, campaign)
+                self._heard.pop(campaign, None)
+                return word
+            case "Deed" if data.get("what") == "emergency stop":
+                lines = [f"By {data.get('by')}.", str(data.get("detail") or ""), "Nothing begins before it is cleared."]
+                return self._made("emergency", "", "EMERGENCY STOP", lines)
+        return None
+
+    def _rests(self, data: Mapping[str, Any], campaign: str) -> Notification | None:
+        state, reason = str(data["state"]), str(data.get("reason") or "")
+        match state:
+            case "unknown":
+                return self._made("failed", campaign, "a pour is UNKNOWN", [reason])
+            case "failed":
+                return self._made("failed", campaign, "failed", [reason])
+            case "paused":
+                return None if reason in _BY_PEOPLE else self._made("failed", campaign, "can't go on", [reason])
+        return self._made("ended", campaign, f"is {state}", [reason])
+
+    def _made(self, occasion: Occasion, campaign: str, what: str, lines: Sequence[str]) -> Notification | None:
+        if occasion not in self._about:
+            return None
+        heard = self._heard.get(campaign)
+        mode = "" if heard is None else {"hardware": "REAL ", "virtual": "VIRTUAL "}.get(heard.mode, "")
+        rig = "" if heard is None or not heard.rig else f" at {heard.rig}"
+        title = f"Decant: {what}" if not campaign else f"Decant, {mode}{campaign}{rig}: {what}"
+        return Notification(occasion, title, "\n".join(filter(None, (*lines, self._page))) or title)
+
+    def _listen_for_silence(self) -> None:
+        while not self._ended.wait(min(max(self._silence / 10.0, 0.05), 30.0)):
+            self.listen_for_silence()
+
+    def listen_for_silence(self) -> None:
+        """Send word of campaigns in which nothing has happened for too long; once, until something does."""
+        words = []
+        with self._lock:
+            for campaign, heard in self._heard.items():
+                quiet = self._clock() - heard.at
+                if heard.told or quiet < self._silence:
+                    continue
+                heard.told = True
+                lasts = f"{quiet / 60:.0f} min" if quiet >= 120.0 else f"{quiet:.0f} s"
+                if heard.question:
+                    words.append(
+                        self._made("silence", campaign, f"has waited for an answer for {lasts}", [heard.question])
+                    )
+                else:
+                    lines = ["Nothing has happened in it since then: look after the bench."]
+                    words.append(self._made("silence", campaign, f"hangs: no news for {lasts}", lines))
+        for word in filter(None, words):
+            self._send(word)
+
+    def _send(self, word: Notification) -> None:
+        for one in self._receivers:
+            one.put(word)
+
+
+class NotificationResult(Protocol):
+    """An event of the daemon's feed."""
+
+    @property
+    def type(self) -> str:
+        """Name of its class, or a word for what the daemon itself says."""
+        ...
+
+    @property
+    def data(self) -> str:
+        """JSON."""
+        ...
+
+    @property
+    def campaign(self) -> str:
+        """That it belongs to; '' for what concerns the daemon."""
+        ...
+
+
+async def pass_on(events: AsyncIterator[NotificationResult | None], notifier: Notifier) -> None:
+    """Tell a notifier what a feed tells, until the feed is closed: `pass_on(feed.read(), notifier)`."""
+    async for sent in events:
+        if sent is not None:
+            notifier.note(sent.type, json.loads(sent.data) if sent.type in _TOLD else {}, sent.campaign)
+
+
+@dataclass
+class _Heard:
+    """When a campaign last gave news (monotonic), and what is known of it."""
+
+    at: float
+    rig: str = ""
+    mode: str = ""
+    question: str = ""
+    told: bool = False
+
+
+@dataclass
+class _Receiver:
+    """One URL, its queue, and its thread's work."""
+
+    number: int
+    url: str
+    counts: Counts = field(default_factory=Counts)
+
+    def __post_init__(self) -> None:
+        from apprise import Apprise
+
+        url = os.environ.get(self.url.removeprefix(ENVIRONMENT), "") if self.url.startswith(ENVIRONMENT) else self.url
+        self._scheme = url.partition(":")[0]
+        found = Apprise()
+        if not url or not found.add(url):
+            where = self.url if self.url.startswith(ENVIRONMENT) else f"the {self.number}. one ({self._scheme}:…)"
+            raise NotifyError(f"{where}: is not a URL that apprise knows; see https://appriseit.com/services/")
+        self._apprise = found
+        self._words: queue.Queue[Notification | None] = queue.Queue(QUEUE)
+        self._ending = threading.Event()
+
+    def __str__(self) -> str:
+        return f"{self._scheme} ({self.number})"
+
+    def put(self, word: Notification) -> None:
+        """Take a message, or drop it where too many wait."""
+        try:
+            self._words.put_nowait(word)
+        except queue.Full:
+            self.counts.dropped += 1
+
+    def end(self) -> None:
+        """Send what waits, without another try where one fails, and end."""
+        self._ending.set()
+        try:
+            self._words.put_nowait(None)
+        except queue.Full:
+            self._words.get_nowait()
+            self.counts.dropped += 1
+            self._words.put_nowait(None)
+
+    def work(self) -> None:
+        """Send, until the end."""
+        while (word := self._words.get()) is not None:
+            if self._delivered(word):
+                self.counts.sent += 1
+            else:
+                self.counts.failed += 1
+                _log.warning("no word to %s: '%s' could not be delivered", self, word.title)
+
+    def _delivered(self, word: Notification) -> bool:
+        for attempt in range(TRIES):
+            if attempt and self._ending.wait(PAUSES[attempt - 1]):
+                return False
+            try:
+                if self._apprise.notify(title=word.title, body=word.body):
+                    return True
+            except Exception:  # a plug-in of apprise may raise anything
+                _log.debug("word to %s", self, exc_info=True)
+        return False
+
+
+def problem_of(url: str) -> str | None:
+    """What is wrong with a receiver, without its secrets; None where apprise knows it."""
+    try:
+        _Receiver(1, url)
+    except NotifyError as error:
+        return str(error).partition(": ")[2]
+    return None

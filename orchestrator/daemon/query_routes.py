@@ -1,0 +1,225 @@
+"""The part of the API that only looks: status, campaigns, questions, rigs, events, a run's report."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.metadata
+import time
+from collections.abc import AsyncIterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, HTTPException, Query, Request, Response
+from fastapi.responses import FileResponse, StreamingResponse
+
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.daemon.access_control import Daemon, Viewer
+from orchestrator.daemon.daemon_store import QueueItem
+from orchestrator.daemon.metrics import measures
+from orchestrator.daemon.remote_operator import question_json
+from orchestrator.daemon.rig_worker import job_of
+from orchestrator.daemon.run_readout import REPORT, summary_of
+from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, RigOut, StatusOut
+from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.run_errors import RunError
+from orchestrator.strategies.campaign_plan import CampaignPlan
+
+READERS = 400
+"""Readers of events at a time."""
+
+BEAT = 15.0
+"""After so long without an event a comment is sent, so that both ends notice a connection that is gone [s]."""
+
+router = APIRouter()
+
+
+@router.get("/status", operation_id="status")
+async def status(request: Request, daemon: Daemon, person: Viewer) -> StatusOut:
+    """Everything at a glance."""
+    emergency = daemon.emergency
+    return StatusOut.model_validate(
+        {
+            "version": importlib.metadata.version("decant"),
+            "time": time.time(),
+            "began": daemon.began,
+            "stopping": daemon.stopping,
+            "ready": daemon.warm.ready and not daemon.problems and not daemon.stopping,
+            "problems": list(daemon.problems.values()),
+            "queue_paused": daemon.queue_paused,
+            "emergency": emergency,
+            "simulators": daemon.warm.size,
+            "rigs": rigs_out(daemon),
+            "campaigns": daemon.store.counts(),
+            "questions": len(daemon.store.questions()),
+            "last_event": daemon.feed.last,
+            "live": request.app.state.live(None),
+        }
+    )
+
+
+@router.get("/rigs", operation_id="rigs")
+async def rigs(daemon: Daemon, person: Viewer) -> list[RigOut]:
+    """Laboratories, and which campaign has each of them."""
+    return rigs_out(daemon)
+
+
+def rigs_out(daemon: Supervisor) -> list[RigOut]:
+    """Rigs as they go out."""
+    found = []
+    for name, lane in daemon.lanes.items():
+        running = lane.running
+        checkpoint = running.watching.checkpoint if running is not None and running.watching is not None else ""
+        campaign = None if running is None else running.item.id
+        stop = daemon.emergencies.get(name)
+        found.append(
+            RigOut.model_validate(
+                {"name": name, "mode": lane.rig.mode, "campaign": campaign, "checkpoint": checkpoint, "emergency": stop}
+            )
+        )
+    return found
+
+
+@router.get("/campaigns", operation_id="campaigns")
+async def campaigns(
+    request: Request,
+    daemon: Daemon,
+    person: Viewer,
+    state: Annotated[list[str] | None, Query(max_length=20, description="Only those in one of these states.")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 200,
+) -> list[CampaignOut]:
+    """Campaigns: those that run, the queue in its order, then the others, the newest first."""
+    return [campaign_out(request, daemon, item) for item in daemon.store.items(state or (), limit)]
+
+
+@router.get("/campaigns/{key}", operation_id="campaign")
+async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -> CampaignDetailOut:
+    """One campaign, with its pours and what came of it."""
+    item = found_item(daemon, key)
+    summary: dict[str, Any] | None = None
+    pours: list[dict[str, Any]] = []
+    if item.run is not None:
+        directory = daemon.settings.runs / item.run
+
+        def read() -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
+            def plan() -> CampaignPlan:
+                return job_of(daemon.settings, item, daemon.settings.rig(item.rig)).plan
+
+            return daemon.pours.of(directory, plan), summary_of(directory)
+
+        try:
+            pours, summary = await asyncio.to_thread(read)
+        except (ConfigError, RunError, KeyError):  # a rig that the settings don't name any more, say
+            summary = await asyncio.to_thread(summary_of, directory)
+    table = campaign_out(request, daemon, item).model_dump()
+    if daemon.progress(item) is None:  # a run whose process was killed: its journal ends in the middle of the pour
+        for pour in pours:
+            pour["state"] = "unknown" if pour["state"] == "under way" else pour["state"]
+    deeds = daemon.store.deeds(item.id)
+    return CampaignDetailOut.model_validate({**table, "pours_made": pours, "summary": summary, "deeds": deeds})
+
+
+@router.get(
+    "/campaigns/{key}/report",
+    operation_id="report",
+    response_class=FileResponse,
+    responses={200: {"content": {"text/html": {}}, "description": "A page that needs nothing else."}},
+)
+async def report(daemon: Daemon, person: Viewer, key: str) -> FileResponse:
+    """The report of a campaign's run."""
+    item = found_item(daemon, key)
+    path = None if item.run is None else daemon.settings.runs / item.run / REPORT
+    if path is None or not path.is_file():
+        raise HTTPException(404, f"{item.id} has no report yet")
+    return FileResponse(path, media_type="text/html")
+
+
+@router.get("/questions", operation_id="questions")
+async def questions(
+    daemon: Daemon,
+    person: Viewer,
+    answered: Annotated[bool, Query(description="All of them, the newest first.")] = False,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 200,
+) -> list[QuestionOut]:
+    """What people are asked: open questions, the oldest first."""
+    found = daemon.store.questions(only_open=not answered, limit=limit)
+    return [QuestionOut.model_validate(question_json(question)) for question in found]
+
+
+@router.get(
+    "/events",
+    operation_id="events",
+    response_class=StreamingResponse,
+    responses={
+        200: {"content": {"text/event-stream": {}}, "description": "Server-sent events: id, event, data (JSON)."},
+        503: {"description": "Too many readers."},
+    },
+)
+async def events(
+    daemon: Daemon,
+    person: Viewer,
+    campaign: Annotated[str | None, Query(max_length=80, description="Only what belongs to it.")] = None,
+    after: Annotated[int | None, Query(ge=0, description="The last event that was seen; 0 for all there are.")] = None,
+    last_event_id: Annotated[str | None, Header(description="The same, as browsers say it.")] = None,
+    until: Annotated[bool, Query(description="End with the newest event there is now.")] = False,
+) -> Response:
+    """Everything that happens, as it happens; with a number to go on from."""
+    if daemon.feed.readers >= READERS:
+        raise HTTPException(503, f"{READERS} readers are at it already")
+    if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
+        after = int(last_event_id[:18])
+    only = None if campaign is None else found_item(daemon, campaign).id
+    newest = daemon.feed.last
+
+    async def stream() -> AsyncIterator[str]:
+        yield ": from here on\n\n"
+        if until and (after is None or after >= newest):
+            return
+        async for sent in daemon.feed.read(after, only, beat=0.5 if until else BEAT):
+            if sent is None:
+                if until:
+                    return
+                yield ": still here\n\n"
+                continue
+            if until and sent.id > newest:
+                return
+            yield f"id: {sent.id}\nevent: {sent.type}\ndata: {sent.data}\n\n"
+            if until and sent.id >= newest:
+                return
+
+    return StreamingResponse(stream(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
+
+
+@router.get(
+    "/metrics",
+    operation_id="metrics",
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {}}, "description": "Prometheus' text format."}},
+)
+async def metrics(daemon: Daemon, person: Viewer) -> Response:
+    """What Prometheus asks for."""
+    return Response(measures(daemon), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+def found_item(daemon: Supervisor, key: str) -> QueueItem:
+    """A campaign by its id or the beginning of it. Raises HTTPException 404."""
+    try:
+        return daemon.item(key)
+    except KeyError:
+        raise HTTPException(404, f"there is no campaign '{key[:80]}'") from None
+
+
+def campaign_out(request: Request, daemon: Supervisor, item: QueueItem) -> CampaignOut:
+    """A campaign as it goes out."""
+    table = asdict(item)
+    waits = item.state not in ("finished", "stopped", "withdrawn") and daemon.progress(item) is None
+    run: Path | None = None if item.run is None else daemon.settings.runs / item.run
+    return CampaignOut.model_validate(
+        {
+            **table,
+            "needs_arming": item.mode == "hardware" and not item.armed and waits,
+            "progress": daemon.progress(item),
+            "report": run is not None and (run / REPORT).is_file(),
+            "live": request.app.state.live(item.id) if daemon.progress(item) is not None else None,
+        }
+    )

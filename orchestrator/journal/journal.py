@@ -1,0 +1,402 @@
+"""The write-ahead record of a run: one SQLite file, append-only, one writer, any number of readers.
+
+Every entry is one row: sequence number, stage, time, kind, JSON body. Nothing is ever changed or deleted (triggers
+refuse it). Entries written together (`append_all`) are there together or not at all, whenever the process dies. Pours
+are flushed to the disk before the arm moves and before their outcome is used (synchronous=FULL), everything else
+survives the death of the process, and a power cut but for its last moments. At a pour the write-ahead log is copied
+into the file, and the entry is repeated in a ledger (`orchestrator.journal.pour_ledger`), so that a lost or changed journal is
+detected: see `orchestrator.journal.journal_check`. A full disk takes no pour's records away: see `orchestrator.journal.disk_reserve`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sqlite3
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+
+from orchestrator.journal.codec import canonical, digest, first_difference
+from orchestrator.journal.disk_reserve import MB, Reserve, free_space
+from orchestrator.journal.journal_check import check_journal, has_begun, traces_of_a_run
+from orchestrator.journal.journal_file import (
+    WITHOUT_CHAIN,
+    EventRow,
+    Header,
+    JournalError,
+    add_chain,
+    chain_of,
+    chained,
+    check_format,
+    checkpoint,
+    connect,
+    connect_writer,
+    has_tables,
+    lay_out,
+    take_lock,
+)
+from orchestrator.journal.pour_ledger import BEGUN, LEDGER_NAME, LedgerLine, PourLedger, read_ledger
+from orchestrator.states import State
+
+JOURNAL_NAME = "journal.sqlite"
+
+
+class Kind(StrEnum):
+    """What an entry says. The bodies' keys stand behind each."""
+
+    CAMPAIGN_STATE = "campaign.state"  # before, after, reason, pid
+    STAGE_OPENED = "stage.opened"  # seed
+    STAGE_CLOSED = "stage.closed"  # result
+    ASKED = "asked"  # simulations, pours (the free slots), ids (of the requests it brought)
+    REQUESTED = "requested"  # id, request
+    STARTED = "started"  # id
+    FINISHED = "finished"  # id, outcome, seconds
+    POUR_STARTED = "pour.started"  # id, attempt, number
+    POUR_WITHDRAWN = "pour.withdrawn"  # id, reason: nothing was poured, it may be poured later
+    POUR_FINISHED = "pour.finished"  # id, outcome, seconds
+    TOLD = "told"  # id
+    DECISION = "decision"  # text, values
+    OPERATOR_ASKED = "operator.asked"  # id, question, options
+    OPERATOR_ANSWERED = "operator.answered"  # id, answer
+    NOTE = "note"  # text
+
+
+_IN_LEDGER = frozenset({Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED})
+_DURABLE = _IN_LEDGER | {Kind.OPERATOR_ANSWERED}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row."""
+
+    seq: int
+    stage: str
+    t: float
+    kind: str
+    body: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Draft:
+    """An entry that is still to be written."""
+
+    kind: Kind
+    body: dict[str, Any]
+    stage: str = ""
+
+
+class JournalReader:
+    """Reads a journal, also while a run is writing it."""
+
+    def __init__(self, path: Path) -> None:
+        """Open for reading.
+
+        Raises:
+            JournalError: there is no journal at that path, or it is not one of ours.
+        """
+        self.path = path
+        if not path.is_file():
+            raise JournalError(f"{path}: there is no journal here; has the run been started?")
+        self._connection = connect(f"{path.absolute().as_uri()}?mode=ro")
+        try:
+            self.header = self._read_header()
+        except BaseException:
+            self._connection.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the file back. May be called twice."""
+        self._connection.close()
+
+    def entries(
+        self, *, after: int = 0, stage: str | None = None, kinds: Iterable[Kind] | None = None
+    ) -> Iterator[Entry]:
+        """Entries in the order in which they were written.
+
+        Args:
+            after: only those with a larger sequence number.
+            stage: only those of one stage.
+            kinds: only those of some kinds.
+
+        Raises:
+            JournalError: the file is damaged.
+        """
+        query = "select seq, stage, t, kind, body from event where seq > ?"
+        arguments: list[Any] = [after]
+        if stage is not None:
+            query += " and stage = ?"
+            arguments.append(stage)
+        if kinds is not None:
+            names = [str(kind) for kind in kinds]
+            query += f" and kind in ({', '.join('?' * len(names))})"
+            arguments += names
+        try:
+            for row in self._connection.execute(query + " order by seq", arguments):
+                yield Entry(row[0], row[1], row[2], row[3], _body(row[0], row[4]))
+        except (sqlite3.DatabaseError, _BodyError) as error:
+            raise JournalError(f"{self.path}: is damaged ({error}); see `decant runs check`") from error
+
+    def state(self) -> State:
+        """The campaign's last written state."""
+        last = State.QUEUED
+        for entry in self.entries(kinds=[Kind.CAMPAIGN_STATE]):
+            try:
+                last = State(entry.body["after"])
+            except (KeyError, ValueError) as error:
+                raise JournalError(
+                    f"{self.path}: entry {entry.seq} is damaged ({error}); see `decant runs check`"
+                ) from None
+        return last
+
+    def stage_results(self) -> dict[str, dict[str, Any]]:
+        """Results of the closed stages by name, in the order in which they were closed; see `orchestrator.journal.stage_results`."""
+        return {entry.stage: entry.body["result"] for entry in self.entries(kinds=[Kind.STAGE_CLOSED])}
+
+    def last_id(self) -> int:
+        """The largest request id in use; 0 before the first request."""
+        found = self._connection.execute(
+            "select max(json_extract(body, '$.id')) from event where kind = ?", [str(Kind.REQUESTED)]
+        ).fetchone()
+        return int(found[0] or 0)
+
+    def _read_header(self) -> Header:
+        try:
+            row = self._connection.execute("select format, name, fingerprint, created from header").fetchone()
+        except sqlite3.DatabaseError as error:
+            raise JournalError(f"{self.path}: not a journal of Decant ({error})") from error
+        if row is None:
+            raise JournalError(f"{self.path}: the journal has no header; it is damaged")
+        check_format(row[0], self.path)
+        try:
+            return Header(row[1], json.loads(row[2]), row[3])
+        except ValueError as error:
+            raise JournalError(f"{self.path}: the journal's header is damaged ({error})") from None
+
+
+class _BodyError(ValueError):
+    """The body of an entry is damaged."""
+
+
+def _body(seq: int, text: str) -> dict[str, Any]:
+    try:
+        body = json.loads(text)
+    except ValueError as error:
+        raise _BodyError(f"entry {seq}: {error}") from None
+    if not isinstance(body, dict):
+        raise _BodyError(f"entry {seq}: its body is not a mapping")
+    return body
+
+
+class Journal(JournalReader):
+    """The one writer of a journal. Made by `Journal.create` and `Journal.resume`."""
+
+    def __init__(self, path: Path, lock: IO[str], connection: sqlite3.Connection) -> None:
+        self.path = path
+        self._lock = lock
+        self._connection = connection
+        self._durable = False
+        self._reserve = Reserve(path.with_suffix(".reserve"))
+        self.header = self._read_header()
+        self._last = _last_of_chain(connection)
+        self._unwritten: list[LedgerLine] = []
+        self._ledger: PourLedger
+
+    @classmethod
+    def create(cls, path: Path, header: Header) -> Journal:
+        """Begin a new journal.
+
+        Raises:
+            JournalLockedError: another process is writing it.
+            JournalError: it holds a run already, or traces of one, or can't be written.
+        """
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # A recording may be there: the program that is about to run the campaign has opened it.
+        traces = [name for name in traces_of_a_run(path) if not name.endswith(".rrd")]
+        with contextlib.ExitStack() as opened:
+            lock = opened.enter_context(take_lock(path))
+            if traces and not path.is_file():
+                raise JournalError(
+                    f"{path}: a run was begun here ({', '.join(traces)}), and its journal is missing: pours could be "
+                    "repeated. Restore the journal, or begin in another directory"
+                )
+            connection = opened.enter_context(closing(connect_writer(path)))
+            if has_tables(connection, path):
+                raise JournalError(f"{path}: holds a run already; resume that one, or begin in another directory")
+            lay_out(connection, header, path)
+            journal = cls(path, lock, connection)
+            journal._ledger = journal._open_ledger()
+            opened.pop_all()
+            return journal
+
+    @classmethod
+    def resume(cls, path: Path, header: Header) -> Journal:
+        """Go on with a journal. One whose process died before it had written anything is begun again.
+
+        Raises:
+            JournalLockedError: another process is writing it.
+            JournalDamagedError: it has lost or changed entries.
+            JournalError: there is none, it has another format, or it belongs to another campaign.
+        """
+        if not has_begun(path):
+            raise JournalError(f"{path}: there is no journal to resume; begin the campaign without --resume")
+        with contextlib.ExitStack() as opened:
+            lock = opened.enter_context(take_lock(path))
+            check_journal(path).require()
+            connection = opened.enter_context(closing(connect_writer(path)))
+            if not has_tables(connection, path):
+                lay_out(connection, header, path)
+            journal = cls(path, lock, connection)
+            journal._check_same_campaign(header)
+            journal._ledger = journal._open_ledger()
+            opened.pop_all()
+            return journal
+
+    def reserve_space(self) -> None:
+        """Hold room on the disk for a pour's records, until the journal is closed.
+
+        Raises:
+            NoSpaceError: there isn't enough.
+        """
+        self._reserve.take()
+
+    def check_space_for_pour(self) -> None:
+        """See that whatever comes of a pour can be written down.
+
+        Raises:
+            NoSpaceError: it can't; the pour must not begin.
+        """
+        self._reserve.check_pour()
+
+    def append(self, kind: Kind, body: dict[str, Any], *, stage: str = "") -> None:
+        """Write one entry; it is in the file when this returns."""
+        self.append_all([Draft(kind, body, stage)])
+
+    def append_all(self, drafts: Sequence[Draft]) -> None:
+        """Write several entries in one transaction: all or none. On a full disk the reserve makes room.
+
+        Raises:
+            JournalError: the file can't be written.
+        """
+        durable = any(draft.kind in _DURABLE for draft in drafts)
+        if durable != self._durable:
+            self._connection.execute(f"pragma synchronous = {'full' if durable else 'normal'}")
+            self._durable = durable
+        now, (seq, digest) = time.time(), self._last
+        rows: list[EventRow] = []
+        links: list[tuple[int, bytes]] = []
+        lines: list[LedgerLine] = []
+        for draft in drafts:
+            seq += 1
+            rows.append((seq, draft.stage, now, str(draft.kind), canonical(draft.body)))
+            digest = chained(digest, rows[-1])
+            links.append((seq, digest))
+            if draft.kind in _IN_LEDGER:
+                lines.append(LedgerLine(seq, digest.hex(), now, str(draft.kind), draft.stage, draft.body))
+        try:
+            self._with_reserve(lambda: self._insert(rows, links))
+            self._last = seq, digest
+            if lines:
+                self._unwritten += lines
+                self._with_reserve(lambda: self._ledger.append(self._unwritten))
+                self._unwritten = []
+        except (sqlite3.OperationalError, OSError) as error:
+            raise JournalError(
+                f"{self.path}: can't be written ({error}; {free_space(self.path) / MB:.1f} MB are free on its disk); "
+                "what is in it is safe. Mend that and resume the run"
+            ) from error
+        if durable:
+            checkpoint(self._connection)
+
+    def _with_reserve(self, write: Callable[[], None]) -> None:
+        """Write; if that fails, once more in the room of the reserve."""
+        try:
+            write()
+        except (sqlite3.OperationalError, OSError):
+            if not self._reserve.release():
+                raise
+            write()
+
+    def _insert(self, rows: Sequence[EventRow], links: Sequence[tuple[int, bytes]]) -> None:
+        try:
+            self._connection.execute("begin immediate")
+            self._connection.executemany("insert into event (seq, stage, t, kind, body) values (?, ?, ?, ?, ?)", rows)
+            self._connection.executemany("insert into chain values (?, ?)", links)
+            self._connection.execute("commit")
+        except BaseException:
+            if self._connection.in_transaction:  # SQLite itself rolls back where the disk is full
+                self._connection.execute("rollback")
+            raise
+
+    def _open_ledger(self) -> PourLedger:
+        """The ledger, with everything that the journal has about pours. A journal of an older version gets its chain.
+
+        Raises:
+            JournalError: it can't be written.
+        """
+        path = self.path.with_name(LEDGER_NAME)
+        try:
+            if not path.is_file():
+                old = self._lines_about_pours(after=0)
+                (seq, digest), created = self._last, self.header.created
+                body = {"name": self.header.name, "created": created, "entries": seq}
+                ledger = PourLedger.begin(path, [LedgerLine(seq, digest.hex(), created, BEGUN, "", body), *old])
+            else:
+                ledger = PourLedger.resume(path)
+                if missing := self._lines_about_pours(after=max(line.seq for line in read_ledger(path))):
+                    ledger.append(missing)
+            if self._connection.execute("select format from header").fetchone()[0] == WITHOUT_CHAIN:
+                add_chain(self._connection)
+                checkpoint(self._connection)
+            return ledger
+        except (sqlite3.OperationalError, OSError) as error:
+            raise JournalError(
+                f"{path}: can't be written ({error}; {free_space(self.path) / MB:.1f} MB are free)"
+            ) from error
+
+    def _lines_about_pours(self, *, after: int) -> list[LedgerLine]:
+        found = [
+            LedgerLine(row[0], digest.hex(), row[2], row[3], row[1], json.loads(row[4]))
+            for row, digest in chain_of(self._connection)
+            if row[0] > after and row[3] in _IN_LEDGER
+        ]
+        if any(line.kind == Kind.POUR_STARTED and "number" not in line.body for line in found):
+            asked = {entry.body["id"]: entry.body["request"] for entry in self.entries(kinds=[Kind.REQUESTED])}
+            for line in found:
+                if line.kind == Kind.POUR_STARTED:
+                    line.body["number"] = asked[line.body["id"]]["number"]
+        return found
+
+    def close(self) -> None:
+        """Give file, lock and reserve back. May be called twice."""
+        self._reserve.release()
+        self._connection.close()
+        self._ledger.close()
+        self._lock.close()
+
+    def _check_same_campaign(self, header: Header) -> None:
+        if digest(self.header.fingerprint) == digest(header.fingerprint):
+            return
+        difference = first_difference(self.header.fingerprint, header.fingerprint)
+        raise JournalError(
+            f"{self.path}: this run was begun with other settings, and its next steps depend on them: {difference}. "
+            "Set that back to resume it, or begin a new run"
+        )
+
+
+def _last_of_chain(connection: sqlite3.Connection) -> tuple[int, bytes]:
+    """The last entry's sequence number and digest; the header's, as number 0, if there is none."""
+    ((row, digest),) = deque(chain_of(connection), maxlen=1)
+    return row[0], digest

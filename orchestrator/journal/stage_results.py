@@ -1,0 +1,91 @@
+"""The results of a campaign's stages: all kinds of them, their JSON form and its schema.
+
+A result is a value with a `kind`, declared beside the strategy that learns it; here they come together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from pkgutil import resolve_name
+from typing import Any, TypeVar, cast
+
+from pydantic import ValidationError
+
+from orchestrator.journal.codec import from_json, to_json
+from orchestrator.run_errors import RunError
+from orchestrator.strategies.stage_result import StageResult
+
+L = TypeVar("L", bound=StageResult)
+
+Results = Mapping[str, StageResult]
+"""What the stages learnt, by their names, in order."""
+
+DECLARED_IN = (
+    "orchestrator.strategies.calibration.pour_design",
+    "orchestrator.strategies.calibration.calibration_base",
+    "orchestrator.strategies.calibration.calibration_scores",
+    "orchestrator.strategies.deployment.deployment_result",
+    "orchestrator.strategies.deployment.confirmation",
+    "orchestrator.strategies.repeated_simulation",
+    "orchestrator.strategies.single_pour",
+    "orchestrator.study.study_strategies",
+)
+"""Modules that declare the kinds of results that Decant comes with, named by text: results know no strategy."""
+
+
+def kinds() -> tuple[type[StageResult], ...]:
+    """All kinds: ours, and those of the packages whose strategies are installed."""
+    strategies = resolve_name("orchestrator.strategies.strategy_registry:STRATEGIES").all.values()  # this loads them
+    packages = {settings.__module__.partition(".")[0] for settings in strategies}
+    for module in DECLARED_IN:
+        import_module(module)
+    ours = [found for module in DECLARED_IN for found in StageResult.KINDS.values() if found.__module__ == module]
+    theirs = {found for found in StageResult.KINDS.values() if found.__module__.partition(".")[0] in packages}
+    return (*ours, *sorted(theirs - set(ours), key=lambda found: found.__name__))
+
+
+def encode_result(result: StageResult) -> dict[str, Any]:
+    """JSON-ready mapping of a result; numbers that are not finite as the journal writes them."""
+    return cast("dict[str, Any]", to_json(result.model_dump()))
+
+
+def decode_result(data: Mapping[str, Any]) -> StageResult:
+    """Inverse of `encode_result`.
+
+    Raises:
+        RunError: the kind is not known, or the data don't fit it.
+    """
+    kind = data.get("kind")
+    if kind not in StageResult.KINDS:
+        kinds()  # perhaps of a package that nobody has asked for yet
+    known = StageResult.KINDS.get(str(kind))
+    if known is None:
+        raise RunError(
+            f"a result of the kind '{kind}' is not known; is the package installed whose strategy learnt it? "
+            f"Known are: {', '.join(sorted(StageResult.KINDS))}"
+        )
+    try:
+        return known.model_validate(from_json(data))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise RunError(f"a result of the kind '{kind}' can't be read: {place}: {first['msg']}") from None
+
+
+def decode_results(data: Mapping[str, Mapping[str, Any]]) -> dict[str, StageResult]:
+    """Results by their stages' names. Raises RunError as `decode_result` does."""
+    return {name: decode_result(result) for name, result in data.items()}
+
+
+def result_of(results: Results, stage: str, kind: type[L]) -> L:
+    """What a stage learnt.
+
+    Raises:
+        RunError: there is no such stage, or it learnt something of another kind.
+    """
+    found = results.get(stage)
+    if not isinstance(found, kind):
+        what = "nothing" if found is None else f"a result of the kind '{found.kind}'"
+        raise RunError(f"stage {stage} should have learnt a {kind.__name__}, but there is {what}")
+    return found

@@ -1,0 +1,1 @@
+"""The Rerun live view: recordings, viewers and their servers."""

@@ -1,0 +1,209 @@
+"""The balance: what it shows against time, and what simulations had foretold of the same pour.
+
+The band is of the simulations whose actions lie nearest to the pour's, in the same scene: what they spilled at each
+moment, the middle of them and the outermost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.interfaces import PourProgress
+from orchestrator.live_view import rerun_shapes as shapes
+from orchestrator.live_view.playback import Track
+from orchestrator.live_view.recording_sink import RecordingSink, columns_of
+from orchestrator.requests import Pour
+from orchestrator.results import figure_style as style
+from sim_engine.action import ACTION_DIMENSIONS, Action
+from sim_engine.outcome import PourMeasurement, PourOutcome
+from sim_engine.scene import Scene
+
+PLACE = "/balance"
+
+NEAREST = 5
+"""Simulations that a prediction is made of."""
+
+REMEMBERED = 200
+"""Simulations of a scene that are kept for that."""
+
+_POURING = ("tilt", "hold", "return", "settle", "weigh")
+"""While these last, what is on the balance beyond the tare is what was spilled."""
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass
+class _Running:
+    """A pour under way."""
+
+    scene: Scene
+    band: FloatArray | None
+    """Spilled mass [g] at `times`: least, middle, most; shape (3, T)."""
+    times: FloatArray
+    shown: list[tuple[float, float]] = field(default_factory=list)
+    """Wall time and display [g]."""
+    tilted: float | None = None
+    """Wall time."""
+    tared: float | None = None
+    verdict: float | None = None
+    """Spilled, as weighed at the end [g]."""
+
+
+class BalanceStage:
+    """Rows of the balance. For one thread.
+
+    Args:
+        outlet: where rows go.
+        time_scale: bench seconds per second of the clock.
+    """
+
+    def __init__(self, outlet: RecordingSink, time_scale: float) -> None:
+        import rerun as rr
+
+        self._rr, self._outlet, self._scale = rr, outlet, time_scale
+        self._simulated: dict[str, list[tuple[Action, PourOutcome]]] = {}
+        self._running: _Running | None = None
+        self._checkpoint = ""
+        for name, label, colour, width in (
+            ("shown", "display [g]", style.MEASURED, 3.0),
+            ("net", "since the tare [g]", style.MEASURED, 3.0),
+            ("expected/low", "expected, least [g]", "#f0c27a", 1.5),
+            ("expected/middle", "expected at the end [g]", style.PREDICTED, 3.0),
+            ("expected/high", "expected, most [g]", "#f0c27a", 1.5),
+            ("pour/low", "simulated, least [g]", "#f0c27a", 1.5),
+            ("pour/middle", "simulated [g]", style.PREDICTED, 3.0),
+            ("pour/high", "simulated, most [g]", "#f0c27a", 1.5),
+            ("pour/weighed", "balance [g]", style.MEASURED, 3.0),
+            ("pour/liquid", "virtual liquid [g]", style.FALLING, 3.0),
+        ):
+            looks = rr.SeriesLines(names=label, colors=shapes.rgb(colour), widths=width)
+            outlet.log(f"{PLACE}/{name}", looks, static=True)
+        for name, label, colour, size in (
+            ("stable", "stable [g]", style.GOOD, 4.0),
+            ("tare", "tare [g]", style.INK, 6.0),
+            ("verdict", "weighed [g]", style.BEST, 9.0),
+            ("pour/verdict", "weighed [g]", style.BEST, 9.0),
+        ):
+            outlet.log(
+                f"{PLACE}/{name}",
+                rr.SeriesPoints(names=label, colors=shapes.rgb(colour), marker_sizes=size),
+                static=True,
+            )
+
+    def simulated(self, scene: str, action: Action, outcome: PourOutcome) -> None:
+        """A simulation that later pours may be compared with."""
+        if outcome.curve_times:
+            kept = self._simulated.setdefault(scene, [])
+            kept.append((action, outcome))
+            del kept[:-REMEMBERED]
+
+    def begin(self, pour: Pour, scene: Scene) -> None:
+        """A pour begins."""
+        times, band = self._foretold(pour, scene)
+        self._running, self._checkpoint = _Running(scene, band, times), ""
+        if band is not None:
+            for name, value in zip(("low", "middle", "high"), band[:, -1], strict=True):
+                self._number(f"expected/{name}", value)
+
+    def progress(self, told: PourProgress, wall: float) -> str | None:
+        """The display; returns what the balance is doing, where that is new."""
+        running = self._running
+        if running is None:
+            return None
+        if told.checkpoint == "tilt" and running.tilted is None:
+            running.tilted = wall
+            running.tared = running.shown[-1][1] if running.shown else 0.0
+            self._number("tare", running.tared)
+        if told.balance is not None:
+            grams = 1e3 * told.balance
+            if not running.shown or running.shown[-1] != (wall, grams):
+                running.shown.append((wall, grams))
+                self._number("shown", grams)
+                if told.stable:
+                    self._number("stable", grams)
+                net = grams - (running.tared or 0.0)
+                # After the verdict somebody puts the pourer there.
+                if (
+                    running.tilted is not None
+                    and told.checkpoint in _POURING
+                    and net <= 1e3 * running.scene.liquid.mass
+                ):
+                    self._number("net", net)
+        if told.checkpoint == self._checkpoint:
+            return None
+        self._checkpoint = told.checkpoint
+        return told.checkpoint
+
+    def finish(self, measured: PourMeasurement) -> _Running | None:
+        """A pour was weighed; returns what it showed, for `beside`."""
+        running, self._running = self._running, None
+        self._number("verdict", 1e3 * measured.spilled)
+        if running is not None:
+            running.verdict = 1e3 * measured.spilled
+        if running is not None and running.band is not None:
+            for name, value in zip(("low", "middle", "high"), running.band[:, -1], strict=True):
+                self._number(f"expected/{name}", value)
+        for ended in ("net", "expected"):  # no line from one pour to the next
+            self._outlet.clear(f"{PLACE}/{ended}", recursive=True)
+        return running
+
+    def beside(self, running: _Running | None, times: FloatArray, spilled: FloatArray | None) -> list[Track]:
+        """What the balance showed in a pour, beside what simulations foretold.
+
+        Args:
+            running: the pour, as `finish` returned it.
+            times: of the pour's film, shape (T,) [s of bench time].
+            spilled: by the liquid of a virtual bench, by then, shape (T,) [kg].
+        """
+        if running is None:
+            return []
+        tracks = []
+        if running.band is not None:
+            for name, curve in zip(("low", "middle", "high"), running.band, strict=True):
+                tracks.append(self._curve(f"pour/{name}", times, np.interp(times, running.times, curve)))
+        if spilled is not None:
+            tracks.append(self._curve("pour/liquid", times, 1e3 * spilled))
+        if running.tilted is not None and np.isfinite(self._scale) and running.shown:
+            walls, grams = np.array(running.shown).T
+            at = running.tilted + times / self._scale
+            known = at <= walls[-1] + 1.0
+            net = np.interp(at[known], walls, grams) - (running.tared or 0.0)
+            tracks.append(self._curve("pour/weighed", times[known], net))
+        if running.verdict is not None:
+            tracks.append(self._curve("pour/verdict", times[-1:], np.array([running.verdict])))
+        return tracks
+
+    def told(self) -> None:
+        """The film of a pour is over."""
+        self._outlet.clear(f"{PLACE}/pour", recursive=True)
+
+    def _curve(self, name: str, times: FloatArray, values: FloatArray) -> Track:
+        return Track(f"{PLACE}/{name}", times, columns_of(self._rr.Scalars.columns(scalars=values)))
+
+    def _foretold(self, pour: Pour, scene: Scene) -> tuple[FloatArray, FloatArray | None]:
+        known = self._simulated.get(pour.scene, [])
+        wanted = _numbers(pour.action.values())
+        if not known:
+            return np.zeros(0), None
+        names = sorted(wanted)
+        places = np.array([[_numbers(action.values()).get(n, wanted[n]) for n in names] for action, _ in known])
+        spread = np.ptp(places, axis=0)
+        away = (places - np.array([wanted[n] for n in names])) / np.where(spread > 0.0, spread, 1.0)
+        nearest = np.argsort(np.linalg.norm(away, axis=1), kind="stable")[:NEAREST]
+        outcomes = [known[int(i)][1] for i in nearest]
+        end = max(outcome.curve_times[-1] for outcome in outcomes)
+        times = np.linspace(0.0, end, 80)
+        grams = 1e3 * scene.liquid.mass
+        curves = np.array([grams * np.interp(times, o.curve_times, o.curve_spilled) for o in outcomes])
+        return times, np.stack([curves.min(axis=0), np.median(curves, axis=0), curves.max(axis=0)])
+
+    def _number(self, name: str, value: float) -> None:
+        self._outlet.number(f"{PLACE}/{name}", float(value))
+
+
+def _numbers(values: Mapping[str, float | None]) -> dict[str, float]:
+    return {name: float(value) for name, value in values.items() if value is not None and name in ACTION_DIMENSIONS}

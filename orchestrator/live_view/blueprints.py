@@ -1,0 +1,311 @@
+"""What a viewer shows: one arrangement for each moment of a campaign, each with what matters then in the middle.
+
+Several recordings in one, side by side: each under a name of its own, on the timelines that they share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from orchestrator.results.figure_style import safe_name
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+
+Moment = Literal["calibrating", "deploying", "replaying"]
+
+BACKGROUND = [246, 247, 249]
+
+LEGEND = 0.5
+"""Room beside a curve for its legend, as a share of the curve's time."""
+
+
+def simulation_blueprint() -> rrb.Blueprint:
+    """For one simulated pour: the scene above the shares of the liquid."""
+    import rerun.blueprint as rrb
+
+    return _blueprint(rrb.Vertical(_simulation(), _shares(), row_shares=[3, 1]), "replaying")
+
+
+def campaign_blueprint(
+    moment: Moment,
+    receivers: Mapping[str, str],
+    loss_label: str,
+    *,
+    theta_slices: bool = False,
+    action_slices: bool = False,
+) -> rrb.Blueprint:
+    """For a campaign.
+
+    Args:
+        moment: 'calibrating', 'deploying', or 'replaying' once it is over.
+        receivers: what people call each deployment scene, by its name.
+        loss_label: of the pours' loss.
+        theta_slices: θ has more axes than one picture shows.
+        action_slices: actions have.
+    """
+    import rerun.blueprint as rrb
+
+    # Made anew for each tab: a view has one place, and one that were put into two would stay empty in the second.
+    def losses() -> list[Any]:
+        named = [(safe_name(scene), name) for scene, name in receivers.items()]
+        return [_loss(place, f"{name}: {loss_label}") for place, name in named] + [
+            _trust(place, f"{name}: distrust") for place, name in named
+        ]
+
+    def maps() -> list[Any]:
+        views = []
+        for scene, name in receivers.items():
+            views += _surrogate(safe_name(scene), f"{name}: expected loss", sliced=action_slices)
+        return views
+
+    def theta() -> list[Any]:
+        found = _picture("/learning/calibration/theta", "θ* and which θ fit the pours")
+        return [*_surrogate("calibration", "Discrepancy over θ", sliced=theta_slices), found]
+
+    def calibrated() -> Any:
+        return _loss("calibration", "Calibration pours: spilled / poured [%]")
+
+    *discrepancies, found = theta()
+    calibrating = rrb.Horizontal(
+        rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
+        rrb.Vertical(
+            rrb.Tabs(*discrepancies),
+            found,
+            rrb.Horizontal(calibrated(), _shares(), column_shares=[3, 4]),
+            row_shares=[5, 4, 4],
+        ),
+        rrb.Vertical(_status(), _log(), _lanes(), row_shares=[5, 3, 3]),
+        column_shares=[5, 7, 4],
+        name="Calibrating",
+    )
+    deploying = rrb.Horizontal(
+        rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
+        rrb.Vertical(rrb.Tabs(*maps()), rrb.Tabs(*losses()), rrb.Tabs(_weight(), _display()), row_shares=[5, 4, 4]),
+        rrb.Vertical(_status(), _log(), _lanes(), row_shares=[5, 3, 3]),
+        column_shares=[5, 7, 4],
+        name="Deploying",
+    )
+    replaying = rrb.Horizontal(
+        rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
+        rrb.Vertical(
+            rrb.Horizontal(_weighed_pour(), _shares()),
+            rrb.Tabs(*losses(), calibrated()),
+            rrb.Tabs(*maps(), *theta()),
+            row_shares=[4, 4, 5],
+        ),
+        rrb.Vertical(rrb.Tabs(_outcome(), _status()), _log(), row_shares=[5, 4]),
+        column_shares=[5, 7, 4],
+        name="Replaying",
+    )
+    # All three stand in every arrangement, behind tabs: whoever looks late may be shown an earlier moment first.
+    tabs = {"calibrating": calibrating, "deploying": deploying, "replaying": replaying}
+    if not receivers:
+        del tabs["deploying"]
+        moment = "calibrating" if moment == "deploying" else moment
+    return _blueprint(rrb.Tabs(*tabs.values(), active_tab=list(tabs).index(moment)), moment)
+
+
+def beside_blueprint(names: Sequence[str]) -> rrb.Blueprint:
+    """For several recordings in one, each below its name.
+
+    Args:
+        names: first parts of the entities' paths.
+    """
+    import rerun.blueprint as rrb
+
+    columns = [
+        rrb.Vertical(
+            _cell(f"/{name}", f"{name}: the cell"),
+            _simulation(f"/{name}", f"{name}: simulated pour"),
+            _weighed_pour(f"/{name}", f"{name}: spilled [g], weighed and simulated"),
+            _outcome(f"/{name}"),
+            row_shares=[4, 4, 3, 3],
+        )
+        for name in names
+    ]
+    return _blueprint(rrb.Horizontal(*columns), "replaying")
+
+
+def _blueprint(root: Any, moment: Moment) -> rrb.Blueprint:
+    import rerun.blueprint as rrb
+
+    # The wall clock of a campaign that is over gives minutes to thought and an instant to a pour: films are watched on
+    # the timeline of simulated time, again and again.
+    time = (
+        rrb.TimePanel(timeline="sim_time", play_state="playing", loop_mode="all", state="collapsed")
+        if moment == "replaying"
+        else rrb.TimePanel(timeline="wall", play_state="following", state="collapsed")
+    )
+    return rrb.Blueprint(
+        root, time, rrb.SelectionPanel(state="collapsed"), rrb.BlueprintPanel(state="collapsed"), auto_views=False
+    )
+
+
+def _cell(under: str = "", name: str = "The cell: planned (orange), done (blue)") -> Any:
+    import rerun.blueprint as rrb
+
+    eye = rrb.EyeControls3D(position=(0.45, -0.95, 0.62), look_target=(0.12, 0.15, 0.22), eye_up=(0, 0, 1))
+    return rrb.Spatial3DView(
+        origin=f"{under}/cell",
+        name=name,
+        background=BACKGROUND,
+        eye_controls=eye,
+        line_grid=rrb.LineGrid3D(visible=False),
+    )
+
+
+def _simulation(under: str = "", name: str = "Simulated pour, by the fate of its liquid") -> Any:
+    import rerun.blueprint as rrb
+
+    # From the side, a little above: the picture in docs/frames.md.
+    eye = rrb.EyeControls3D(position=(-0.05, -0.42, 0.22), look_target=(-0.04, 0.0, 0.08), eye_up=(0, 0, 1))
+    return rrb.Spatial3DView(
+        origin=f"{under}/simulation",
+        contents=[f"{under}/simulation/{what}" for what in ("pourer/**", "receiver/**", "liquid")],
+        name=name,
+        background=BACKGROUND,
+        eye_controls=eye,
+        line_grid=rrb.LineGrid3D(visible=False),
+    )
+
+
+def _recent(origin: str, name: str, before: float, *, contents: Any = "$origin/**", **more: Any) -> Any:
+    """Curves of the last so many seconds; to the right of now, where nothing is, there is room for the legend."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    at = rr.TimeRangeBoundary.cursor_relative
+    shown = [
+        rrb.VisibleTimeRange(line, start=at(seconds=-before), end=at(seconds=0.0)) for line in ("wall", "sim_time")
+    ]
+    return rrb.TimeSeriesView(
+        origin=origin,
+        contents=contents,
+        name=name,
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(at(seconds=-before), at(seconds=LEGEND * before))),
+        time_ranges=shown,
+        plot_legend=rrb.Corner2D.RightTop,
+        **more,
+    )
+
+
+def _whole(origin: str, name: str, *, contents: Any = "$origin/**") -> Any:
+    """Curves of the whole campaign. Left to itself the viewer shows half a minute around now, which is mostly empty."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    ever = rr.TimeRangeBoundary.infinite
+    return rrb.TimeSeriesView(
+        origin=origin,
+        contents=contents,
+        name=name,
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(ever(), ever())),
+        plot_legend=rrb.Corner2D.RightTop,
+    )
+
+
+def _shares() -> Any:
+    import rerun.blueprint as rrb
+
+    axis = rrb.ScalarAxis(range=(-3.0, 104.0))
+    return _recent("/simulation/share", "Simulated: where the liquid is [%]", 12.0, axis_y=axis)
+
+
+def _weight() -> Any:
+    contents = ["/balance/net", "/balance/verdict", "/balance/expected/**"]
+    return _recent("/balance", "Balance: spilled [g], and what simulations expect", 60.0, contents=contents)
+
+
+def _display() -> Any:
+    contents = ["/balance/shown", "/balance/stable", "/balance/tare"]
+    return _recent("/balance", "Its display [g]", 60.0, contents=contents)
+
+
+def _weighed_pour(under: str = "", name: str = "Pour: spilled [g], weighed and simulated") -> Any:
+    return _recent(f"{under}/balance/pour", name, 12.0)
+
+
+def _trust(place: str, name: str) -> Any:
+    return _whole(f"/learning/{place}", name, contents=["$origin/trust"])
+
+
+def _surrogate(place: str, name: str, *, sliced: bool) -> list[Any]:
+    views = [_picture(f"/learning/{place}/surrogate", name)]
+    return [*views, _picture(f"/learning/{place}/slices", f"{name}, two axes at a time")] if sliced else views
+
+
+def _loss(place: str, name: str) -> Any:
+    return _whole(f"/learning/{place}/loss", name)
+
+
+def _picture(entity: str, name: str) -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.Spatial2DView(origin=entity, name=name)
+
+
+def _lanes() -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.Tabs(rrb.StateTimelineView(origin="/machine/lanes", name="Who works at what"), _machine())
+
+
+def _machine() -> Any:
+    contents = ["/machine/load/**", "/machine/seconds", "/machine/wait", "/machine/dropped"]
+    return _recent("/machine", "Queue, seconds, waits, drops", 120.0, contents=contents)
+
+
+def _status(under: str = "") -> Any:
+    import rerun.blueprint as rrb
+
+    return rrb.TextDocumentView(origin=f"{under}/status", name="What is going on")
+
+
+def _outcome(under: str = "") -> Any:
+    """How the run ended. `_status` follows the time cursor, which begins at the start when a recording is opened."""
+    import rerun.blueprint as rrb
+
+    return rrb.TextDocumentView(origin=f"{under}/outcome", name="How it ended")
+
+
+def _log() -> Any:
+    import rerun.blueprint as rrb
+
+    # An empty list would stand for the timeline that is watched: a column of cut numbers.
+    hidden = [rrb.encodings.TimelineColumn(timeline, visible=False) for timeline in ("wall", "sim_time", "step")]
+    columns = rrb.TextLogColumns(text_log_columns=[rrb.encodings.TextLogColumn("Body")], timeline_columns=hidden)
+    return rrb.TextLogView(origin="/log", name="Events and decisions", columns=columns)
+
+
+def put_beside(recordings: Mapping[str, Path], path: Path) -> Path:
+    """Write one recording of several.
+
+    Args:
+        recordings: `.rrd` files by the name that each is to have; a part of an entity's path.
+        path: `.rrd` to write.
+
+    Returns:
+        `path`.
+
+    Raises:
+        OSError: a file can't be read or written.
+    """
+    import rerun as rr
+    from rerun.chunk import RrdReader
+
+    path.open("wb").close()
+    stream = rr.RecordingStream("decant beside")
+    stream.set_sinks(rr.FileSink(str(path)))
+    stream.send_recording_name(" beside ".join(recordings))
+    stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for name, file in recordings.items():
+        for chunk in RrdReader(str(file)).stream():
+            entity = str(chunk.entity_path)
+            if entity != "/" and not entity.startswith("/__"):
+                stream.send_chunks([chunk.with_entity_path(f"/{name}{entity}")])
+    stream.send_blueprint(beside_blueprint(tuple(recordings)))
+    stream.disconnect()
+    return path

@@ -1,0 +1,265 @@
+"""The cell: table, tray, both vessels, the arm as it moves, its path planned and executed, and the pour's liquid."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.arm_interface import ArmFigure
+from actors.interfaces import PourProgress
+from orchestrator.live_view import rerun_shapes as shapes
+from orchestrator.live_view.playback import Playback, PlaybackQueue, Track
+from orchestrator.live_view.recording_sink import Moment, RecordingSink
+from orchestrator.live_view.simulation_view import MAXIMUM_RATE
+from orchestrator.requests import Pour
+from orchestrator.results import figure_style as style
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.outcome import ParticleState, PourMeasurement, RecordedFrames
+from sim_engine.scene import Scene
+
+if TYPE_CHECKING:
+    from sim_engine.vessel.shapes import VesselSpec
+
+PLACE = "/cell"
+
+SLOW = 3.0
+"""A bench whose time runs faster than this is shown by films of its pours: nobody could follow it."""
+
+TRAILING = 5
+"""The path that was executed is drawn again with every so many places of it."""
+
+_TRAY = 0.012
+"""Thickness of the tray [m]."""
+
+FloatArray = NDArray[np.float64]
+
+
+class CellScene:
+    """What stands and moves on the bench. For one thread.
+
+    Args:
+        outlet: where rows go.
+        films: that pours are shown by once they are known.
+        plan: of the campaign.
+    """
+
+    def __init__(self, outlet: RecordingSink, films: PlaybackQueue, plan: CampaignPlan) -> None:
+        import rerun as rr
+
+        self._rr, self._outlet, self._films = rr, outlet, films
+        laboratory = plan.laboratory
+        self._figure: ArmFigure | None = None if laboratory.arm is None else laboratory.arm.figure()
+        scales = [one.time_scale for one in (laboratory.bench, laboratory.arm) if one is not None]
+        self.time_scale = max(scales, default=1.0) or float("inf")
+        self._shown: dict[str, str] = {}
+        self._trail: list[list[float]] = []
+        self._moves: list[tuple[Moment, tuple[float, ...]]] = []
+        self._liquid: RecordedFrames | None = None
+        self._stands: tuple[float, ...] = ()
+        outlet.log(PLACE, shapes.fates(), static=True)  # not of the liquid, with which it would be cleared
+        outlet.log(f"{PLACE}/tool", rr.TransformAxes3D(0.06), static=True)
+        self._furnish()
+
+    def _furnish(self) -> None:
+        rr = self._rr
+        table = -_TRAY if self._figure is None else min(self._figure.table, -_TRAY)
+        self._outlet.log(
+            f"{PLACE}/tray",
+            rr.Boxes3D(
+                centers=[[0.0, 0.0, -0.5 * _TRAY - 1e-3]],
+                half_sizes=[[0.16, 0.16, 0.5 * _TRAY]],
+                colors=[shapes.TRAY],
+                fill_mode="solid",
+            ),
+            static=True,
+        )
+        middle, half = np.zeros(2), np.array([0.45, 0.4])
+        if self._figure is not None:
+            home = self._figure.ends(np.array(self._figure.home))
+            base = home[0, 0, :2]
+            low, high = np.minimum(base, 0.0) - 0.3, np.maximum(base, 0.0) + 0.3
+            middle, half = 0.5 * (low + high), 0.5 * (high - low)
+            # Where it waits, until it moves; what it looks like never changes.
+            self._outlet.times(wall=time.time(), step=0, sim_time=0.0)
+            self._outlet.log(f"{PLACE}/arm", shapes.bars(self._figure, home), static=True)
+            self._outlet.rows(f"{PLACE}/arm", [self._outlet.now], shapes.stances(home[None]))
+        self._outlet.log(
+            f"{PLACE}/table",
+            rr.Boxes3D(
+                centers=[[*middle, table - 0.015]],
+                half_sizes=[[*half, 0.012]],
+                colors=[shapes.TABLE],
+                fill_mode="solid",
+            ),
+            static=True,
+        )
+
+    # ---- a pour under way
+
+    def begin(self, pour: Pour, scene: Scene) -> None:
+        """A pour begins: its vessels stand there, and its path is planned."""
+        self.show()
+        self._trail, self._liquid = [], None
+        self._stand("pourer", scene.pourer)
+        self._stand("receiver", scene.receiver)
+        self._outlet.clear(f"{PLACE}/liquid")
+        self._outlet.clear(f"{PLACE}/path/executed")
+        planned = planned_poses(scene, pour)
+        if planned is None:
+            return
+        self._outlet.log(f"{PLACE}/path/planned", self._line(self._tool_places(planned), style.PREDICTED, 1.5e-3))
+        if self._figure is None:
+            self._outlet.log(f"{PLACE}/pourer", shapes.placed(planned[0]))
+
+    def progress(self, told: PourProgress) -> None:
+        """The arm is somewhere."""
+        if told.liquid is not None:
+            self._liquid = told.liquid
+        if self.time_scale > SLOW and self._films.next_due is not None:
+            return  # a film of the pour before is shown
+        if (stands := (*told.joints, *told.pourer)) == self._stands:
+            return
+        self._stands = stands
+        if told.joints and self._figure is not None:
+            self._moves.append((self._outlet.now, told.joints))
+        elif told.pourer:
+            self._outlet.log(f"{PLACE}/pourer", shapes.placed(np.array(told.pourer)))
+            self._follow(told.pourer[:3], self._outlet.now)
+
+    def show(self) -> None:
+        """Show how the arm has moved. Several stances are worked out and sent in the time of one."""
+        if not self._moves or (figure := self._figure) is None:
+            return
+        moments, joints = [at for at, _ in self._moves], np.array([where for _, where in self._moves])
+        self._moves = []
+        tools = figure.tool(joints)
+        self._outlet.rows(f"{PLACE}/arm", moments, shapes.stances(figure.ends(joints)))
+        self._outlet.rows(f"{PLACE}/tool", moments, shapes.places(tools))
+        self._outlet.rows(f"{PLACE}/pourer", moments, shapes.places(figure.pourer(joints)))
+        for at, tool in zip(moments, tools, strict=True):
+            self._follow(tool[:3], at)
+
+    def _follow(self, place: Sequence[float] | FloatArray, at: Moment) -> None:
+        """The path that was executed, as far as that [m]."""
+        self._trail.append([float(value) for value in place])
+        if len(self._trail) % TRAILING == 2 and self.time_scale <= SLOW:
+            line = self._line(np.array(self._trail), style.MEASURED, 3e-3)
+            self._outlet.log(f"{PLACE}/path/executed", line, at=at)
+
+    # ---- a pour that is over
+
+    def finish(
+        self,
+        scene: Scene,
+        measured: PourMeasurement,
+        *,
+        now: float,
+        step: int,
+        beside: Callable[[FloatArray, FloatArray | None], Sequence[Track]],
+        told: Callable[[], object],
+    ) -> None:
+        """Show what was done and what the liquid did.
+
+        Args:
+            scene: what was poured.
+            measured: what came of it.
+            now: on the wall clock [s since 1970].
+            step: of the campaign.
+            beside: what else there is to say of moments of the pour (T,) [s], and of what a virtual bench's liquid has
+                spilled by then (T,) [kg], where that is known.
+            told: called when all that has been shown.
+        """
+        self.show()
+        moves = self._executed(measured)
+        liquid, self._liquid = self._liquid, None
+        if moves is None and liquid is None:
+            return
+        ends = [float(each[-1]) for each in (None if moves is None else moves[0], _times(liquid)) if each is not None]
+        if self.time_scale <= SLOW and liquid is None:
+            return  # it was seen as it was made
+        times = np.arange(0.0, max(ends) + 0.5 / MAXIMUM_RATE, 1.0 / MAXIMUM_RATE)
+        path = self._path(moves, liquid)
+        tracks = [] if moves is None else self._moved(times, *moves)
+        spilled = None
+        if liquid is not None:
+            shown, share = self._poured(times, liquid, scene.liquid.volume, posed=moves is None)
+            tracks, spilled = [*tracks, *shown], share * measured.loaded
+        tracks += beside(times, spilled)
+
+        def begin() -> None:
+            if len(path) > 1:
+                self._outlet.log(f"{PLACE}/path/executed", self._line(path, style.MEASURED, 3e-3))
+
+        self._films.add(now, step, Playback(float(times[-1]), tracks, begin, told))
+
+    def _executed(self, measured: PourMeasurement) -> tuple[FloatArray, FloatArray] | None:
+        record = measured.notes.get("executed")
+        return None if self._figure is None or not record else self._figure.executed(record)
+
+    def _path(self, moves: tuple[FloatArray, FloatArray] | None, liquid: RecordedFrames | None) -> FloatArray:
+        if moves is not None and self._figure is not None:
+            return self._figure.tool(moves[1][::5])[:, :3]
+        return np.zeros((0, 3)) if liquid is None else np.asarray(liquid.pourer_poses, float)[:, :3]
+
+    def _moved(self, times: FloatArray, known: FloatArray, joints: FloatArray) -> list[Track]:
+        """The arm at moments (T,) [s] of a pour, whose joints (K, n) [rad] are known at others (K,) [s]."""
+        figure = self._figure
+        assert figure is not None
+        stands = np.column_stack([np.interp(times, known, column) for column in joints.T])
+        some = shapes.changes(stands)
+        when, stands = times[some], stands[some]
+        return [
+            Track(f"{PLACE}/arm", when, shapes.stances(figure.ends(stands))),
+            Track(f"{PLACE}/tool", when, shapes.places(figure.tool(stands))),
+            Track(f"{PLACE}/pourer", when, shapes.places(figure.pourer(stands))),
+        ]
+
+    def _poured(
+        self, times: FloatArray, liquid: RecordedFrames, volume: float, *, posed: bool
+    ) -> tuple[list[Track], FloatArray]:
+        """The liquid at moments (T,) [s]; and the share of it that is spilled by then, shape (T,)."""
+        radius = 0.5 * shapes.spacing(liquid.positions[0], volume)
+        kept = np.asarray(liquid.times, dtype=float)
+        at = np.clip(np.searchsorted(kept, times + 1e-6, side="left") - 1, 0, len(kept) - 1)
+        some = shapes.changes(at[:, None].astype(float))  # it is kept less often, or not as long
+        states = {int(index): np.asarray(liquid.states[index]) for index in at}
+        swarms = shapes.swarms([liquid.positions[i] for i in at[some]], [states[int(i)] for i in at[some]], radius)
+        tracks = [Track(f"{PLACE}/liquid", times[some], swarms)]
+        if posed:
+            poses = np.asarray(liquid.pourer_poses, float)[at]
+            tracks.append(shapes.moving(f"{PLACE}/pourer", times, poses))
+        spilled = {index: float(np.mean(each == ParticleState.SPILLED)) for index, each in states.items()}
+        return tracks, np.array([spilled[int(index)] for index in at])
+
+    # ---- how
+
+    def _stand(self, what: str, spec: VesselSpec) -> None:
+        if self._shown.get(what) != (key := spec.content_hash()):
+            self._shown[what] = key
+            self._outlet.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
+
+    def _tool_places(self, poses: FloatArray) -> FloatArray:
+        return poses[:, :3] if self._figure is None else self._figure.tool_of(poses)
+
+    def _line(self, points: FloatArray, colour: str, radius: float) -> Any:
+        return self._rr.LineStrips3D([np.asarray(points, np.float32)], colors=[shapes.rgb(colour)], radii=[radius])
+
+
+def planned_poses(scene: Scene, pour: Pour) -> FloatArray | None:
+    """Poses of the pourer along a planned pour, shape (T, 7); None where nothing can be planned."""
+    from actors.bench.pour_feasibility import plan_pour
+    from actors.interfaces import InvalidActionError
+
+    try:
+        motion = plan_pour(scene, pour.action)
+    except InvalidActionError:
+        return None
+    return motion.sample(np.linspace(0.0, motion.duration, 120))
+
+
+def _times(liquid: RecordedFrames | None) -> FloatArray | None:
+    return None if liquid is None else np.asarray(liquid.times, dtype=float)

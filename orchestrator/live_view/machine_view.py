@@ -1,0 +1,249 @@
+"""The machine: who works at what, the queue, seconds for each simulation, waits, what was dropped; log and status.
+
+What is going on, for somebody who looks in from the door: a page of a few large lines.
+"""
+
+from __future__ import annotations
+
+import re
+
+from orchestrator.live_view import rerun_shapes as shapes
+from orchestrator.live_view.recording_sink import RecordingSink
+from orchestrator.requests import Pour, Simulate
+from orchestrator.results import figure_style as style
+from orchestrator.results.figure_style import safe_name
+from orchestrator.runs.events import (
+    CampaignClosed,
+    CampaignOpened,
+    CampaignStateChanged,
+    Event,
+    LogLine,
+    PourProgressed,
+    RequestFinished,
+    RequestStarted,
+    StageOpened,
+    StrategyProgressed,
+)
+from orchestrator.strategies.campaign_plan import CampaignPlan
+
+PLACE = "/machine"
+
+IDLE = "idle"
+
+LOG = "/log"
+
+STATUS = "/status"
+
+OUTCOME = "/outcome"
+
+_PURPOSES = {
+    "calibrate": style.MEASURED,
+    "prior": style.FALLING,
+    "refine": style.GOOD,
+    "evaluate": style.PREDICTED,
+    "tilt": style.BEST,
+    "idle": style.PALE,
+}
+"""Colours of lanes that have one of their own; others get Rerun's."""
+
+
+class MachineView:
+    """Rows of the machine. For one thread.
+
+    Args:
+        outlet: where rows go.
+    """
+
+    def __init__(self, outlet: RecordingSink) -> None:
+        import rerun as rr
+
+        self._rr, self._outlet = rr, outlet
+        self._simulators = 1
+        self._slots: dict[int, int] = {}
+        self._styled: set[str] = set()
+        self._poured: float | None = None
+        self._page = ""
+        for name, label, colour in (
+            ("load/busy", "simulators busy", style.MEASURED),
+            ("load/queue", "simulations waiting", style.PREDICTED),
+            ("seconds", "one simulation [s]", style.GOOD),
+            ("wait", "arm waited before the pour [s]", style.BEST),
+            ("dropped", "events that watchers missed", style.ESCAPED),
+        ):
+            points = name in ("seconds", "wait")
+            looks = (
+                rr.SeriesPoints(names=label, colors=shapes.rgb(colour), marker_sizes=4.0)
+                if points
+                else rr.SeriesLines(names=label, colors=shapes.rgb(colour), widths=2.5)
+            )
+            outlet.log(f"{PLACE}/{name}", looks, static=True)
+
+    def opened(self, simulators: int, *, arm: bool) -> None:
+        """The pool is so large, and there is an arm or not: nobody works yet."""
+        self._simulators = max(simulators, 1)
+        for name in (*(["arm"] if arm else []), "optimiser", *(f"simulator {n + 1}" for n in range(self._simulators))):
+            self.lane(name, None)
+        self._load()
+
+    def simulation_started(self, key: int, purpose: str) -> None:
+        """One was handed to the pool."""
+        taken = set(self._slots.values())
+        self._slots[key] = slot = next(i for i in range(len(taken) + 1) if i not in taken)
+        if slot < self._simulators:
+            self.lane(f"simulator {slot + 1}", purpose)
+        self._load()
+
+    def simulation_finished(self, key: int, seconds: float) -> None:
+        """It came back, or not."""
+        slot = self._slots.pop(key, None)
+        if slot is not None and slot < self._simulators:
+            self.lane(f"simulator {slot + 1}", None)
+        if seconds > 0.0:
+            self._number("seconds", seconds)
+        self._load()
+
+    def pour_started(self, now: float) -> None:
+        """The arm is given a pour."""
+        if self._poured is not None:
+            self._number("wait", now - self._poured)
+
+    def pour_finished(self, now: float) -> None:
+        """It is over."""
+        self._poured = now
+        self.lane("arm", None)
+
+    def lane(self, name: str, doing: str | None) -> None:
+        """Somebody begins something, or (None) has ended it."""
+        entity = f"{PLACE}/lanes/{safe_name(name)}"
+        if entity not in self._styled:
+            self._styled.add(entity)
+            known = list(_PURPOSES)
+            colours = [shapes.rgb(_PURPOSES[each]) for each in known]
+            looks = self._rr.StateConfiguration(values=known, labels=known, colors=colours)
+            self._outlet.log(entity, looks, static=True)
+        self._outlet.log(entity, self._rr.StateChange(state=doing or IDLE))
+
+    def dropped(self, count: int) -> None:
+        """So many events were dropped so far."""
+        self._number("dropped", count)
+
+    def line(self, text: str, level: str = "info", source: str = "campaign") -> None:
+        """A line of the log."""
+        log = self._rr.TextLogLevel
+        levels = {"info": log.INFO, "warning": log.WARN, "error": log.ERROR}
+        self._outlet.log(f"{LOG}/{safe_name(source)}", self._rr.TextLog(text, level=levels.get(level, log.INFO)))
+
+    def status(self, markdown: str) -> None:
+        """What is going on, in large letters; replaces what was there before."""
+        if markdown != self._page:
+            self._page = markdown
+            self._outlet.log(STATUS, self._rr.TextDocument(markdown, media_type="text/markdown"))
+
+    def outcome(self, markdown: str) -> None:
+        """How the run ended: the same at all times, wherever a viewer's time cursor is."""
+        self._outlet.log(OUTCOME, self._rr.TextDocument(markdown, media_type="text/markdown"), static=True)
+
+    def _load(self) -> None:
+        running = len(self._slots)
+        self._number("load/busy", min(running, self._simulators))
+        self._number("load/queue", max(running - self._simulators, 0))
+
+    def _number(self, name: str, value: float) -> None:
+        self._outlet.number(f"{PLACE}/{name}", float(value))
+
+
+_DOING = {
+    "operator": "the operator refills and wipes",
+    "tare": "the balance is tared",
+    "approach": "the arm goes to its start",
+    "tilt": "the arm tilts",
+    "hold": "the arm holds",
+    "return": "the arm comes back upright",
+    "settle": "the last drops fall",
+    "weigh": "what was spilled is weighed",
+    "record": "the pour is written down",
+}
+
+
+class StatusView:
+    """Collects what the page says.
+
+    Args:
+        plan: of the campaign.
+    """
+
+    def __init__(self, plan: CampaignPlan) -> None:
+        self._plan = plan
+        self._state, self._reason, self._stage = "preparing", "", ""
+        self._stages: tuple[str, ...] = ()
+        self._progress: dict[str, str] = {}
+        self._pour = self._doing = self._question = ""
+        self._simulating = 0
+        self._pours = self._simulations = 0
+        self.best: dict[str, str] = {}
+        self.trust = ""
+
+    @property
+    def reality(self) -> str:
+        """'VIRTUAL' or 'REAL'."""
+        return "REAL" if self._plan.laboratory.mode == "hardware" else "VIRTUAL"
+
+    def take(self, event: Event) -> None:
+        """Take note of an event."""
+        match event:
+            case CampaignOpened():
+                self._stages = event.stages
+            case CampaignStateChanged():
+                self._state, self._reason = event.after, event.reason
+            case CampaignClosed():
+                self._state, self._pour, self._stage = event.state, "", ""
+            case StageOpened():
+                self._stage = f"{event.stage} ({event.index} of {event.count})"
+            case StrategyProgressed():
+                self._progress[event.stage] = str(event.progress)
+            case LogLine() if event.asked:
+                self._question = event.text
+            case PourProgressed():
+                self._doing = _DOING.get(event.progress.checkpoint, event.progress.checkpoint)
+                if event.progress.checkpoint not in ("operator", "tare"):
+                    self._question = ""
+            case RequestStarted():
+                self._started(event)
+            case RequestFinished():
+                self._finished(event)
+
+    def _started(self, event: RequestStarted) -> None:
+        if isinstance(event.request, Simulate):
+            self._simulating += 1
+        elif isinstance(event.request, Pour):
+            self._pour, self._doing = str(event.request.number), "it is prepared"
+
+    def _finished(self, event: RequestFinished) -> None:
+        if isinstance(event.request, Simulate):
+            self._simulating = max(self._simulating - 1, 0)
+            self._simulations += 1
+        elif isinstance(event.request, Pour):
+            self._pour, self._doing, self._pours = "", "", self._pours + 1
+
+    def page(self) -> str:
+        """The page, as Markdown."""
+        lines = [f"# {self.reality}: {_plain(self._state)}", f"## {_plain(self._stage or self._plan.name)}"]
+        if self._question:
+            lines.append(f"## A question is open\n\n{_plain(self._question)}")
+        if self._state in ("running", "pausing") or self._pour or self._simulating:
+            doing = [f"**Pour {self._pour}**: {self._doing}"] if self._pour else []
+            if self._simulating:
+                doing.append(f"**{self._simulating} simulation{'s' if self._simulating > 1 else ''}** under way")
+            lines += doing or ["The next step is being chosen"]
+        elif self._reason:
+            lines.append(_plain(self._reason))
+        lines += [f"{_plain(stage)}: {said}" for stage, said in self._progress.items() if said]
+        lines += [f"**Best into {_plain(name)}: {value}**" for name, value in self.best.items()]
+        if self.trust:
+            lines.append(f"Trust: {_plain(self.trust)}")
+        lines.append(f"{self._pours} pours and {self._simulations} simulations so far")
+        return "\n\n".join(lines) + "\n"
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"([|*_#<>])", r"\\\1", text)

@@ -1,0 +1,149 @@
+"""Our shapes as Rerun has them: vessels, poses, the bars of an arm, particles by their fate."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orchestrator.live_view.playback import Track
+from orchestrator.live_view.recording_sink import Columns, columns_of
+from orchestrator.results import figure_style as style
+
+if TYPE_CHECKING:
+    from actors.arm.arm_interface import ArmFigure
+    from sim_engine.vessel.shapes import VesselSpec
+    from sim_engine.vessel.vessel import Vessel
+
+FloatArray = NDArray[np.float64]
+
+GLASS = (120, 140, 160, 110)
+METAL = (95, 100, 108, 255)
+TABLE = (222, 219, 212, 255)
+TRAY = (205, 208, 212, 255)
+
+
+def rgb(colour: str) -> list[int]:
+    """'#0072b2' as three bytes."""
+    return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+
+
+@functools.lru_cache(maxsize=16)
+def vessel(spec: VesselSpec) -> Vessel:
+    """A vessel, built once."""
+    from sim_engine.vessel.vessel import build_vessel
+
+    return build_vessel(spec)
+
+
+def mesh(spec: VesselSpec) -> Any:
+    """The true surface of a vessel."""
+    import rerun as rr
+
+    solid = vessel(spec)
+    vertices, faces = np.asarray(solid.solid_vertices, np.float32), np.asarray(solid.solid_faces, np.uint32)
+    # Flat normals from unshared corners: rims and floors stay sharp.
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return rr.Mesh3D(
+        vertex_positions=corners.reshape(-1, 3),
+        triangle_indices=np.arange(3 * len(faces), dtype=np.uint32).reshape(-1, 3),
+        vertex_normals=np.repeat(normal, 3, axis=0),
+        albedo_factor=GLASS,
+    )
+
+
+def placed(pose: FloatArray) -> Any:
+    """A pose (7,) x y z qw qx qy qz as a transform."""
+    import rerun as rr
+
+    turn = rr.Quaternion(xyzw=[pose[4], pose[5], pose[6], pose[3]])
+    return rr.Transform3D(translation=pose[:3], quaternion=turn)
+
+
+def places(poses: FloatArray) -> Columns:
+    """Poses (T, 7) as transforms at T moments."""
+    import rerun as rr
+
+    return columns_of(rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, [4, 5, 6, 3]]))
+
+
+def moving(entity: str, times: FloatArray, poses: FloatArray) -> Track:
+    """What moves along poses (T, 7) at times (T,) [s]; while it rests nothing is said."""
+    some = changes(poses)
+    return Track(entity, times[some], places(poses[some]))
+
+
+def changes(rows: FloatArray) -> NDArray[np.intp]:
+    """Which rows (T, n) differ from the one before; the first does, and the last is taken for one that does."""
+    differs = np.any(np.abs(np.diff(rows, axis=0)) > 1e-6, axis=1)
+    return np.flatnonzero([True, *differs[:-1], True] if len(differs) else [True])
+
+
+def bars(figure: ArmFigure, ends: FloatArray) -> Any:
+    """What an arm's links look like, however they stand: capsules as long as they always are.
+
+    Args:
+        figure: of the arm.
+        ends: of its bars for any joints, shape (bars, 2, 3) [m].
+    """
+    import rerun as rr
+
+    return rr.Capsules3D(
+        lengths=np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1),
+        radii=[bar.radius for bar in figure.bars],
+        colors=[METAL if i % 2 else (*rgb("#56b4e9"), 255) for i in range(len(figure.bars))],
+        labels=[bar.name for bar in figure.bars],
+        show_labels=False,
+        fill_mode="solid",
+    )
+
+
+def stances(ends: FloatArray) -> Columns:
+    """Where an arm's links are at some moments; what they look like is `bars`.
+
+    Args:
+        ends: of its bars, shape (T, bars, 2, 3) [m].
+    """
+    import rerun as rr
+
+    along = ends[..., 1, :] - ends[..., 0, :]
+    axes = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
+    # A capsule lies along z; how it is turned about itself nobody sees. The turn from z to an axis a is the quaternion
+    # (z × a, 1 + z · a), but for an axis straight down, where any half turn will do.
+    turns = np.stack([-axes[..., 1], axes[..., 0], np.zeros(axes.shape[:-1]), 1.0 + axes[..., 2]], axis=-1)
+    turns[turns[..., 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)
+    turns /= np.linalg.norm(turns, axis=-1, keepdims=True)
+    columns = rr.Capsules3D.columns(translations=ends[..., 0, :].reshape(-1, 3), quaternions=turns.reshape(-1, 4))
+    return columns_of(columns.partition([ends.shape[1]] * len(ends)))
+
+
+def fates() -> Any:
+    """What the colours of particles mean."""
+    import rerun as rr
+
+    return rr.AnnotationContext(
+        [
+            rr.AnnotationInfo(id=i, label=text, color=rgb(colour))
+            for i, (text, colour) in enumerate(style.PARTICLE_STATES)
+        ]
+    )
+
+
+def swarms(positions: Sequence[NDArray[np.float32]], states: Sequence[NDArray[np.uint8]], radius: float) -> Columns:
+    """Particles by their fate at some moments, positions (N, 3) [m] and states (N,) for each."""
+    import rerun as rr
+
+    places = np.concatenate([np.asarray(each, np.float32) for each in positions])
+    fate = np.concatenate([np.asarray(each, np.uint16) for each in states])
+    points = rr.Points3D.columns(positions=places, class_ids=fate).partition([len(each) for each in positions])
+    return columns_of(points, rr.Points3D.columns(radii=np.full(len(positions), radius, np.float32)))
+
+
+def spacing(positions: NDArray[np.float32], volume: float) -> float:
+    """Between particles that share a volume [m³] among them [m]."""
+    return float((volume / max(len(positions), 1)) ** (1.0 / 3.0))

@@ -1,0 +1,125 @@
+"""The watcher that has a campaign's recording written, by a process of its own."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import pickle
+import sys
+from pathlib import Path
+from typing import Any
+
+from actors.runtime.child_process import ChildProcess
+from orchestrator.live_view.queue_thread import QueueThread
+from orchestrator.live_view.recording_writer import Closing, Missed, Opening
+from orchestrator.live_view.viewer_server import environment
+from orchestrator.runs.events import Event
+from orchestrator.strategies.campaign_plan import CampaignPlan
+
+CAPACITY = 4_000
+"""Events that may wait: minutes of a busy campaign."""
+
+PATIENCE = 30.0
+"""Longest wait for the recording to be completed [s]."""
+
+_log = logging.getLogger(__name__)
+
+
+class RerunMonitor:
+    """Has a campaign written into a Rerun recording: a watcher.
+
+    Events go through a bounded queue to a thread, which only packs them for a process that draws and writes. Where that
+    process or its disk can't keep up, hangs, or dies, events are dropped and counted; nothing here waits for, or raises
+    into, the campaign.
+
+    Args:
+        path: `.rrd` to write; if it exists (a resumed run), the next free name beside it is used.
+        plan: of the campaign.
+        url: of a Rerun server that gets the same, see `orchestrator.live_view.live_server`.
+        capacity: events that may wait.
+
+    Raises:
+        OSError: the file can't be written (said before the campaign starts, while it can be mended).
+
+    Limitations: a resumed run's recording has everything that the journal knows, but no particles of simulations that
+    ran before the interruption; these are in the recording of that time.
+    """
+
+    def __init__(self, path: Path, plan: CampaignPlan, *, url: str = "", capacity: int = CAPACITY) -> None:
+        self.path = free_path(path)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        # The writer could only say so when nobody listens any more.
+        self.path.open("wb").close()
+        self._process = _start_writer()
+        self._report: dict[str, Any] = {"failed": 0}
+        self._told = 0
+        self._worker: QueueThread[Event | Opening] = QueueThread(
+            self._send, self._finish, capacity=capacity, name=f"recording {self.path.name}"
+        )
+        self._worker.put(Opening(self.path, plan, url))
+
+    def __call__(self, event: Event) -> None:
+        """Take note of an event. Returns at once."""
+        self._worker.put(event)
+
+    @property
+    def pid(self) -> int:
+        """The process id of the writer."""
+        return self._process.pid
+
+    @property
+    def dropped(self) -> int:
+        """Events that are missing from the recording because nobody could take them."""
+        return self._worker.dropped
+
+    @property
+    def failed(self) -> int:
+        """Events that couldn't be written, as far as is known: all of them only after `close`."""
+        return self._worker.failed + int(self._report["failed"])
+
+    def close(self, timeout: float = PATIENCE) -> bool:
+        """Write out what waits; False if the file could not be completed within `timeout` [s]. Never raises."""
+        if not self._worker.close(timeout):
+            _log.warning("recording %s: could not be completed within %g s", self.path.name, timeout)
+        self._process.kill()  # done, or past help
+        self._worker.close(1.0)
+        return self._report.get("complete", False) is True
+
+    def _send(self, item: Event | Opening | Missed | Closing) -> None:
+        if (dropped := self._worker.dropped if isinstance(item, Event) else 0) > self._told:
+            self._told = dropped
+            self._send(Missed(dropped))
+        self._process.write(pickle.dumps(item, protocol=pickle.HIGHEST_PROTOCOL))
+
+    def _finish(self) -> None:
+        self._send(Closing(self.dropped))
+        self._process.close_input()
+        try:
+            said = self._process.read_line()
+        except EOFError:
+            raise ChildProcessError(
+                f"the process that writes {self.path} has died; what it had written is kept"
+            ) from None
+        self._report = {"complete": True} | json.loads(said)
+        if self._report["failed"]:
+            _log.warning(
+                "recording %s: %d event(s) could not be drawn; the first: %s",
+                *(self.path.name, self._report["failed"], self._report["problem"]),
+            )
+
+
+def _start_writer() -> ChildProcess:
+    # What is importable here is importable there: strategies and devices of others are among the settings.
+    variables = environment() | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-c", "from orchestrator.live_view.recording_writer import main; main()"]
+    return ChildProcess(command, environment=variables, errors="dropped")
+
+
+def free_path(path: Path) -> Path:
+    """`path`, or the first of name-2, name-3 … that does not exist."""
+    number, candidate = 2, path
+    while candidate.exists():
+        candidate = path.with_name(f"{path.stem}-{number}{path.suffix}")
+        number += 1
+    return candidate

@@ -1,0 +1,265 @@
+"""A campaign's recording: events in, Rerun rows out.
+
+Three timelines: `wall`, when something was known; `step`, how many requests had been answered; `sim_time`, on which the
+films of simulations and pours lie one behind the other.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orchestrator.live_view.balance_view import BalanceStage
+from orchestrator.live_view.blueprints import Moment, campaign_blueprint
+from orchestrator.live_view.cell_view import CellScene
+from orchestrator.live_view.learning_view import MAPPED, LearningStage
+from orchestrator.live_view.machine_view import MachineView, StatusView
+from orchestrator.live_view.playback import PlaybackQueue
+from orchestrator.live_view.recording_sink import RecordingSink
+from orchestrator.live_view.simulation_view import SimulatedStage
+from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Suggest, Suggested
+from orchestrator.results.loss_units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
+from orchestrator.results.stage_views import receiver_names
+from orchestrator.runs.events import (
+    CampaignClosed,
+    CampaignOpened,
+    CampaignStateChanged,
+    DecisionMade,
+    Event,
+    LogLine,
+    PourProgressed,
+    RequestFinished,
+    RequestStarted,
+    StageClosed,
+    StageOpened,
+    StrategyProgressed,
+)
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.scene import Scene
+
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+
+
+class CampaignRecording:
+    """Knows what each event means in a recording. For one thread.
+
+    Args:
+        path: `.rrd` to write.
+        plan: of the campaign.
+        url: of a Rerun server that gets the same; '' for none.
+
+    Raises:
+        OSError: the file can't be written.
+    """
+
+    def __init__(self, path: Path, plan: CampaignPlan, *, url: str = "") -> None:
+        import rerun as rr
+
+        self.path, self._plan = path, plan
+        self._scenes = scenes_of(plan)
+        self.status = StatusView(plan)
+        outlet = self._outlet = RecordingSink(
+            path, application=f"decant {plan.name}", name=f"{plan.name} · {self.status.reality}", url=url
+        )
+        self._moment: Moment | None = None
+        outlet.keep(blueprint_of(plan, "replaying"))
+        self._show("calibrating" if plan.calibration is not None else "deploying")
+        outlet.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        outlet.times(step=0, sim_time=0.0)
+        self._films = PlaybackQueue(outlet)
+        self._simulated = SimulatedStage(outlet, self._films)
+        self._cell = CellScene(outlet, self._films, plan)
+        self._balance = BalanceStage(outlet, self._cell.time_scale)
+        self._learning = LearningStage(outlet, plan)
+        self._machine = MachineView(outlet)
+        self._machine.outcome(
+            f"# {self.status.reality}: no end\n\nThe run is under way, or its process was killed before it ended.\n"
+        )
+        self._step = 0
+        self._decided = ""
+
+    @property
+    def wait(self) -> float | None:
+        """How long `play` has nothing to do [s]; None: until there are events."""
+        film = self._films.next_due
+        waits = (None if film is None else max(film - time.time(), 0.0), self._outlet.wait)
+        return min((each for each in waits if each is not None), default=None)
+
+    def play(self) -> None:
+        """Write what is due by now. Best not after each event, but after what has come in half a second."""
+        self._films.play(time.time())
+        self._cell.show()
+        self._outlet.send()
+
+    def close(self, dropped: int = 0) -> None:
+        """Complete the recording; `dropped` events never came."""
+        self._films.play(float("inf"))
+        self._cell.show()
+        if dropped:
+            self.missed(dropped)
+            self._machine.line(f"{dropped} events are missing: the recording could not keep up", "warning", "recording")
+        self._outlet.close()
+
+    def missed(self, dropped: int) -> None:
+        """So many events never came until now."""
+        self._machine.dropped(dropped)
+
+    def handle(self, event: Event) -> None:
+        """Take note of an event."""
+        if isinstance(event, RequestFinished):
+            self._step += 1
+        self._outlet.times(wall=event.time, step=self._step, sim_time=self._films.end)
+        self.status.take(event)
+        match event:
+            case CampaignOpened():
+                self._machine.opened(event.simulators, arm=self._plan.laboratory.bench is not None)
+                self._learning.opened()
+                self._say(f"{event.name}: {'goes on' if event.resumed else 'begins'}, mode {event.mode}")
+            case CampaignStateChanged():
+                self._say(f"{event.before} → {event.after}{': ' + event.reason if event.reason else ''}")
+            case CampaignClosed():
+                self._learning.flush(event.time)
+                self._say(f"ended: {event.state}")
+                self._machine.outcome(self.status.page())
+                self._show("replaying")
+            case StageOpened():
+                self._say(f"stage {event.stage} begins", source=event.stage)
+            case StageClosed():
+                self._learning.learnt(event.result, event.time)
+                self._learning.flush(event.time)
+                self._say(f"stage {event.stage} is done", source=event.stage)
+            case RequestStarted():
+                self._started(event)
+            case RequestFinished():
+                self._finished(event)
+            case PourProgressed():
+                self._cell.progress(event.progress)
+                if (doing := self._balance.progress(event.progress, event.time)) is not None:
+                    self._machine.lane("arm", doing)
+            case StrategyProgressed():
+                self._learning.learnt(event.result, event.time)
+                self.status.best, self.status.trust = self._learning.best, self._learning.trust
+            case DecisionMade():
+                level = "warning" if event.decision.urgent else "info"
+                self._decided = event.decision.text
+                self._say(event.decision.text, level, event.stage)
+            case LogLine():
+                self._say(event.text, event.level, event.stage)
+        self._machine.status(self.status.page())
+
+    def _say(self, text: str, level: str = "info", source: str = "") -> None:
+        self._machine.line(text, level, source or "campaign")
+
+    def _show(self, moment: Moment) -> None:
+        """Arrange the views for a moment; not anew for one that is shown already, since people move views about."""
+        if self._moment == moment:
+            return
+        self._moment = moment
+        self._outlet.show(blueprint_of(self._plan, moment))
+
+    def _follow(self, request: Request) -> None:
+        """The views follow what is asked for."""
+        if isinstance(request, Simulate | Pour) and self._moment != "replaying":
+            deployed = self._plan.deployment is not None and request.scene in {
+                scene.name for scene in self._plan.deployment.scenes
+            }
+            self._show("deploying" if deployed and request.purpose != "calibration" else "calibrating")
+
+    def _started(self, event: RequestStarted) -> None:
+        self._follow(event.request)
+        match event.request:
+            case Simulate() as request:
+                self._machine.simulation_started(event.id, request.purpose)
+            case Suggest():
+                self._machine.lane("optimiser", "suggest")
+            case Pour() as pour:
+                self._machine.pour_started(event.time)
+                scene = self._scenes[pour.scene]
+                self._cell.begin(pour, scene)
+                self._balance.begin(pour, scene)
+                expected = ""
+                if pour.predicted is not None:
+                    unit = unit_of_pour(self._plan, pour)
+                    expected = f", predicted {unit.text(pour.predicted.mean, pour.predicted.deviation)}"
+                if (action := self._action(pour)) not in self._decided:  # most strategies have just said so
+                    self._say(f"pour {pour.number}: {action}{expected}", source=event.stage)
+
+    def _finished(self, event: RequestFinished) -> None:
+        match event.request:
+            case Simulate():
+                self._machine.simulation_finished(event.id, event.seconds)
+            case Suggest():
+                self._machine.lane("optimiser", None)
+            case Pour():
+                self._machine.pour_finished(event.time)
+        if isinstance(event.outcome, Failed):
+            self._say(f"{event.outcome.kind}: {event.outcome.reason}", "warning", event.stage)
+            return
+        match event.request, event.outcome:
+            case Simulate() as request, Simulated() as outcome:
+                self._learning.about(event.stage, request.scene)
+                self._simulation(event, request, outcome)
+            case Pour() as request, Poured() as outcome:
+                self._learning.about(event.stage, request.scene)
+                self._say(self._learning.poured(request, outcome), source=event.stage)
+                self.status.best = self._learning.best
+                measured, shown = outcome.measurement, self._balance.finish(outcome.measurement)
+                self._cell.finish(
+                    self._scenes[request.scene],
+                    measured,
+                    now=event.time,
+                    step=self._step,
+                    beside=lambda times, spilled: self._balance.beside(shown, times, spilled),
+                    told=self._balance.told,
+                )
+            case Suggest() as request, Suggested() as outcome:
+                self._learning.suggested(event, request, outcome)
+
+    def _simulation(self, event: RequestFinished, request: Simulate, outcome: Simulated) -> None:
+        result = outcome.outcome
+        self._balance.simulated(request.scene, request.action, result)
+        if result.invalid is not None:
+            self._say(f"simulation {event.id} is not valid: {result.invalid}", "warning", event.stage)
+        if event.frames is None:
+            return
+        title = (
+            f"simulation {event.id} ({request.purpose}): {request.action.display('angular_velocity')}, "
+            f"{100 * result.spilled:.1f} % spilled, {result.particles} particles"
+        )
+        shown = f"shown: simulation {event.id} ({request.purpose}), {100 * result.spilled:.1f} % spilled"
+        self._say(shown, source=event.stage)
+        self._simulated.film(event.frames, self._scenes[request.scene], title, now=event.time, step=self._step)
+
+    def _action(self, pour: Pour) -> str:
+        plan = self._plan.calibration if is_calibration(self._plan, pour) else self._plan.deployment
+        return pour.action.display(*(plan.actions.names if plan is not None else ()))
+
+
+def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
+    """All scenes of a campaign, by name."""
+    scenes: dict[str, Scene] = {}
+    if plan.calibration is not None:
+        for records in (plan.calibration.records, plan.calibration.transfer):
+            if records is not None:
+                scenes[records.scene.name] = records.scene
+        scenes.update({scene.name: scene for scene in plan.calibration.poured})
+    if plan.deployment is not None:
+        scenes.update({scene.name: scene for scene in plan.deployment.scenes})
+    return scenes
+
+
+def blueprint_of(plan: CampaignPlan, moment: Moment) -> rrb.Blueprint:
+    """What a viewer shows of a campaign at a moment."""
+    calibration, deployment = plan.calibration, plan.deployment
+    names = receiver_names(plan)
+    receivers = {s.name: names[s.name] for s in deployment.scenes} if deployment is not None else {}
+    unit = deployment_unit(deployment) if deployment is not None else DISCREPANCY
+    return campaign_blueprint(
+        moment,
+        receivers,
+        unit.label,
+        theta_slices=calibration is not None and calibration.parameters.dimension > MAPPED,
+        action_slices=deployment is not None and deployment.actions.dimension > MAPPED,
+    )

@@ -1,0 +1,143 @@
+"""A simulated pour on its own stage: vessels, particles by their fate, and how much of the liquid is where.
+
+One simulated pour as a recording, for `decant simulate --rrd`.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orchestrator.live_view import rerun_shapes as shapes
+from orchestrator.live_view.blueprints import simulation_blueprint
+from orchestrator.live_view.playback import Playback, PlaybackQueue, Track
+from orchestrator.live_view.recording_sink import RecordingSink, columns_of
+from orchestrator.results import figure_style as style
+from sim_engine.outcome import RecordedFrames, SimulatedPour
+from sim_engine.scene import PourTask, Scene
+
+MAXIMUM_RATE = 10.0
+"""Frames per second of a film: 3 000 particles cost about 36 kB each."""
+
+PLACE = "/simulation"
+
+SHARES = ("in the pourer", "falling", "received", "spilled")
+
+
+class SimulatedStage:
+    """Films of simulations. For one thread.
+
+    Args:
+        outlet: where rows go.
+        films: that they are shown by.
+    """
+
+    def __init__(self, outlet: RecordingSink, films: PlaybackQueue) -> None:
+        import rerun as rr
+
+        self._rr, self._outlet, self._films = rr, outlet, films
+        self._shown: dict[tuple[str, bool], str] = {}
+        outlet.log(f"{PLACE}/liquid", shapes.fates(), static=True)
+        for state, name in enumerate(SHARES):
+            colour = shapes.rgb(style.PARTICLE_STATES[state][1])
+            outlet.log(f"{PLACE}/share/{state}", rr.SeriesLines(names=name, colors=colour, widths=3), static=True)
+
+    def film(self, frames: RecordedFrames, scene: Scene, title: str, *, now: float, step: int) -> None:
+        """Show a simulation.
+
+        Args:
+            frames: that were kept; thinned to `MAXIMUM_RATE`.
+            scene: what was simulated.
+            title: of it, for people.
+            now: on the wall clock [s since 1970].
+            step: of the campaign.
+        """
+        times = np.asarray(frames.times, dtype=float)
+        if len(times) == 0:
+            return
+        radius = 0.5 * shapes.spacing(frames.positions[0], scene.liquid.volume)
+        kept = thinned(times)
+        moments = times[kept] - times[kept[0]]
+        states = [np.asarray(frames.states[index]) for index in kept]
+        shares = [100.0 * np.bincount(each, minlength=5) / max(len(each), 1) for each in states]
+        poses = np.asarray([frames.pourer_poses[index] for index in kept], float)
+        liquid = shapes.swarms([frames.positions[index] for index in kept], states, radius)
+        tracks = [shapes.moving(f"{PLACE}/pourer", moments, poses), Track(f"{PLACE}/liquid", moments, liquid)]
+        for state, share in enumerate(np.transpose(shares)[: len(SHARES)]):
+            curve = columns_of(self._rr.Scalars.columns(scalars=share))
+            tracks.append(Track(f"{PLACE}/share/{state}", moments, curve))
+        film = Playback(
+            float(moments[-1]),
+            tracks,
+            begin=lambda: self._set(scene, title),
+            end=lambda: self._outlet.clear(f"{PLACE}/share", recursive=True),  # no line to the next film
+        )
+        self._films.add(now, step, film)
+
+    def _set(self, scene: Scene, title: str) -> None:
+        self._outlet.log(f"{PLACE}/title", self._rr.TextDocument(f"### {title}", media_type="text/markdown"))
+        for what, spec in (("pourer", scene.pourer), ("receiver", scene.receiver)):
+            # What is left out of the wall clock isn't there for those who watch by it.
+            key, place = spec.content_hash(), (what, self._outlet.on_wall)
+            if self._shown.get(place) != key:
+                self._shown[place] = self._shown[what, False] = key
+                self._outlet.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
+
+
+def thinned(times: NDArray[np.float64]) -> list[int]:
+    """Which frames a film keeps: `MAXIMUM_RATE`, and the last one, which decides what was spilled."""
+    kept = [0]
+    for index in range(1, len(times)):
+        if times[index] - times[kept[-1]] >= 1.0 / MAXIMUM_RATE - 1e-6:
+            kept.append(index)
+    if kept[-1] != len(times) - 1:
+        kept.append(len(times) - 1)
+    return kept
+
+
+def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str = "") -> Path:
+    """Write a recording of one simulated pour.
+
+    Args:
+        path: `.rrd` to write; replaced if it exists.
+        task: what was simulated, with `record_rate` > 0.
+        result: what came of it.
+        title: of the recording; what is poured into what if not given.
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: the result has no frames.
+        OSError: the file can't be written.
+    """
+    import rerun as rr
+
+    if result.frames is None:
+        raise ValueError("this simulation kept no frames to record; simulate it with a record rate above 0")
+    scene, outcome = task.scene, result.outcome
+    title = title or f"{scene.pourer.name} into {scene.receiver.name}, seed {task.seed}"
+    outlet = RecordingSink(path, application="decant simulation", name=title)
+    outlet.keep(simulation_blueprint())
+    outlet.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    films = PlaybackQueue(outlet)
+    now = time.time()
+    outlet.times(wall=now, step=0, sim_time=0.0)
+    SimulatedStage(outlet, films).film(result.frames, scene, title, now=now, step=0)
+    films.play(float("inf"))
+    for source, text in (
+        ("action", style.display_values(task.action.values())),
+        ("parameters", style.display_values(task.parameters.model_dump())),
+        (
+            "outcome",
+            f"received {100 * outcome.received:.2f} %, spilled {100 * outcome.spilled:.2f} %, "
+            f"retained {100 * outcome.retained:.2f} %, in flight {100 * outcome.in_flight:.2f} %",
+        ),
+    ):
+        level = rr.TextLogLevel.WARN if source == "outcome" and outcome.invalid is not None else rr.TextLogLevel.INFO
+        outlet.log(f"/log/{source}", rr.TextLog(text, level=level))
+    outlet.close()
+    return path

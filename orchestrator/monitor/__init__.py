@@ -1,1 +1,0 @@
-"""Rerun recordings: what a campaign looks like while it runs and afterwards."""

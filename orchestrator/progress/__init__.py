@@ -1,0 +1,1 @@
+"""A running campaign in numbers: progress state, time estimate, console display."""

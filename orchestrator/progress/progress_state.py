@@ -1,0 +1,266 @@
+"""What a person wants to know of a running campaign, counted from its events: no terminal, no clock of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from actors.interfaces import PourProgress
+from orchestrator.progress.time_estimate import Forecast, particles_of, work_of
+from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated
+from orchestrator.results import figure_style as style
+from orchestrator.results.loss_units import LossUnit, is_calibration, loss_of_pour, unit_of_pour
+from orchestrator.results.stage_views import receiver_name
+from orchestrator.runs.events import (
+    CampaignClosed,
+    CampaignOpened,
+    CampaignStateChanged,
+    Event,
+    MadeAhead,
+    PourProgressed,
+    RequestFinished,
+    RequestStarted,
+    StageClosed,
+    StageOpened,
+    StrategyProgressed,
+)
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.deployment.confirmation import PURPOSE as CONFIRM
+from orchestrator.strategies.strategy import Progress
+
+CHECKPOINT_WORDS = {
+    "operator": "waiting for the operator",
+    "tare": "taring",
+    "approach": "moving to start",
+    "tilt": "tilting",
+    "hold": "holding",
+    "return": "returning upright",
+    "settle": "settling",
+    "weigh": "weighing",
+    "record": "recording",
+}
+
+
+@dataclass
+class StageProgressState:
+    """Progress of one stage.
+
+    Attributes:
+        progress: as the strategy told it last.
+        opened_at, closed_at: times of these events; a replayed opening has none.
+    """
+
+    name: str
+    progress: Progress = field(default_factory=Progress)
+    opened_at: float | None = None
+    closed_at: float | None = None
+
+
+@dataclass
+class PourProgressState:
+    """The pour that runs, or the last one."""
+
+    number: int
+    stage: str
+    scene: str
+    action: str
+    predicted: str
+    started_at: float
+    calibrating: bool
+    confirming: bool = False
+    progress: PourProgress | None = None
+    result: str = ""
+
+
+@dataclass
+class Best:
+    """The smallest measured loss of a receiver, in the loss' own unit."""
+
+    loss: float
+    pour: int
+    unit: LossUnit
+
+
+@dataclass
+class ProgressState:
+    """Counts a campaign's events.
+
+    Attributes:
+        plan: the campaign.
+        simulators: members of the pool.
+        running: ids of simulations that run.
+        ahead: of those that nobody has asked for yet.
+        simulations, failed_simulations: finished ones.
+        simulation_seconds: wall seconds that finished simulations took, all together (replayed ones not counted).
+        timed_simulations: how many these were.
+        best: by scene.
+        forecast: of the time that is left.
+    """
+
+    plan: CampaignPlan
+    mode: str = ""
+    state: str = ""
+    simulators: int = 0
+    stages: dict[str, StageProgressState] = field(default_factory=dict)
+    running: set[int] = field(default_factory=set)
+    ahead: MadeAhead = field(default_factory=lambda: MadeAhead(running=0, waiting=0))
+    simulations: int = 0
+    failed_simulations: int = 0
+    simulation_seconds: float = 0.0
+    timed_simulations: int = 0
+    pour: PourProgressState | None = None
+    best: dict[str, Best] = field(default_factory=dict)
+
+    forecast: Forecast = field(init=False)
+
+    _busy_seconds: float = 0.0
+    _load_from: float | None = None
+    _load_to: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.forecast = Forecast(self.plan.parallel_simulations, particles_of(self.plan))
+
+    def __call__(self, event: Event) -> None:
+        """Count an event."""
+        if not event.replayed:
+            self._pass_time(event.time)
+        self.forecast(event)
+        match event:
+            case CampaignOpened():
+                self.mode, self.simulators = event.mode, event.simulators
+                self.stages = {name: StageProgressState(name) for name in event.stages}
+                self.forecast.begin(event.simulators, work_of(self.plan, event.stages))
+            case CampaignStateChanged():
+                self.state = event.after
+            case CampaignClosed():
+                self.state = event.state
+            case StageOpened():
+                stage = self._stage(event.stage)
+                # A stage that is being replayed has no pace; the first live event starts its clock.
+                stage.opened_at = None if event.replayed else event.time
+            case StageClosed():
+                self._stage(event.stage).closed_at = event.time
+            case StrategyProgressed():
+                stage = self._stage(event.stage)
+                stage.progress = event.progress
+                if not event.replayed and stage.opened_at is None:
+                    stage.opened_at = event.time
+            case RequestStarted():
+                self._started(event)
+            case RequestFinished():
+                self._finished(event)
+            case MadeAhead():
+                self.ahead = event
+            case PourProgressed() if self.pour is not None:
+                self.pour.progress = event.progress
+
+    def _stage(self, name: str) -> StageProgressState:
+        return self.stages.setdefault(name, StageProgressState(name))
+
+    def _started(self, event: RequestStarted) -> None:
+        match event.request:
+            case Simulate():
+                self.running.add(event.id)
+            case Pour() as pour:
+                section = self.plan.calibration if is_calibration(self.plan, pour) else self.plan.deployment
+                names = section.actions.names if section is not None else ("angular_velocity", "x_offset")
+                predicted = ""
+                if pour.predicted is not None:
+                    unit = unit_of_pour(self.plan, pour)
+                    predicted = unit.prediction(pour.predicted)
+                self.pour = PourProgressState(
+                    pour.number,
+                    event.stage,
+                    pour.scene,
+                    style.display_values({name: getattr(pour.action, name) for name in names}),
+                    predicted,
+                    event.time,
+                    is_calibration(self.plan, pour),
+                    pour.purpose == CONFIRM,
+                )
+
+    def _finished(self, event: RequestFinished) -> None:
+        match event.request, event.outcome:
+            case Simulate(), outcome:
+                self.running.discard(event.id)
+                if isinstance(outcome, Simulated):
+                    self.simulations += 1
+                    if event.seconds > 0.0:
+                        self.simulation_seconds += event.seconds
+                        self.timed_simulations += 1
+                else:
+                    self.failed_simulations += 1
+            case Pour() as pour, Poured() as outcome:
+                unit = unit_of_pour(self.plan, pour)
+                loss = loss_of_pour(self.plan, pour, outcome.measurement)
+                if self.pour is not None:
+                    self.pour.result = "too little was poured" if loss is None else unit.text(loss)
+                if loss is not None and pour.purpose != CONFIRM and not is_calibration(self.plan, pour):
+                    best = self.best.get(pour.scene)
+                    if best is None or loss < best.loss:
+                        self.best[pour.scene] = Best(loss, pour.number, unit)
+            case Pour(), Failed() as failed:
+                if self.pour is not None:
+                    self.pour.result = f"failed: {failed.reason}"
+
+    def _pass_time(self, now: float) -> None:
+        if self._load_from is None:
+            self._load_from = now
+        else:
+            self._busy_seconds += self.busy * max(now - self._load_to, 0.0)
+        self._load_to = now
+
+    @property
+    def busy(self) -> int:
+        """Simulators that work."""
+        return min(len(self.running) + self.ahead.running, self.simulators)
+
+    @property
+    def _calibration_pour(self) -> bool:
+        return self.pour is not None and self.pour.calibrating and not self.pour.result
+
+    def load(self) -> float | None:
+        """Mean share of the pool (0 … 1) that was busy since this was asked last; None if no time has passed."""
+        elapsed = 0.0 if self._load_from is None else self._load_to - self._load_from
+        if elapsed <= 0.0 or not self.simulators:
+            return None
+        share = self._busy_seconds / (elapsed * self.simulators)
+        self._load_from, self._busy_seconds = self._load_to, 0.0
+        return share
+
+    def pool_line(self, scene: str | None = None) -> str:
+        """'pool 2/2 busy · 214 simulations, 0.9 s each · best so far 1.10 % (pour 4)'."""
+        pool = f"pool {self.busy}/{self.simulators} busy · " if self.simulators else ""
+        return pool + self.counts_line(scene)
+
+    def counts_line(self, scene: str | None = None) -> str:
+        """'214 simulations, 0.9 s each · best so far 1.10 % (pour 4)'."""
+        each = f", {self.simulation_seconds / self.timed_simulations:.1f} s each" if self.timed_simulations else ""
+        parts = [f"{self.simulations} simulation{'s' * (self.simulations != 1)}{each}"]
+        if self.ahead.waiting and (self.ahead.running or self._calibration_pour):  # later on some are never asked for
+            parts.append(f"{self.ahead.waiting} more made ahead")
+        if self.failed_simulations:
+            parts.append(f"{self.failed_simulations} failed")
+        wanted = self.pour.scene if scene is None and self.pour is not None else scene
+        if wanted is not None and wanted in self.best:
+            best = self.best[wanted]
+            parts.append(f"best so far {best.unit.text(best.loss)} (pour {best.pour})")
+        return " · ".join(parts)
+
+    def pour_line(self) -> str | None:
+        """'pour 7/15 into narrow  angular velocity 41.2 deg/s, x offset 104 mm  predicted 0.80 ± 0.90 %'."""
+        pour = self.pour
+        if pour is None:
+            return None
+        total = None
+        if pour.calibrating:
+            total = self.plan.calibration.pour_count if self.plan.calibration is not None else None
+        elif self.plan.deployment is not None:
+            total = self.plan.deployment.confirm if pour.confirming else self.plan.deployment.pours
+        of = f"/{total}" if total else ""
+        kind = "confirming pour" if pour.confirming else "pour"
+        line = f"{kind} {pour.number}{of} into {receiver_name(self.plan, pour.scene)}  {pour.action}"
+        if pour.predicted:
+            line += f"  predicted {pour.predicted}"
+        if pour.result:
+            line += f"  measured {pour.result}"
+        return line

@@ -1,0 +1,311 @@
+"""A simulated pour as a picture: four moments from the side, and where the liquid was at every time.
+
+Vessels cut open: the section of a mesh by its plane y = 0, and poses in that plane.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orchestrator.results import figure_style as style
+from sim_engine.outcome import ParticleState
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from sim_engine.outcome import SimulatedPour
+    from sim_engine.scene import PourTask
+
+Floats = NDArray[np.float64]
+
+
+class Solid(Protocol):
+    """What is needed of a vessel: its closed surface in its own frame [m]."""
+
+    @property
+    def solid_vertices(self) -> Any:
+        """(V, 3)."""
+        ...
+
+    @property
+    def solid_faces(self) -> Any:
+        """(F, 3), oriented outwards."""
+        ...
+
+
+def section(vertices: Floats, faces: NDArray[np.integer[Any]]) -> list[Floats]:
+    """Closed outlines where a watertight mesh meets the plane y = 0.
+
+    Args:
+        vertices: (V, 3) [m].
+        faces: (F, 3), consistently oriented.
+
+    Returns:
+        One (n, 2) array of (x, z) [m] for each loop, oriented as the faces are, so that holes run the other way round.
+
+    Raises:
+        ValueError: the mesh is open where it was cut.
+    """
+    above = vertices[:, 1] >= 0.0
+    count = above[faces].sum(axis=1)
+    follows: dict[tuple[int, int], tuple[int, int]] = {}
+    for face in faces[(count > 0) & (count < 3)]:
+        enter = leave = None
+        for i in range(3):
+            a, b = int(face[i]), int(face[(i + 1) % 3])
+            if above[a] != above[b]:
+                edge = (min(a, b), max(a, b))
+                if above[b]:
+                    enter = edge
+                else:
+                    leave = edge
+        assert enter is not None
+        assert leave is not None
+        follows[enter] = leave
+    loops = []
+    while follows:
+        start, edge = follows.popitem()
+        loop = [start]
+        while edge != start:
+            loop.append(edge)
+            if edge not in follows:
+                raise ValueError("the mesh is open: its section by the plane y = 0 has a loose end")
+            edge = follows.pop(edge)
+        ends = np.array(loop)
+        a, b = vertices[ends[:, 0]], vertices[ends[:, 1]]
+        t = (a[:, 1] / (a[:, 1] - b[:, 1]))[:, None]
+        loops.append((a + t * (b - a))[:, [0, 2]])
+    return loops
+
+
+def place(points: Floats, pose: Floats) -> Floats:
+    """Points of a body's plane y = 0 in the world's x–z plane.
+
+    Args:
+        points: (n, 2) as (x, z) in the body's frame [m].
+        pose: x y z qw qx qy qz of the body; its turn must be about y.
+
+    Returns:
+        (n, 2) as (x, z) [m].
+    """
+    tilt = 2.0 * np.arctan2(pose[5], pose[3])
+    c, s = np.cos(tilt), np.sin(tilt)
+    # A positive turn about +y tips z towards +x.
+    x = c * points[:, 0] + s * points[:, 1] + pose[0]
+    z = -s * points[:, 0] + c * points[:, 1] + pose[2]
+    return np.column_stack([x, z])
+
+
+def fill_section(axes: Axes, loops: list[Floats], **look: Any) -> None:
+    """Draw outlines as one filled shape with its holes left open."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+
+    axes.add_patch(PathPatch(Outline.make_compound_path(*(Outline(loop, closed=False) for loop in loops)), **look))
+
+
+IN_POURER, _FALLING, _RECEIVED, SPILLED, _ESCAPED = (int(state) for state in ParticleState)
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+
+
+def simulation_png(path: Path, task: PourTask, result: SimulatedPour) -> Path:
+    """Picture of one simulated pour, for `decant simulate --png`.
+
+    Args:
+        path: PNG to write.
+        task: what was simulated, with `record_rate` > 0.
+        result: what came of it.
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: the result has no frames.
+    """
+    from sim_engine.vessel.vessel import build_vessel
+
+    scene = task.scene
+    names = ("angular_velocity", "max_angle", "x_offset", "height")
+    action = style.display_values({name: getattr(task.action, name) for name in names})
+    outcome = result.outcome
+    title = (
+        f"{scene.pourer.name} into {scene.receiver.name}: {100 * outcome.received:.1f} % received, "
+        f"{100 * outcome.spilled:.1f} % spilled, {100 * outcome.retained:.1f} % retained"
+    )
+    if outcome.invalid is not None:
+        title += f"   [not valid: {outcome.invalid}]"
+    note = f"{action}; {style.display_value('particles', outcome.particles)} particles, seed {outcome.seed}"
+    return draw_pour(
+        path,
+        result,
+        build_vessel(scene.pourer),
+        build_vessel(scene.receiver),
+        receiver_shift=(task.placement.x, task.placement.z),
+        title=title,
+        note=note,
+    )
+
+
+def draw_pour(
+    path: Path,
+    result: SimulatedPour,
+    pourer: Solid,
+    receiver: Solid,
+    *,
+    title: str,
+    note: str = "",
+    receiver_shift: tuple[float, float] = (0.0, 0.0),
+    snapshots: int = 4,
+) -> Path:
+    """Snapshots of a pour seen from the side (vessels cut open at y = 0), above the shares of the liquid over time.
+
+    Args:
+        path: PNG to write.
+        result: a simulated pour with frames.
+        pourer: its surface.
+        receiver: its surface; it stands at x and z = `receiver_shift` [m].
+        title: first line.
+        note: second line.
+        receiver_shift: see above.
+        snapshots: how many moments.
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: the result has no frames.
+    """
+    frames = result.frames
+    if frames is None or len(frames.times) == 0:
+        raise ValueError("this simulation kept no frames to draw; simulate it with a record rate above 0")
+    times = np.asarray(frames.times, dtype=float)
+    shares = _shares(frames.states)
+    chosen = _moments(times, shares, snapshots)
+    outlines = [section(np.asarray(v.solid_vertices, float), np.asarray(v.solid_faces)) for v in (pourer, receiver)]
+    stand = UPRIGHT + np.array([receiver_shift[0], 0, receiver_shift[1], 0, 0, 0, 0])
+    window = _window(outlines, np.asarray(frames.pourer_poses, float)[chosen], stand)
+    aspect = (window[3] - window[2]) / (window[1] - window[0])
+    width = 3.1 * snapshots
+    figure, grid = style.new_figure(
+        2,
+        snapshots,
+        size=(width, 3.0 * min(max(aspect, 0.7), 1.9) + 2.6),
+        height_ratios=[3.0 * min(max(aspect, 0.7), 1.9), 1.5],
+        squeeze=False,
+    )
+    figure.suptitle(title, fontsize=12.5, color=style.INK, x=0.01, ha="left")
+    for axes, index in zip(grid[0], chosen, strict=True):
+        _snapshot(
+            axes,
+            np.asarray(frames.positions[index], float),
+            np.asarray(frames.states[index]),
+            [
+                [place(loop, np.asarray(frames.pourer_poses[index], float)) for loop in outlines[0]],
+                [place(loop, stand) for loop in outlines[1]],
+            ],
+            window,
+            result.outcome.spacing,
+        )
+        axes.set_title(f"{times[index]:.2f} s", fontsize=10.5, loc="left", color=style.INK)
+    _scale_bar(grid[0, 0], window)
+    for axes in grid[1, 1:]:
+        axes.remove()
+    timeline = grid[1, 0]
+    timeline.set_subplotspec(timeline.get_gridspec()[1, :])
+    _timeline(timeline, times, shares, times[chosen])
+    if note:
+        figure.supxlabel(note, fontsize=8.5, color=style.GREY, x=0.01, ha="left")
+    return style.save(figure, path)
+
+
+def _shares(states: Any) -> Floats:
+    """(F, 5) fraction of the particles in every state."""
+    return np.array([np.bincount(np.asarray(s, dtype=int), minlength=5)[:5] / len(s) for s in states])
+
+
+def _moments(times: Floats, shares: Floats, count: int) -> NDArray[np.intp]:
+    """Frames worth a picture: when shares 1/8 … 7/8 of what will leave had left, and the end; if
+    nothing left, evenly spread."""
+    left = 1.0 - shares[:, IN_POURER]
+    if left[-1] < 0.01:
+        return np.linspace(0, len(times) - 1, count).round().astype(int)
+    wanted = np.linspace(0.0, 1.0, 2 * count - 1)[1::2][: count - 1] * left.max()
+    picked = [int(np.argmax(left >= level)) for level in wanted]
+    return np.array([*picked, len(times) - 1])
+
+
+def _window(outlines: list[list[Floats]], poses: Floats, stand: Floats) -> tuple[float, float, float, float]:
+    """x and z range that shows both vessels in all snapshots and some table on either side."""
+    corners = [place(loop, pose) for pose in poses for loop in outlines[0]]
+    corners += [place(loop, stand) for loop in outlines[1]]
+    everything = np.concatenate(corners)
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    margin = 0.12 * float(max(high - low))
+    return low[0] - margin, high[0] + 2 * margin, min(low[1], 0.0) - 0.4 * margin, high[1] + 0.5 * margin
+
+
+def _snapshot(
+    axes: Axes,
+    positions: Floats,
+    states: NDArray[Any],
+    vessels: list[list[Floats]],
+    window: tuple[float, float, float, float],
+    spacing: float,
+) -> None:
+    from matplotlib.collections import EllipseCollection
+
+    axes.set_xlim(window[0], window[1])
+    axes.set_ylim(window[2], window[3])
+    axes.set_aspect("equal")
+    axes.axis("off")
+    axes.axhline(0.0, color=style.GREY, linewidth=1.0, zorder=0)
+    # Far particles first, so that what is near covers what is far, as an eye at −y would see it.
+    order = np.argsort(-positions[:, 1])
+    palette = np.array([colour for _, colour in style.PARTICLE_STATES])
+    axes.add_collection(
+        EllipseCollection(
+            widths=[spacing],
+            heights=[spacing],
+            angles=[0.0],
+            units="xy",
+            offsets=positions[order][:, [0, 2]],
+            offset_transform=axes.transData,
+            facecolors=palette[np.minimum(states[order], 4)].tolist(),
+            edgecolors=(1.0, 1.0, 1.0, 0.35),
+            linewidths=0.2,
+            zorder=1,
+        )
+    )
+    for loops in vessels:
+        fill_section(axes, loops, facecolor=style.INK, edgecolor=style.INK, linewidth=0.4, zorder=2)
+
+
+def _scale_bar(axes: Axes, window: tuple[float, float, float, float]) -> None:
+    length = 0.05
+    right = window[1] - 0.04 * (window[1] - window[0])
+    top = window[3] - 0.05 * (window[3] - window[2])
+    axes.plot([right - length, right], [top, top], color=style.INK, linewidth=2.0, solid_capstyle="butt")
+    axes.text(right - length / 2, top, "50 mm", ha="center", va="bottom", fontsize=8, color=style.INK)
+
+
+def _timeline(axes: Axes, times: Floats, shares: Floats, marks: Floats) -> None:
+    shown = [i for i in (2, SPILLED, 1, IN_POURER, 4) if i != 4 or shares[:, 4].max() > 0]
+    axes.stackplot(
+        times,
+        *(100 * shares[:, i] for i in shown),
+        colors=[style.PARTICLE_STATES[i][1] for i in shown],
+        labels=[style.PARTICLE_STATES[i][0] for i in shown],
+        linewidth=0,
+        alpha=0.9,
+    )
+    for mark in marks:
+        axes.axvline(mark, color="white", linewidth=1.6)
+        axes.axvline(mark, color=style.INK, linewidth=0.7, linestyle=(0, (4, 2)))
+    style.dress(axes, x="time [s]", y="liquid [%]", grid=None)
+    axes.set_xlim(times[0], max(times[-1], times[0] + 1e-6))
+    axes.set_ylim(0, 100)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8.5, frameon=False, reverse=True)

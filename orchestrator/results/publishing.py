@@ -1,0 +1,294 @@
+"""What follows a run, whoever drove it: its recording is closed, its figures, summary, θ* and report are written."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from orchestrator.catalogue.run_reading import read_run
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.journal_check import check_journal
+from orchestrator.journal.run_record import CampaignResult, read_record
+from orchestrator.results import validity_warnings as regimes
+from orchestrator.results.campaign_figures import draw_figures
+from orchestrator.results.html_report import REPORT_NAME, reduced_run_page, run_page
+from orchestrator.results.pool_occupancy import occupancies
+from orchestrator.results.run_summary import SUMMARY_NAME, PoolUse, RunSummary, Totals, write_summary
+from orchestrator.results.stage_views import evaluation_of, receiver_names, theta_of
+from orchestrator.results.summarise import summarise
+from orchestrator.runs.run_folder import read_versions
+from orchestrator.states import State
+from orchestrator.strategies.calibration.calibration_base import CalibratedTheta
+from orchestrator.strategies.calibration.calibration_scores import (
+    UNCALIBRATED,
+    Scores,
+    recommended_theta,
+    shift_left_over,
+)
+from orchestrator.strategies.campaign_plan import CampaignPlan
+
+W = TypeVar("W")
+
+FIGURES, THETA_FILE = "figures", "theta.json"
+
+KEPT_THETAS = 50
+"""Draws of the posterior in that file."""
+
+_log = logging.getLogger(__name__)
+
+
+class Recording(Protocol):
+    """The recording of a run, as far as publishing goes."""
+
+    @property
+    def path(self) -> Path:
+        """Its file."""
+        ...
+
+    @property
+    def dropped(self) -> int:
+        """Events that are missing in it."""
+        ...
+
+    def close(self) -> object:
+        """Write what is left, and end it; may be called twice."""
+        ...
+
+
+@dataclass(frozen=True)
+class Published:
+    """What was written about a run.
+
+    Attributes:
+        figures: by name.
+        theta: the file of the recommended θ, for `--parameters`; None where nothing was calibrated.
+        report: the page about the run, for people; None where it could not be written.
+    """
+
+    summary: RunSummary
+    figures: dict[str, Path]
+    recording: Path | None = None
+    theta: Path | None = None
+    report: Path | None = None
+
+
+def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | None = None) -> Published:
+    """Close a run's recording, and write its figures (if the plan wants any), `theta.json`, `summary.json` and the
+    report. A run that stands still may be published, too: its report says where it stands.
+
+    Safe to call again: the files are then written anew.
+
+    Args:
+        plan: of the campaign.
+        result: what it came to, as `run_campaign` or `read_result` has it.
+        recording: that watched it.
+
+    Raises:
+        OSError: a file can't be written.
+    """
+    if recording is not None:
+        recording.close()
+        return _write(plan, result, recording.path, recording.dropped)
+    return _write(plan, result, None, 0)
+
+
+def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
+    """Publish a finished run whose process ended before `summary.json` or `theta.json` was written.
+
+    Returns:
+        Whether anything was missing.
+
+    Raises:
+        OSError: a file can't be written.
+    """
+    expected = [SUMMARY_NAME, *([] if theta_of(result.results) is None else [THETA_FILE])]
+    if result.state is not State.FINISHED or all((result.directory / name).is_file() for name in expected):
+        return False
+    recording = result.directory / "campaign.rrd"
+    _write(plan, result, recording if recording.is_file() else None, 0)
+    return True
+
+
+def _write(plan: CampaignPlan, result: CampaignResult, recording: Path | None, dropped: int) -> Published:
+    directory = result.directory
+    figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
+    summary = summary_of(
+        plan,
+        result,
+        figures,
+        recording=recording,
+        dropped_events=dropped,
+    )
+    write_summary(directory, summary)
+    found = theta_of(result.results)
+    theta = None if found is None else directory / THETA_FILE
+    if theta is not None and found is not None:
+        written = theta_file(found, evaluation_of(result.results))
+        theta.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
+    report: Path | None = directory / REPORT_NAME
+    try:
+        write_report(directory / REPORT_NAME, plan, summary, directory)
+    except Exception as error:  # days of pouring don't end in a traceback about a page
+        _log.warning("the report was not written: %s: %s", type(error).__name__, error)
+        report = None
+    return Published(summary, figures, recording, theta, report)
+
+
+def summary_of(
+    plan: CampaignPlan,
+    result: CampaignResult,
+    figures: Mapping[str, Path],
+    *,
+    recording: Path | None = None,
+    dropped_events: int = 0,
+) -> RunSummary:
+    """The summary of a run as its folder holds it, of one that is not finished too."""
+    return summarise(
+        plan,
+        result.results,
+        figures=figures,
+        recording=recording,
+        dropped_events=dropped_events,
+        not_covered=worked_out(lambda: regimes.campaign_warnings(plan)),
+        best_not_covered=worked_out(lambda: regimes.best_action_warnings(plan, result.results)),
+        totals=_totals(plan, result),
+    )
+
+
+def report_on(
+    plan: CampaignPlan, result: CampaignResult, path: Path | None = None, formats: tuple[str, ...] = (".svg",)
+) -> tuple[Path, dict[str, Path]]:
+    """Draw a run's figures anew, and write the page about it, wherever the run stands.
+
+    Args:
+        path: of the page; in the run's folder unless given.
+        formats: of the figures.
+
+    Raises:
+        OSError: a file can't be written.
+        RunError: the journal can't be read.
+    """
+    figures = draw_figures(result.directory / FIGURES, plan, result.results, formats)
+    summary = summary_of(plan, result, figures)
+    return write_report(path or result.directory / REPORT_NAME, plan, summary, result.directory), figures
+
+
+def write_report(path: Path, plan: CampaignPlan, summary: RunSummary, directory: Path) -> Path:
+    """Write the page about a run, whole or not at all.
+
+    Args:
+        path: of the page.
+        summary: with the figures that go into it.
+        directory: of the run.
+
+    Raises:
+        OSError: it can't be written, or a figure can't be read.
+        RunError: the journal can't be read.
+    """
+    check = check_journal(directory / JOURNAL_NAME)
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        record = read_record(journal)
+    versions = read_versions(directory)
+    return _write_page(path, run_page(plan, summary, record, directory, versions=versions, check=check))
+
+
+def write_reduced_report(path: Path, directory: Path, reason: str) -> Path:
+    """Write the page about a run whose campaign or results can't be read: what its journal has without them.
+
+    Args:
+        path: of the page.
+        directory: of the run.
+        reason: why the whole report can't be made.
+
+    Raises:
+        OSError: it can't be written, or a figure can't be read.
+        RunError: the journal can't be read.
+    """
+    check = check_journal(directory / JOURNAL_NAME)
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        name, record = journal.header.name, read_record(journal)
+    found = read_run(directory).run
+    page = reduced_run_page(
+        name, record, directory, versions=read_versions(directory), check=check, reason=reason, found=found
+    )
+    return _write_page(path, page)
+
+
+def _write_page(path: Path, page: str) -> Path:
+    draft = path.with_suffix(".html.part")
+    draft.write_text(page, encoding="utf-8")
+    draft.replace(path)
+    return path
+
+
+def theta_file(found: CalibratedTheta, scored: Scores | None = None) -> dict[str, Any]:
+    """What `theta.json` holds: the recommended θ, what it left over, and where it is known the posterior of θ.
+
+    The posterior is a list of weighted θ, each complete. If the uncalibrated θ is recommended, `calibrated` has θ* and
+    `recommended` is 'uncalibrated', so that predictions do not draw from the posterior unless they are asked to.
+
+    Args:
+        found: by the calibration.
+        scored: θ* on the weighed pours; None: nobody knows what it left over.
+    """
+    theta = found.theta.model_dump()
+    data: dict[str, Any] = {"theta": recommended_theta(found.theta, scored).model_dump()}
+    if scored is not None and scored.gain is not None:
+        data |= {"recommended": scored.gain.recommended, "why": scored.gain.text}
+        if scored.gain.recommended == UNCALIBRATED:
+            data["calibrated"] = theta
+    left = None if scored is None else shift_left_over(scored, len(found.searched))
+    if left is not None:
+        data["remaining_discrepancy"] = {"shift": left}
+    if found.posterior is not None:
+        draws = found.posterior.thetas
+        kept = draws[:: max(len(draws) // KEPT_THETAS, 1)]
+        data["posterior"] = [{"theta": theta | values, "weight": 1.0 / len(kept)} for values in kept]
+    return data
+
+
+def _totals(plan: CampaignPlan, result: CampaignResult) -> Totals:
+    with JournalReader(result.directory / JOURNAL_NAME) as journal:
+        found = occupancies(journal.entries(), plan.parallel_simulations)
+    return Totals(
+        mode=plan.laboratory.mode,
+        simulations=result.simulations,
+        pours=result.pours,
+        cpu_s=result.cpu_s,
+        seconds=result.seconds,
+        occupancy={
+            stage: PoolUse(
+                pool_busy=one.fraction,
+                pool_useful=one.useful / one.total if one.total > 0.0 else None,
+                arm_longest_wait_s=max(one.waits, default=None),
+                arm_mean_wait_s=sum(one.waits) / len(one.waits) if one.waits else None,
+            )
+            for stage, one in found.items()
+        },
+    )
+
+
+def worked_out(
+    work: Callable[[], dict[str, list[W]]], tell: Callable[[str], None] = _log.warning
+) -> dict[str, list[W]]:
+    """Warnings, or none if they can't be worked out: that is not a reason to lose a summary."""
+    try:
+        return work()
+    except (ValueError, OSError) as error:
+        tell(f"note: whether something is not simulated could not be worked out: {error}")
+        return {}
+
+
+def not_simulated(plan: CampaignPlan, tell: Callable[[str], None] = _log.warning) -> list[str]:
+    """What is not simulated in a campaign's action spaces: lines for the user before it begins.
+
+    Args:
+        plan: of the campaign.
+        tell: called if that can't be worked out.
+    """
+    warnings = worked_out(lambda: regimes.campaign_warnings(plan), tell)
+    return regimes.lines(warnings, receiver_names(plan))

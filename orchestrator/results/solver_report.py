@@ -1,0 +1,287 @@
+"""The solver's physical cases for people: a table in the terminal, figures, and the page docs/validation.md."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.results import figure_style as style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from rich.table import Table
+
+    from sim_engine.validation.case_result import CaseResult, Figure
+    from sim_engine.validation.cases import Case
+
+PAGE_NAME, DATA_NAME, IMAGES = "validation.md", "validation.json", "images"
+
+SHOWN_UNITS = {"1": (1.0, ""), "m": (1e3, "mm"), "m³": (1e6, "mL")}
+"""Factor and name of what people see of an SI unit; others are shown as they are."""
+
+PANELS_ABREAST = 3
+"""More panels than these go into further rows."""
+
+CHARACTER = 0.075
+"""Width of a character in a legend [inch]."""
+
+FEW = 20
+"""Points of a reference from which it is a line."""
+
+MOST_PLACES = 5
+"""Points of a logarithmic axis that each get their number; of more, round numbers do."""
+
+AGAIN = "decant physics --full --write docs"
+
+REFERENCES = (("--", "o"), (":", "s"), ("-.", "^"), ((0, (6, 2)), "D"))
+"""Line style, or marker where there are few points, of several references in a panel."""
+
+COLOURS = (style.MEASURED, style.PREDICTED, style.GOOD, style.BEST, style.FALLING, style.ESCAPED)
+
+INTRODUCTION = """# Validation
+
+<!-- written by `decant physics`; edit the cases, not this page -->
+
+What the solver does in cases whose outcome is known: from theory, from experiments, from other solvers. Every quantity
+is measured, not assumed, and judged by a criterion that was set beforehand; what fails is shown as failing. The page is
+written by
+
+<!-- needs: checkout and minutes -->
+```
+decant physics --full --write docs
+```
+
+θ of all cases unless they say otherwise: {theta}.
+N is the number of particles.
+"""
+
+
+def shown(value: float | None, unit: str) -> str:
+    """A quantity as people read it, from its SI value: '39.8 mm', '0.92'; '—' for None."""
+    if value is None:
+        return "—"
+    factor, name = SHOWN_UNITS.get(unit, (1.0, unit))
+    number = f"{value * factor:.4g}" if abs(value * factor) < 1000 else f"{value * factor:,.0f}".replace(",", " ")
+    return f"{number} {name}".rstrip()
+
+
+def verdict(row: Mapping[str, Any]) -> str:
+    """'pass', 'FAIL', or '' for what is only reported."""
+    if not row["judged"]:
+        return ""
+    return "pass" if row["passed"] else "FAIL"
+
+
+def results_table(rows: Sequence[tuple[str, Mapping[str, Any]]]) -> Table:
+    """The terminal's table.
+
+    Args:
+        rows: case title and `Measurement.as_json` of every measurement, case by case.
+    """
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for heading, justify in (("case", "left"), ("quantity", "left"), ("N", "right"), ("measured", "right")):
+        table.add_column(heading, justify="right" if justify == "right" else "left")
+    for heading in ("reference", "criterion", ""):
+        table.add_column(heading)
+    before = ""
+    for title, row in rows:
+        word = verdict(row)
+        table.add_row(
+            title if title != before else "",
+            row["name"],
+            f"{row['particles']:,}".replace(",", " "),
+            shown(row["value"], row["unit"]),
+            shown(row["reference"], row["unit"]),
+            row["criterion"],
+            f"[bold red]{word}[/]" if word == "FAIL" else f"[green]{word}[/]",
+        )
+        before = title
+    return table
+
+
+def draw(figure: Figure, path: Path) -> Path:
+    """Write a case's figure.
+
+    Args:
+        figure: its curves.
+        path: of the PNG; its folder is made if needed.
+    """
+    panels = len(figure.titles)
+    columns = min(panels, PANELS_ABREAST)
+    rows = -(-panels // columns)
+    wide, high = (6.2, 3.9) if panels == 1 else (3.4, 2.7)
+    canvas, axes = style.new_figure(rows, columns, size=(wide * columns, 0.5 + high * rows), squeeze=False)
+    looks = _looks(figure)
+    for number, place in enumerate(axes.flat):
+        if number < panels:
+            _panel(place, figure, number, looks)
+        else:
+            place.set_visible(False)
+    # Below the panels: inside it would lie on curves, wherever it stood.
+    handles = {n: h for place in axes.flat for h, n in zip(*place.get_legend_handles_labels(), strict=True)}
+    names = [name for name in looks if name in handles]
+    room = wide * columns / (0.55 + CHARACTER * max(map(len, names), default=1))
+    canvas.legend(
+        [handles[name] for name in names], names, loc="outside lower center", ncols=max(1, min(int(room), len(names))),
+        fontsize=8.5, frameon=False,
+    )  # fmt: skip
+    return style.save(canvas, path)
+
+
+@dataclass(frozen=True)
+class CaseFigureStyle:
+    """How the curves of one name are drawn, in all panels alike.
+
+    Attributes:
+        colour, line, marker: of them; '' for none. No two names of a figure share all three.
+    """
+
+    colour: str
+    line: Any = "-"
+    marker: str = ""
+
+
+def _looks(figure: Figure) -> dict[str, CaseFigureStyle]:
+    """Measured curves differ in colour, references have the colour of their subject and differ in line or marker."""
+    measured = list(dict.fromkeys(s.name for s in figure.series if s.kind == "measured"))
+    looks = {name: CaseFigureStyle(colour) for name, colour in zip(measured, COLOURS * 4, strict=False)}
+    of_subject = {_subject(name): looks[name].colour for name in reversed(measured)}
+    styles = iter(REFERENCES * 4)
+    for series in figure.series:
+        if series.name not in looks:
+            line, marker = next(styles)
+            few = 2 < len(series.x) < FEW
+            colour = of_subject.get(_subject(series.name), style.INK)
+            looks[series.name] = CaseFigureStyle(colour, "", marker) if few else CaseFigureStyle(colour, line)
+    return looks
+
+
+def _panel(axes: Axes, figure: Figure, number: int, looks: Mapping[str, CaseFigureStyle]) -> None:
+    for series in (s for s in figure.series if s.panel == number):
+        look = looks[series.name]
+        above = 3 if series.kind == "reference" else 2
+        axes.plot(
+            series.x, series.y, color=look.colour, ls=look.line or "none", marker=look.marker or None, ms=5,
+            mfc="white", lw=1.2 if series.kind == "reference" else 1.6, label=series.name, zorder=above,
+        )  # fmt: skip
+        if series.spread:
+            low, high = ([y + side * s for y, s in zip(series.y, series.spread, strict=True)] for side in (-1, 1))
+            axes.fill_between(series.x, low, high, color=look.colour, alpha=0.18, lw=0)
+    style.dress(axes, title=figure.titles[number], x=figure.x_labels[number], y=figure.y_labels[number], grid="both")
+    if figure.log_x if isinstance(figure.log_x, bool) else figure.log_x[number]:
+        axes.set_xscale("log")
+        places = sorted({x for s in figure.series if s.panel == number and s.kind == "measured" for x in s.x})
+        if len(places) > MOST_PLACES:
+            places = style.log_ticks(places[0], places[-1])
+        axes.set_xticks(places, [style.number(x) for x in places])
+        axes.minorticks_off()
+
+
+def _subject(name: str) -> str:
+    """What a curve and its reference have in common: 'cone' of 'cone, 2,000 particles' and of 'cone, at rest'."""
+    return name.split(", ", maxsplit=1)[0]
+
+
+def figure_of(record: Mapping[str, Any]) -> Figure | None:
+    """The figure whose curves a record keeps, so that it can be drawn again without measuring."""
+    from sim_engine.validation.case_result import Figure, Series
+
+    kept = record.get("figure")
+    if kept is None:
+        return None
+    series = [
+        Series(s["name"], tuple(s["x"]), tuple(s["y"]), s["kind"], s["panel"], tuple(s["spread"]))
+        for s in kept["series"]
+    ]
+    titles, x_labels, y_labels = (tuple(kept[name]) for name in ("titles", "x_labels", "y_labels"))
+    log_x = kept["log_x"] if isinstance(kept["log_x"], bool) else tuple(kept["log_x"])
+    return Figure(titles, x_labels, y_labels, tuple(series), log_x)
+
+
+def _curves(figure: Figure) -> dict[str, Any]:
+    """JSON-ready, with five digits."""
+
+    def short(value: Any) -> Any:
+        if isinstance(value, float):
+            return float(f"{value:.5g}")
+        return [short(one) for one in value] if isinstance(value, list | tuple) else value
+
+    kept = dataclasses.asdict(figure)
+    kept["series"] = [{name: short(value) for name, value in one.items()} for one in kept["series"]]
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in kept.items()}
+
+
+def case_record(case: Case, result: CaseResult, image: Path | None, fingerprint: str) -> dict[str, Any]:
+    """What is kept of a case between runs, JSON-ready; the image by its file name, the solver by its fingerprint."""
+    return {
+        "solver": fingerprint,
+        "title": case.title,
+        "about": case.about,
+        "cpu_s": round(result.cpu_s, 1),
+        "image": None if image is None else image.name,
+        "figure": None if result.figure is None else _curves(result.figure),
+        "measurements": [m.as_json() for m in result.measurements],
+    }
+
+
+def kept_records(folder: Path) -> dict[str, dict[str, Any]]:
+    """Records of cases that earlier runs wrote into a folder."""
+    path = folder / DATA_NAME
+    return dict(json.loads(path.read_text(encoding="utf-8"))["cases"]) if path.is_file() else {}
+
+
+def write_page(
+    folder: Path, records: Mapping[str, Mapping[str, Any]], order: Sequence[str], *, fingerprint: str, theta: str
+) -> Path:
+    """Write the page and the data that it was made from.
+
+    Args:
+        folder: of the page.
+        records: `case_record`s by case.
+        order: of the cases on the page.
+        fingerprint: of the solver as it is now; cases that another one measured are marked.
+        theta: of the cases, as people read it.
+
+    Raises:
+        OSError: it can't be written.
+    """
+    sorted_records = {name: records[name] for name in order if name in records}
+    data = {"solver": fingerprint, "theta": theta, "cases": sorted_records}
+    text = json.dumps(data, indent=1, ensure_ascii=False)
+    # Curves in a line each: a number a line would be tens of thousands.
+    text = re.sub(r"\[\s+([-+\d.eE,\s]+?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+    (folder / DATA_NAME).write_text(text + "\n", encoding="utf-8")
+    page = folder / PAGE_NAME
+    page.write_text(page_text(sorted_records, theta, fingerprint), encoding="utf-8")
+    return page
+
+
+def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint: str) -> str:
+    """The page of some records, in their order, see `write_page`."""
+    rows = [m for record in records.values() for m in record["measurements"]]
+    judged = [m for m in rows if m["judged"]]
+    failed = sum(not m["passed"] for m in judged)
+    parts = [INTRODUCTION.format(theta=theta)]
+    parts.append(f"{len(judged) - failed} of {len(judged)} criteria are met.\n")
+    for name, record in records.items():
+        parts.append(f"## {record['title']}\n\n{record['about']} (`decant physics {name}`)\n")
+        if record["solver"] != fingerprint:
+            parts.append(f"Measured before the solver's sources last changed; again: `{AGAIN} {name}`\n")
+        lines = ["| quantity | N | measured | reference | criterion | |", "|---|---:|---:|---:|---|---|"]
+        for m in record["measurements"]:
+            word = {"FAIL": "**fails**"}.get(verdict(m), verdict(m))
+            lines.append(
+                f"| {m['name']} | {m['particles']:,} | {shown(m['value'], m['unit'])} | "
+                f"{shown(m['reference'], m['unit'])} | {m['criterion']} | {word} |"
+            )
+        parts.append("\n".join(lines) + "\n")
+        if record["image"] is not None:
+            parts.append(f"![{record['title']}]({IMAGES}/{record['image']})\n")
+    return "\n".join(parts)

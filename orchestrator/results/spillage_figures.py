@@ -1,0 +1,252 @@
+"""Figures of a campaign: spillage against pours, and how far the calibrated simulator is from the scale."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from orchestrator.results import figure_style as style
+from sim_engine.prediction_band import LEVEL
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+TOP = 1.08
+"""Upper end of the axis, over the largest value in view."""
+
+
+@dataclass(frozen=True)
+class PourSeries:
+    """Pours into one receiver, in the order they were made.
+
+    Attributes:
+        receiver: name for people.
+        losses: measured loss of each pour in the axis' unit; None where a pour failed.
+        predicted: (mean, low, high): what was expected of each pour, and the band that it should lie in with a
+            probability of `sim_engine.prediction_band.LEVEL`; None where nothing was.
+    """
+
+    receiver: str
+    losses: Sequence[float | None]
+    predicted: Sequence[tuple[float, float, float] | None]
+
+    def best_so_far(self) -> list[float | None]:
+        """Smallest loss up to each pour; None before the first that worked."""
+        best: float | None = None
+        running: list[float | None] = []
+        for loss in self.losses:
+            if loss is not None:
+                best = loss if best is None else min(best, loss)
+            running.append(best)
+        return running
+
+
+def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title: str) -> Path:
+    """Loss against pours, one panel for each receiver: measured, best so far, and where it was to lie.
+
+    Args:
+        path: PNG to write.
+        series: one per receiver.
+        cost: label of the loss with its unit.
+        title: of the whole figure.
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: no receiver, or a receiver without pours.
+    """
+    if not series or not all(len(s.losses) for s in series):
+        raise ValueError("spillage against pours: no pours to draw")
+    columns = min(len(series), 3)
+    rows = -(-len(series) // columns)
+    figure, axes = style.new_figure(
+        rows, columns, size=(max(6.4, 4.2 * columns), 0.6 + 3.7 * rows), squeeze=False, sharey=True
+    )
+    figure.suptitle(title, fontsize=12.5, color=style.INK, x=0.02, ha="left")
+    top = 0.0
+    for place, one in enumerate(series):
+        panel = axes[place // columns, place % columns]
+        top = max(top, _pour_panel(panel, one))
+        style.dress(panel, title=_pour_title(one, cost), x="pour", y=cost if place % columns == 0 else "")
+    for extra in range(len(series), rows * columns):
+        axes[extra // columns, extra % columns].set_visible(False)
+    axes[0, 0].set_ylim(0.0, TOP * top or 1.0)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+    return style.save(figure, path)
+
+
+def _pour_title(series: PourSeries, cost: str) -> str:
+    """Receiver, and the best pour: the number that the reader came for, with the unit of the cost's label."""
+    worked = [(loss, number) for number, loss in enumerate(series.losses, start=1) if loss is not None]
+    if not worked:
+        return f"{series.receiver}: every pour failed"
+    loss, number = min(worked)
+    unit = cost.partition("[")[2].rstrip("]")
+    return f"{series.receiver}: best {loss:.3g} {unit} (pour {number})"
+
+
+def _pour_panel(axes: Axes, series: PourSeries) -> float:
+    """Draw one receiver; returns the largest value that must stay in view."""
+    from matplotlib.ticker import MaxNLocator
+
+    numbers = np.arange(1, len(series.losses) + 1)
+    measured = np.array([np.nan if loss is None else loss for loss in series.losses], dtype=float)
+    best = np.array([np.nan if value is None else value for value in series.best_so_far()], dtype=float)
+    mean = np.array([np.nan if p is None else p[0] for p in series.predicted], dtype=float)
+    low = np.array([np.nan if p is None else p[1] for p in series.predicted], dtype=float)
+    high = np.array([np.nan if p is None else p[2] for p in series.predicted], dtype=float)
+    top = float(np.nanmax(measured)) if np.isfinite(measured).any() else 1.0
+    if np.isfinite(mean).any():
+        # Bars, not a ribbon: every pour is another action, there is nothing between two of them.
+        axes.errorbar(
+            numbers,
+            mean,
+            yerr=np.vstack([np.maximum(mean - low, 0.0), np.maximum(high - mean, 0.0)]),
+            fmt="_",
+            markersize=9,
+            markeredgewidth=2.0,
+            elinewidth=6.0,
+            ecolor=(*_rgb(style.PREDICTED), 0.35),
+            color=style.PREDICTED,
+            label=f"predicted: mean, {100 * LEVEL:.0f} % band",
+            zorder=2,
+        )
+        # A first, clueless prediction must not squeeze what was measured into the lowest tenth.
+        top = max(top, min(float(np.nanmax(high)), 2.0 * top))
+        for number, end in zip(numbers, high, strict=True):
+            if end > TOP * top:
+                axes.annotate(
+                    f"{end:.3g}", (float(number), TOP * top), xytext=(7, -2), textcoords="offset points",
+                    va="top", fontsize=8, color=style.GREY, arrowprops=None,
+                )  # fmt: skip
+    axes.step(numbers, best, where="post", color=style.BEST, linewidth=2.0, label="best so far", zorder=3)
+    axes.plot(
+        numbers,
+        measured,
+        "o",
+        color=style.MEASURED,
+        markersize=6.5,
+        markeredgecolor="white",
+        label="measured",
+        zorder=4,
+        clip_on=False,
+    )
+    failed = numbers[np.isnan(measured)]
+    if len(failed):
+        axes.plot(failed, np.full(len(failed), 0.02 * top), "x", color=style.INK, label="failed", zorder=4)
+    axes.set_xlim(0.4, len(numbers) + 0.6)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    return top
+
+
+def _rgb(colour: str) -> tuple[float, float, float]:
+    return (int(colour[1:3], 16) / 255, int(colour[3:5], 16) / 255, int(colour[5:7], 16) / 255)
+
+
+@dataclass(frozen=True)
+class DiscrepancyGroup:
+    """Mean |Δ| of several predictors on the same pours.
+
+    Attributes:
+        name: 'training pours', 'test pours', 'another receiver'.
+        pours: how many.
+        calibrated: of the calibrated simulator θ*.
+        posterior: of the mean of its simulations over draws of θ's posterior; None if there is none.
+        uncalibrated: of the simulator as it is without calibration; None if not scored.
+        random: of the simulator with θ drawn at random, one number each; empty if not scored.
+        mean_predictor: of 'what the training pours spilled on average'; None if not scored.
+        regression: of a GP regression without simulator; None where it can't answer (another vessel).
+    """
+
+    name: str
+    pours: int
+    calibrated: float
+    uncalibrated: float | None = None
+    random: Sequence[float] = ()
+    mean_predictor: float | None = None
+    regression: float | None = None
+    posterior: float | None = None
+
+
+def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: str) -> Path:
+    """Mean |Δ| of θ* and its posterior beside their rivals: uncalibrated, random θ (median, quartiles), mean of
+    training pours, regression.
+
+    Args:
+        path: PNG to write.
+        groups: sets of pours; values are fractions (0 … 1), shown in percent.
+        title: of the figure.
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: no group.
+    """
+    if not groups:
+        raise ValueError("discrepancy figure: no set of pours was scored")
+    figure, axes = style.new_figure(size=(2.2 + 2.5 * len(groups), 4.4))
+    width = 0.17
+    named: set[str] = set()
+    top, left, middles = 0.0, 0.0, []
+    for group in groups:
+        every: list[tuple[str, float | None, str, tuple[float, float] | None]] = [
+            ("calibrated simulator θ*", group.calibrated, style.BEST, None),
+            ("mean over θ's posterior", group.posterior, style.POSTERIOR, None),
+            ("uncalibrated simulator", group.uncalibrated, style.PREDICTED, None),
+            (*_random(group.random),),
+            ("mean of training pours", group.mean_predictor, style.PALE, None),
+            ("GP regression, no simulator", group.regression, style.FALLING, None),
+        ]
+        bars = [(name, value, colour, spread) for name, value, colour, spread in every if value is not None]
+        middles.append(left + 0.5 * (len(bars) - 1) * width)
+        for slot, (name, value, colour, quartiles) in enumerate(bars):
+            x = left + slot * width
+            error = None if quartiles is None else 100 * np.array([[value - quartiles[0]], [quartiles[1] - value]])
+            axes.bar(
+                x,
+                100 * value,
+                width * 0.9,
+                color=colour,
+                yerr=error,
+                ecolor=style.INK,
+                capsize=3,
+                error_kw={"elinewidth": 1.0},
+                label=None if name in named else name,
+            )
+            named.add(name)
+            peak = 100 * (value if quartiles is None else max(value, quartiles[1]))
+            top = max(top, peak)
+            axes.annotate(
+                f"{100 * value:.1f}",
+                (x, peak),
+                xytext=(0, 3),
+                textcoords="offset points",
+                ha="center",
+                fontsize=8.5,
+                color=style.INK,
+                fontweight="bold" if slot == 0 else "normal",
+            )
+        left += (len(bars) + 1.5) * width  # a set of pours takes the room of those who had something to say
+    style.dress(axes, title=title, y="mean |measured − predicted| spillage [%]")
+    axes.set_ylim(0.0, 1.12 * top or 1.0)
+    axes.set_xlim(-1.5 * width, left - width)
+    axes.set_xticks(middles, [f"{g.name}\n{g.pours} pour{'s' * (g.pours != 1)}" for g in groups], fontsize=9.5)
+    axes.tick_params(axis="x", length=0)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+    return style.save(figure, path)
+
+
+def _random(values: Sequence[float]) -> tuple[str, float | None, str, tuple[float, float] | None]:
+    if not len(values):
+        return "random θ", None, style.GREY, None
+    name = "random θ (median, quartiles)" if len(values) > 1 else "random θ (median)"
+    quartiles = (float(np.percentile(values, 25)), float(np.percentile(values, 75))) if len(values) > 1 else None
+    return name, float(np.median(values)), style.GREY, quartiles

@@ -1,0 +1,401 @@
+"""Pictures of a surrogate: the discrepancy over θ, the predicted loss over actions.
+
+The safe window as a picture: the loss over actions with the window in it, and the loss along each dimension.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orchestrator.results import figure_style as style
+from orchestrator.results.loss_units import LossUnit, at_least_nothing
+from orchestrator.strategies.deployment.deployment_result import Deployed, RiskFound
+from orchestrator.strategies.deployment.safe_window import WindowFound
+from sim_engine.search_space import Axis, Space
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Values = Mapping[str, float | None]
+"""Named SI values of one point."""
+
+
+@dataclass(frozen=True)
+class SurrogatePicture:
+    """What a surrogate knows about a cost, ready to be drawn.
+
+    Attributes:
+        title: of the picture.
+        cost: label of the cost with its unit, e.g. 'discrepancy [%]'.
+        space: searched box.
+        points: where the cost was observed, SI.
+        costs: what was observed there, in the unit of `cost`.
+        best: the chosen point, SI; None while there is none.
+        best_name: what it is called: 'θ*', 'best action'.
+        mean: (R, R) surrogate mean over the unit square, row i at the second axis' i-th place; None without a map.
+        deviation: (R, R) its standard deviation.
+        numbers: what to write on the points (pours); None: they are dots (simulations).
+        over: names of the map's two axes; empty: the space has no others.
+        held: values of the other axes at which the map cuts the surrogate, SI.
+        simulated: where simulations were made beside the observed pours, SI.
+        largest: what the cost can be at most; a surrogate that says more is shown as saying that.
+    """
+
+    title: str
+    cost: str
+    space: Space
+    points: Sequence[Values]
+    costs: Sequence[float]
+    best: Values | None = None
+    best_name: str = "θ*"
+    mean: NDArray[np.float64] | None = None
+    deviation: NDArray[np.float64] | None = None
+    numbers: Sequence[int] | None = None
+    over: tuple[str, ...] = ()
+    held: Values = field(default_factory=dict)
+    simulated: Sequence[Values] = ()
+    largest: float = math.inf
+
+    @property
+    def plane(self) -> Space:
+        """The two axes of the map, the first across, the second up."""
+        return Space(tuple(axis for axis in self.space.axes if not self.over or axis.name in self.over))
+
+
+def draw_surrogate(path: Path, picture: SurrogatePicture) -> Path:
+    """Write a surrogate's picture: maps of mean and deviation over two axes; without a map, as `draw_trials`.
+
+    Of more than two axes the map is a cut through the surrogate; the observations, made anywhere, are projected on it.
+
+    Args:
+        path: PNG to write.
+        picture: at least one point or a map.
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: there is nothing to draw.
+    """
+    if not picture.points and picture.mean is None:
+        raise ValueError(f"'{picture.title}': neither a surrogate nor a single observation to draw")
+    mapped = picture.space.dimension == 2 or (picture.mean is not None and picture.space.dimension > 2)
+    return style.save(_maps(picture) if mapped else _slices(picture), path)
+
+
+def draw_trials(path: Path, picture: SurrogatePicture) -> Path:
+    """Write the observed costs against each searched axis, side by side.
+
+    Args:
+        path: PNG to write.
+        picture: at least one point.
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: there is nothing to draw.
+    """
+    if not picture.points:
+        raise ValueError(f"'{picture.title}': not a single observation to draw")
+    return style.save(_slices(picture), path)
+
+
+def _maps(picture: SurrogatePicture) -> Figure:
+    panels: list[tuple[str, NDArray[np.float64] | None]] = [
+        ("mean", picture.mean),
+        ("standard deviation", picture.deviation),
+    ]
+    shown: list[tuple[str, NDArray[np.float64] | None]] = [panel for panel in panels if panel[1] is not None] or [
+        ("observations", None)
+    ]
+    figure, axes = style.new_figure(1, len(shown), size=(5.6 * len(shown), 4.8), squeeze=False)
+    figure.suptitle(picture.title, fontsize=12.5, color=style.INK, x=0.02, ha="left")
+    for place, (name, grid) in enumerate(shown):
+        _map_panel(figure, axes[0, place], picture, name, grid)
+    marked = {name: h for h, name in zip(*axes[0, 0].get_legend_handles_labels(), strict=True)}
+    if marked:
+        figure.legend(marked.values(), marked.keys(), loc="outside upper right", ncols=3, fontsize=9, frameon=False)
+    if notes := _notes(picture):
+        figure.supxlabel("\n".join(notes), fontsize=8.5, color=style.INK, x=0.02, ha="left")
+    return figure
+
+
+def _notes(picture: SurrogatePicture) -> list[str]:
+    """Where the map lies in the box, and whether the best lies at an end of what was searched."""
+    notes = []
+    if picture.held:
+        note = f"others at {picture.best_name}: {style.display_values(dict(picture.held))}"
+        if picture.points:
+            note += f"; the {_things(picture)} were made at any values of them"
+        notes.append(note)
+    if picture.best is not None and (ends := style.at_ends(dict(picture.best), picture.space.axes)):
+        notes.append(f"{picture.best_name} has {' and '.join(ends)}: a wider range may hold a better one")
+    return notes
+
+
+def _map_panel(
+    figure: Figure, axes: Axes, picture: SurrogatePicture, name: str, grid: NDArray[np.float64] | None
+) -> None:
+    x_axis, y_axis = picture.plane.axes
+    # Deviations say how sure the mean is, not how good a place is: another colour map, so that nobody mixes them up.
+    colours = "cividis" if name == "standard deviation" else "viridis"
+    costs = np.asarray(picture.costs, dtype=float)
+    low, high = _limits(np.minimum(costs if grid is None else np.asarray(grid, dtype=float), picture.largest))
+    if grid is not None:
+        mesh = _coloured(axes, picture, np.asarray(grid, dtype=float), colours, low, high)
+        if name == "mean":
+            _contours(axes, picture, np.asarray(grid, dtype=float), low, high)
+    else:
+        mesh = axes.scatter([], [], c=[], cmap=colours, vmin=low, vmax=high)
+    if picture.simulated:
+        places = (_column(picture.simulated, x_axis), _column(picture.simulated, y_axis))
+        axes.scatter(
+            *places,
+            marker="X",
+            s=26,
+            linewidths=0.6,
+            facecolor="white",  # grey lines are lost in the middle of a colour map
+            edgecolor=style.INK,
+            clip_on=False,
+            zorder=3,
+            label="simulation",
+        )
+    # Observations are filled with their own cost on the same scale: where one stands out, the surrogate disagrees.
+    filled: dict[str, Any] = {"c": "white"}
+    if name != "standard deviation":
+        filled = {"c": np.minimum(costs, picture.largest), "cmap": colours, "vmin": low, "vmax": high}
+    _observed(
+        axes, picture, filled, np.full(len(costs), name != "standard deviation") & (costs < 0.6 * low + 0.4 * high)
+    )
+    if picture.best is not None:
+        _mark_best(axes, picture, x_axis, y_axis)
+    style.dress(
+        axes, title=_panel_title(name, picture), x=style.label(x_axis.name), y=style.label(y_axis.name), grid=None
+    )
+    style.frame(axes, x_axis, "x")
+    style.frame(axes, y_axis, "y")
+    _bar(figure, axes, mesh, picture.cost if name != "standard deviation" else f"± {picture.cost}")
+
+
+def _coloured(
+    axes: Axes, picture: SurrogatePicture, values: NDArray[np.float64], colours: str, low: float, high: float
+) -> Any:
+    """The grid in its own range: single observations, far noisier, would flatten it."""
+    x_axis, y_axis = picture.plane.axes
+    places = np.linspace(0.0, 1.0, values.shape[0])
+    beyond: Any = "max" if values.max() > high + 1e-9 * (high - low) else "neither"
+    return axes.contourf(
+        _decode(x_axis, places),
+        _decode(y_axis, places),
+        np.maximum(values, low),
+        levels=np.linspace(low, high, 25),
+        cmap=colours,
+        extend=beyond,
+    )
+
+
+def _contours(axes: Axes, picture: SurrogatePicture, values: NDArray[np.float64], low: float, high: float) -> None:
+    x_axis, y_axis = picture.plane.axes
+    places = np.linspace(0.0, 1.0, values.shape[0])
+    axes.contour(
+        _decode(x_axis, places),
+        _decode(y_axis, places),
+        values,
+        levels=np.linspace(low, high, 9)[1:-1],
+        colors="white",
+        linewidths=0.5,
+        alpha=0.6,
+    )
+
+
+def _observed(axes: Axes, picture: SurrogatePicture, filled: Mapping[str, Any], dark: NDArray[np.bool_]) -> None:
+    """Dots, or numbered discs; whole ones, also at the edge."""
+    if not len(picture.points):
+        return
+    xs, ys = (_column(picture.points, axis) for axis in picture.plane.axes)
+    size = 26 if picture.numbers is None else 130
+    edge = style.INK if isinstance(filled["c"], str) else "white"
+    name = "simulation" if picture.numbers is None else "pour"
+    axes.scatter(xs, ys, s=size, edgecolors=edge, linewidths=1.0, zorder=5, clip_on=False, label=name, **filled)
+    for number, x, y, inked in zip(picture.numbers or (), xs, ys, ~dark, strict=False):
+        colour = style.INK if inked else "white"
+        axes.text(x, y, str(number), ha="center", va="center", fontsize=6.5, fontweight="bold", color=colour, zorder=6)
+
+
+def _bar(figure: Figure, axes: Axes, mesh: Any, label: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    bar = figure.colorbar(mesh, ax=axes, fraction=0.05, pad=0.03)
+    bar.set_label(label, fontsize=9)
+    bar.ax.tick_params(labelsize=8)
+    bar.outline.set_visible(False)
+    bar.locator = MaxNLocator(6)
+    bar.update_ticks()
+
+
+def _panel_title(name: str, picture: SurrogatePicture) -> str:
+    match name:
+        case "mean":
+            return f"surrogate mean, {len(picture.points)} {_things(picture)}"
+        case "standard deviation":
+            return "its standard deviation"
+        case _:
+            return f"{len(picture.points)} {_things(picture)}"
+
+
+def _things(picture: SurrogatePicture) -> str:
+    return "simulations" if picture.numbers is None else "pours"
+
+
+def _mark_best(axes: Axes, picture: SurrogatePicture, x_axis: Axis, y_axis: Axis) -> None:
+    assert picture.best is not None
+    x, y = _column([picture.best], x_axis)[0], _column([picture.best], y_axis)[0]
+    # Above the map and below the numbers: where the best action was poured, its pour can still be read.
+    axes.scatter(
+        [x], [y], marker="*", s=560, color=style.BEST, edgecolors="white", linewidths=1.3, zorder=4, clip_on=False,
+        label=picture.best_name,
+    )  # fmt: skip
+
+
+def _slices(picture: SurrogatePicture) -> Figure:
+    """One or more than two axes: the cost against each of them, the other axes wherever they were."""
+    count = picture.space.dimension
+    figure, axes = style.new_figure(1, count, size=(max(5.4, 3.4 * count), 4.1), squeeze=False, sharey=True)
+    figure.suptitle(picture.title, fontsize=12.5, color=style.INK, x=0.02, ha="left")
+    for place, axis in enumerate(picture.space.axes):
+        panel = axes[0, place]
+        panel.scatter(
+            _column(picture.points, axis),
+            picture.costs,
+            s=26,
+            color=style.MEASURED,
+            alpha=0.75,
+            edgecolors="white",
+            linewidths=0.5,
+            clip_on=False,
+            zorder=3,
+            label="pour" if picture.numbers is not None else "simulation, the other parameters at any values",
+        )
+        if picture.best is not None:
+            x = _column([picture.best], axis)[0]
+            panel.axvline(x, color=style.BEST, linewidth=1.8, label=picture.best_name)
+        style.dress(panel, x=style.label(axis.name), y=picture.cost if place == 0 else "")
+        style.frame(panel, axis, "x")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+    return figure
+
+
+def _decode(axis: Axis, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    # Not Axis.decode for whole numbers: rounding would fold the grid's lines onto each other.
+    smooth = Axis(axis.name, axis.lower, axis.upper, axis.scale)
+    return np.array([smooth.decode(u) for u in places]) / style.display_factor(axis.name)
+
+
+def _column(points: Sequence[Values], axis: Axis) -> NDArray[np.float64]:
+    factor = style.display_factor(axis.name)
+    return np.array([float(point[axis.name] or 0.0) / factor for point in points], dtype=float)
+
+
+def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Colour range of the values, never empty."""
+    low, high = float(np.min(values)), float(np.max(values))
+    return (low, high) if high - low > 1e-12 else (low - 0.5, low + 0.5)
+
+
+def draw_window(
+    path: Path, result: Deployed, picture: SurrogatePicture | None, *, unit: LossUnit, receiver: str
+) -> Path:
+    """A loss map with action and window, where there is one, and a panel for each dimension: what the surrogate
+    expects along it, what the checks came to, the tolerance.
+
+    Args:
+        path: PNG to write.
+        result: of a deployment, with its window and what it recommends.
+        picture: its loss map.
+        unit: of the loss.
+        receiver: for the title.
+
+    Returns:
+        `path`.
+
+    Raises:
+        ValueError: no window was looked for, or nothing is recommended.
+    """
+    if result.window is None or result.recommended is None:
+        raise ValueError("safe window: none was looked for")
+    window, action = result.window, result.recommended.action_si
+    names, mapped = list(window.outline), picture is not None and picture.mean is not None
+    count = len(names) + mapped
+    figure, axes = style.new_figure(1, count, size=(4.3 * count, 4.1), squeeze=False)
+    measure = _measure(result.risk)
+    figure.suptitle(f"Safe window: {receiver}, {measure}", fontsize=12.5, color=style.INK, x=0.02, ha="left")
+    if picture is not None and mapped:
+        _window_map_panel(axes[0, 0], picture, window, unit)
+    for panel, name in zip(axes[0, count - len(names) :], names, strict=True):
+        _profile(panel, name, window, action[name], unit)
+        style.dress(panel, x=style.label(name), y=unit.label)
+    handles, labels = axes[0, -1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8.5, frameon=False)
+    return style.save(figure, path)
+
+
+def _measure(risk: RiskFound | None) -> str:
+    if risk is None:
+        return "executed exactly but for one dimension"
+    if risk.measure == "cvar":
+        return f"CVaR {100 * risk.level:g} % under errors of execution"
+    return "expected under errors of execution"
+
+
+def _window_map_panel(axes: Axes, picture: SurrogatePicture, window: WindowFound, unit: LossUnit) -> None:
+    across, up = picture.plane.axes
+    assert picture.mean is not None
+    mean, places = np.asarray(picture.mean), np.linspace(0.0, 1.0, len(picture.mean))
+    xs, ys = (np.array([axis.decode(u) for u in places]) / style.display_factor(axis.name) for axis in (across, up))
+    mesh = axes.contourf(xs, ys, mean, levels=20, cmap="viridis")
+    axes.figure.colorbar(mesh, ax=axes, fraction=0.05, pad=0.02).ax.tick_params(labelsize=8)
+    axes.contour(xs, ys, mean, levels=[unit.factor * window.tolerance], colors="white", linewidths=1.3)
+    if picture.best is not None:
+        x, y = (float(picture.best[a.name] or 0.0) / style.display_factor(a.name) for a in (across, up))
+        for name, ends in window.axes.items():
+            low, high = (end / style.display_factor(name) for end in (ends.low, ends.high))
+            if name == across.name:
+                axes.plot([low, high], [y, y], color=style.BEST, linewidth=3.0, solid_capstyle="butt", clip_on=False)
+            elif name == up.name:
+                axes.plot([x, x], [low, high], color=style.BEST, linewidth=3.0, solid_capstyle="butt", clip_on=False)
+        axes.scatter(
+            [x], [y], marker="*", s=230, color=style.BEST, edgecolors="white", linewidths=1.2, zorder=5, clip_on=False
+        )
+    style.dress(axes, title=f"{unit.label}, contour at the tolerance", x=style.label(across.name), grid=None)
+    axes.set_ylabel(style.label(up.name), fontsize=9.5, color=style.INK)
+
+
+def _profile(axes: Axes, name: str, window: WindowFound, best: float, unit: LossUnit) -> None:
+    factor, tolerance = style.display_factor(name), unit.factor * window.tolerance
+    along = window.outline[name]
+    expected = [unit.factor * at_least_nothing(loss) for loss in along.expected]
+    axes.plot(np.array(along.values) / factor, expected, color=style.PREDICTED, label="surrogate", zorder=2)
+    axes.axhline(tolerance, color=style.GREY, linewidth=1.0, linestyle="--", label="tolerance")
+    axes.axvline(best / factor, color=style.BEST, linewidth=1.4, label="action")
+    if name in window.axes:
+        ends = window.axes[name]
+        axes.axvspan(ends.low / factor, ends.high / factor, color=style.GOOD, alpha=0.16, label="safe window")
+    top = 4.0 * tolerance
+    for inside, colour, marker in ((True, style.GOOD, "o"), (False, style.SPILLED, "X")):
+        checks = [c for c in window.checks if c.inside is inside and c.axis in (None, name)]
+        losses = [top if c.loss is None else unit.factor * c.loss for c in checks]
+        top = max([top, *losses]) if losses else top
+        said = "simulated, inside" if inside else "simulated, outside"
+        places = [c.action_si[name] / factor for c in checks]
+        axes.plot(places, losses, marker, color=colour, markeredgecolor="white", markersize=8, label=said, zorder=4)
+    axes.set_ylim(0.0, 1.08 * min(top, max([*expected, 4.0 * tolerance])))

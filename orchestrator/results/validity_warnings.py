@@ -1,0 +1,159 @@
+"""What a campaign's pours call for and the simulator lacks, for people and for summaries. Warnings, never errors."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from orchestrator.journal.stage_results import Results
+from orchestrator.results import figure_style as style
+from orchestrator.results.stage_views import deployments_of, recommended_theta_of
+from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan
+from sim_engine.action import Action
+from sim_engine.model_validity import ModelValidity, NotCovered, regimes
+from sim_engine.scene import Scene
+from sim_engine.search_space import Space
+from sim_engine.simulator import spacing
+from sim_engine.vessel.vessel import build_vessel
+
+MOST_CORNERS = 32
+"""A space of many dimensions has too many corners to try them all."""
+
+_vessel = lru_cache(maxsize=16)(build_vessel)
+
+
+@dataclass(frozen=True)
+class SpaceWarning:
+    """Something that is not simulated in part of an action space.
+
+    Attributes:
+        worst: of the actions tried, the one with the largest share.
+        values: searched values of that action [SI].
+        hit, tried: actions that it holds for, and all of them.
+    """
+
+    worst: NotCovered
+    values: dict[str, float]
+    hit: int
+    tried: int
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        at = style.display_values(dict(self.values))
+        return f"{self.worst.text} (at {at}; {self.hit} of {self.tried} actions tried)"
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON-ready mapping."""
+        return {**self.worst.as_json(), "action_si": self.values, "hit": self.hit, "tried": self.tried}
+
+
+def regimes_of(scene: Scene, action: Action, particles: float) -> ModelValidity:
+    """What one action is like.
+
+    Args:
+        particles: of a simulation of it.
+
+    Raises:
+        ValueError, OSError: its vessels can't be built, or don't hold the load.
+    """
+    distance = spacing(scene.liquid.volume, max(round(particles), 1))
+    return regimes(scene, action, _vessel(scene.pourer), _vessel(scene.receiver), spacing=distance)
+
+
+def space_warnings(scene: Scene, actions: Space, particles: float) -> list[SpaceWarning]:
+    """What is not simulated at the middle and the corners of an action space, each kind once.
+
+    Raises:
+        ValueError, OSError: as `regimes_of`.
+    """
+    corners = itertools.islice(itertools.product((0.0, 1.0), repeat=actions.dimension), MOST_CORNERS)
+    tried = [actions.decode(point) for point in ((0.5,) * actions.dimension, *corners)]
+    found: dict[str, list[tuple[NotCovered, dict[str, float]]]] = {}
+    for values in tried:
+        for one in regimes_of(scene, scene.action(values), particles).not_covered:
+            found.setdefault(one.kind, []).append((one, values))
+    warnings = []
+    for hits in found.values():
+        worst, values = max(hits, key=lambda hit: hit[0].share)
+        warnings.append(SpaceWarning(worst, values, len(hits), len(tried)))
+    return warnings
+
+
+def campaign_warnings(plan: CampaignPlan) -> dict[str, list[SpaceWarning]]:
+    """What is not simulated in a campaign's action spaces, by scene; scenes without warnings are left out.
+
+    Where calibration searches the number of particles, the middle of its range counts.
+
+    Raises:
+        ValueError, OSError: as `regimes_of`.
+    """
+    spaces: list[tuple[Scene, Space, float]] = []
+    particles = float(plan.parameters.particles)
+    if plan.calibration is not None:
+        particles = _middle(plan.calibration, particles)
+        spaces += [(scene, plan.calibration.actions, particles) for scene in plan.calibration.scenes]
+    if plan.deployment is not None:
+        spaces += [(scene, plan.deployment.actions, particles) for scene in plan.deployment.scenes]
+    found = {scene.name: space_warnings(scene, actions, n) for scene, actions, n in spaces}
+    return {name: warnings for name, warnings in found.items() if warnings}
+
+
+def best_action_warnings(plan: CampaignPlan, results: Results) -> dict[str, list[NotCovered]]:
+    """What is not simulated of the action that each deployment recommends, by scene.
+
+    Raises:
+        ValueError, OSError: as `regimes_of`.
+    """
+    particles = (recommended_theta_of(results) or plan.parameters).particles
+    scenes = {} if plan.deployment is None else {scene.name: scene for scene in plan.deployment.scenes}
+    found = {}
+    for name, result in deployments_of(results).items():
+        if name in scenes and result.recommended is not None:
+            action = scenes[name].action(dict(result.recommended.action_si))
+            found[name] = list(regimes_of(scenes[name], action, particles).not_covered)
+    return found
+
+
+def lines(warnings: Mapping[str, Sequence[SpaceWarning]], names: Mapping[str, str]) -> list[str]:
+    """Warnings of a campaign for the terminal.
+
+    Args:
+        names: what people call the scenes.
+    """
+    if not warnings:
+        return []
+    found = ["not simulated (docs/user-guide.md tells what to do about it):"]
+    for scene, several in warnings.items():
+        found += [f"  into {names.get(scene, scene)}, {one.worst.kind}: {one.text}" for one in several]
+    return found
+
+
+def numbers_line(found: ModelValidity) -> str:
+    """Dimensionless numbers of a pour in one line: 'lip: Re 880 … 4 500, We 3 … 26, …; stream: …'."""
+    if found.lip is None or found.stream is None:
+        return "nothing leaves the pourer, as far as hydrostatics tells"
+    parts = []
+    for place, numbers in (("lip", found.lip), ("stream", found.stream)):
+        ranges = (("Re", numbers.reynolds), ("We", numbers.weber), ("Bo", numbers.bond))
+        shown = (f"{name} {_number(r.smallest)} … {_number(r.largest)}" for name, r in ranges)
+        parts.append(f"{place}: {', '.join(shown)}")
+    return "; ".join(parts)
+
+
+def _number(value: float) -> str:
+    """Two digits that mean something: '0.47', '5.2', '1 500'."""
+    if value < 100.0:
+        return f"{value:.2g}"
+    digits = 10 ** (len(str(int(value))) - 2)
+    return f"{round(value / digits) * digits:,}".replace(",", " ")
+
+
+def _middle(calibration: CalibrationPlan, otherwise: float) -> float:
+    for axis in calibration.parameters.axes:
+        if axis.name == "particles":
+            return axis.decode(0.5)
+    return calibration.fixed_parameters.get("particles", otherwise)

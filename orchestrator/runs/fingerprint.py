@@ -1,0 +1,63 @@
+"""What of a plan decides which requests are made: a run may only be resumed with the same.
+
+Everything does, but for fields that say otherwise where they are declared (`sim_engine.settings.model`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel
+
+from orchestrator.journal.codec import to_json
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.liquids import Liquid
+from sim_engine.scene import Scene
+from sim_engine.settings.model import BY_CONTENT, FREE, marks_of
+from sim_engine.vessel.shapes import ProfileShape
+
+
+def fingerprint(plan: CampaignPlan) -> dict[str, Any]:
+    """JSON-ready copy of everything that matters; meshes by content, so that the project may be moved.
+
+    Raises:
+        OSError: a mesh file can't be read.
+    """
+    return dict(deciding(plan))
+
+
+def scene_by_content(scene: Scene) -> dict[str, Any]:
+    """A scene as fingerprints have it: comparable with one in the header of a journal.
+
+    Raises:
+        OSError: a mesh file can't be read.
+    """
+    return dict(deciding(scene))
+
+
+def deciding(value: Any) -> Any:
+    """What of a value decides requests, JSON-ready.
+
+    Raises:
+        OSError: a file that matters by its content can't be read.
+        CodecError: it holds something that JSON can't.
+    """
+    if isinstance(value, BaseModel) or (dataclasses.is_dataclass(value) and not isinstance(value, type)):
+        free = value.free_fields() if isinstance(value, Liquid | ProfileShape) else frozenset()
+        fields = {
+            name: (getattr(value, name), mark)
+            for name, mark in marks_of(type(value)).items()
+            if mark != FREE and name not in free
+        }
+        return {
+            name: hashlib.sha256(found.read_bytes()).hexdigest() if mark == BY_CONTENT else deciding(found)
+            for name, (found, mark) in fields.items()
+        }
+    if isinstance(value, Mapping):
+        return {key: deciding(found) for key, found in value.items()}
+    if isinstance(value, list | tuple):
+        return [deciding(found) for found in value]
+    return to_json(value)

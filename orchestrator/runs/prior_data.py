@@ -1,0 +1,176 @@
+"""Pours weighed before a campaign: read from a former run's journal, and held against the scene they enter."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from orchestrator.journal.codec import decode_outcome, decode_request
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.stage_results import Results, decode_results
+from orchestrator.requests import Pour, Poured
+from orchestrator.runs.fingerprint import scene_by_content
+from orchestrator.strategies.calibration.pour_design import DesignPoured
+from orchestrator.strategies.campaign_plan import RecordedPour
+from orchestrator.strategies.strategy import is_sound
+from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
+from sim_engine.outcome import PourMeasurement
+from sim_engine.scene import Scene
+from sim_engine.search_space import Space
+
+SAME = 1e-6
+"""Largest difference [SI] between two values of a dimension that are called the same."""
+
+
+@dataclass(frozen=True)
+class PreviousRun:
+    """What a run poured.
+
+    Attributes:
+        path: of its journal.
+        mode: of its laboratory, 'virtual' or 'hardware'.
+        scenes: by name, as they are in the journal's header.
+        pours: (scene, pour) in the order in which they were made; failed ones are left out.
+    """
+
+    path: Path
+    mode: str
+    scenes: dict[str, Mapping[str, Any]]
+    pours: tuple[tuple[str, RecordedPour], ...]
+
+
+def read_former_run(directory: Path) -> PreviousRun:
+    """Read the weighed pours of a run, also of one that was never finished.
+
+    Pours made for calibration keep their split where the run finished making them; all others are 'train'.
+
+    Raises:
+        JournalError: there is no run, or it was written by another version.
+        CodecError: what stands in it can't be read.
+    """
+    path = directory / JOURNAL_NAME
+    with JournalReader(path) as journal:
+        requests: dict[int, tuple[str, Pour]] = {}
+        weighed: list[tuple[str, Pour, PourMeasurement]] = []
+        for entry in journal.entries(kinds=[Kind.REQUESTED, Kind.POUR_FINISHED]):
+            if entry.kind == Kind.REQUESTED:
+                request = decode_request(entry.body["request"])
+                if isinstance(request, Pour):
+                    requests[entry.body["id"]] = (entry.stage, request)
+            elif isinstance(outcome := decode_outcome(entry.body["outcome"]), Poured) and is_sound(
+                outcome.measurement.fractions
+            ):
+                weighed.append((*requests[entry.body["id"]], outcome.measurement))
+        splits = _splits(decode_results(journal.stage_results()))
+        header = journal.header.fingerprint
+    pours = tuple(
+        (pour.scene, _recorded(pour.action, measured, splits.get((stage, pour.number), "train")))
+        for stage, pour, measured in weighed
+    )
+    mode = str(header.get("laboratory", {}).get("mode", "virtual"))
+    return PreviousRun(path, mode, {scene["name"]: scene for scene in scenes_in(header)}, pours)
+
+
+def _recorded(action: Action, measured: PourMeasurement, split: str) -> RecordedPour:
+    return RecordedPour(action, measured.loaded - measured.retained, measured.spilled, measured.retained, split)
+
+
+def _splits(results: Results) -> dict[tuple[str, int], str]:
+    """Stage and number of a designed pour → what it was kept for."""
+    return {
+        (stage, pour.number): pour.split
+        for stage, result in results.items()
+        if isinstance(result, DesignPoured)
+        for pour in result.pours
+    }
+
+
+def scenes_in(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """The scenes of a run, as they are in its journal's header (a fingerprint)."""
+    calibration, deployment = header.get("calibration") or {}, header.get("deployment") or {}
+    if calibration:
+        yield calibration["scene"]
+        yield from (*calibration.get("further", ()), *calibration.get("tested", ()))
+    for records in (calibration.get("records"), calibration.get("transfer")):
+        if records:
+            yield records["scene"]
+    yield from deployment.get("scenes", ())
+
+
+def pours_in(run: PreviousRun, scene: Scene) -> tuple[list[RecordedPour], str]:
+    """The run's pours in the same scene: vessels by their shapes, liquid, pivot; and why there are none."""
+    ours = scene_by_content(scene)
+    differences = {name: _difference(theirs, ours) for name, theirs in run.scenes.items()}
+    same = {name for name, difference in differences.items() if not difference}
+    pours = [pour for name, pour in run.pours if name in same]
+    if pours:
+        return pours, ""
+    if same:
+        return [], f"poured nothing in the scene '{', '.join(sorted(same))}'"
+    nearest = min(differences.values(), key=len, default=["it has no scene"])
+    return [], f"poured in another scene: {'; '.join(nearest)}"
+
+
+def _difference(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
+    found = []
+    for role in ("pourer", "receiver"):
+        if theirs[role]["shape"] != ours[role]["shape"]:
+            found.append(f"its {role} '{theirs[role]['name']}' is not shaped as '{ours[role]['name']}'")
+    for name, unit, factor in (("mass", "g", 1e3), ("density", "kg/m^3", 1.0)):
+        there, here = theirs["liquid"][name], ours["liquid"][name]
+        if not math.isclose(there, here, rel_tol=1e-6):
+            found.append(f"its liquid has {there * factor:g} {unit}, here {here * factor:g} {unit}")
+    for name in ("pivot", "hold_cap"):
+        if theirs.get(name) != ours[name]:
+            found.append(f"its motion.{name} is another one")
+    return found
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """Pours that a strategy may learn from.
+
+    Attributes:
+        pours: inside the searched box, and in all else as the scene has it.
+        left_out: why others are not, one text each.
+    """
+
+    pours: tuple[RecordedPour, ...]
+    left_out: tuple[str, ...]
+
+
+def fitting(pours: Sequence[RecordedPour], scene: Scene, actions: Space) -> Fitting:
+    """Those pours that the action space could have asked for."""
+    reasons = [_unfit(pour.action, scene, actions) for pour in pours]
+    counted = Counter(reason for reason in reasons if reason)
+    return Fitting(
+        tuple(pour for pour, reason in zip(pours, reasons, strict=True) if not reason),
+        tuple(f"{count} pour{'s' * (count > 1)}: {reason}" for reason, count in counted.items()),
+    )
+
+
+def _unfit(action: Action, scene: Scene, actions: Space) -> str:
+    usual = scene.action(actions.decode([0.5] * actions.dimension))
+    axes = {axis.name: axis for axis in actions.axes}
+    for name, dimension in ACTION_DIMENSIONS.items():
+        value = getattr(action, name)
+        if name in axes:
+            axis = axes[name]
+            slack = 1e-9 * (axis.upper - axis.lower)
+            if value is None or not axis.lower - slack <= value <= axis.upper + slack:
+                bounds = f"{_shown(axis.lower, dimension)} … {_shown(axis.upper, dimension)}"
+                return f"{name} {'is switched off' if value is None else 'is outside ' + bounds}"
+            continue
+        here = getattr(usual, name)
+        same = value is here if value is None or here is None else abs(value - here) <= SAME
+        if not same:
+            return f"{name} was {_shown(value, dimension)}, here it is {_shown(here, dimension)}"
+    return ""
+
+
+def _shown(value: float | None, dimension: Dimension) -> str:
+    return dimension.switched_off if value is None else f"{value / dimension.factor:g} {dimension.display_unit}"

@@ -1,0 +1,254 @@
+"""How one request is run on the laboratory: scenes, deadlines, and what counts as an answer.
+
+Three lanes: the real one of width one (there is one arm), the optimiser's of width one, and that of simulations, whose
+width is the number of free slots that strategies are shown.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from actors.interfaces import (
+    Bench,
+    BenchLostError,
+    InvalidActionError,
+    Laboratory,
+    LaboratoryError,
+    NotPouredError,
+    ProgressCallback,
+    SimulationError,
+    SimulatorPool,
+    UnknownPourError,
+)
+from orchestrator.requests import Failed, Outcome, Pour, Poured, Simulate, Simulated, Suggest, Suggested
+from orchestrator.run_errors import RunError
+from orchestrator.runs.speculation import SpeculativeExecution
+from sim_engine.outcome import RecordedFrames
+from sim_engine.scene import PourTask, Scene
+
+
+class RequestExecutorError(RunError):
+    """The laboratory can't serve the campaign any longer, or was asked for something it can't know.
+
+    Attributes:
+        problem: what is wrong, without what to do about a run that can be resumed.
+    """
+
+    def __init__(self, problem: str, way_on: str = "") -> None:
+        super().__init__(problem + way_on)
+        self.problem = problem
+
+
+class PourNotMadeError(RequestExecutorError):
+    """A pour did not begin, and somebody has to see to that: nothing is lost, and resuming asks for it again."""
+
+    exit_code = 3
+
+
+class PourUnknownError(RequestExecutorError):
+    """A pour began and broke off: a person has to say what came of it."""
+
+    exit_code = 3
+
+
+SUGGESTIONS = 3
+"""How often the optimiser is asked one question: it is idempotent, and a process may die of bad luck."""
+
+
+@dataclass(frozen=True)
+class Deadlines:
+    """When a request that has not answered is given up [s of wall time].
+
+    Attributes:
+        simulate: time in the pool's queue included. A pour of 50 000 particles takes minutes on one core; half an
+            hour means that the pool is dead, not slow.
+        suggest: for one answer; a fit to some hundred points takes seconds. Longer than the optimiser's own deadline
+            (`actors.optimizer.optimizer_actor`), since only that replaces a process that hangs.
+        pour: 90 s in a laboratory, but an operator may be fetched from another room for each of its steps, and these
+            have deadlines of their own. After it the outcome is not waited for: nobody knows it, and a person is asked.
+        pour_grace: how long a pause waits for a pour that has begun.
+        cleanup: how long cancelled requests may take to let go.
+    """
+
+    simulate: float = 1800.0
+    suggest: float = 700.0
+    pour: float = 6.0 * 3600.0
+    pour_grace: float = 300.0
+    cleanup: float = 20.0
+
+
+class RequestExecutor:
+    """Runs requests on a laboratory; turns what may go wrong with one of them into its outcome."""
+
+    def __init__(
+        self, laboratory: Laboratory, scenes: Mapping[str, Scene], deadlines: Deadlines, record_rate: float
+    ) -> None:
+        self._laboratory = laboratory
+        self._scenes = scenes
+        self.deadlines = deadlines
+        self._record_rate = record_rate
+        self._real = asyncio.Lock()
+        self._optimiser = asyncio.Lock()
+        self.ahead = SpeculativeExecution(self._foreseen, laboratory.simulators.size)
+
+    async def _foreseen(self, request: Simulate) -> Outcome:
+        return (await self._simulated(request))[0]
+
+    async def simulate(
+        self, request: Simulate, *, record: bool, started: Callable[[], None]
+    ) -> tuple[Outcome, RecordedFrames | None]:
+        """Run a simulation.
+
+        Args:
+            record: whether frames are kept; changes nothing about the outcome. Those made ahead have none.
+            started: called when it is handed to the pool.
+        """
+        if not record and self.ahead.knows(request):
+            started()
+            if (foreseen := await self.ahead.take(request)) is not None:
+                return foreseen, None
+        else:
+            started()
+        with self.ahead.asked_for():
+            return await self._simulated(request, record=record)
+
+    async def _simulated(self, request: Simulate, *, record: bool = False) -> tuple[Outcome, RecordedFrames | None]:
+        rate = self._record_rate if record else 0.0
+        scene = self._scene(request.scene)
+        task = PourTask(
+            scene.drawn(request.seed) if request.drawn_shapes else scene,
+            request.action,
+            request.parameters,
+            request.seed,
+            record_rate=rate,
+            pose_error=request.pose_error,
+        )
+        try:
+            async with asyncio.timeout(self.deadlines.simulate):
+                result = await self._laboratory.simulators.simulate(task)
+        except InvalidActionError as error:
+            return Failed("invalid_action", str(error)), None
+        except SimulationError as error:
+            _raise_if_cancelled()
+            return Failed("simulation", str(error)), None
+        except TimeoutError:
+            return Failed("simulation", f"no result within {self.deadlines.simulate:g} s"), None
+        if result.outcome.invalid is not None:
+            return Failed("simulation", result.outcome.invalid), result.frames
+        return Simulated(result.outcome), result.frames
+
+    async def pour(
+        self,
+        request: Pour,
+        *,
+        started: Callable[[], None],
+        withdrawn: Callable[[str], None] = lambda reason: None,
+        progress: ProgressCallback,
+    ) -> Outcome:
+        """Pour once.
+
+        Args:
+            started: called when nothing stands between the request and the arm any more; must have made a durable
+                record of it when it returns.
+            withdrawn: called when the bench says that nothing was poured, with the reason; likewise.
+            progress: handed to the bench.
+
+        Raises:
+            LaneError: there is no bench, or it was lost during the pour, whose outcome nobody knows then.
+            PourNotMadeError: nothing was poured.
+            PourUnknownError: nobody knows what was poured; so it is of a pour that has not been weighed in time.
+            BenchLostError: it was lost before.
+        """
+        bench, scene = self.bench, self._scene(request.scene)
+        async with self._real:
+            started()
+            try:
+                async with asyncio.timeout(self.deadlines.pour):
+                    measurement = await bench.pour(scene, request.action, seed=request.seed, progress=progress)
+            except InvalidActionError as error:
+                return Failed("invalid_action", str(error))
+            except NotPouredError as error:
+                withdrawn(str(error))
+                _raise_if_cancelled()
+                raise PourNotMadeError(str(error), "; see to it, then resume the run") from error
+            except UnknownPourError as error:
+                _raise_if_cancelled()
+                raise PourUnknownError(str(error), "; resuming asks what came of it") from error
+            except BenchLostError as error:
+                # No outcome: a person has to look, and there is nothing left to pour with.
+                _raise_if_cancelled()
+                raise RequestExecutorError(
+                    f"{error}; what was poured is unknown: see to the bench", ", then resume the run"
+                ) from error
+            except LaboratoryError as error:
+                _raise_if_cancelled()
+                return Failed("pour_failed", str(error))
+            except TimeoutError:
+                raise PourUnknownError(
+                    f"the pour had begun and was not weighed within {_duration(self.deadlines.pour)}; the bench was "
+                    "told to stop, and what was poured is unknown",
+                    "; see to the bench. Resuming asks what came of it",
+                ) from None
+        return Poured(measurement)
+
+    async def suggest(
+        self, request: Suggest, *, started: Callable[[], None], retrying: Callable[[str], None]
+    ) -> Outcome:
+        """Ask the optimiser, up to `SUGGESTIONS` times. Nobody below asks again of their own accord.
+
+        Raises:
+            LaneError: it failed each time, or its machine is gone. Nothing is made up in its place.
+        """
+        async with self._optimiser:
+            started()
+            for attempt in range(1, SUGGESTIONS + 1):
+                try:
+                    async with asyncio.timeout(self.deadlines.suggest):
+                        return Suggested(await self._laboratory.optimizer.suggest(request.problem))
+                except Exception as error:
+                    reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+                    if attempt == SUGGESTIONS or isinstance(error, BenchLostError):
+                        times = "once" if attempt == 1 else f"{attempt} times"
+                        raise RequestExecutorError(
+                            f"the optimiser was asked the same question {times} and failed each time ({reason})",
+                            "; nothing is lost: mend the cause and resume the run",
+                        ) from error
+                    retrying(f"the optimiser failed ({reason}); it is asked again, for the {_ORDINAL[attempt]} time")
+        raise AssertionError("unreachable")
+
+    @property
+    def simulators(self) -> SimulatorPool:
+        """The pool that simulations run on."""
+        return self._laboratory.simulators
+
+    @property
+    def bench(self) -> Bench:
+        """The bench. Raises LaneError if there is none."""
+        if self._laboratory.bench is None:
+            raise RequestExecutorError(
+                "a pour is asked for, but this laboratory has no bench; add one to the laboratory's file"
+            )
+        return self._laboratory.bench
+
+    def _scene(self, name: str) -> Scene:
+        try:
+            return self._scenes[name]
+        except KeyError:
+            known = ", ".join(sorted(self._scenes)) or "none"
+            raise RequestExecutorError(f"a request names the scene '{name}', but the plan has {known}") from None
+
+
+_ORDINAL = {1: "second", 2: "third"}
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds / 3600.0:g} h" if seconds >= 3600.0 else f"{seconds:g} s"
+
+
+def _raise_if_cancelled() -> None:
+    """An error that comes of our own cancelling says nothing about the request: it has no outcome."""
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError

@@ -1,0 +1,337 @@
+"""Runs the stages of a campaign on a laboratory, and resumes them."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from actors.interfaces import Laboratory, Notice, Telling
+from orchestrator.journal.disk_reserve import NoSpaceError
+from orchestrator.journal.journal import JOURNAL_NAME, Journal, Kind
+from orchestrator.journal.journal_file import Header, JournalError
+from orchestrator.journal.run_record import CampaignResult, read_result
+from orchestrator.journal.stage_results import Results, decode_results
+from orchestrator.run_errors import RunError
+from orchestrator.runs.events import (
+    CampaignClosed,
+    CampaignOpened,
+    CampaignStateChanged,
+    LogLine,
+    MadeAhead,
+    StageClosed,
+    StageOpened,
+    Watcher,
+    Watchers,
+)
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.runs.replay import StageHistory, read_history, replayed_events
+from orchestrator.runs.request_executor import Deadlines, RequestExecutor, RequestExecutorError
+from orchestrator.runs.run_folder import write_provenance
+from orchestrator.runs.speculative_requests import RequestForecast
+from orchestrator.runs.stage_scheduler import StageScheduler
+from orchestrator.runs.stages import StageDefinition, scenes_of, stage_seed, stages_of
+from orchestrator.runs.unknown_pours import (
+    AskOperator,
+    OperatorNeededError,
+    settle_open_questions,
+    settle_unknown_pours,
+)
+from orchestrator.states import RESTING, State, check_transition
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.stage_result import StageResult
+
+
+async def run_campaign(
+    plan: CampaignPlan,
+    laboratory: Laboratory,
+    run_directory: Path,
+    *,
+    resume: bool = False,
+    watchers: Sequence[Watcher] = (),
+    ask_operator: AskOperator | None = None,
+    stages: Sequence[StageDefinition] | None = None,
+    deadlines: Deadlines | None = None,
+) -> CampaignResult:
+    """Run a campaign to its end, or go on with one.
+
+    Cancelling the awaiting task pauses the run: simulations are dropped, a pour that has begun is finished and
+    weighed, then `asyncio.CancelledError` is raised. Cancelling it again gives the pour up, too; it is UNKNOWN then.
+
+    Args:
+        laboratory: not opened yet; it is opened here, after everything that can be checked without it was, and closed.
+        run_directory: where the journal is, or will be.
+        resume: go on with the journal in `run_directory`; without, there must be none.
+        ask_operator: asked about pours whose outcome is unknown; None if nobody is there.
+        stages: in place of those that the plan asks for.
+        deadlines: other than the usual ones.
+
+    Raises:
+        RunError: the run can't begin or go on: another process runs it (JournalLockedError), its journal doesn't fit
+            (JournalError, ReplayError), a person is needed (OperatorNeededError), the disk is too full for a pour's
+            records (NoSpaceError), the laboratory or a strategy fails.
+        LaboratoryError: the laboratory can't be opened.
+    """
+    run = _Run(
+        plan,
+        laboratory,
+        run_directory,
+        Watchers(watchers),
+        ask_operator,
+        tuple(stages_of(plan) if stages is None else stages),
+        deadlines or _patience(plan),
+    )
+    return await run.run(resume)
+
+
+def _patience(plan: CampaignPlan) -> Deadlines:
+    """A person who has to weigh what was poured takes the time that questions may take."""
+    usual, laboratory = Deadlines(), plan.laboratory
+    if laboratory.arm is None or laboratory.operator.answers == "virtual":
+        return usual
+    return replace(usual, pour_grace=max(usual.pour_grace, laboratory.operator.deadline))
+
+
+@dataclass
+class _Run:
+    """One process' part of a campaign's run."""
+
+    _plan: CampaignPlan
+    _laboratory: Laboratory
+    _directory: Path
+    _watchers: Watchers
+    _ask_operator: AskOperator | None
+    _stages: tuple[StageDefinition, ...]
+    _deadlines: Deadlines
+
+    def __post_init__(self) -> None:
+        self._scenes = scenes_of(self._plan)
+        self._state = State.QUEUED
+        self._unknown_pours = False
+        self._begin = time.monotonic()
+        names = [stage.name for stage in self._stages]
+        if not names or len(set(names)) != len(names):
+            raise RunError(f"a campaign needs stages with different names, got: {', '.join(names) or 'none'}")
+
+    async def run(self, resume: bool) -> CampaignResult:
+        path, header = self._directory / JOURNAL_NAME, Header(self._plan.name, fingerprint(self._plan))
+        self._journal = Journal.resume(path, header) if resume else Journal.create(path, header)
+        try:
+            if not resume:
+                write_provenance(self._directory, self._plan)
+            self._state = self._journal.state()
+            if self._state is State.FINISHED:
+                return self._close()
+            if any(stage.pours for stage in self._stages):
+                self._journal.reserve_space()
+            try:
+                await self._run_stages(resume)
+            except asyncio.CancelledError:
+                if not self._is_finished():
+                    self._come_to_rest(State.PAUSED, "stopped on request")
+                raise
+            except (OperatorNeededError, NoSpaceError) as error:
+                self._come_to_rest(State.PAUSED, str(error))
+                raise
+            except Exception as error:
+                if self._is_finished():  # the results are safe; only the tidying up went wrong
+                    self._watchers.log("warning", f"while closing the laboratory: {error}")
+                else:
+                    self._come_to_rest(State.FAILED, f"{type(error).__name__}: {error}")
+                    raise
+            return self._close()
+        finally:
+            self._journal.close()
+
+    async def _run_stages(self, resume: bool) -> None:
+        histories = {stage.name: read_history(self._journal, stage.name) for stage in self._stages}
+        self._unknown_pours = any(history.unknown_pours() for history in histories.values())
+        if self._state not in RESTING:
+            found = State.UNKNOWN if self._unknown_pours else State.PAUSED
+            self._enter(found, "found interrupted: its process ended without a word")
+        self._enter(State.PREPARING, "resumed" if resume else "begun")
+        for stage in self._stages:
+            history = histories[stage.name]
+            if history.unknown_pours() or history.open_questions():
+                histories[stage.name] = await self._settle(stage, history)
+        async with self._laboratory as laboratory:
+            if isinstance(laboratory, Telling):
+                laboratory.listen(self._hear)
+            self._check_bench(laboratory, histories)
+            lanes = RequestExecutor(laboratory, self._scenes, self._deadlines, self._plan.outputs.record_rate)
+            lanes.ahead.changed = lambda running, waiting: self._watchers.emit(
+                MadeAhead(running=running, waiting=waiting)
+            )
+            opened = CampaignOpened(
+                name=self._plan.name,
+                run_directory=self._directory,
+                stages=tuple(stage.name for stage in self._stages),
+                mode=laboratory.bench.mode if laboratory.bench is not None else "none",
+                simulators=laboratory.simulators.size,
+                resumed=resume,
+            )
+            self._watchers.emit(opened)
+            self._tell_of_idle(laboratory.simulators.size)
+            self._enter(State.RUNNING)
+            results: dict[str, StageResult] = {}
+            try:
+                for index, stage in enumerate(self._stages, start=1):
+                    results[stage.name] = await self._run_stage(stage, index, histories[stage.name], results, lanes)
+            finally:
+                await lanes.ahead.close()
+            self._enter(State.FINISHED)
+
+    async def _run_stage(
+        self,
+        stage: StageDefinition,
+        index: int,
+        history: StageHistory,
+        results: Results,
+        lanes: RequestExecutor,
+    ) -> StageResult:
+        done = history.result is not None
+        opened = StageOpened(
+            stage=stage.name,
+            index=index,
+            count=len(self._stages),
+            resumed=history.seed is not None,
+            replayed=done,
+        )
+        self._watchers.emit(opened)
+        if history.result is not None:
+            for event in replayed_events(history, stage.name):
+                self._watchers.emit(event)
+            self._watchers.emit(StageClosed(stage=stage.name, replayed=True, result=history.result))
+            return history.result
+        seed = stage_seed(self._plan.seed, stage.name)
+        if history.seed is None:
+            self._journal.append(Kind.STAGE_OPENED, {"seed": seed}, stage=stage.name)
+        scheduler = StageScheduler(
+            stage.name,
+            stage.build(results, seed),
+            journal=self._journal,
+            lanes=lanes,
+            watchers=self._watchers,
+            capacity=self._plan.parallel_simulations,
+            order=stage.order,
+            recordings=self._plan.outputs.recorded_simulations if self._plan.outputs.record_rate > 0.0 else 0,
+            on_pausing=lambda reason: self._enter(State.PAUSING, reason),
+            on_stopping=lambda reason: self._enter(State.STOPPING, reason),
+        )
+        scheduler.restore(history)
+        used = lanes.ahead.used
+        try:
+            with self._foreseeing(stage, index, results, lanes):
+                result = await scheduler.run()
+        finally:
+            self._unknown_pours = bool(scheduler.unknown_pours)
+        if lanes.ahead.used > used:
+            text = f"{lanes.ahead.used - used} simulation(s) of {stage.name} were made while the arm was pouring before"
+            self._journal.append(Kind.NOTE, {"text": text}, stage=stage.name)
+        self._watchers.emit(StageClosed(stage=stage.name, result=result))
+        return result
+
+    @contextmanager
+    def _foreseeing(
+        self, stage: StageDefinition, index: int, results: Results, lanes: RequestExecutor
+    ) -> Iterator[None]:
+        """While the arm pours, simulate what later stages will ask for, where that disturbs nobody."""
+        later = self._stages[index - 1 :]
+        if not stage.pours or len(later) < 2 or not lanes.simulators.separate:
+            yield
+            return
+        rehearsal = RequestForecast(later, results, self._plan.seed, self._plan.parallel_simulations, lanes)
+        task = asyncio.create_task(rehearsal.run(), name=f"rehearsal beside {stage.name}")
+        try:
+            yield
+        finally:
+            task.cancel()
+            lanes.ahead.pause()
+            # Awaited nowhere: whatever goes wrong in a rehearsal shows when its stage's turn comes.
+            task.add_done_callback(lambda task: task.cancelled() or task.exception())
+
+    async def _settle(self, stage: StageDefinition, history: StageHistory) -> StageHistory:
+        await settle_unknown_pours(
+            self._journal,
+            history,
+            stage.name,
+            plan=self._plan,
+            scenes=self._scenes,
+            ask=self._ask_operator,
+            on_waiting=lambda question: self._enter(State.WAITING_FOR_OPERATOR, question),
+        )
+        await settle_open_questions(
+            self._journal,
+            history,
+            stage.name,
+            ask=self._ask_operator,
+            on_waiting=lambda question: self._enter(State.WAITING_FOR_OPERATOR, question),
+        )
+        if self._state is State.WAITING_FOR_OPERATOR:
+            self._enter(State.PREPARING, "answered")
+        self._unknown_pours = False
+        return read_history(self._journal, stage.name)
+
+    def _check_bench(self, laboratory: Laboratory, histories: Mapping[str, StageHistory]) -> None:
+        needing = [s.name for s in self._stages if s.pours and histories[s.name].result is None]
+        if not needing:
+            return
+        if laboratory.bench is None:
+            raise RequestExecutorError(
+                f"stage {needing[0]} pours, but the laboratory '{self._plan.laboratory.name}' has no bench; add one to "
+                "its file, or calibrate on records"
+            )
+        if laboratory.bench.mode != self._plan.laboratory.mode:
+            raise RequestExecutorError(
+                f"the plan is for a {self._plan.laboratory.mode} bench, but the laboratory's is {laboratory.bench.mode}"
+            )
+
+    def _tell_of_idle(self, simulators: int) -> None:
+        slots = self._plan.parallel_simulations
+        if simulators > slots:
+            self._watchers.log(
+                "info",
+                f"{simulators} simulators, but this campaign keeps at most {slots} simulation(s) in flight: "
+                f"{simulators - slots} will have nothing to do; 'parallel_simulations' in the campaign changes that",
+            )
+
+    def _hear(self, notice: Notice) -> None:
+        """Something happened to the laboratory: written down, and shown."""
+        try:
+            self._journal.append(Kind.NOTE, {"text": notice.text})
+        except JournalError:  # it ends the run with the next write that matters; until then the screen holds everything
+            self._watchers.log("error", f"can't be written down: {notice.text}")
+            return
+        if notice.level != "note":
+            self._watchers.emit(LogLine(level=notice.level, text=notice.text, asked=notice.asked))
+
+    def _enter(self, state: State, reason: str = "") -> None:
+        if state is self._state:
+            return
+        check_transition(self._state, state)
+        before, self._state = self._state, state
+        body = {"before": str(before), "after": str(state), "reason": reason, "pid": os.getpid()}
+        self._journal.append(Kind.CAMPAIGN_STATE, body)
+        self._watchers.emit(CampaignStateChanged(before=str(before), after=str(state), reason=reason))
+
+    def _is_finished(self) -> bool:
+        return self._state is State.FINISHED
+
+    def _come_to_rest(self, state: State, reason: str) -> None:
+        if self._unknown_pours:
+            state, reason = State.UNKNOWN, f"{reason}, while a pour was under way: nobody knows what came of it"
+        try:
+            self._enter(state, reason)
+        except JournalError as problem:  # the next process sees it from what is missing
+            self._watchers.log("error", f"can't write that the run is {state}: {problem}")
+        results = decode_results(self._journal.stage_results())
+        self._watchers.emit(CampaignClosed(state=str(self._state), results=results))
+
+    def _close(self) -> CampaignResult:
+        result = read_result(self._journal, self._directory, seconds=time.monotonic() - self._begin)
+        self._watchers.emit(CampaignClosed(state=str(result.state), results=result.results))
+        return result

@@ -1,0 +1,157 @@
+"""Run directories: their names, what is kept in them beside the journal, and how an unfinished one is found again."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+import re
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from orchestrator.catalogue.run_registry import register
+from orchestrator.installed_plugins import packages as plugin_packages
+from orchestrator.journal.codec import digest
+from orchestrator.journal.disk_reserve import TO_BEGIN, require_space
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.journal_check import check_journal, has_begun
+from orchestrator.journal.journal_file import JournalError
+from orchestrator.journal.pour_ledger import LEDGER_NAME, readable_lines
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.states import State
+from orchestrator.strategies.campaign_plan import CampaignPlan
+
+RESOLVED, VERSIONS = "resolved.json", "versions.json"
+"""What a run was asked for, and by which program."""
+
+
+class RunNotFoundError(JournalError):
+    """There is no run to resume."""
+
+
+def create_run(plan: CampaignPlan) -> Path:
+    """Make the directory of a new run, NAME-DATE-N (NAME-hardware-DATE-N), N counting the day's.
+
+    It is made in the plan's output directory, and entered into the catalogue of runs.
+
+    Raises:
+        NoSpaceError: there is too little room for a run.
+        OSError: it can't be made.
+    """
+    parent = plan.outputs.directory
+    require_space(parent, TO_BEGIN, "to begin a run")
+    parent.mkdir(parents=True, exist_ok=True)
+    name = plan.name if plan.laboratory.mode == "virtual" else f"{plan.name}-{plan.laboratory.mode}"
+    stem = f"{name}-{time.strftime('%Y%m%d')}"
+    number = 1 + max(
+        (int(m[1]) for p in parent.iterdir() if (m := re.fullmatch(rf"{re.escape(stem)}-(\d+)", p.name))), default=0
+    )
+    while True:
+        directory = parent / f"{stem}-{number}"
+        try:
+            directory.mkdir()  # two runs begun at the same moment get two directories
+            break
+        except FileExistsError:
+            number += 1
+    register(directory)
+    return directory
+
+
+def write_provenance(directory: Path, plan: CampaignPlan) -> None:
+    """Keep with the run what is needed to reproduce it: resolved.json (the plan) and versions.json."""
+    _write_json(directory / RESOLVED, plan.resolved)
+    _write_json(directory / VERSIONS, {"campaign": str(plan.source), "seed": plan.seed, **versions()})
+
+
+def versions() -> dict[str, Any]:
+    """Versions of Python, platform, Decant, what it is built on, and packages that add plug-ins."""
+    packages: dict[str, str] = {}
+    names = ["decant"]
+    try:
+        names += [re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in importlib.metadata.requires("decant") or []]
+    except importlib.metadata.PackageNotFoundError:
+        names += ["numpy", "scipy", "scikit-learn", "taichi", "ray", "trimesh"]
+    for name in names:
+        try:
+            packages[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            packages[name] = "not installed"
+    plugins = plugin_packages()
+    packages |= {name: version for name, (version, _) in plugins.items()}
+    return {
+        "python": sys.version.split()[0],
+        "platform": platform.platform(),
+        "processor": platform.machine(),
+        "packages": packages,
+        "plugins": {name: sorted(set(added)) for name, (_, added) in plugins.items()},
+    }
+
+
+def missing_plugins(versions: Mapping[str, Any]) -> list[str]:
+    """Packages with plug-ins that a run had and that are not installed here: 'decant-example 1.0 (decant.arms: stand)'.
+
+    Args:
+        versions: as `versions.json` has them.
+    """
+    here, packages = plugin_packages(), versions.get("packages") or {}
+    return [
+        f"{name} {packages.get(name, '')} ({', '.join(added)})"
+        for name, added in (versions.get("plugins") or {}).items()
+        if name not in here
+    ]
+
+
+def read_versions(directory: Path) -> dict[str, Any]:
+    """`versions.json` of a run; empty where it is missing or damaged."""
+    try:
+        found = json.loads((directory / VERSIONS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
+    """The run to resume: the one named, or the campaign's newest unfinished one.
+
+    Among several, one that was begun with the same settings is preferred; if there is none, the newest is returned,
+    so that resuming it can say what was changed.
+
+    Raises:
+        RunNotFoundError: no such run, or none that is unfinished.
+        JournalDamagedError: its journal has lost or changed entries, so that resuming it could repeat pours.
+    """
+    parent = plan.outputs.directory
+    if run_id is not None:
+        directory = parent / run_id
+        if not has_begun(directory / JOURNAL_NAME):
+            known = sorted(p.parent.name for p in parent.glob(f"*/{JOURNAL_NAME}"))
+            raise RunNotFoundError(f"{directory}: no such run; known: {', '.join(known) or 'none'}")
+    else:
+        directory = _newest_unfinished(plan, parent)
+    check_journal(directory / JOURNAL_NAME).require()
+    return directory
+
+
+def _newest_unfinished(plan: CampaignPlan, parent: Path) -> Path:
+    mine = digest(fingerprint(plan))
+    found: list[tuple[bool, float, Path]] = []
+    for directory in sorted(parent.iterdir()) if parent.is_dir() else ():
+        try:
+            with JournalReader(directory / JOURNAL_NAME) as journal:
+                if journal.header.name == plan.name and journal.state() is not State.FINISHED:
+                    same = digest(journal.header.fingerprint) == mine
+                    found.append((same, journal.header.created, directory))
+        except JournalError:
+            # Another program's or version's; a damaged run of this campaign is a candidate, and is refused.
+            begun = readable_lines(directory / LEDGER_NAME)[:1]
+            found += [(True, line.t, directory) for line in begun if line.body.get("name") == plan.name]
+    if not found:
+        raise RunNotFoundError(f"{parent}: no unfinished run of campaign '{plan.name}'; begin one without --resume")
+    return max(found)[2]
+
+
+def _write_json(path: Path, data: Any) -> None:
+    path.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")

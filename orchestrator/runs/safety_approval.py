@@ -1,0 +1,89 @@
+"""Which safety settings of a controller people have accepted: a small file beside the laboratory's, for review.
+
+Decant can't judge safety settings. It can notice that they are not those that somebody has looked at.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import asdict, fields
+from pathlib import Path
+
+from actors.arm.arm_settings import SafetyRecord
+from orchestrator.run_errors import RunError
+
+SUFFIX = ".safety.json"
+_CHECKSUM = re.compile(r"[0-9A-F]{8}")
+
+
+class SafetyRecordError(RunError):
+    """The record can't be read; the text says why."""
+
+    exit_code = 2
+
+
+def record_path(laboratory: Path) -> Path:
+    """Where the record of a laboratory's file is kept: NAME.safety.json beside NAME.yaml."""
+    return laboratory.with_name(laboratory.stem + SUFFIX)
+
+
+def read_record(laboratory: Path) -> SafetyRecord | None:
+    """What was accepted for a laboratory.
+
+    Args:
+        laboratory: its file.
+
+    Returns:
+        None if nothing was.
+
+    Raises:
+        SafetyRecordError: there is a record, and it makes no sense.
+    """
+    path = record_path(laboratory)
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise SafetyRecordError(
+            f"{path}: {error}. Restore it, or accept the settings anew: {_accept(laboratory)}"
+        ) from None
+    names = {field.name for field in fields(SafetyRecord)}
+    if not isinstance(data, dict) or set(data) != names or not all(isinstance(v, str) for v in data.values()):
+        raise SafetyRecordError(
+            f"{path}: should hold {', '.join(sorted(names))}, each a text. Restore it, or accept the settings anew: "
+            f"{_accept(laboratory)}"
+        )
+    record = SafetyRecord(**data)
+    if not _CHECKSUM.fullmatch(record.checksum.upper()):
+        raise SafetyRecordError(f"{path}: checksum '{record.checksum}' should be eight hexadecimal digits")
+    return record
+
+
+def write_record(laboratory: Path, record: SafetyRecord) -> Path:
+    """Keep what was accepted.
+
+    Raises:
+        OSError: it can't be written there.
+    """
+    path = record_path(laboratory)
+    path.write_text(json.dumps(asdict(record), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    return path
+
+
+def accepted_checksum(laboratory: Path) -> str | None:
+    """Checksum that was accepted for a laboratory; None if none was.
+
+    Args:
+        laboratory: the file that describes it, which is a campaign's where it stands in there.
+
+    Raises:
+        SafetyRecordError: the record makes no sense.
+    """
+    record = read_record(laboratory)
+    return None if record is None else record.checksum.upper()
+
+
+def _accept(laboratory: Path) -> str:
+    return f"decant doctor {laboratory} --accept-safety"

@@ -1,0 +1,337 @@
+"""The stages of a campaign: which strategy comes next, and what it is given of those before it."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from orchestrator.journal.stage_results import Results, result_of
+from orchestrator.requests import Order
+from orchestrator.run_errors import RunError
+from orchestrator.strategies.calibration.active_design import ActivePours
+from orchestrator.strategies.calibration.bench_draws import drawn_benches
+from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
+from orchestrator.strategies.calibration.calibration_scores import (
+    DRAWS,
+    CalibrationEvaluation,
+    ScoredPour,
+    Scores,
+    random_parameters,
+    recommended_theta,
+    shift_left_over,
+)
+from orchestrator.strategies.calibration.pour_contexts import Contexts
+from orchestrator.strategies.calibration.pour_design import DesignedPours, DesignPoured
+from orchestrator.strategies.campaign_plan import (
+    CalibrationPlan,
+    CampaignPlan,
+    DeploymentPlan,
+    KnownSimulation,
+    MeasuredPour,
+    RecordSet,
+)
+from orchestrator.strategies.deployment.bench_offset import displacement
+from orchestrator.strategies.deployment.confirmation import Confirmation
+from orchestrator.strategies.deployment.costing import Costing
+from orchestrator.strategies.deployment.deployment_result import Deployed
+from orchestrator.strategies.repeated_simulation import RepeatedSimulation
+from orchestrator.strategies.strategy import Strategy
+from sim_engine.liquids import SimulationParameters
+from sim_engine.scene import Scene
+
+POURS, CALIBRATION, EVALUATION = "pours", "calibration", "evaluation"
+DEPLOYMENT, CONFIRMATION, PREDICTION = "deployment:", "confirmation:", "prediction:"
+"""Names of a calibration's stages, and what those of receivers begin with."""
+
+POSTERIOR_DRAWS = 64
+"""θ of a posterior that a deployment under risk draws from."""
+
+
+@dataclass(frozen=True)
+class StageDefinition:
+    """One stage.
+
+    Attributes:
+        name: unique in the campaign; part of the stage's seed.
+        build: makes the strategy from the former stages' results and the stage's seed.
+        order: in which outcomes are told.
+        pours: whether it needs a bench.
+        stand_in: what takes its result's place where later stages are acted out beforehand (`orchestrator.runs.speculative_requests`).
+    """
+
+    name: str
+    build: Callable[[Results, int], Strategy]
+    order: Order = "logical"
+    pours: bool = False
+    stand_in: Calibrated | None = None
+
+
+def stage_seed(seed: int, stage: str) -> int:
+    """The seed of a stage: the same anywhere, and independent of the other stages'."""
+    words = np.frombuffer(hashlib.sha256(stage.encode()).digest(), dtype="<u4")
+    high, low = np.random.SeedSequence([seed, *(int(w) for w in words)]).generate_state(2, dtype=np.uint32)
+    return (int(high) >> 1) << 32 | int(low)
+
+
+def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
+    """All scenes of a plan by name.
+
+    Raises:
+        RunError: two different scenes bear the same name.
+    """
+    found: list[Scene] = []
+    if plan.calibration is not None:
+        found += plan.calibration.poured
+        found += [records.scene for records in (plan.calibration.records, plan.calibration.transfer) if records]
+    if plan.deployment is not None:
+        found += plan.deployment.scenes
+    scenes: dict[str, Scene] = {}
+    for scene in found:
+        if scenes.setdefault(scene.name, scene) != scene:
+            raise RunError(f"two different scenes are both named '{scene.name}'; give one of the vessels another name")
+    return scenes
+
+
+def stages_of(plan: CampaignPlan) -> tuple[StageDefinition, ...]:
+    """All stages of a campaign in order: pours, calibration, evaluation, then a deployment for each receiver."""
+    stages: list[StageDefinition] = []
+    if plan.calibration is not None:
+        stages += calibration_stages(plan.calibration, plan.deployment)
+    if plan.deployment is not None:
+        stages += deployment_stages(plan, plan.deployment)
+    return tuple(stages)
+
+
+def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None = None) -> list[StageDefinition]:
+    """Pours (unless records take their place), the strategy, and what came of it beside its rivals.
+
+    Args:
+        deployment: what pours that are chosen actively are to teach about; None: about calibration's own actions.
+    """
+    stages = []
+    if plan.pour_count > 0:
+
+        def pours(results: Results, seed: int) -> Strategy:
+            if plan.design == "active":
+                return ActivePours(plan, deployment, seed)
+            return DesignedPours(
+                plan.scenes,
+                plan.actions,
+                plan.pour_count,
+                plan.holdout,
+                seed,
+                constraints=plan.constraints,
+                tested=plan.tested,
+            )
+
+        stages.append(StageDefinition(POURS, pours, pours=True))
+
+    def calibration(results: Results, seed: int) -> Strategy:
+        pours = [scored.pour for scored in measured_pours(plan, results)]
+        return plan.settings.build(replace(plan, known=known_simulations(plan, results)), pours, seed)
+
+    def evaluation(results: Results, seed: int) -> Strategy:
+        theta = calibrated_theta(results).theta
+        rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
+        pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
+        measured = {prior.name: prior.mean for prior in plan.parameter_prior}
+        plain = SimulationParameters.from_values(plan.fixed_parameters | measured)
+        drawn = posterior_draws(calibrated_theta(results), DRAWS) if rivals else ()
+        return CalibrationEvaluation(theta, rivals, pours, Contexts.of(plan), seed, uncalibrated=plain, drawn=drawn)
+
+    found = StageDefinition(CALIBRATION, calibration, stand_in=_stand_in(plan))
+    return [*stages, found, StageDefinition(EVALUATION, evaluation)]
+
+
+def _stand_in(plan: CalibrationPlan) -> Calibrated:
+    """A θ* that has not been found: one of the box that no campaign would name."""
+    values = plan.parameters.decode([math.sqrt(0.3)] * plan.parameters.dimension)
+    theta = CalibratedTheta(
+        theta=SimulationParameters.from_values({**plan.fixed_parameters, **values}),
+        searched=plan.parameters.names,
+        predicted_discrepancy=0.0,
+        predicted_deviation=0.0,
+        hyperparameters=None,
+        map=None,
+    )
+    return Calibrated(
+        strategy=plan.strategy, simulations=0, lost=0, undefined=0, training_pours=0, trials=(), found=theta
+    )
+
+
+def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[StageDefinition]:
+    """One stage for each receiver, all with the recommended θ (the plan's where nothing is calibrated).
+
+    Each is followed by one that pours what was recommended again, where the plan asks for that.
+    """
+
+    def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
+        def build(results: Results, seed: int) -> Strategy:
+            known = with_left_over(with_posterior(deployment, results), results)
+            known = with_bench(known, results, _theta(plan, results))
+            return known.settings.build(known, scene, _theta(plan, results), seed)
+
+        return build
+
+    def confirm_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
+        def build(results: Results, seed: int) -> Strategy:
+            recommended = result_of(results, DEPLOYMENT + name, Deployed).recommended
+            costing = Costing.of(deployment, scene, _theta(plan, results))
+            return Confirmation(costing, recommended, deployment.confirm, seed)
+
+        return build
+
+    stages = []
+    for name, scene in _by_receiver(deployment).items():
+        order, pours = deployment.settings.order, deployment.pours > 0
+        stages.append(StageDefinition(DEPLOYMENT + name, build_for(scene), order=order, pours=pours))
+        if deployment.confirm:
+            stages.append(StageDefinition(CONFIRMATION + name, confirm_for(name, scene), pours=True))
+    return stages
+
+
+def prediction_stages(
+    plan: CampaignPlan,
+    deployment: DeploymentPlan,
+    seeds: int,
+    thetas: Sequence[SimulationParameters] = (),
+) -> list[StageDefinition]:
+    """One stage for each receiver: what was recommended there is simulated again with fresh seeds.
+
+    Args:
+        seeds: how many, each.
+        thetas: draws of a posterior that the seeds take turns with; none: the θ that was planned with.
+    """
+
+    def build_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
+        def build(results: Results, seed: int) -> Strategy:
+            recommended = result_of(results, DEPLOYMENT + name, Deployed).recommended
+            action = None if recommended is None else scene.action(dict(recommended.action_si))
+            theta, known = _theta(plan, results), with_posterior(deployment, results)
+            costing = Costing.of(deployment, scene, theta)
+            draws = known.settings.draws(known, theta, seeds, seed)
+            drawn = [draw.parameters for draw in draws] if known.settings.needs_posterior else thetas
+            errors = [draw.error for draw in draws]
+            return RepeatedSimulation(costing, action, seeds, seed, drawn, errors, deployment.left_over)
+
+        return build
+
+    return [
+        StageDefinition(PREDICTION + name, build_for(name, scene)) for name, scene in _by_receiver(deployment).items()
+    ]
+
+
+def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPlan:
+    """The deployment with the draws of θ that its settings ask for, from the calibration before it.
+
+    Raises:
+        RunError: it has none.
+    """
+    if not deployment.settings.needs_posterior or deployment.thetas:
+        return deployment
+    found = calibrated_theta(results) if CALIBRATION in results else None
+    if found is None or found.posterior is None or not found.posterior.thetas:
+        raise RunError("deployment.risk: theta: posterior, but no calibration of this campaign tells one; C4 does")
+    return replace(deployment, thetas=posterior_draws(found, POSTERIOR_DRAWS))
+
+
+def with_left_over(deployment: DeploymentPlan, results: Results) -> DeploymentPlan:
+    """The deployment with what the calibration before it left over of its pours, where that was scored."""
+    if deployment.left_over is not None or CALIBRATION not in results or EVALUATION not in results:
+        return deployment
+    scores = result_of(results, EVALUATION, Scores)
+    return replace(deployment, left_over=shift_left_over(scores, len(calibrated_theta(results).searched)))
+
+
+def posterior_draws(found: CalibratedTheta, count: int) -> tuple[SimulationParameters, ...]:
+    """So many draws of θ's posterior, or all that there are; none where it has none."""
+    rows = () if found.posterior is None else found.posterior.thetas
+    count = min(count, len(rows))
+    kept = [rows[i * len(rows) // count] for i in range(count)]
+    return tuple(SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in kept)
+
+
+def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationParameters) -> DeploymentPlan:
+    """The deployment with what is known of the bench: by pours into the receiver before, or by the calibration.
+
+    A calibration says something of it where it searched nuisances; those that it did not search have their tolerances.
+    """
+    if not deployment.settings.learns_of_benches or deployment.bench:
+        return deployment
+    former = [learnt.bench for learnt in results.values() if isinstance(learnt, Deployed) and learnt.bench is not None]
+    if former:
+        return replace(deployment, bench=former[-1].displacements())
+    found = calibrated_theta(results) if CALIBRATION in results else None
+    known = set(SimulationParameters.nuisances()).intersection(() if found is None else found.searched)
+    if found is None or found.posterior is None or not known:
+        return deployment
+    rows = found.posterior.thetas
+    posterior = [SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in rows]
+    benches = drawn_benches(best, POSTERIOR_DRAWS, 0, posterior=posterior, known=known)
+    return replace(deployment, bench=tuple(displacement(best, bench, deployment.actions) for bench in benches))
+
+
+def _by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:
+    """Scenes by their receivers' names, or by their own where receivers share one."""
+    distinct = len({scene.receiver.name for scene in deployment.scenes}) == len(deployment.scenes)
+    return {scene.receiver.name if distinct else scene.name: scene for scene in deployment.scenes}
+
+
+def _theta(plan: CampaignPlan, results: Results) -> SimulationParameters:
+    """The θ that calibration recommends; the plan's where nothing was calibrated."""
+    return deployed_theta(results) if CALIBRATION in results else plan.parameters
+
+
+def deployed_theta(results: Results) -> SimulationParameters:
+    """The θ to deploy with: θ*, or the uncalibrated one if the weighed pours do not justify θ*.
+
+    Raises:
+        RunError: the calibration found no θ*.
+    """
+    scores = result_of(results, EVALUATION, Scores) if EVALUATION in results else None
+    return recommended_theta(calibrated_theta(results).theta, scores)
+
+
+def calibrated_theta(results: Results) -> CalibratedTheta:
+    """θ* of the calibration's stage.
+
+    Raises:
+        RunError: there is none.
+    """
+    found = result_of(results, CALIBRATION, Calibrated).found
+    if found is None:
+        raise RunError("the calibration has found no θ*")
+    return found
+
+
+def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:
+    """Weighed pours of the calibration's scene: from the stage that made them, and from the records."""
+    made, scenes = [], {scene.name: scene for scene in plan.poured}
+    for pour in result_of(results, POURS, DesignPoured).measured if POURS in results else ():
+        scene = scenes.get(pour.scene, plan.scene)
+        action = scene.action(dict(pour.action_si))
+        measured = MeasuredPour(action, pour.spillage, pour.poured, pour.split, scene.name)
+        made.append(ScoredPour(scene.name, measured))
+    return [*made, *_recorded(plan.records)]
+
+
+def known_simulations(plan: CalibrationPlan, results: Results) -> tuple[KnownSimulation, ...]:
+    """What the stage that made the pours has simulated in the calibration's scenes; what is known without one."""
+    if POURS not in results:
+        return plan.known
+    simulated = result_of(results, POURS, DesignPoured).simulated
+    scenes = {scene.name: scene for scene in plan.scenes}
+    return tuple(
+        KnownSimulation(dict(one.theta), one.scene, scenes[one.scene].action(dict(one.action_si)), one.spillage)
+        for one in simulated
+    )
+
+
+def _recorded(records: RecordSet | None) -> list[ScoredPour]:
+    if records is None:
+        return []
+    return [ScoredPour(pour.scene or records.scene.name, MeasuredPour.from_record(pour)) for pour in records.pours]

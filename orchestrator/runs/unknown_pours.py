@@ -1,0 +1,196 @@
+"""Pours that had begun when their run died: nobody knows what came of them, and software must not guess."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+
+from orchestrator.journal.codec import encode_outcome
+from orchestrator.journal.journal import Draft, Journal, Kind
+from orchestrator.requests import Answered, Ask, Failed, Outcome, Pour, Poured
+from orchestrator.run_errors import RunError
+from orchestrator.runs.replay import StageHistory
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.outcome import PourMeasurement
+from sim_engine.scene import Scene
+
+AskOperator = Callable[[str, Sequence[str]], str | Awaitable[str]]
+"""Asked with a question and the answers allowed; returns one of them, 'weighed' being followed by its numbers."""
+
+LOST, REPEAT, WEIGHED = "lost", "repeat", "weighed SPILLED RETAINED [LOADED]"
+_TRIES = 3
+
+LOAD_WITHIN, LOAD_WITHIN_MASS = 0.1, 5e-3
+"""How far a load that the operator weighed may lie from the nominal one: as a share of it, or [kg] if that is more."""
+
+
+class OperatorNeededError(RunError):
+    """A person has to say what happened, and nobody is there to be asked."""
+
+    exit_code = 3
+
+
+async def settle_unknown_pours(
+    journal: Journal,
+    history: StageHistory,
+    stage: str,
+    *,
+    plan: CampaignPlan,
+    scenes: Mapping[str, Scene],
+    ask: AskOperator | None,
+    on_waiting: Callable[[str], None],
+) -> None:
+    """Find out what becomes of each pour that had started and has no outcome, and write it down.
+
+    A pour that is to be repeated (virtual bench only) stays without outcome and will be run again with its seed.
+
+    Args:
+        ask: None if nobody can be asked.
+        on_waiting: called with the question before it is asked.
+
+    Raises:
+        OperatorNeededError: nobody is there, or no sensible answer came.
+        RunError: the plan repeats pours, but the bench is not virtual.
+    """
+    virtual = plan.laboratory.mode == "virtual"
+    for key in history.unknown_pours():
+        pour = history.request(key)
+        assert isinstance(pour, Pour)
+        scene = scenes[pour.scene]
+        what = f"pour {pour.number} of stage {stage} ({pour.action.display(*_searched(scene, pour))})"
+        if plan.on_unknown == "repeat":
+            if not virtual:
+                raise RunError(
+                    f"{what} has begun and has no outcome; 'on_unknown: repeat' is for the virtual bench only, because "
+                    "on a real one the liquid may be in the receiver already. Set on_unknown: ask"
+                )
+            text = f"{what} had begun and has no outcome; it is repeated with the same seed on the virtual bench"
+            journal.append(Kind.NOTE, {"text": text}, stage=stage)
+            continue
+        options = (*((REPEAT,) if virtual else ()), LOST, WEIGHED)
+        question = f"{what} had begun when the run was interrupted; what came of it?"
+        answer, outcome = await _ask(ask, question, options, scene.liquid.mass, on_waiting)
+        drafts = [
+            Draft(Kind.OPERATOR_ASKED, {"id": key, "question": question, "options": list(options)}, stage),
+            Draft(Kind.OPERATOR_ANSWERED, {"id": key, "answer": answer}, stage),
+        ]
+        if outcome is not None:
+            body = {"id": key, "outcome": encode_outcome(outcome), "seconds": 0.0}
+            drafts.append(Draft(Kind.POUR_FINISHED, body, stage))
+        journal.append_all(drafts)
+
+
+async def settle_open_questions(
+    journal: Journal,
+    history: StageHistory,
+    stage: str,
+    *,
+    ask: AskOperator | None,
+    on_waiting: Callable[[str], None],
+) -> None:
+    """Have each question that a strategy paused the run with answered, and write the answer down.
+
+    Raises:
+        OperatorNeededError: nobody is there, or no sensible answer came.
+    """
+    for key, request in history.open_questions().items():
+        if ask is None:
+            raise needs_answer(request)
+        on_waiting(request.question)
+        text = request.question
+        for _ in range(_TRIES):
+            reply = ask(text, request.options)
+            answer = await reply if inspect.isawaitable(reply) else reply
+            meant = next((o for o in request.options if o.lower() == " ".join(answer.lower().split())), None)
+            if meant is not None:
+                break
+            text = f"{request.question}\n'{answer}' is not an answer; answer with one of: {'; '.join(request.options)}"
+        else:
+            raise needs_answer(request)
+        asked = {"id": key, "question": request.question, "options": list(request.options)}
+        answered = {"id": key, "answer": meant, "outcome": encode_outcome(Answered(meant))}
+        journal.append_all([Draft(Kind.OPERATOR_ASKED, asked, stage), Draft(Kind.OPERATOR_ANSWERED, answered, stage)])
+
+
+def needs_answer(request: Ask) -> OperatorNeededError:
+    """The run pauses with this, and says how to answer."""
+    options = "; ".join(request.options)
+    return OperatorNeededError(
+        f"{request.question} The run is paused. Resume with one of these answers: {options}, for example "
+        f"--answer '{request.options[0]}'"
+    )
+
+
+def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome | None:
+    """What an operator's answer means.
+
+    Args:
+        answer: 'repeat', 'lost', or 'weighed' with the masses spilled, retained and perhaps loaded [g].
+        options: allowed answers.
+        loaded: mass that the pourer should have held [kg].
+
+    Returns:
+        The outcome; None if the pour is to be repeated.
+
+    Raises:
+        ValueError: what is wrong with the answer.
+    """
+    words = answer.lower().replace(",", " ").split()
+    text = answer.strip().lower()
+    if text == REPEAT and REPEAT in options:
+        return None
+    if text == LOST:
+        return Failed("pour_unknown", "declared lost by the operator")
+    if not words or words[0] != "weighed":
+        raise ValueError(f"'{answer}' is not an answer; answer with one of: {'; '.join(options)} (masses in grams)")
+    try:
+        masses = [float(word) * 1e-3 for word in words[1:] if word != "g"]
+    except ValueError:
+        raise ValueError(f"'{answer}': after 'weighed' there must be numbers in grams, e.g. weighed 3.2 0.4") from None
+    if len(masses) not in (2, 3):
+        raise ValueError(f"'{answer}': two masses are needed, spilled and retained, e.g. weighed 3.2 0.4 (grams)")
+    spilled, retained = masses[:2]
+    slack = max(LOAD_WITHIN * loaded, LOAD_WITHIN_MASS) + 1e-9
+    if len(masses) == 3 and not abs(masses[2] - loaded) <= slack:
+        raise ValueError(
+            f"'{answer}': the pour was to have a load of {loaded * 1e3:g} g, and {masses[2] * 1e3:g} g is more than "
+            f"{slack * 1e3:g} g away from that"
+        )
+    loaded = masses[2] if len(masses) == 3 else loaded
+    if not (min(spilled, retained) >= 0.0 and loaded > 0.0 and spilled + retained <= 1.02 * loaded):
+        raise ValueError(
+            f"'{answer}': {spilled * 1e3:g} g spilled and {retained * 1e3:g} g retained don't fit a load of "
+            f"{loaded * 1e3:g} g"
+        )
+    return Poured(PourMeasurement(loaded, spilled, retained, {"source": "weighed by the operator after a restart"}))
+
+
+def weighed_by_hand(pour: Pour, measured: PourMeasurement) -> str:
+    """What a person types on resume about a pour that was weighed and can't be written down."""
+    loaded, spilled, retained = (f"{1e3 * mass:.1f}" for mass in (measured.loaded, measured.spilled, measured.retained))
+    return (
+        f"Pour {pour.number} was made and weighed, and is not written down: {loaded} g loaded, {spilled} g spilled, "
+        f"{retained} g retained. Resuming asks what came of it; answer: weighed {spilled} {retained} {loaded}"
+    )
+
+
+async def _ask(
+    ask: AskOperator | None, question: str, options: Sequence[str], loaded: float, on_waiting: Callable[[str], None]
+) -> tuple[str, Outcome | None]:
+    how = f"Resume with one of these answers: {'; '.join(options)} (masses in grams), for example --answer lost"
+    if ask is None:
+        raise OperatorNeededError(f"{question} Nobody is here to be asked. {how}")
+    on_waiting(question)
+    text = question
+    for _ in range(_TRIES):
+        reply = ask(text, options)
+        answer = await reply if inspect.isawaitable(reply) else reply
+        try:
+            return answer, parse_answer(answer, options, loaded)
+        except ValueError as error:
+            text = f"{question}\n{error}"
+    raise OperatorNeededError(f"{text}. {how}")
+
+
+def _searched(scene: Scene, pour: Pour) -> tuple[str, ...]:
+    return tuple(name for name in pour.action.values() if name not in scene.fixed) or ("angular_velocity", "x_offset")

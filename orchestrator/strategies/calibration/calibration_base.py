@@ -1,0 +1,359 @@
+"""What the calibration strategies share: asking, listening, dropping what failed, reporting θ*.
+
+What the settings of calibrations share: how many θ are tried, and whether that fits what they may spend.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Annotated, ClassVar, Generic, Literal, Self, TypeVar, cast
+
+from actors.optimizer.questions import Point, Suggestion
+from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots, Suggest
+from orchestrator.run_errors import LearningError
+from orchestrator.strategies.calibration.posterior_summary import PosteriorFound
+from orchestrator.strategies.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
+from orchestrator.strategies.optimizer_queries import OptimizerQueries
+from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.stage_result import DisplayedMap, ResultPart, StageResult, displayed_map
+from orchestrator.strategies.strategy import Progress, is_sound
+from orchestrator.strategies.trials import Trial, Trials
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import MINIMUM_POURED, normalised_spillage
+from sim_engine.settings.model import MOST_SIMULATIONS, PositiveSimulationCount, Problems
+from sim_engine.settings.quantity import Quantity
+
+MAP_RESOLUTION = 30
+
+S = TypeVar("S", bound=CalibrationSettings)
+"""Settings of a calibration."""
+
+
+class CalibrationTrial(ResultPart):
+    """A θ that was tried, and how far the simulator was from the pours with it."""
+
+    theta: dict[str, float]
+    """Searched parameters."""
+
+    discrepancy: float | None
+    """Mean |r − c_s|, or of a single action; None where nothing could be compared."""
+
+
+class TriedOnPours(CalibrationTrial):
+    """C1 to C3: a θ that was simulated on every training pour."""
+
+    defined: int
+    """Pours on which it could be compared."""
+
+    largest: float | None
+    """The largest |r − c_s| among them."""
+
+
+class TriedOnce(CalibrationTrial):
+    """C4: a θ that was simulated at one action."""
+
+    action_si: dict[str, float]
+    """Searched dimensions of the action."""
+
+    measured: float
+    """What the regression of the weighed pours expects there, c_r."""
+
+    difference: float | None
+    """c_r − c_s with its sign, where the surrogate sees the action; else None."""
+
+
+class CalibratedTheta(ResultPart):
+    """θ*, and what is known of it."""
+
+    theta: SimulationParameters
+    """All parameters, those that were not searched too."""
+
+    searched: tuple[str, ...]
+    """Names of the searched ones."""
+
+    predicted_discrepancy: float
+    """Expected mean |r − c_s| of it."""
+
+    predicted_deviation: float
+    """Standard deviation of that expectation."""
+
+    hyperparameters: dict[str, float] | None
+    """Those of the surrogate; None where there is none."""
+
+    map: DisplayedMap | None
+    """The discrepancy over the two parameters that matter most."""
+
+    posterior: PosteriorFound | None = None
+    """Which other θ fit the pours; only C4 says."""
+
+
+class Calibrated(StageResult):
+    """What a calibration has learnt."""
+
+    kind: Literal["calibration"] = "calibration"
+
+    strategy: str
+    """'C1' to 'C4', or another one's name."""
+
+    simulations: int
+    """Those that were answered."""
+
+    lost: int
+    """Those of them that gave no discrepancy."""
+
+    undefined: int
+    """Those that poured too little for a spillage."""
+
+    training_pours: int
+    """Weighed pours that it learnt from."""
+
+    trials: tuple[TriedOnPours | TriedOnce, ...]
+    """Every θ that has been answered, in the order of asking."""
+
+    found: CalibratedTheta | None = None
+    """θ*; None until the end."""
+
+
+class Calibration(ABC, Generic[S]):
+    """Base of C1 to C4. Subclasses say what to try next (`_next`) and what a simulation tells (`_discrepancy`).
+
+    Only pours of the split 'train' are used. A simulation that failed, or poured too little for c_s to be defined, says
+    nothing and is dropped.
+    """
+
+    def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:
+        """Plan the campaign.
+
+        Raises:
+            LearningError: fewer than two usable pours.
+        """
+        self._train = [pour for pour in measured if pour.split == "train"]
+        self._usable = [pour for pour in self._train if pour.spillage is not None]
+        if len(self._usable) < 2:
+            raise LearningError(
+                f"calibration needs at least 2 training pours with ≥ {MINIMUM_POURED:.0%} poured, got "
+                f"{len(self._usable)} of {len(self._train)}; make more pours, or let them tilt farther (max_angle)"
+            )
+        self._plan = plan
+        self._settings = cast(S, plan.settings)
+        self._seeds = SeedStream(seed, plan.strategy)
+        self._questions = OptimizerQueries(self._seeds)
+        self._trials = Trials()
+        self._width_known = False
+        self._undefined = 0
+        self._best: Point | None = None
+        self._expected: tuple[float, float] = (0.0, 0.0)
+        self._final: Suggestion | None = None
+        self.decisions: list[Decision] = []
+
+    # -- asking ----------------------------------------------------------------------------------------------------
+
+    @property
+    def finished(self) -> bool:
+        """θ* is known."""
+        return self._best is not None and not self._questions.out
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """What is queued, and what comes next as soon as its premises are known."""
+        if not self._width_known and slots.simulations > 0:
+            self._trials.width, self._width_known = self._trials_at_once(slots.simulations), True
+        simulations = self._trials.issue(slots.simulations)
+        if not self.finished and not self._questions.out and not self._trials.queued:
+            self._next()
+            simulations += self._trials.issue(slots.simulations - len(simulations))
+        # questions come first: where outcomes are told in the order of asking, they then wait for no simulation
+        return [*self._questions.issue(), *simulations]
+
+    @abstractmethod
+    def _next(self) -> None:
+        """Put the next question, queue trials, or conclude. Nothing is queued and no question is out."""
+
+    def _trials_at_once(self, slots: int) -> int:
+        """Trials that are in flight at a time."""
+        return slots
+
+    # -- listening -------------------------------------------------------------------------------------------------
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What came of a question or a simulation."""
+        if isinstance(request, Suggest):
+            self._questions.answer(request, outcome)
+        elif isinstance(request, Simulate):
+            self._trials.settle(request, self._judged(request, outcome))
+        else:
+            raise ValueError(f"calibration asks for no {type(request).__name__}")
+
+    def _judged(self, request: Simulate, outcome: Outcome) -> float | None:
+        if not isinstance(outcome, Simulated) or outcome.outcome.invalid is not None:
+            return None
+        if not is_sound(outcome.outcome.fractions):
+            return None
+        simulated = normalised_spillage(outcome.outcome.fractions)
+        if simulated is None:
+            self._undefined += 1
+            return None
+        return self._discrepancy(request, simulated)
+
+    @abstractmethod
+    def _discrepancy(self, request: Simulate, simulated: float) -> float:
+        """What a simulation's c_s(a, θ) tells about Δ."""
+
+    def _settle(self, point: Point, mean: float, deviation: float) -> None:
+        """θ* is found: where, and what discrepancy is expected there."""
+        self._best, self._expected = point, (mean, deviation)
+        text = f"θ* {described(self._values(point))}: |Δ| {max(mean, 0.0):.3f} ± {deviation:.3f}"
+        self.decisions.append(Decision(text, {"mean": mean, "sd": deviation}))
+
+    def _settle_at_minimum(self, suggestion: Suggestion) -> None:
+        """θ* is the proposed minimiser of the posterior mean."""
+        if not suggestion.means:
+            raise self._nothing_learnt()
+        self._final = suggestion
+        self._settle(suggestion.points[0], suggestion.means[0], suggestion.deviations[0])
+
+    def _nothing_learnt(self) -> LearningError:
+        return LearningError(
+            f"calibration learnt nothing: of {self._trials.answered} simulations {self._trials.lost} gave no "
+            "discrepancy (see their reasons in the journal)"
+        )
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    def parameters_at(self, point: Point) -> SimulationParameters:
+        """θ_s of a place in the unit cube, with the plan's fixed values."""
+        return SimulationParameters.from_values({**self._plan.fixed_parameters, **self._values(point)})
+
+    @property
+    def theta(self) -> SimulationParameters:
+        """θ*.
+
+        Raises:
+            RuntimeError: the calibration isn't finished.
+        """
+        if self._best is None:
+            raise RuntimeError("the calibration isn't finished")
+        return self.parameters_at(self._best)
+
+    def _values(self, point: Point) -> dict[str, float]:
+        return self._plan.parameters.decode(point)
+
+    @property
+    @abstractmethod
+    def _budget(self) -> int:
+        """Simulations in all."""
+
+    def progress(self) -> Progress:
+        """Simulations answered, simulations in all."""
+        return Progress(self._trials.answered, self._budget)
+
+    @abstractmethod
+    def _row(self, number: int, trial: Trial) -> TriedOnPours | TriedOnce:
+        """What the result has of a trial."""
+
+    def _posterior_found(self) -> PosteriorFound | None:
+        """Which other θ fit the pours."""
+        return None
+
+    def result(self) -> Calibrated:
+        """θ* with its expected discrepancy, every trial, and the discrepancy's map over the two θ that matter most."""
+        return Calibrated(
+            strategy=self._plan.strategy,
+            simulations=self._trials.answered,
+            lost=self._trials.lost,
+            undefined=self._undefined,
+            training_pours=len(self._usable),
+            trials=tuple(self._row(i, trial) for i, trial in enumerate(self._trials.all) if trial.closed),
+            found=self._found() if self.finished else None,
+        )
+
+    def _found(self) -> CalibratedTheta:
+        mean, deviation = self._expected
+        final = self._final
+        return CalibratedTheta(
+            theta=self.theta,
+            searched=self._plan.parameters.names,
+            predicted_discrepancy=mean,
+            predicted_deviation=deviation,
+            hyperparameters=None if final is None else final.hyperparameters,
+            map=None if final is None else displayed_map(final.surrogate, self._plan.parameters),
+            posterior=self._posterior_found(),
+        )
+
+
+def described(values: Mapping[str, float]) -> str:
+    """Parameters for people: 'particles 1200  cohesion 0.031  receiver_x 3.2 mm'."""
+    infos = SimulationParameters.info()
+    return "  ".join(
+        f"{name} {value / infos[name].factor:.4g}" + (f" {infos[name].shown}" if infos[name].factor != 1.0 else "")
+        for name, value in values.items()
+    )
+
+
+Kappa = Annotated[float, Quantity("1", "2.0", 0.0, 100.0)]
+"""κ of the lower confidence bound."""
+
+
+class DesignSettings(CalibrationSettings):
+    """Settings of C1, C2 and C3: so many θ, each simulated on all training pours.
+
+    A number of θ is wanted; `simulations` is a limit to it, or alone says how many θ there are.
+    """
+
+    examples: ClassVar[dict[str, str]] = {}
+    """Keys that say how many θ are tried, each with an example; the last one is asked for where all are missing."""
+
+    simulations: PositiveSimulationCount | None = None
+    """Single simulated pours: a limit, or, alone, all that says how many θ are tried."""
+
+    @property
+    @abstractmethod
+    def thetas(self) -> int:
+        """How many θ are tried, once settled."""
+
+    @abstractmethod
+    def with_thetas(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
+        """The settings with the number of θ that is given, or that `simulations` allows."""
+
+    def simulations_on(self, train: int) -> int:
+        """Each θ on all of them."""
+        return self.thetas * train
+
+    def settled(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
+        """The number of θ, from the one key that says it."""
+        given = [key for key in self.examples if getattr(self, key) is not None]
+        if len(given) > 1:
+            complaints.add(f"stands beside '{given[0]}'; keep one of them", given[1], key=True)
+        if not given and self.simulations is None and not complaints.any:
+            wanted, example = list(self.examples.items())[-1]
+            complaints.add(f"key '{wanted}' is missing; add for example '{wanted}: {example}'", key=True, of=wanted)
+        if complaints.any or train < 1 or not searched or not (given or self.simulations):
+            return None
+        found = self.with_thetas(searched, train, complaints)
+        if found is None:
+            return None
+        key = given[0] if given else "simulations"
+        cost, limit = found.simulations_on(train), self.simulations or MOST_SIMULATIONS
+        if cost > limit:
+            said = "'simulations' allows" if self.simulations is not None else "at most are possible:"
+            text = f"makes {found.thetas} θ × {train} training pours = {cost} simulations; {said} {limit}"
+            complaints.add(text, key)
+            return None
+        return found
+
+    def _counted(self, given: int | None, train: int, complaints: Problems) -> int | None:
+        """The number that is given, or that the simulations allow."""
+        if given is None and (self.simulations or 0) < train:
+            text = f"allows not a single θ: each is simulated on all {train} training pours"
+            complaints.add(text, "simulations")
+            return None
+        return (self.simulations or 0) // train if given is None else given
+
+
+def check_initial(
+    settings: CalibrationSettings, initial: int, budget: int, key: str, unit: str, complaints: Problems
+) -> None:
+    """Random parameters must fit into the budget, which a key gives in a unit."""
+    if initial > budget:
+        at = "initial" if "initial" in settings.model_fields_set else key
+        complaints.add(f"{initial} random parameters don't fit into {budget} {unit}", at)

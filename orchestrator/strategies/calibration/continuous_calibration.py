@@ -1,0 +1,312 @@
+"""C4: Bayesian optimisation of O2, at one simulation per iteration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar, Literal, Self
+
+from actors.optimizer.questions import Data, Point, Posterior, PosteriorQuestion, Suggestion, SuggestProblem
+from orchestrator.requests import Decision, Simulate
+from orchestrator.run_errors import LearningError
+from orchestrator.strategies.calibration.calibration_base import (
+    MAP_RESOLUTION,
+    Calibration,
+    Kappa,
+    TriedOnce,
+    check_initial,
+    described,
+)
+from orchestrator.strategies.calibration.posterior_summary import (
+    PosteriorFound,
+    central,
+    left_open,
+    posterior_found,
+    unit_prior,
+)
+from orchestrator.strategies.calibration.pour_contexts import Contexts
+from orchestrator.strategies.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
+from orchestrator.strategies.strategy import Strategy
+from orchestrator.strategies.trials import Trial
+from sim_engine.outcome import MINIMUM_POURED
+from sim_engine.settings.model import PositiveSimulationCount, Problems
+
+CONTEXT_SIZE = 24
+"""Actions over which the surrogate's answer is averaged."""
+
+LIVE_MAP_EVERY = 10
+"""Simulations between two maps for those who watch; one costs about 20 ms."""
+
+LIVE_MAP_RESOLUTION = 20
+
+
+class C4Settings(CalibrationSettings):
+    """C4: Bayesian optimisation of the mean discrepancy over the actions, one simulation an iteration."""
+
+    has_prior: ClassVar[bool] = True
+
+    strategy: Literal["C4"] = "C4"
+    """Bayesian optimisation of the mean discrepancy over the actions, one simulation an iteration."""
+
+    simulations: PositiveSimulationCount | None = None
+    """Single simulated pours."""
+
+    initial: PositiveSimulationCount = 8
+    """Random parameters before the surrogate takes over."""
+
+    kappa: Kappa = 2.0
+    """κ of the lower confidence bound."""
+
+    averaging: Literal["context", "noise"] = "context"
+    """context: the surrogate knows which action was simulated; noise, the paper's: its influence is noise."""
+
+    @property
+    def budget(self) -> int:
+        """Simulations, once settled."""
+        assert self.simulations is not None, "settled settings have a budget"
+        return self.simulations
+
+    @property
+    def makes_posterior(self) -> bool:
+        """Only a surrogate that knows the actions tells what else fits the pours."""
+        return self.averaging == "context"
+
+    def settled(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
+        """As they are."""
+        if self.simulations is None:
+            text = "key 'simulations' is missing; add for example 'simulations: 108'"
+            complaints.add(text, key=True, of="simulations")
+            return None
+        check_initial(self, self.initial, self.simulations, "simulations", "simulations", complaints)
+        return None if complaints.any else self
+
+    def simulations_on(self, train: int) -> int:
+        """One an iteration, however many pours there are."""
+        return self.budget
+
+    def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
+        """The strategy itself."""
+        return ContinuousBayesianCalibration(plan, pours, seed)
+
+
+class ContinuousBayesianCalibration(Calibration[C4Settings]):
+    """C4: minimise O2(θ) = E_{a~g} |c_r(a) − c_s(a, θ)| with one simulation per iteration.
+
+    The measured spillage is first regressed by a GP, so that a discrepancy can be formed at any action. Every iteration
+    simulates one θ at one action of the prior g; the surrogate does the averaging. Two things are done
+    differently from the paper, because both lower the variance at the same price:
+
+    * In place of independent draws the actions are a scrambled Sobol sequence: any run of consecutive iterations
+      covers g evenly.
+    * The discrepancy varies far more over actions than over θ, and |·| folds away its sign. So the surrogate is a GP of
+      the signed difference c_r − c_s over (θ, a), and what is minimised is the mean over g of the absolute
+      value that it predicts (the setting `averaging`: 'context'). With 'noise', as in the paper, the surrogate sees
+      |c_r − c_s| over θ alone and takes the action's influence for noise; κ is a constant then, too.
+
+    g is uniform over the box of actions unless they have a `prior`, but limited to where c_r is defined: actions at
+    which less than 5 % is expected to be poured are left out. A simulation that failed, or poured too little for c_s to
+    be defined, says nothing about its neighbours and is dropped.
+
+    θ* is the most central of the θ that fit the weighed pours: of the posterior's draws the one that is nearest to all
+    others. Where O2 is flat, its minimiser is a matter of chance, mostly at an edge of the box, and often excluded by
+    the very pours that it was found from. With 'noise' θ* minimises the surrogate's mean over the whole box, as in the
+    paper; the lowest observation would only be the luckiest.
+
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C4); a surrogate over both arguments of an expected cost:
+    Toscano-Palmerin & Frazier, Bayesian optimization with expensive integrands, 2018.
+    Limitations: θ that make the simulated pour stop short are judged only by the actions at which they do pour. With
+    `averaging` 'noise' the optimiser sees heteroscedastic noise, large where the discrepancy varies over g, and nothing
+    is known about θ beside θ*.
+    """
+
+    def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:
+        """Plan the campaign; only pours of the split 'train' are used.
+
+        Raises:
+            LearningError: fewer than two usable pours.
+        """
+        super().__init__(plan, measured, seed)
+        self._contexts = Contexts.of(plan)
+        self._knows_actions = self._settings.averaging == "context"
+        self._started = False
+        self._mapped = 0
+        self._actions: tuple[Point, ...] = ()
+        self._measured_at: tuple[float, ...] = ()
+        self._expected_at: dict[Simulate, float] = {}
+        self._posterior: Posterior | None = None
+        self._before = Data()
+
+    # -- asking ----------------------------------------------------------------------------------------------------
+
+    def _next(self) -> None:
+        """Regress c_r once; then θ by θ, one simulation each; last, θ*."""
+        if not self._started:
+            self._started = True
+            self._ask_regression()
+        elif self._actions:
+            self._ask_parameters()
+
+    def _ask_regression(self) -> None:
+        """c_r(a), and whether it is defined, along the prior's sequence of actions."""
+        contexts = self._contexts
+        sequence = contexts.sequence(self._plan, 2 * self._settings.budget, self._seeds.next())
+        scenes = {scene.name: scene for scene in self._plan.scenes}
+        known = tuple(contexts.place(scenes[one.scene], one.action) for one in self._plan.known)
+        everywhere = (*sequence, *known)
+        spillage, poured = Data(), Data()
+        for pour in self._train:
+            point = contexts.point(pour)
+            poured = poured.added(point, pour.poured)
+            if pour.spillage is not None:
+                spillage = spillage.added(point, pour.spillage)
+        problem = SuggestProblem(contexts.space, spillage, count=0, predict_at=everywhere)
+
+        def with_poured(regression: Suggestion, likely: Suggestion | None) -> None:
+            keep = [
+                i
+                for i in range(len(sequence))
+                if likely is None or likely.predictions[i] - likely.prediction_deviations[i] >= MINIMUM_POURED
+            ][: self._settings.budget]
+            if not keep:
+                raise LearningError(
+                    f"at no action of the calibration's space would {MINIMUM_POURED:.0%} of the liquid be poured, as "
+                    "far as the weighed pours tell; let it tilt farther (max_angle)"
+                )
+            # few places may be left where c_r is defined: they are used again
+            order = [keep[i % len(keep)] for i in range(self._settings.budget)]
+            self._actions = tuple(sequence[i] for i in order)
+            self._measured_at = tuple(min(max(regression.predictions[i], 0.0), 1.0) for i in order)
+            expected = regression.predictions[len(sequence) :]
+            for one, place, measured in zip(self._plan.known, known, expected, strict=True):
+                theta = tuple(map(float, self._plan.parameters.encode(one.theta)))
+                self._before = self._before.added((*theta, *place), min(max(measured, 0.0), 1.0) - one.spillage)
+            self.decisions.append(
+                Decision(f"c_r(a) regressed from {len(self._usable)} pours", dict(regression.hyperparameters or {}))
+            )
+
+        def with_spillage(regression: Suggestion) -> None:
+            if len(self._usable) == len(self._train):
+                with_poured(regression, None)
+            else:
+                where_defined = SuggestProblem(contexts.space, poured, count=0, predict_at=sequence)
+                self._questions.put(where_defined, "regress", lambda likely: with_poured(regression, likely))
+
+        self._questions.put(problem, "regress", with_spillage)
+
+    def _ask_parameters(self) -> None:
+        """The next θ, or θ* once the budget is spent."""
+        remaining = self._settings.budget - len(self._trials)
+        if remaining <= 0:
+            if self._trials.idle and self._knows_actions:
+                self._ask_posterior()
+            elif self._trials.idle:
+                problem = self._problem(everything=True, acquisition="posterior_minimum", resolution=MAP_RESOLUTION)
+                self._questions.put(problem, "conclude", self._settle_at_minimum)
+            return
+        if len(self._trials) == 0:
+            count = min(max(self._settings.initial, 1), remaining)
+            problem = SuggestProblem(self._plan.parameters, Data(), acquisition="sobol", count=count)
+            self._questions.put(problem, "start", self._queue)
+        elif self._trials.ready:
+            self._questions.put(self._problem(resolution=self._live_resolution()), "calibrate", self._queue)
+
+    def _ask_posterior(self) -> None:
+        """Draws of θ given the training pours: first what the regression says at them, for it is in the differences."""
+        places = tuple(self._contexts.point(pour) for pour in self._usable)
+        weighed = tuple(pour.spillage for pour in self._usable if pour.spillage is not None)
+
+        def drawn(suggestion: Suggestion) -> None:
+            self._posterior = suggestion.posterior
+            if self._posterior is None:
+                raise self._nothing_learnt()
+            self.decisions += [Decision(text) for text in left_open(self._posterior, self._plan.parameters.names)]
+            self._ask_expected(central(self._posterior))
+
+        def regressed(regression: Suggestion) -> None:
+            offsets = tuple(
+                spillage - min(max(expected, 0.0), 1.0)
+                for spillage, expected in zip(weighed, regression.predictions, strict=True)
+            )
+            noise = (regression.hyperparameters or {}).get("noise", 0.0)
+            problem = replace(
+                self._problem(everything=True),
+                count=0,
+                posterior=PosteriorQuestion(places, offsets, noise, prior=unit_prior(self._plan)),
+            )
+            self._questions.put(problem, "posterior", drawn)
+
+        data = Data(places, weighed)
+        self._questions.put(
+            SuggestProblem(self._contexts.space, data, count=0, predict_at=places), "regress", regressed
+        )
+
+    def _ask_expected(self, point: Point) -> None:
+        """What is expected of θ*, and the map through it."""
+
+        def settle(suggestion: Suggestion) -> None:
+            self._final = suggestion
+            self._settle(point, suggestion.predictions[0], suggestion.prediction_deviations[0])
+
+        problem = self._problem(everything=True, resolution=MAP_RESOLUTION)
+        self._questions.put(replace(problem, count=0, predict_at=(point,), map_at=point), "conclude", settle)
+
+    def _live_resolution(self) -> int:
+        """Resolution of the map that the next answer carries for those who watch; mostly 0, for none."""
+        if len(self._trials) - self._mapped < LIVE_MAP_EVERY:
+            return 0
+        self._mapped = len(self._trials)
+        return LIVE_MAP_RESOLUTION
+
+    def _problem(self, *, everything: bool = False, acquisition: str = "lcb", resolution: int = 0) -> SuggestProblem:
+        data = self._trials.data(everything=everything)
+        if self._knows_actions:
+            data = Data(self._before.points + data.points, self._before.costs + data.costs)
+        return SuggestProblem(
+            self._plan.parameters,
+            data,
+            pending=() if everything else self._trials.pending(),
+            acquisition=acquisition,  # type: ignore[arg-type]
+            kappa=self._settings.kappa,
+            map_resolution=resolution,
+            context=self._actions[:CONTEXT_SIZE] if self._knows_actions else (),
+            plain=not self._knows_actions,
+        )
+
+    # -- listening -------------------------------------------------------------------------------------------------
+
+    def _queue(self, suggestion: Suggestion) -> None:
+        for i, point in enumerate(suggestion.points):
+            index = len(self._trials)
+            theta = self.parameters_at(point)
+            scene, action = self._contexts.request(self._actions[index])
+            request = Simulate(scene.name, action, theta, self._seeds.next(), "calibrate")
+            context = self._actions[index] if self._knows_actions else ()
+            self._expected_at[request] = self._measured_at[index]
+            self._trials.add(Trial(point, (request,), context))
+            if suggestion.means:
+                text = f"θ {described(self._values(point))}: expected |Δ| {max(suggestion.means[i], 0.0):.3f}"
+                self.decisions.append(Decision(text, {"mean": suggestion.means[i], "sd": suggestion.deviations[i]}))
+
+    def _discrepancy(self, request: Simulate, simulated: float) -> float:
+        """c_r(a) − c_s(a, θ); without its sign where the surrogate takes actions for noise."""
+        difference = self._expected_at[request] - simulated
+        return difference if self._knows_actions else abs(difference)
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    def _posterior_found(self) -> PosteriorFound | None:
+        return None if self._posterior is None else posterior_found(self._posterior, self._plan.parameters)
+
+    @property
+    def _budget(self) -> int:
+        return self._settings.budget
+
+    def _row(self, number: int, trial: Trial) -> TriedOnce:
+        action = trial.requests[0].action
+        return TriedOnce(
+            theta=self._values(trial.point),
+            action_si={name: getattr(action, name) for name in self._plan.actions.names},
+            measured=self._measured_at[number],
+            discrepancy=None if trial.cost is None else abs(trial.cost),
+            difference=trial.cost if self._knows_actions else None,
+        )

@@ -1,0 +1,332 @@
+"""O1: what C1, C2 and C3 minimise, every θ simulated on every training pour.
+
+C1: O1 on a dense uniform grid.
+
+C2: O1 on a stratified sample.
+
+C3: Bayesian optimisation of O1, every iteration on all training pours.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Literal, Self, TypeVar
+
+from actors.optimizer.questions import Data, Point, Suggestion, SuggestProblem
+from orchestrator.requests import Decision, Simulate
+from orchestrator.strategies.calibration.calibration_base import (
+    MAP_RESOLUTION,
+    Calibration,
+    DesignSettings,
+    Kappa,
+    TriedOnPours,
+    check_initial,
+    described,
+)
+from orchestrator.strategies.calibration.pour_design import stratified
+from orchestrator.strategies.campaign_plan import CalibrationPlan, MeasuredPour
+from orchestrator.strategies.strategy import Strategy
+from orchestrator.strategies.trials import Trial
+from sim_engine.settings.model import PositiveSimulationCount, Problems, Text
+
+LEAST_DEFINED = 0.5
+"""Share of the training pours on which a θ must have a discrepancy, to be compared with others at all."""
+
+MOST_MAPPED = 1_000
+"""θ from which a map is drawn: a Gaussian process of more takes minutes."""
+
+
+S = TypeVar("S", bound=DesignSettings)
+"""Settings of a strategy that tries so many θ on all pours."""
+
+
+class DiscrepancyOverPours(Calibration[S]):
+    """Base of C1, C2 and C3: O1(θ) = 1/n Σ_i |r_i − c_s(a_i, θ)| over the n training pours.
+
+    A pour has the same seed under every θ, so that two θ don't differ by their initial positions. A θ that failed, or
+    poured too little, on more than half of the pours is never θ*: the mean of the few others may be luck.
+
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (O1).
+    """
+
+    def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:
+        super().__init__(plan, measured, seed)
+        self._seed_of_pour = [self._seeds.next() for _ in self._usable]
+        self._measured = {
+            seed: float(pour.spillage)
+            for seed, pour in zip(self._seed_of_pour, self._usable, strict=True)
+            if pour.spillage is not None
+        }
+
+    @property
+    def _budget(self) -> int:
+        return self._settings.thetas * len(self._usable)
+
+    def _trials_at_once(self, slots: int) -> int:
+        return math.ceil(slots / len(self._usable))
+
+    def _try(self, point: Point, predicted: tuple[float, float] | None = None) -> None:
+        """Queue a θ on all training pours."""
+        theta = self.parameters_at(point)
+        requests = tuple(
+            Simulate(pour.scene or self._plan.scene.name, pour.action, theta, seed, "calibrate")
+            for pour, seed in zip(self._usable, self._seed_of_pour, strict=True)
+        )
+        self._trials.add(Trial(point, requests))
+        if predicted is not None:
+            text = f"θ {described(self._values(point))}: expected |Δ| {max(predicted[0], 0.0):.3f}"
+            self.decisions.append(Decision(text, {"mean": predicted[0], "sd": predicted[1]}))
+
+    def _discrepancy(self, request: Simulate, simulated: float) -> float:
+        """|r_i − c_s(a_i, θ)|."""
+        return abs(self._measured[request.seed] - simulated)
+
+    def _observed(self, *, everything: bool = False) -> Data:
+        """O1 of the θ that count; a θ that can't be compared has the worst of them, so that the search leaves it."""
+        trials = self._trials.counting(everything=everything)
+        scores = [(trial.point, _score(trial)) for trial in trials]
+        known = [score for _, score in scores if score is not None]
+        if not known:
+            return Data()
+        costs = tuple(max(known) if score is None else score for _, score in scores)
+        return Data(tuple(point for point, _ in scores), costs)
+
+    def _row(self, number: int, trial: Trial) -> TriedOnPours:
+        known = [cost for cost in trial.costs.values() if cost is not None]
+        return TriedOnPours(
+            theta=self._values(trial.point),
+            discrepancy=_score(trial),
+            defined=len(known),
+            largest=max(known, default=None),
+        )
+
+
+class BestOfDesign(DiscrepancyOverPours[S]):
+    """Base of C1 and C2: all θ are chosen beforehand, and θ* is the one with the least O1.
+
+    An optimiser is asked only for the map. `predicted_deviation` is the standard error of θ*'s mean over the pours.
+
+    Limitations: the least of many noisy means is somewhat lucky; θ* lies on the design, never between.
+    """
+
+    @abstractmethod
+    def _design(self) -> Sequence[Point]:
+        """The θ to be tried, in the unit cube."""
+
+    def _next(self) -> None:
+        if not self._trials.all:
+            for point in self._design():
+                self._try(point)
+            text = f"{self._plan.strategy}: {self._settings.thetas} θ on {len(self._usable)} pours"
+            text += f", {self._budget} simulations"
+            self.decisions.append(Decision(text))
+        elif self._trials.idle:
+            self._conclude()
+
+    def _conclude(self) -> None:
+        scored = [(score, trial) for trial in self._trials.all if (score := _score(trial)) is not None]
+        if not scored:
+            raise self._nothing_learnt()
+        mean, best = min(scored, key=lambda pair: pair[0])
+        known = [cost for cost in best.costs.values() if cost is not None]
+        variance = sum((cost - mean) ** 2 for cost in known) / max(len(known) - 1, 1)
+        self._settle(best.point, mean, math.sqrt(variance / len(known)))
+        if 2 <= len(scored) <= MOST_MAPPED:
+            data = Data(tuple(trial.point for _, trial in scored), tuple(score for score, _ in scored))
+            problem = SuggestProblem(self._plan.parameters, data, count=0, map_resolution=MAP_RESOLUTION)
+            self._questions.put(problem, "map", self._mapped)
+
+    def _mapped(self, suggestion: Suggestion) -> None:
+        self._final = suggestion
+
+
+def _score(trial: Trial) -> float | None:
+    """O1 of a θ; None where it is defined on too few pours."""
+    known = sum(cost is not None for cost in trial.costs.values())
+    return trial.cost if known >= LEAST_DEFINED * len(trial.requests) else None
+
+
+class C1Settings(DesignSettings):
+    """C1: a uniform grid, each θ on all training pours."""
+
+    required: ClassVar[dict[str, str]] = {"strategy": "C1"}
+    examples: ClassVar[dict[str, str]] = {"grid": "{particles: 5, cohesion: 6}", "per_axis": "10"}
+
+    strategy: Literal["C1"] = "C1"
+    """A uniform grid."""
+
+    grid: dict[Text, PositiveSimulationCount] | None = None
+    """Values of every searched parameter: {particles: 5, cohesion: 6}."""
+
+    per_axis: PositiveSimulationCount | None = None
+    """Values of each searched parameter, in place of 'grid'."""
+
+    @property
+    def cells(self) -> dict[str, int]:
+        """Values tried of every searched θ, once settled."""
+        assert self.grid is not None, "settled settings have a grid"
+        return self.grid
+
+    @property
+    def thetas(self) -> int:
+        """All places of the grid."""
+        return math.prod(self.cells.values())
+
+    def with_thetas(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
+        """The grid: as it is written, or the finest with the same number on every axis that the simulations allow."""
+        if self.grid is not None:
+            for name in self.grid:
+                if name not in searched:
+                    complaints.add(f"is not searched; searched are {', '.join(searched)}", "grid", name, key=True)
+            for name in searched:
+                if name not in self.grid:
+                    complaints.add(f"has no number of values for {name}, which is searched", "grid", key=True)
+            grid = {name: self.grid.get(name, 0) for name in searched}
+        elif self.per_axis is not None:
+            grid = dict.fromkeys(searched, self.per_axis)
+        else:
+            per_axis = 1
+            while train * (per_axis + 1) ** len(searched) <= (self.simulations or 0):
+                per_axis += 1
+            if per_axis < 2:
+                least = train * 2 ** len(searched)
+                text = f"allows no grid: 2 values of each searched parameter on {train} training pours take {least}"
+                complaints.add(text, "simulations")
+            grid = dict.fromkeys(searched, per_axis)
+        return None if complaints.any else self.model_copy(update={"grid": grid, "per_axis": None})
+
+    def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
+        """The strategy itself."""
+        return UniformGrid(plan, pours, seed)
+
+
+class UniformGrid(BestOfDesign[C1Settings]):
+    """C1: θ* = argmin O1(θ) over a uniform grid, each θ simulated on all training pours.
+
+    Every axis of θ's box is cut into equal cells (log-equal where its scale is), and θ tried at their middles: no place
+    of the box is then farther from the grid than half a cell.
+
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C1: 10 × 10 over two θ, 2800 simulations).
+    Limitations: the price grows with the power of the dimension.
+    """
+
+    def _design(self) -> Sequence[Point]:
+        cells = [self._settings.cells[name] for name in self._plan.parameters.names]
+        middles = [[(i + 0.5) / count for i in range(count)] for count in cells]
+        return list(itertools.product(*middles))
+
+
+class C2Settings(DesignSettings):
+    """C2: stratified sampling, each θ on all training pours."""
+
+    required: ClassVar[dict[str, str]] = {"strategy": "C2"}
+    examples: ClassVar[dict[str, str]] = {"samples": "18"}
+
+    strategy: Literal["C2"] = "C2"
+    """Stratified sampling."""
+
+    samples: PositiveSimulationCount | None = None
+    """θ in all, in equal strata where the number fits, else a Latin hypercube."""
+
+    @property
+    def thetas(self) -> int:
+        """All samples."""
+        return self.samples or 0
+
+    def with_thetas(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
+        """As many samples as are given, or as the simulations allow."""
+        samples = self._counted(self.samples, train, complaints)
+        return None if samples is None else self.model_copy(update={"samples": samples})
+
+    def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
+        """The strategy itself."""
+        return StratifiedSampling(plan, pours, seed)
+
+
+class StratifiedSampling(BestOfDesign[C2Settings]):
+    """C2: θ* = argmin O1(θ) over a jittered grid, each θ simulated on all training pours.
+
+    θ's box is cut into equal strata with two random θ in each (18 = 3 × 3 × 2 of two parameters, as in the paper), or
+    one, where the number of samples allows it; any other number becomes a Latin hypercube.
+
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C2: 3 × 3 strata, 2 samples each, 504 simulations).
+    """
+
+    def _design(self) -> Sequence[Point]:
+        strata = stratified(self._settings.thetas, self._plan.parameters.dimension, self._seeds.rng)
+        return [stratum.draw(self._seeds.rng) for stratum in strata]
+
+
+class C3Settings(DesignSettings):
+    """C3: Bayesian optimisation, each θ on all training pours."""
+
+    required: ClassVar[dict[str, str]] = {"strategy": "C3"}
+    examples: ClassVar[dict[str, str]] = {"iterations": "59"}
+
+    strategy: Literal["C3"] = "C3"
+    """Bayesian optimisation, each θ on all training pours."""
+
+    iterations: PositiveSimulationCount | None = None
+    """θ in all, each simulated on all training pours."""
+
+    initial: PositiveSimulationCount = 8
+    """Random parameters before the surrogate takes over."""
+
+    kappa: Kappa = 2.0
+    """κ of the lower confidence bound."""
+
+    @property
+    def thetas(self) -> int:
+        """One for each iteration."""
+        return self.iterations or 0
+
+    def with_thetas(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
+        """As many iterations as are given, or as the simulations allow."""
+        iterations = self._counted(self.iterations, train, complaints)
+        if iterations is None:
+            return None
+        key = "simulations" if self.iterations is None else "iterations"
+        check_initial(self, self.initial, iterations, key, "θ", complaints)
+        return self.model_copy(update={"iterations": iterations})
+
+    def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
+        """The strategy itself."""
+        return BayesianCalibration(plan, pours, seed)
+
+
+class BayesianCalibration(DiscrepancyOverPours[C3Settings]):
+    """C3: minimise O1(θ) = 1/n Σ_i |r_i − c_s(a_i, θ)| by Bayesian optimisation; one iteration costs n simulations.
+
+    Started at Sobol points; every further θ minimises the lower confidence bound of a Gaussian process of O1. θ*
+    minimises the posterior mean over the whole box.
+
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C3: 59 iterations, 1652 simulations).
+    """
+
+    def _next(self) -> None:
+        tried = len(self._trials)
+        if tried == 0:
+            count = min(max(self._settings.initial, 1), self._settings.thetas)
+            problem = SuggestProblem(self._plan.parameters, Data(), acquisition="sobol", count=count)
+            self._questions.put(problem, "start", self._queue)
+        elif tried < self._settings.thetas:
+            if self._trials.ready:
+                problem = SuggestProblem(
+                    self._plan.parameters, self._observed(), pending=self._trials.pending(), kappa=self._settings.kappa
+                )
+                self._questions.put(problem, "calibrate", self._queue)
+        elif self._trials.idle:
+            problem = SuggestProblem(
+                self._plan.parameters,
+                self._observed(everything=True),
+                acquisition="posterior_minimum",
+                map_resolution=MAP_RESOLUTION,
+            )
+            self._questions.put(problem, "conclude", self._settle_at_minimum)
+
+    def _queue(self, suggestion: Suggestion) -> None:
+        for i, point in enumerate(suggestion.points):
+            self._try(point, (suggestion.means[i], suggestion.deviations[i]) if suggestion.means else None)

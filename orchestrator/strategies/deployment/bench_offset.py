@@ -1,0 +1,105 @@
+"""How far a bench may differ from what it is believed to be, by the units of what is searched.
+
+Which simulations a question carries where there are too many for a quick answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from actors.optimizer.questions import BenchOffset, Data, Play, Point
+from sim_engine.action import ACTION_DIMENSIONS, DEG
+from sim_engine.liquids import SimulationParameters
+from sim_engine.search_space import Axis, Space
+
+LENGTH = 0.010
+"""Deviation of where something stands [m]: a receiver is placed by hand."""
+
+ANGLE = 2.0 * DEG
+"""Deviation of a tilt [rad]."""
+
+CLOCK = 0.05
+"""Relative deviation of a speed, an acceleration or a time."""
+
+UNKNOWN = 0.1
+"""Deviation of what has no unit of these, as a share of the searched range."""
+
+
+def play_of(actions: Space) -> tuple[Play, ...]:
+    """The play of each searched dimension."""
+    return tuple(_play(axis) for axis in actions.axes)
+
+
+def displacement(believed: SimulationParameters, bench: SimulationParameters, actions: Space) -> BenchOffset:
+    """Where a simulator with one set of nuisances does what a bench with another one does.
+
+    Nuisances of dimensions that are not searched are left to the rest of the model.
+
+    Args:
+        believed: what the simulator has.
+        bench: what the bench may have.
+    """
+    scales, shifts = [], []
+    moved = {
+        "x_offset": bench.receiver_x - believed.receiver_x,
+        "y_offset": believed.receiver_y - bench.receiver_y,  # the receiver moves, so the pourer is off the other way
+        "height": believed.receiver_z - bench.receiver_z,
+        "max_angle": bench.tilt_zero - believed.tilt_zero,
+    }
+    for axis in actions.axes:
+        factor = bench.speed_factor / believed.speed_factor if axis.name == "angular_velocity" else 1.0
+        if axis.scale == "log":
+            middle = axis.decode(0.5)
+            factor *= max(1.0 + moved.get(axis.name, 0.0) / middle, 0.1)
+            scales.append(1.0)
+            shifts.append(math.log(factor) / math.log(axis.upper / axis.lower))
+        else:
+            width = axis.upper - axis.lower
+            scales.append(factor)
+            shifts.append(((factor - 1.0) * axis.lower + moved.get(axis.name, 0.0)) / width)
+    return BenchOffset(tuple(scales), tuple(shifts))
+
+
+def _play(axis: Axis) -> Play:
+    dimension = ACTION_DIMENSIONS.get(axis.name)
+    unit = "" if dimension is None else dimension.unit
+    if axis.scale == "log":  # a factor is a shift there
+        return Play(shift=CLOCK / math.log(axis.upper / axis.lower) if unit not in ("m", "rad", "") else UNKNOWN)
+    width = axis.upper - axis.lower
+    match unit:
+        case "m":
+            return Play(shift=LENGTH / width)
+        case "rad":
+            return Play(shift=ANGLE / width)
+        case "":
+            return Play(shift=UNKNOWN)
+        case _:
+            return Play(factor=CLOCK, origin=axis.lower / width)
+
+
+def thinned(data: Data, around: Sequence[Point], most: int) -> Data:
+    """At most `most` observations: half of them those nearest to some places, the others spread over the rest.
+
+    They are chosen by where they are and never by what they came to: leaving out high costs would make the others
+    look better than they are.
+    """
+    if len(data) <= most:
+        return data
+    points = np.array(data.points)
+    kept: list[int] = []
+    if around:
+        near = np.linalg.norm(points[:, None, :] - np.array(around)[None, :, :], axis=2).min(axis=1)
+        kept = [int(i) for i in np.argsort(near, kind="stable")[: most // 2]]
+    distance = np.full(len(points), np.inf)
+    for i in kept:
+        distance = np.minimum(distance, np.linalg.norm(points - points[i], axis=1))
+    while len(kept) < most:
+        distance[kept] = -1.0
+        farthest = int(np.argmax(distance))
+        kept.append(farthest)
+        distance = np.minimum(distance, np.linalg.norm(points - points[farthest], axis=1))
+    kept.sort()
+    return Data(tuple(data.points[i] for i in kept), tuple(data.costs[i] for i in kept))

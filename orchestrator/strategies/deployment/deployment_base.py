@@ -1,0 +1,355 @@
+"""What the deployment strategies share: asking, pouring, counting, reporting.
+
+What the settings of deployments share that look for the best action by a surrogate.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, Generic, TypeVar, cast
+
+from actors.optimizer.questions import Data, Point, Suggestion, SuggestProblem
+from orchestrator.requests import Decision, Failed, Outcome, Pour, Prediction, Request, Simulate, Slots, Suggest
+from orchestrator.strategies.calibration.calibration_base import Kappa
+from orchestrator.strategies.campaign_plan import DeploymentPlan, DeploymentSettings
+from orchestrator.strategies.deployment.costing import Costing
+from orchestrator.strategies.deployment.deployment_result import Deployed, Recommended, RiskFound, SimulatedAction
+from orchestrator.strategies.deployment.model_check import Compared
+from orchestrator.strategies.deployment.model_monitoring import Believed
+from orchestrator.strategies.deployment.objectives import Vector
+from orchestrator.strategies.deployment.real_pours import Foretold, PourTrial, expecting, former_pours, trust
+from orchestrator.strategies.deployment.safe_window import WindowFound
+from orchestrator.strategies.deployment.scalarization import Scalarization
+from orchestrator.strategies.optimizer_queries import OptimizerQueries
+from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.stage_result import displayed_map
+from orchestrator.strategies.strategy import Progress
+from orchestrator.strategies.trials import Trial, Trials
+from sim_engine.action import Action, described
+from sim_engine.liquids import SimulationParameters
+from sim_engine.prediction_band import SampleStatistics
+from sim_engine.scene import Scene
+from sim_engine.settings.model import PositiveSimulationCount
+
+
+class SearchSettings(DeploymentSettings):
+    """Settings of D1, D2 and D3: Bayesian optimisation."""
+
+    kappa: Kappa = 2.0
+    """κ of the lower confidence bound."""
+
+    initial: PositiveSimulationCount = 3
+    """Random actions before the surrogate takes over."""
+
+
+MAX_REFUSED = 20
+"""Actions that may be refused (touching vessels, out of reach) free of charge: pours before a strategy gives up, and as
+many simulations before others count against the budget."""
+
+MAP_RESOLUTION = 25
+
+S = TypeVar("S", bound=DeploymentSettings)
+"""Settings of a deployment."""
+
+
+class Deployment(ABC, Generic[S]):
+    """Base of D1, D2 and D3 in one scene. Subclasses say what to ask next (`_next`) and what to conclude.
+
+    An action that can't be made, because the vessels touch or the arm can't reach, is refused before anything is
+    simulated or moved. It has no cost; the optimiser is given the place, and keeps away from where another refusal is
+    likely. A refusal does not count against a budget, but only so many are free. A pour that failed after something had
+    moved counts, and enters the data with the worst cost (`on_failed_pour: penalise`) or not at all (`ignore`).
+    """
+
+    def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
+        self._plan = plan
+        self._settings = cast(S, plan.settings)
+        self._data = plan.data if plan.settings.learns_on_pours else None
+        self._scene = scene
+        self._parameters = parameters
+        self._costing = Costing.of(plan, scene, parameters)
+        self._seeds = SeedStream(seed, f"{plan.strategy} {scene.name}")
+        self._compromise = Scalarization(self._costing, self._seeds.rng)
+        self._questions = OptimizerQueries(self._seeds)
+        self._trials = Trials()
+        self._width_known = False
+        self._pours: list[PourTrial] = []
+        self._former = () if self._data is None else former_pours(self._data, scene, plan.actions, self._costing)
+        self._queued_pour: Pour | None = None
+        self._pouring: Pour | None = None
+        self._final: Suggestion | None = None
+        self._latest_map: Suggestion | None = None
+        self._finished = False
+        self.decisions: list[Decision] = []
+        if self._data is not None:
+            path = self._data.path
+            text = f"{len(self._former)} former pours enter the data ({path.parent.name}/{path.name})"
+            self.decisions.append(Decision("; left out: ".join([text, *self._data.left_out])))
+
+    # -- asking and listening --------------------------------------------------------------------------------------
+
+    @property
+    def finished(self) -> bool:
+        """Nothing more to ask, nothing more to wait for."""
+        return self._finished and self._pouring is None and self._trials.idle
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """What is queued, and a question about what comes next as soon as its premises are known."""
+        if not self._width_known and slots.simulations > 0:
+            self._trials.width, self._width_known = slots.simulations, True
+        simulations = self._trials.issue(slots.simulations)
+        pours = self._issued_pour(slots)
+        if not self._finished and self._may_think and self._queued_pour is None:
+            self._next(slots.simulations - len(simulations))
+            pours += self._issued_pour(slots)
+        # questions come first: where outcomes are told in the order of asking, they then wait for no simulation
+        return [*self._questions.issue(), *pours, *simulations]
+
+    def _issued_pour(self, slots: Slots) -> list[Pour]:
+        """The queued pour, if there is one and the arm is free."""
+        if self._queued_pour is None or self._pouring is not None or slots.pours < 1:
+            return []
+        self._pouring, self._queued_pour = self._queued_pour, None
+        return [self._pouring]
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What came of a question, a simulation or a pour."""
+        if isinstance(request, Suggest):
+            self._questions.answer(request, outcome)
+        elif isinstance(request, Simulate):
+            avoided = request.pose_error is None  # under an error, touching is what may happen
+            if avoided and isinstance(outcome, Failed) and outcome.kind == "invalid_action":
+                self._trials.settle(request, None, refused=True)
+            else:
+                vector = self._costing.simulated(outcome, request.action)
+                self._trials.settle(request, self._compromise.note(request, vector))
+        elif request == self._pouring:
+            self._pouring = None
+            trial = self._pours[-1]
+            trial.take(outcome, self._scene, self._costing, penalised=self._settings.on_failed_pour == "penalise")
+            if trial.status == "weighed" and trial.cost is not None:
+                self.decisions.append(Decision(f"pour {trial.number}: loss {trial.cost:.4g}", {"loss": trial.cost}))
+        else:
+            raise ValueError(f"this pour was not asked for: {request}")
+
+    @property
+    def _may_think(self) -> bool:
+        """Nothing is queued and no question is out, so that it can be said what comes next."""
+        return not self._questions.out and not self._trials.queued
+
+    @abstractmethod
+    def _next(self, free_simulations: int) -> None:
+        """Put the next question, or finish. Called where `_may_think` and no pour is queued."""
+
+    # -- pieces for subclasses -------------------------------------------------------------------------------------
+
+    def _simulate(self, suggestion: Suggestion, purpose: str, *, first: int = 0, repeats: int = 1) -> None:
+        """Queue simulations of the suggested points, from the `first`."""
+        for i, point in enumerate(suggestion.points[first:], start=first):
+            values = self._plan.actions.decode(point)
+            self._trials.add(Trial(point, self._repeated(self._scene.action(values), purpose, repeats)))
+            self._decide(f"simulate ({purpose})", values, suggestion, i)
+
+    def _repeated(self, action: Action, purpose: str, repeats: int) -> tuple[Simulate, ...]:
+        """Simulations of one action."""
+        name, parameters = self._scene.name, self._parameters
+        return tuple(Simulate(name, action, parameters, self._seeds.next(), purpose) for _ in range(repeats))
+
+    def _pour(self, point: Point, prediction: Prediction | None) -> None:
+        """Queue a pour."""
+        values = self._plan.actions.decode(point)
+        noise = 0.0 if prediction is None or prediction.scatter is None else prediction.scatter
+        trial = PourTrial(self._counted + 1, point, values, prediction, noise)
+        self._pours.append(trial)
+        action = self._scene.action(values)
+        self._queued_pour = Pour(self._scene.name, action, trial.number, self._seeds.next(), prediction)
+        text = f"pour {trial.number}/{self._plan.pours}  {described(values)}"
+        self.decisions.append(Decision(text) if prediction is None else expecting(text, prediction))
+
+    def _pour_first(self, suggestion: Suggestion) -> None:
+        """Queue a pour of the first suggested point, with the surrogate's prediction where there is one."""
+        self._latest_map = suggestion if suggestion.surrogate is not None else self._latest_map
+        known = None
+        if suggestion.means and not self._compromise.exploring:
+            noise = suggestion.noises[0] if suggestion.noises else None
+            known = Prediction(
+                suggestion.means[0],
+                suggestion.deviations[0],
+                self._scatter(suggestion, noise),
+                suggestion.bands[0] if suggestion.bands else None,
+            )
+        self._pour(suggestion.points[0], known)
+
+    def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
+        """Standard deviation of one observation around the surrogate [the loss' unit]: from pour to pour, or in
+        simulation from seed to seed, as fitted; None without a surrogate.
+
+        Args:
+            noise: what the answer says of the place; None: what it says of all places.
+        """
+        return (suggestion.hyperparameters or {}).get("noise") if noise is None else noise
+
+    def _real(self) -> Data:
+        """Observations of the real cost, those of before the campaign first."""
+        poured = self._poured
+        return self._compromise.data(poured, [*poured, *self._compromise.of(self._trials.counting(everything=True))])
+
+    def _simulated(self, *, everything: bool = False) -> Data:
+        """Observations of the simulated cost."""
+        if not self._compromise.exploring:
+            return self._trials.data(everything=everything)
+        observed = self._compromise.of(self._trials.counting(everything=everything))
+        return self._compromise.data(observed, [*self._poured, *observed])
+
+    @property
+    def _poured(self) -> list[tuple[Point, Vector]]:
+        return [*self._former, *((p.point, p.vector) for p in self._pours if p.vector is not None)]
+
+    @property
+    def _counted(self) -> int:
+        """Pours that count against the budget."""
+        former = len(self._former) if self._data is not None and self._data.counts else 0
+        return former + sum(p.status in ("weighed", "failed") for p in self._pours)
+
+    @property
+    def _warned(self) -> bool:
+        """Pours that went wrong are warnings of more near them; in the paper they are pours that lost everything."""
+        return True
+
+    @property
+    def _refused(self) -> int:
+        return sum(p.status == "refused" for p in self._pours)
+
+    @property
+    def _spent(self) -> int:
+        """Simulated trials before any pour that count against their budget, as far as the next choice may know."""
+        return len(self._trials) - self._unspent
+
+    @property
+    def _unspent(self) -> int:
+        counting = self._trials.counting(everything=self._trials.idle)
+        return min(sum(t.refused and t.requests[0].purpose not in ("refine", "window") for t in counting), MAX_REFUSED)
+
+    @property
+    def _pours_left(self) -> bool:
+        return self._counted < self._plan.pours and self._refused < MAX_REFUSED
+
+    def _conclude(self, suggestion: Suggestion) -> None:
+        self._final = suggestion
+        self._finish()
+
+    def _finish(self) -> None:
+        """The end, once the front is known where one is looked for: a regression of each objective."""
+        if not self._compromise.wanted or self._compromise.front is not None:
+            self._finished = True
+            return
+        simulated = self._compromise.of(self._trials.counting(everything=True))
+        self._compromise.look_for_front(
+            simulated, self._poured, self._plan.actions, self._front_problem, self._questions, self._finish
+        )
+
+    def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
+        """How one objective is regressed: of the simulations, unless a strategy pours."""
+        return self._problem(simulated)
+
+    def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
+        text = f"{what}  {described(values)}"
+        if not suggestion.means:
+            found = Decision(f"{text}  (no surrogate yet)")
+        elif self._compromise.exploring:
+            found = Decision(f"{text}  (a compromise under random weights)")
+        else:
+            found = expecting(text, Prediction(suggestion.means[index], suggestion.deviations[index]))
+        self.decisions.append(found)
+
+    def _problem(self, data: Data, *, everything: bool = True, **changes: Any) -> SuggestProblem:
+        """A question about the loss.
+
+        Args:
+            everything: use all refusals of simulations; else those that the next choice may know.
+            changes: fields of the problem.
+        """
+        trials = self._trials.counting(everything=everything)
+        if isinstance(self._settings, SearchSettings):
+            changes = {"kappa": self._settings.kappa} | changes
+        return SuggestProblem(
+            self._plan.actions,
+            data,
+            constraints=self._plan.constraints,
+            infeasible=tuple(trial.point for trial in trials if trial.refused),
+            refused=tuple(p.point for p in self._pours if p.status == "refused"),
+            failed=tuple(p.point for p in self._pours if p.mishap and p.cost is not None) if self._warned else (),
+            noise=self._settings.noise,
+            **changes,
+        )
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    @property
+    def best_values(self) -> dict[str, float] | None:
+        """The action to use from now on, by posterior mean [SI]; None before the end, or if nothing was learnt."""
+        if self._final is None or self._final.best_point is None:
+            return None
+        return self._plan.actions.decode(self._final.best_point)
+
+    def progress(self) -> Progress:
+        """Steps done, steps in all."""
+        return Progress(pours=min(self._counted, self._plan.pours), of_pours=self._plan.pours)
+
+    def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold | Believed:
+        """How far the first pours bore out what was predicted."""
+        return trust(weighed)
+
+    def result(self) -> Deployed:
+        """What was learnt so far."""
+        names, front = self._compromise.names, self._compromise.front
+        latest = self._final or self._latest_map
+        return Deployed(
+            strategy=self._plan.strategy,
+            scene=self._scene.name,
+            loss=self._plan.loss_name,
+            simulations=self._trials.answered,
+            simulations_lost=self._trials.lost,
+            simulations_refused=sum(trial.refused for trial in self._trials.all),
+            pours=tuple(p.row(names, self._scene.liquid) for p in self._pours if p.status != "pouring"),
+            simulated=tuple(
+                SimulatedAction(action_si=self._plan.actions.decode(trial.point), loss=trial.cost)
+                for trial in self._trials.all
+                if trial.closed and trial.cost is not None
+            ),
+            former_pours=len(self._former),
+            refused_pours=self._refused,
+            failed_pours=sum(p.status == "failed" for p in self._pours),
+            trust=self._trusted([p for p in self._pours if p.status == "weighed" and p.cost is not None]),
+            gave_up=self._gave_up,
+            objectives=names,
+            front=None if front is None else tuple(front),
+            map=None if latest is None else displayed_map(latest.surrogate, self._plan.actions),
+            recommended=None if self._final is None else self._recommended(self._final),
+            risk=None if self._final is None else self._risk_found(self._final),
+            window=self._window_found(),
+        )
+
+    @property
+    def _gave_up(self) -> str | None:
+        if self._refused < MAX_REFUSED:
+            return None
+        return f"{self._refused} pours were refused as invalid; the action space hardly allows any"
+
+    def _recommended(self, final: Suggestion) -> Recommended | None:
+        """What the last answer recommends, and what to expect of it."""
+        spillage = None if final.best_point is None else self._spillage(final.best_point)
+        return Recommended.of(final, self._plan.actions, self._scatter(final, final.best_noise), spillage)
+
+    def _spillage(self, point: Point) -> SampleStatistics | None:
+        """r = spilled / poured over the simulations of an action, where they are kept."""
+        return None
+
+    def _risk_found(self, final: Suggestion) -> RiskFound | None:
+        """What errors of execution do to the recommended action."""
+        return None
+
+    def _window_found(self) -> WindowFound | None:
+        """How far the recommended action may be missed."""
+        return None

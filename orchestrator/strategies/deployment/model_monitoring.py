@@ -1,0 +1,326 @@
+"""What every pour says about the simulator, in words; when a deployment ends, asks, or can't keep a limit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal
+
+from actors.optimizer.questions import BenchOffset, DiscrepancyFound, Limit, Suggestion
+from orchestrator.requests import Ask, Decision
+from orchestrator.strategies.deployment.real_pours import PourTrial
+from orchestrator.strategies.stage_result import ResultPart
+from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.search_space import Axis, Space
+from sim_engine.settings.model import Section
+from sim_engine.settings.quantity import Quantity
+
+Otherwise = Literal["ask", "go on", "stop"]
+
+GO_ON: Final = "go on"
+STOP: Final = "stop"
+OPTIONS = (GO_ON, STOP)
+
+DOUBT = 0.3
+"""From this ignorance on a simulator is in doubt."""
+
+WORDS = ((0.05, "is borne out"), (DOUBT, "is borne out so far"), (0.7, "is in doubt"), (0.95, "is probably wrong here"))
+"""The words for a simulator whose ignorance is below each of these; above all of them it is wrong here."""
+
+
+class DiscrepancyPolicySettings(Section):
+    """D3 with `model: adaptive`: what follows when the simulator seems to say nothing of this bench."""
+
+    limit: Annotated[float, Quantity("1", "90 %", 0.1, 1.0)] = 0.9
+    """Probability that it says nothing of this bench, from which the policy follows."""
+
+    policy: Otherwise = GO_ON
+    """go on: what it says counts for as little as that; stop: the deployment ends; ask: the campaign pauses with a
+    question."""
+
+
+class RiskLimitSettings(Section):
+    """D3 with `model: adaptive`: what no pour may lose, once one has kept it."""
+
+    loss: Annotated[float, Quantity("1", "10 %", 1e-3, 1.0)] = 0.1
+    """As a share of what spilling the whole load would cost."""
+
+    probability: Annotated[float, Quantity("1", "5 %", 1e-3, 0.5)] = 0.05
+    """With which a pour may lose more."""
+
+    otherwise: Otherwise = GO_ON
+    """Where no action keeps it, which is logged before the pour. go on: the least risky one is poured; stop: the
+    deployment ends; ask: the campaign pauses with a question."""
+
+
+class StopSettings(Section):
+    """D3 with `model: adaptive`: when no further pour is worth it."""
+
+    gain_below: Annotated[float, Quantity("1", "0.2 %", 1e-5, 1.0)] = 0.002
+    """Share of what spilling the whole load would cost: ends when no further pour is expected to save as much."""
+
+
+class Belief(ResultPart):
+    """What was known of the simulator after a pour."""
+
+    pour: int
+    """Its number; 0: before the first one."""
+
+    ignorance: float
+    """Probability that the simulator says nothing of this bench."""
+
+    gain: float | None
+    """What one more pour was expected to save, in the loss' own unit."""
+
+
+class Displaced(ResultPart):
+    """By how much a dimension of what the simulator does differs from what is commanded."""
+
+    mean: float
+    """In the middle of the searched range [SI]."""
+
+    deviation: float
+    """How well it is known [SI]."""
+
+
+class Believed(ResultPart):
+    """How far the simulator is to be trusted, pour by pour."""
+
+    after: tuple[Belief, ...]
+    """Each pour that told something."""
+
+    displaced: dict[str, Displaced]
+    """By dimension."""
+
+    factor: float
+    """Real over simulated loss."""
+
+    limit: float
+    """Ignorance from which the policy follows."""
+
+    policy: str
+    """What follows."""
+
+    followed: str | None
+    """What did; None below the limit."""
+
+    alarm: bool
+    """Ignorance is at or above the limit."""
+
+    text: str
+    """The last state in a sentence."""
+
+
+class BenchFound(ResultPart):
+    """Draws of how the bench differs from the simulator, for the next receiver."""
+
+    axes: tuple[str, ...]
+    """Searched dimensions, in order."""
+
+    scales: tuple[tuple[float, ...], ...]
+    """The factor of each draw in each dimension."""
+
+    shifts: tuple[tuple[float, ...], ...]
+    """The shift of each draw in each dimension, on the unit interval."""
+
+    def displacements(self) -> tuple[BenchOffset, ...]:
+        """As questions carry them."""
+        return tuple(BenchOffset(*pair) for pair in zip(self.scales, self.shifts, strict=True))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What follows from an answer before its pour is made.
+
+    Attributes:
+        ask: a question to a person; None: nothing to ask.
+        end: why no pour follows; empty: one does.
+        limit: whether it is about the limit of a pour's loss.
+    """
+
+    ask: Ask | None = None
+    end: str = ""
+    limit: bool = False
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What a user has set; losses are in the loss' own unit."""
+
+    ignorance: DiscrepancyPolicySettings
+    limit: Limit | None
+    otherwise: Otherwise
+    gain_below: float | None
+    good_enough: float | None
+
+
+class Trust:
+    """Keeps what every answer says about the simulator, and judges whether the pour that it proposes is made."""
+
+    def __init__(self, rules: Rules, actions: Space, worst: float) -> None:
+        self._rules, self._actions, self._worst = rules, actions, worst
+        self._after: list[Belief] = []
+        self._latest: DiscrepancyFound | None = None
+        self._followed: str | None = None
+        self._accepted = False
+        self.decisions: list[Decision] = []
+
+    # -- what is logged --------------------------------------------------------------------------------------------
+
+    def hear(self, found: DiscrepancyFound, pours: Sequence[PourTrial]) -> None:
+        """Take in an answer, and say in words what the latest pour changed."""
+        known = [pour for pour in pours if pour.cost is not None]
+        number = known[-1].number if known else 0
+        self._latest = found
+        if self._after and self._after[-1].pour == number:
+            return
+        self._after.append(Belief(pour=number, ignorance=found.ignorance, gain=found.gain))
+        if number:
+            values = {"ignorance": found.ignorance} | ({} if found.gain is None else {"gain": found.gain})
+            self.decisions.append(Decision(f"after pour {number} {self.text}", values, urgent=True))
+
+    @property
+    def text(self) -> str:
+        """'the simulator is borne out: 2 % that it says nothing of this bench; …'."""
+        if self._latest is None:
+            return ""
+        share = self._latest.ignorance
+        word = next((word for limit, word in WORDS if share < limit), "is wrong here")
+        text = f"the simulator {word}: {_percent(share)} that it says nothing of this bench"
+        if share >= WORDS[-2][0]:
+            return text
+        moved = [
+            _moved(axis, one) for axis, one in zip(self._actions.axes, self._shifts(), strict=True)
+            if abs(one.mean) > one.deviation
+        ]  # fmt: skip
+        if moved:
+            text += f"; it is as if {' and '.join(moved)} than commanded"
+        if abs(math.log(self._latest.factor)) > 0.2:
+            text += f"; {self._latest.factor:.2g} times as much is lost as it says"
+        return text
+
+    def _shifts(self) -> list[Displaced]:
+        assert self._latest is not None
+        pairs = zip(self._actions.axes, self._latest.shifts, self._latest.deviations, strict=True)
+        return [_in_si(axis, shift, deviation) for axis, shift, deviation in pairs]
+
+    # -- what follows ----------------------------------------------------------------------------------------------
+
+    def judge(self, suggestion: Suggestion, pours: Sequence[PourTrial], left: int) -> Verdict:
+        """Whether the proposed pour is made.
+
+        Args:
+            suggestion: the answer with it.
+            pours: those made.
+            left: pours that the budget still has.
+        """
+        found, rules = suggestion.mismatch, self._rules
+        if found is None:
+            return Verdict()
+        weighed = [pour.cost for pour in pours if pour.status == "weighed" and pour.cost is not None]
+        if weighed and suggestion.best_mean is not None:
+            best = max(suggestion.best_mean, 0.0)
+            if rules.good_enough is not None and best <= rules.good_enough:
+                return self._saved(left, f"good enough: the best action is expected to lose {self._share(best)}")
+            if rules.gain_below is not None and found.gain is not None and found.gain < rules.gain_below:
+                why = f"no further pour is worth it: one more is expected to save {self._share(found.gain)}"
+                return self._saved(left, f"{why}, the best action to lose {self._share(best)}")
+        if found.ignorance >= rules.ignorance.limit and self._followed is None and weighed:
+            return self._by(rules.ignorance.policy, self.text, "the simulator counts for as little as that")
+        limit = rules.limit
+        if limit is None or not any(cost <= limit.loss for cost in weighed) or not found.exceedances:
+            return Verdict()
+        risk = found.exceedances[0]
+        if risk <= limit.probability * (1.0 + 1e-9):
+            return Verdict()
+        why = (
+            f"no action is known to keep the limit: the least risky one loses more than {self._share(limit.loss)} "
+            f"with {_percent(risk)}, allowed are {_percent(limit.probability)}"
+        )
+        if self._accepted:
+            self.decisions.append(Decision(f"{why}; it is poured", {"risk": risk}, urgent=True))
+            return Verdict()
+        return self._by(rules.otherwise, why, "the least risky action is poured", limit=True)
+
+    def answer(self, answer: str, *, limit: bool) -> str:
+        """What a person decided; why nothing follows, or nothing."""
+        if limit:
+            self._accepted = answer == GO_ON
+        else:
+            self._followed = answer
+        self.decisions.append(Decision(f"somebody decided: {answer}", urgent=True))
+        return "somebody decided to stop" if answer == STOP else ""
+
+    def _by(self, policy: Otherwise, why: str, then: str, *, limit: bool = False) -> Verdict:
+        if policy == "ask":
+            meaning = f"{GO_ON}: {then}; {STOP}: this deployment ends with what is known"
+            return Verdict(Ask(f"{why[0].upper()}{why[1:]}. How to go on? {meaning}.", OPTIONS), limit=limit)
+        if limit:
+            self._accepted = policy == GO_ON
+        else:
+            self._followed = policy
+        what = then if policy == GO_ON else "this deployment ends with what is known"
+        self.decisions.append(Decision(f"{why}; {what}", urgent=True))
+        return Verdict() if policy == GO_ON else Verdict(end=why)
+
+    def _saved(self, left: int, why: str) -> Verdict:
+        end = f"{why}; {left} pour{'s' * (left != 1)} saved"
+        self.decisions.append(Decision(f"the end: {end}", {"saved": float(left)}, urgent=True))
+        return Verdict(end=end)
+
+    def _share(self, loss: float) -> str:
+        return _percent(loss / self._worst)
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    def result(self) -> Believed:
+        """All that was logged."""
+        ignorance = self._after[-1].ignorance if self._after else 0.0
+        displaced = {} if self._latest is None else dict(zip(self._actions.names, self._shifts(), strict=True))
+        return Believed(
+            after=tuple(self._after),
+            displaced=displaced,
+            factor=1.0 if self._latest is None else self._latest.factor,
+            limit=self._rules.ignorance.limit,
+            policy=self._rules.ignorance.policy,
+            followed=self._followed,
+            alarm=ignorance >= self._rules.ignorance.limit,
+            text=self.text,
+        )
+
+    def bench(self) -> BenchFound | None:
+        """For the next receiver."""
+        if self._latest is None or not self._latest.drawn:
+            return None
+        drawn = self._latest.drawn
+        return BenchFound(
+            axes=self._actions.names,
+            scales=tuple(one.scales for one in drawn),
+            shifts=tuple(one.shifts for one in drawn),
+        )
+
+
+def _in_si(axis: Axis, shift: float, deviation: float) -> Displaced:
+    """A shift on the unit interval in the axis' own unit, taken in the middle of its range."""
+    if axis.scale == "log":
+        middle, width = axis.decode(0.5), math.log(axis.upper / axis.lower)
+        return Displaced(mean=middle * math.expm1(shift * width), deviation=middle * deviation * width)
+    width = axis.upper - axis.lower
+    return Displaced(mean=shift * width, deviation=deviation * width)
+
+
+def _moved(axis: Axis, one: Displaced) -> str:
+    """'x_offset were 6 ± 2 mm more'."""
+    dimension = ACTION_DIMENSIONS.get(axis.name)
+    factor, unit = (1.0, "") if dimension is None else (dimension.factor, f" {dimension.display_unit}")
+    more = "more" if one.mean > 0.0 else "less"
+    return f"{axis.name} were {abs(one.mean) / factor:.2g} ± {one.deviation / factor:.1g}{unit} {more}"
+
+
+def _percent(share: float) -> str:
+    """'3 %', '0.4 %'."""
+    percent = 100.0 * share
+    if percent < 0.05:
+        return "less than 0.1 %"
+    return f"{percent:.1f} %" if percent < 9.95 else f"{percent:.0f} %"

@@ -1,0 +1,190 @@
+"""Several objectives behind one question: which scalar the next action minimises, and the front that was found.
+
+The front of objectives that can't all be had: what finds it, and what of a set lies on it. Pure functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from actors.optimizer.questions import Data, Point, Suggestion, SuggestProblem
+from orchestrator.requests import Simulate
+from orchestrator.strategies.deployment.costing import Costing
+from orchestrator.strategies.deployment.deployment_result import ParetoAction
+from orchestrator.strategies.deployment.objectives import Vector
+from orchestrator.strategies.optimizer_queries import OptimizerQueries
+from orchestrator.strategies.stage_result import displayed_action
+from orchestrator.strategies.trials import Trial
+from sim_engine.search_space import Space
+
+AUGMENTATION = 0.05
+"""Share of the weighted sum in a scalarisation: without it, weakly dominated points would be as good as others."""
+
+
+def random_weights(count: int, rng: np.random.Generator) -> Vector:
+    """Weights drawn evenly from the simplex: positive, adding up to 1."""
+    drawn = rng.exponential(size=count)
+    return tuple(float(w) for w in drawn / drawn.sum())
+
+
+def scalarised(
+    vectors: Sequence[Vector], weights: Vector, worst: Vector, among: Sequence[Vector] | None = None
+) -> list[float]:
+    """The augmented Chebyshev function of each vector: max_j λ_j z_j + ρ Σ_j λ_j z_j.
+
+    z_j is objective j over the range of what was observed of it (`among`; the vectors themselves unless given); pours
+    that delivered too little (beyond `worst`) don't stretch the range, and come to lie above 1. Every point of the
+    front minimises it for some weights, on concave parts too, which no weighted sum reaches.
+
+    Source: Knowles, ParEGO: a hybrid algorithm with on-line landscape approximation for expensive multiobjective
+    optimization problems, IEEE Transactions on Evolutionary Computation 10, 2006.
+    """
+    if not vectors:
+        return []
+    values, limit = np.array(vectors, dtype=np.float64), np.array(worst, dtype=np.float64)
+    known = values if among is None else np.array(among, dtype=np.float64)
+    usual = known[np.all(known <= limit + 1e-12, axis=1)]
+    lower = usual.min(axis=0) if len(usual) else np.zeros_like(limit)
+    upper = usual.max(axis=0) if len(usual) else limit
+    span = np.where(upper - lower > 1e-9, upper - lower, np.maximum(limit, 1e-9))
+    weighted = np.array(weights) * (values - lower) / span
+    return [float(v) for v in weighted.max(axis=1) + AUGMENTATION * weighted.sum(axis=1)]
+
+
+def undominated(vectors: Sequence[Vector]) -> list[int]:
+    """Indices of the vectors that no other one beats: as good in all objectives and better in one."""
+    values = np.array(vectors, dtype=np.float64)
+    kept = []
+    for i, own in enumerate(values):
+        beaten = np.all(values <= own, axis=1) & np.any(values < own, axis=1)
+        if not beaten.any():
+            kept.append(i)
+    return kept
+
+
+Observed = Sequence[tuple[Point, Vector]]
+"""Where objectives were observed, and what they were."""
+
+
+class Scalarization:
+    """Remembers the objectives of simulations, and weighs them anew for every question.
+
+    Unless a front is looked for, what is minimised is always the one number of `Costing.total`.
+    """
+
+    def __init__(self, costing: Costing, rng: np.random.Generator) -> None:
+        self._costing = costing
+        self._rng = rng
+        self._vectors: dict[Simulate, Vector] = {}
+        self._weights: Vector | None = None
+        self.front: list[ParetoAction] | None = None
+
+    @property
+    def wanted(self) -> bool:
+        """A front is looked for."""
+        return self._costing.objectives is not None and self._costing.objectives[0].pareto
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the objectives; empty with a plain loss."""
+        return () if self._costing.objectives is None else self._costing.objectives[0].names
+
+    @property
+    def exploring(self) -> bool:
+        """The question minimises a random compromise, and its numbers are not losses."""
+        return self._weights is not None
+
+    def weigh(self, *, exploring: bool) -> None:
+        """Weigh for the next question: at random to explore the front, else as the campaign says."""
+        self._weights = random_weights(len(self.names), self._rng) if self.wanted and exploring else None
+
+    def note(self, request: Simulate, vector: Vector | None) -> float | None:
+        """Remember what a simulation came to; its cost."""
+        if vector is None:
+            return None
+        self._vectors[request] = vector
+        return self._costing.total(vector)
+
+    def of(self, trials: Sequence[Trial]) -> list[tuple[Point, Vector]]:
+        """Mean objectives of the trials that have any."""
+        found = []
+        for trial in trials:
+            known = [self._vectors[request] for request in trial.requests if request in self._vectors]
+            if known:
+                found.append((trial.point, tuple(float(v) for v in np.mean(known, axis=0))))
+        return found
+
+    def data(self, observed: Observed, among: Observed) -> Data:
+        """Observations of what the next question minimises.
+
+        Args:
+            observed: what is wanted.
+            among: all that is known: its range scales the objectives.
+        """
+        points, vectors = tuple(point for point, _ in observed), [vector for _, vector in observed]
+        if self._weights is None:
+            return Data(points, tuple(self._costing.total(vector) for vector in vectors))
+        known = [vector for _, vector in among]
+        return Data(points, tuple(scalarised(vectors, self._weights, self._costing.limits, known)))
+
+    def look_for_front(
+        self,
+        simulated: Observed,
+        poured: Observed,
+        actions: Space,
+        problem: Callable[[Data, Data], SuggestProblem],
+        questions: OptimizerQueries,
+        then: Callable[[], None],
+    ) -> None:
+        """Put a question for each objective, about the tried actions; their answers make the front.
+
+        Args:
+            problem: how one objective is regressed, given what was simulated and what was poured of it.
+            then: called once the front is known.
+        """
+        candidates = self._candidates([*simulated, *poured])
+        answers: dict[int, Suggestion] = {}
+
+        def answered(j: int, suggestion: Suggestion) -> None:
+            answers[j] = suggestion
+            if len(answers) == len(self.names):
+                self._settle(candidates, [answers[k] for k in sorted(answers)], actions)
+                then()
+
+        for j in range(len(self.names)):
+            question = replace(problem(_one(simulated, j), _one(poured, j)), count=0, predict_at=tuple(candidates))
+            questions.put(question, "front", partial(answered, j))
+
+    def _candidates(self, observed: Observed) -> list[Point]:
+        """Tried actions that may be on the front: those that delivered enough."""
+        limits = np.array(self._costing.limits) + 1e-9
+        return list(dict.fromkeys(point for point, vector in observed if np.all(np.array(vector) <= limits)))
+
+    def _settle(self, candidates: Sequence[Point], answers: Sequence[Suggestion], actions: Space) -> None:
+        """The front among the candidates, by each objective's posterior mean."""
+        if any(len(answer.predictions) != len(candidates) for answer in answers):
+            self.front = []  # too little was observed for a surrogate
+            return
+        means = [tuple(max(answer.predictions[i], 0.0) for answer in answers) for i in range(len(candidates))]
+        kept = sorted(undominated(means), key=lambda i: means[i])
+        self.front = []
+        for i in kept:
+            values = actions.decode(candidates[i])
+            deviations = [answer.prediction_deviations[i] for answer in answers]
+            self.front.append(
+                ParetoAction(
+                    action=displayed_action(values),
+                    action_si=values,
+                    objectives=dict(zip(self.names, means[i], strict=True)),
+                    deviations=dict(zip(self.names, deviations, strict=True)),
+                )
+            )
+
+
+def _one(observed: Observed, index: int) -> Data:
+    """One objective alone."""
+    return Data(tuple(point for point, _ in observed), tuple(vector[index] for _, vector in observed))

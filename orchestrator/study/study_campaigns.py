@@ -1,0 +1,205 @@
+"""From a cell to the campaign that it is: the base campaign's plan with other pours, budget, θ, bench and seed."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from orchestrator.config.run_snapshot import record_of
+from orchestrator.journal.journal import JOURNAL_NAME
+from orchestrator.journal.stage_results import Results, result_of
+from orchestrator.runs.stages import (
+    CALIBRATION,
+    EVALUATION,
+    POURS,
+    StageDefinition,
+    calibration_stages,
+    deployed_theta,
+    deployment_stages,
+    known_simulations,
+    measured_pours,
+    stage_seed,
+    with_posterior,
+)
+from orchestrator.strategies.calibration.action_prior import region_of
+from orchestrator.strategies.calibration.active_design import ActivePours
+from orchestrator.strategies.calibration.calibration_scores import CalibrationEvaluation
+from orchestrator.strategies.calibration.pointwise_calibration import C1Settings
+from orchestrator.strategies.calibration.pour_contexts import Contexts
+from orchestrator.strategies.calibration.pour_design import DesignedPours, DesignPoured, draw_allowed, stratified
+from orchestrator.strategies.campaign_plan import CampaignPlan, OutputPlan, RecordedPour, RecordSet
+from orchestrator.strategies.deployment.costing import Costing
+from orchestrator.strategies.deployment.deployment_result import Deployed
+from orchestrator.strategies.strategy import Strategy
+from orchestrator.study.cells import FINAL, GRID, StudyCell
+from orchestrator.study.study_plan import StudyPlan
+from orchestrator.study.study_strategies import AnsweredByTable, FinalPour, SimulatedTable, Tabled
+from sim_engine.action import Action
+from sim_engine.liquids import SimulationParameters
+
+Load = Callable[[str], Results]
+"""What the stages of a finished cell learnt, by its id."""
+
+
+def campaign_of(
+    study: StudyPlan, cell: StudyCell, load: Load, directory: Path
+) -> tuple[CampaignPlan, list[StageDefinition]]:
+    """The campaign of a cell, with its stages.
+
+    Args:
+        load: of the cells that it needs.
+        directory: of its run.
+    """
+    plan, stages = _planned(study, cell, load, directory)
+    return replace(plan, resolved=record_of(study.base.resolved, plan)), stages
+
+
+def _planned(
+    study: StudyPlan, cell: StudyCell, load: Load, directory: Path
+) -> tuple[CampaignPlan, list[StageDefinition]]:
+    base = study.base
+    bench = base.laboratory.bench if not cell.level else study.level(cell.level).bench
+    plan = replace(
+        base,
+        name=cell.id,
+        seed=cell.seed,
+        laboratory=replace(base.laboratory, bench=bench),
+        outputs=OutputPlan(directory, rrd=False, figures=False, record_rate=0.0, recorded_simulations=0),
+        on_unknown="repeat",
+    )
+    match cell.kind:
+        case "pours" if cell.arm:
+            arm = study.calibration(cell.arm)
+            wanted = study.deployments[0].plan if study.deployments else None
+            plan = replace(plan, calibration=replace(arm.plan, pour_count=arm.pours, holdout=0), deployment=wanted)
+        case "grid" | "pours" if plan.calibration is not None:
+            designed = replace(plan.calibration, pour_count=study.pour_count, holdout=study.holdout)
+            plan = replace(plan, calibration=designed)
+    match cell.kind:
+        case "grid":
+            return plan, [StageDefinition(GRID, lambda results, seed: _table(study, seed))]
+        case "pours":
+            return plan, [StageDefinition(POURS, lambda results, seed: _pours(study, plan, cell, seed), pours=True)]
+        case "calibration":
+            return _calibration(study, cell, plan, load, directory)
+        case "uncalibrated":
+            plan = _with_pours(study, cell, plan, load, directory)
+            return plan, [StageDefinition(EVALUATION, lambda results, seed: _score_of_default(plan, seed))]
+        case "deployment":
+            return _deployment(study, cell, plan, cell.needs, load)
+        case "final":
+            return _final(study, cell, plan, load)
+
+
+def calibration_actions(study: StudyPlan) -> list[tuple[float, ...]]:
+    """The actions of all calibration pours, in the unit cube of the action space: the same in every repetition."""
+    calibration = study.base.calibration
+    assert calibration is not None
+    rng = np.random.default_rng(stage_seed(study.seed, "actions"))
+    region = region_of(calibration.actions, calibration.constraints)
+    strata = stratified(study.pour_count, calibration.actions.dimension, rng)
+    return [draw_allowed(stratum, region, rng) for stratum in strata]
+
+
+def _actions(study: StudyPlan) -> list[Action]:
+    calibration = study.base.calibration
+    assert calibration is not None
+    return [calibration.scene.action(calibration.actions.decode(point)) for point in calibration_actions(study)]
+
+
+def _table(study: StudyPlan, seed: int) -> Strategy:
+    plan = study.calibration("C1").plan
+    assert isinstance(plan.settings, C1Settings)
+    cells = plan.settings.cells
+    middles = [[(i + 0.5) / cells[name] for i in range(cells[name])] for name in plan.parameters.names]
+    thetas = [
+        SimulationParameters.from_values({**plan.fixed_parameters, **plan.parameters.decode(point)})
+        for point in itertools.product(*middles)
+    ]
+    return SimulatedTable(plan.scene.name, _actions(study), thetas, seed)
+
+
+def _pours(study: StudyPlan, campaign: CampaignPlan, cell: StudyCell, seed: int) -> Strategy:
+    plan = campaign.calibration
+    assert plan is not None
+    if cell.arm:
+        return ActivePours(plan, campaign.deployment, seed)
+    points = calibration_actions(study)
+    return DesignedPours(plan.scenes, plan.actions, len(points), study.holdout, seed, points=points, tested=plan.tested)
+
+
+def _with_pours(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load, directory: Path) -> CampaignPlan:
+    """The plan with the repetition's weighed pours as records; of an arm that has its own, those of the test split."""
+    calibration = plan.calibration if not cell.arm else study.calibration(cell.arm).plan
+    assert calibration is not None
+    mass, pours = calibration.scene.liquid.mass, []
+    scenes = {scene.name: scene for scene in calibration.poured}
+    own = study.calibration(cell.arm).pours if cell.arm else 0
+    weighed = result_of(load(cell.needs[0]), POURS, DesignPoured).measured
+    if own:
+        chosen = load(cell.needs[1])
+        weighed = (*result_of(chosen, POURS, DesignPoured).measured, *(p for p in weighed if p.split == "test"))
+        calibration = replace(calibration, known=known_simulations(calibration, chosen))
+    for pour in weighed:
+        poured, scene = pour.poured * mass, scenes.get(pour.scene, calibration.scene)
+        action, spilled = scene.action(dict(pour.action_si)), (pour.spillage or 0.0) * poured
+        pours.append(RecordedPour(action, poured, spilled, mass - poured, pour.split, scene.name))
+    source = cell.needs[1 if own else 0]
+    records = RecordSet(calibration.scene, tuple(pours), directory.parent / source / JOURNAL_NAME)
+    return replace(plan, calibration=replace(calibration, records=records))
+
+
+def _calibration(
+    study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load, directory: Path
+) -> tuple[CampaignPlan, list[StageDefinition]]:
+    plan = _with_pours(study, cell, plan, load, directory)
+    assert plan.calibration is not None
+    stages = calibration_stages(plan.calibration)
+    if cell.arm != "C1":
+        return plan, stages
+    rows = result_of(load(GRID), GRID, Tabled).rows
+
+    def answered(stage: StageDefinition) -> StageDefinition:
+        def build(results: Results, seed: int) -> Strategy:
+            return AnsweredByTable(stage.build(results, seed), rows)
+
+        return replace(stage, build=build)
+
+    return plan, [answered(stage) if stage.name == CALIBRATION else stage for stage in stages]
+
+
+def _score_of_default(plan: CampaignPlan, seed: int) -> Strategy:
+    assert plan.calibration is not None
+    pours = measured_pours(plan.calibration, {})
+    return CalibrationEvaluation(plan.parameters, {}, pours, Contexts.of(plan.calibration), seed)
+
+
+def _deployment(
+    study: StudyPlan, cell: StudyCell, plan: CampaignPlan, calibrations: Sequence[str], load: Load
+) -> tuple[CampaignPlan, list[StageDefinition]]:
+    arm = study.deployment(cell.arm).plan
+    deployment = replace(arm, scenes=tuple(scene for scene in arm.scenes if scene.name == cell.receiver))
+    for calibration in calibrations:
+        found = load(calibration)
+        deployment = with_posterior(deployment, found)
+        plan = replace(plan, parameters=deployed_theta(found))
+    plan = replace(plan, calibration=None, deployment=deployment)
+    return plan, deployment_stages(plan, deployment)
+
+
+def _final(
+    study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load
+) -> tuple[CampaignPlan, list[StageDefinition]]:
+    """The deployment's laboratory and loss, and one pour of what it recommends."""
+    learnt, *calibrations = cell.needs
+    plan, stages = _deployment(study, cell, plan, calibrations, load)
+    assert plan.deployment is not None
+    recommended = result_of(load(learnt), stages[0].name, Deployed).recommended
+    scene = plan.deployment.scenes[0]
+    action = None if recommended is None else scene.action(dict(recommended.action_si))
+    costing = Costing.of(plan.deployment, scene, plan.parameters)
+    return plan, [StageDefinition(FINAL, lambda results, seed: FinalPour(costing, action, seed), pours=True)]

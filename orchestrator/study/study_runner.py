@@ -1,0 +1,195 @@
+"""Runs the cells of a study: those that are not finished, each as soon as what it needs is, several at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from actors.runtime.child_process import ChildProcess, python_module
+from orchestrator.study.cells import StudyCell, cells_of, estimated_seconds
+from orchestrator.study.study_folder import LOG, is_finished
+from orchestrator.study.study_plan import StudyPlan
+
+WAKE = 0.1
+"""Seconds between two looks at the cells' processes."""
+
+GRACE = 10.0
+"""Time that a cell's process has to end after it was asked to [s]."""
+
+
+@dataclass
+class CellStatus:
+    """Where a study stands.
+
+    Attributes:
+        finished, failed, running: ids; `skipped`: cells that need a failed one.
+        cost_left, cost_done: estimated CPU seconds of what is left, and of what this process has finished.
+        seconds: since this process began.
+    """
+
+    cells: int
+    finished: set[str] = field(default_factory=set)
+    failed: dict[str, str] = field(default_factory=dict)
+    skipped: set[str] = field(default_factory=set)
+    running: set[str] = field(default_factory=set)
+    cost_left: float = 0.0
+    cost_done: float = 0.0
+    seconds: float = 0.0
+
+    def seconds_left(self, jobs: int) -> float:
+        """Rough: by the estimate until something is finished, then by how fast that went [s]."""
+        if self.cost_done <= 0.0:
+            return self.cost_left / max(jobs, 1)
+        return self.cost_left * self.seconds / self.cost_done
+
+
+Watch = Callable[[CellStatus], None]
+
+
+def cell_command(study: StudyPlan) -> list[str]:
+    """What runs cells in a process of its own."""
+    return python_module("orchestrator.study.cell_process", str(study.source))
+
+
+class CellProcess:
+    """A process that runs cells, one at a time.
+
+    Args:
+        command: that starts it; see `orchestrator.study.cell_process` for what it reads and writes.
+        log: file that takes what else it says.
+
+    Attributes:
+        cell: that it runs now.
+    """
+
+    def __init__(self, command: Sequence[str], log: Path) -> None:
+        self._log = log
+        with log.open("wb") as errors:
+            self.child = ChildProcess(command, errors=errors)
+        self.cell: StudyCell | None = None
+
+    def begin(self, cell: StudyCell) -> None:
+        """Give it a cell."""
+        self.cell = cell
+        with contextlib.suppress(BrokenPipeError):  # it has died; `ended` says so
+            self.child.write(f"{cell.id}\n".encode())
+
+    def ended(self) -> tuple[StudyCell, str | None] | None:
+        """The cell that has just ended, if one has, and what went wrong with it."""
+        if self.cell is None:
+            return None
+        dead = self.dead  # before the last look at what it wrote
+        line = None
+        with contextlib.suppress(TimeoutError, EOFError):
+            line = self.child.read_line(0.0)
+        if line is None and not dead:
+            return None
+        cell, self.cell = self.cell, None
+        return cell, last_words(self._log) if line is None else json.loads(line)[1]
+
+    @property
+    def dead(self) -> bool:
+        """Its process has ended."""
+        return not self.child.alive
+
+    def close(self) -> None:
+        """Let go of its pipes."""
+        self.child.release()
+
+
+def run_cells(
+    study: StudyPlan,
+    folder: Path,
+    *,
+    jobs: int,
+    watch: Watch = lambda status: None,
+    command: Callable[[StudyPlan], list[str]] = cell_command,
+) -> CellStatus:
+    """Run all cells that are not finished. What fails is noted, and the others go on.
+
+    Interrupted (KeyboardInterrupt), the cells' processes are ended first: their journals say how far they came.
+
+    Args:
+        folder: of the study, held by this process.
+        jobs: cells at a time.
+    """
+    cells = cells_of(study)
+    cost = {cell.id: estimated_seconds(study, cell) for cell in cells}
+    status = CellStatus(len(cells), {cell.id for cell in cells if is_finished(folder, cell.id)})
+    waiting = [cell for cell in cells if cell.id not in status.finished]
+    status.cost_left = sum(cost[cell.id] for cell in waiting)
+    processes: list[CellProcess] = []
+    started = 0
+    begun = time.monotonic()
+    watch(status)
+    try:
+        while waiting or status.running:
+            _skip(waiting, status)
+            ready = [cell for cell in waiting if status.finished.issuperset(cell.needs)]
+            idle = [process for process in processes if process.cell is None]
+            for cell in ready[: max(jobs, 1) - len(status.running)]:
+                if not idle:
+                    started += 1
+                    processes.append(CellProcess(command(study), folder / LOG.format(started)))
+                    idle = processes[-1:]
+                waiting.remove(cell)
+                idle.pop().begin(cell)
+                status.running.add(cell.id)
+            for process in list(processes):
+                if (end := process.ended()) is not None:
+                    _note(*end, folder, cost, status)
+                if process.dead:
+                    process.close()
+                    processes.remove(process)
+            status.seconds = time.monotonic() - begun
+            watch(status)
+            if status.running:
+                time.sleep(WAKE)
+    finally:
+        _end(processes)
+    return status
+
+
+def _note(cell: StudyCell, problem: str | None, folder: Path, cost: dict[str, float], status: CellStatus) -> None:
+    status.running.discard(cell.id)
+    status.cost_left -= cost[cell.id]
+    if is_finished(folder, cell.id):
+        status.finished.add(cell.id)
+        status.cost_done += cost[cell.id]
+    else:
+        status.failed[cell.id] = problem or "it ended without a result"
+
+
+def last_words(log: Path) -> str:
+    """The last line that a cell's process wrote."""
+    try:
+        lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    except OSError:
+        return "its process ended without a word"
+    return lines[-1] if lines else "its process ended without a word"
+
+
+def _skip(waiting: list[StudyCell], status: CellStatus) -> None:
+    """Cells that need one that failed: they can't be run now."""
+    for cell in list(waiting):
+        if any(need in status.failed or need in status.skipped for need in cell.needs):
+            waiting.remove(cell)
+            status.skipped.add(cell.id)
+
+
+def _end(processes: Iterable[CellProcess]) -> None:
+    mine = list(processes)
+    for process in mine:
+        if process.cell is None:
+            process.child.close_input()  # it keeps what it has compiled
+        else:
+            process.child.terminate()
+    deadline = time.monotonic() + GRACE
+    for process in mine:
+        if not process.child.wait(max(deadline - time.monotonic(), 0.1)):
+            process.child.kill()
+        process.close()

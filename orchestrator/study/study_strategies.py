@@ -1,0 +1,258 @@
+"""What only a study asks for: simulations that many repetitions score, a strategy that they answer, final pours."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+from orchestrator.requests import Decision, Failed, Outcome, Poured, Request, Simulate, Simulated, Slots
+from orchestrator.strategies.deployment.costing import Costing
+from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.single_pour import OnePour
+from orchestrator.strategies.stage_result import ResultPart, StageResult
+from orchestrator.strategies.strategy import Progress, Strategy, is_sound
+from sim_engine.action import Action
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import PourOutcome, normalised_spillage
+
+Key = tuple[tuple[tuple[str, float], ...], tuple[tuple[str, float | None], ...]]
+
+
+class TableRow(ResultPart):
+    """One simulation of a table."""
+
+    theta: SimulationParameters
+    action: dict[str, float | None]
+    """All dimensions [SI]."""
+
+    fractions: tuple[float, float, float, float] | None = None
+    """Received, spilled, retained, in flight; None where it was lost."""
+
+    particles: int = 0
+    lost: str = ""
+    """Why there are no fractions."""
+
+
+class Tabled(StageResult):
+    """Simulations that the repetitions of a study share."""
+
+    kind: Literal["table"] = "table"
+
+    simulations: int
+    """Those that were answered."""
+
+    rows: tuple[TableRow, ...]
+    """All of them, at the end."""
+
+
+class FinalPoured(StageResult):
+    """A pour of what a deployment recommends, with a seed that took no part in the choice."""
+
+    kind: Literal["final"] = "final"
+
+    action_si: dict[str, float | None] | None
+    """All dimensions [SI]; None where nothing was recommended."""
+
+    loss: float
+    """In its own unit; the worst where nothing was weighed."""
+
+    spillage: float
+    """r = spilled / poured; 1 where nothing was weighed."""
+
+    made: bool
+    """Whether it was poured and weighed."""
+
+    reason: str
+    """Why it was not, or hardly poured anything."""
+
+
+class SimulatedTable:
+    """Simulate every θ at every action once. An action has the same seed under every θ, as in C1."""
+
+    def __init__(
+        self, scene: str, actions: Sequence[Action], thetas: Sequence[SimulationParameters], seed: int
+    ) -> None:
+        seeds = SeedStream(seed, "table")
+        each = [(action, seeds.next()) for action in actions]
+        self._rows: list[TableRow] = []
+        self._total = len(actions) * len(thetas)
+        self._unissued = deque(Simulate(scene, action, theta, s, "table") for theta in thetas for action, s in each)
+        self._open: list[Simulate] = []
+        self.decisions: list[Decision] = [Decision(f"{len(thetas)} θ at {len(actions)} actions, {self._total} in all")]
+
+    @property
+    def finished(self) -> bool:
+        """Every simulation has been answered."""
+        return not self._unissued and not self._open
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """The next simulations."""
+        asked = [self._unissued.popleft() for _ in range(min(slots.simulations, len(self._unissued)))]
+        self._open += asked
+        return list(asked)
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What came of a simulation. Raises ValueError if it was not asked for."""
+        if not isinstance(request, Simulate) or request not in self._open:
+            raise ValueError(f"this simulation was not asked for: {request}")
+        self._open.remove(request)
+        theta, action = request.parameters, request.action.values()
+        match outcome:
+            case Simulated(result) if result.invalid is None and is_sound(result.fractions):
+                fractions = (result.received, result.spilled, result.retained, result.in_flight)
+                self._rows.append(TableRow(theta=theta, action=action, fractions=fractions, particles=result.particles))
+            case _:
+                lost = getattr(outcome, "reason", "") or "invalid outcome"
+                self._rows.append(TableRow(theta=theta, action=action, lost=lost))
+
+    def progress(self) -> Progress:
+        """Simulations answered, simulations in all."""
+        return Progress(len(self._rows), self._total)
+
+    def result(self) -> Tabled:
+        """One row for each simulation, once all are there: watchers get their number until then."""
+        return Tabled(simulations=len(self._rows), rows=tuple(self._rows) if self.finished else ())
+
+
+class AnsweredByTable:
+    """A strategy whose simulations were made beforehand: only its other requests reach the laboratory."""
+
+    def __init__(self, inner: Strategy, rows: Sequence[TableRow]) -> None:
+        """Take over.
+
+        Args:
+            inner: any strategy that simulates at the θ and actions of the table alone.
+            rows: of a `SimulatedTable`.
+        """
+        self._inner = inner
+        self._known = {_key(row.theta, row.action): row for row in rows}
+
+    @property
+    def finished(self) -> bool:
+        """The strategy is."""
+        return self._inner.finished
+
+    @property
+    def decisions(self) -> list[Decision]:
+        """The strategy's."""
+        return list(getattr(self._inner, "decisions", ()))
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """What the strategy wants beside simulations."""
+        others: list[Request] = []
+        while not self._inner.finished:
+            requests = self._inner.ask(slots)
+            simulations = [request for request in requests if isinstance(request, Simulate)]
+            others += [request for request in requests if not isinstance(request, Simulate)]
+            for request in simulations:
+                self._inner.tell(request, self._answer(request))
+            if not simulations:
+                break
+        return others
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """Passed on."""
+        self._inner.tell(request, outcome)
+
+    def progress(self) -> Progress:
+        """The strategy's."""
+        return self._inner.progress()
+
+    def result(self) -> StageResult:
+        """The strategy's."""
+        return self._inner.result()
+
+    def _answer(self, request: Simulate) -> Outcome:
+        row = self._known.get(_key(request.parameters, request.action.values()))
+        if row is None:
+            raise ValueError(f"the table has no simulation of {request.parameters} at {request.action}")
+        if row.fractions is None:
+            return Failed("simulation", row.lost)
+        received, spilled, retained, in_flight = row.fractions
+        return Simulated(
+            PourOutcome(
+                received=received,
+                spilled=spilled,
+                retained=retained,
+                in_flight=in_flight,
+                escaped=0.0,
+                particles=row.particles,
+                spacing=0.0,
+                density_error=0.0,
+                simulated_time=0.0,
+                steps=0,
+                cpu_s=0.0,
+                seed=request.seed,
+            )
+        )
+
+
+class FinalPour:
+    """Pour what a deployment recommends once more, with a seed that took no part in the choice.
+
+    The least loss that was measured is the luckiest of several pours; a single pour of another strategy had no such
+    choice. Pours of recommended actions can be compared.
+
+    What can't be made, or goes wrong, has the worst loss and counts as all spilled, as does a pour that hardly left the
+    cup; so does a deployment that recommends nothing. In a study the strategies of a repetition share the seed.
+    """
+
+    def __init__(self, costing: Costing, action: Action | None, seed: int) -> None:
+        """Plan.
+
+        Args:
+            costing: scene and loss of the deployment.
+            action: None: nothing was recommended, and nothing is poured.
+        """
+        self._costing = costing
+        self._action = action
+        self._pour = None if action is None else OnePour(costing.scene, action, seed)
+        self._made: FinalPoured | None = None if action is not None else self._lost("nothing was recommended")
+        self.decisions: list[Decision] = [] if self._pour is None else self._pour.decisions
+
+    @property
+    def finished(self) -> bool:
+        """It was poured, or came to nothing."""
+        return self._made is not None
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """The pour, once."""
+        return [] if self._pour is None else self._pour.ask(slots)
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """What came of it. Raises ValueError if it was not asked for."""
+        if self._pour is None or self._action is None:
+            raise ValueError(f"this pour was not asked for: {request}")
+        self._pour.tell(request, outcome)
+        match outcome:
+            case Poured(measurement) if is_sound(measurement.fractions):
+                loss = self._costing.total(self._costing.poured(measurement, self._action))
+                spillage = normalised_spillage(measurement.fractions)
+                self._made = FinalPoured(
+                    action_si=self._action.values(),
+                    loss=loss,
+                    spillage=1.0 if spillage is None else spillage,
+                    made=True,
+                    reason="" if spillage is not None else "hardly anything was poured",
+                )
+            case Poured():
+                self._made = self._lost("weighing: the balance gave no numbers")
+            case Failed(kind, reason):
+                self._made = self._lost(f"{kind}: {reason}")
+
+    def progress(self) -> Progress:
+        """Pours done, pours in all."""
+        return Progress(pours=int(self.finished), of_pours=1)
+
+    def result(self) -> FinalPoured:
+        """What came of it; as lost, until something has."""
+        return self._lost("it has not been poured yet") if self._made is None else self._made
+
+    def _lost(self, reason: str) -> FinalPoured:
+        action = None if self._action is None else self._action.values()
+        return FinalPoured(action_si=action, loss=self._costing.worst, spillage=1.0, made=False, reason=reason)
+
+
+def _key(theta: SimulationParameters, action: Mapping[str, float | None]) -> Key:
+    return tuple(sorted(theta.model_dump().items())), tuple(sorted(action.items()))

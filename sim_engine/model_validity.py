@@ -1,0 +1,222 @@
+"""What a planned pour calls for and the simulator does not have: told from dimensionless numbers, before it runs.
+
+The numbers are those of `sim_engine.lip_flow`. A warning is given when more than 5 % of what is poured leaves under such
+conditions; every pour begins and ends with a trickle.
+
+Sources:
+    Duez, Ybert, Clanet & Bocquet, Wetting controls separation of inertial flows from solid surfaces, PRL 104, 084503
+    (2010), and Bouwhuis & Snoeijer, The effect of surface wettability on inertial pouring flows (2015): a critical
+    Weber number, which grows with wetting and with the roundness of the edge.
+    Kistler & Scriven, The teapot effect, J. Fluid Mech. 263 (1994): wetting and its hysteresis.
+    Taylor, Proc. R. Soc. A 253 (1959): how fast the edge of a sheet recedes.
+    de Gennes, Brochard-Wyart & Quéré, Capillarity and Wetting Phenomena (2004), chapter 2: capillary length, puddles.
+    Bretherton, J. Fluid Mech. 10 (1961): bubbles that don't rise in narrow tubes.
+    Clanet & Searby, On the glug-glug of ideal bottles, J. Fluid Mech. 510 (2004).
+
+Limitations: those of `sim_engine.lip_flow`; and the limits are orders of magnitude. No warning is no promise.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from sim_engine.action import Action
+from sim_engine.lip_flow import EDGE, FlowCourse, FlowNumbers, bond, capillary_length, flow_course, reynolds, weber
+from sim_engine.liquids import Liquid
+from sim_engine.motion import Motion, plan_motion
+from sim_engine.scene import Scene
+from sim_engine.vessel.vessel import Vessel
+
+DRIBBLING_WEBER = 2.0
+"""Film at the lip: below it surface tension, which pulls a free sheet's edge back with 2σ, outweighs the momentum ρU²e
+that carries it away (Taylor 1959); a wetted wall at a right angle to the film holds it with up to as much,
+σ (1 + cos of the contact angle). Over round, well wetted edges liquid dribbles at several times that already."""
+
+WETTING_BOND = 1.0
+"""Film at the lip: below it the film is thinner than the capillary length √(σ/ρg). Liquid that does not wet its lip
+stands up to twice that length above it before it leaves, and one that does creeps over it."""
+
+VISCOUS_REYNOLDS = 100.0
+"""Film at the lip: a boundary layer of 5√(νl/U) fills the film within the l ≈ 3e in which it gathers its speed at about
+Re = 75. Above, so short a time is not enough for the liquid's viscosity to be felt. Of liquids as thin as water only:
+of others it is simulated, …"""
+
+CREEPING = 2.0
+"""… up to this viscosity [Pa s], the largest that was held against theory (`decant physics film`) …"""
+
+FLOOR = 300e-6
+"""… and roughly below that kinematic viscosity [m²/s]: so much the solver adds by itself at most, in a tank 41 mm deep
+(`decant physics floor`, spacings of 4.1 to 5.9 mm, .05 and .2 m/s)."""
+
+PARTICLES_ACROSS = 2.0
+"""Particles across the falling stream: with fewer none has neighbours all around it, and the stream is a string."""
+
+AIRTIGHT_BOND = 0.842
+"""Bond number of the opening: air does not rise into a narrower one that is full of liquid (Bretherton 1961)."""
+
+
+@dataclass(frozen=True)
+class NotCovered:
+    """Something that decides where the liquid goes and that the simulator does not know.
+
+    Attributes:
+        kind: 'dribbling', 'wetting', 'viscous', 'thin_stream', 'glugging' or 'airtight'.
+        share: of what is poured that leaves under such conditions.
+        text: what it is and what to do about it, for people.
+    """
+
+    kind: str
+    share: float
+    text: str
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON-ready mapping."""
+        return {"kind": self.kind, "share": self.share, "text": self.text}
+
+
+@dataclass(frozen=True)
+class ModelValidity:
+    """What a planned pour is like.
+
+    Attributes:
+        poured: fraction of the load that leaves, by the tilting-cup equation.
+        lip, stream: None where nothing leaves.
+        not_covered: what the simulator can't tell about this pour.
+    """
+
+    poured: float
+    lip: FlowNumbers | None = None
+    stream: FlowNumbers | None = None
+    not_covered: tuple[NotCovered, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON-ready mapping."""
+        return {
+            "poured": self.poured,
+            "lip": None if self.lip is None else self.lip.as_json(),
+            "stream": None if self.stream is None else self.stream.as_json(),
+            "not_covered": [one.as_json() for one in self.not_covered],
+        }
+
+
+def regimes(
+    scene: Scene, action: Action, pourer: Vessel, receiver: Vessel, *, spacing: float, motion: Motion | None = None
+) -> ModelValidity:
+    """What a planned pour is like, without simulating it.
+
+    Args:
+        scene: its liquid, pivot and fixed values.
+        action: complete action.
+        pourer, receiver: geometry of the scene's vessels.
+        spacing: of the particles that the pour would be simulated with [m].
+        motion: other than the planned one.
+
+    Raises:
+        ValueError: the pourer can't hold the load.
+    """
+    motion = plan_motion(scene, action, pourer, receiver) if motion is None else motion
+    liquid = scene.liquid
+    course = flow_course(motion, liquid, pourer, receiver)
+    if course is None:
+        return ModelValidity(0.0)
+    found = [
+        _dribbling(course, liquid),
+        _wetting(course, liquid),
+        _viscous(course, liquid),
+        _thin_stream(course, liquid, spacing),
+        _without_air(course, liquid, pourer),
+    ]
+    return ModelValidity(
+        float(course.volume.sum()) / liquid.volume,
+        course.lip_numbers(liquid),
+        course.stream_numbers(liquid),
+        tuple(one for one in found if one.share > EDGE),
+    )
+
+
+def _dribbling(course: FlowCourse, liquid: Liquid) -> NotCovered:
+    share = course.share(weber(liquid, course.velocity, course.film) < DRIBBLING_WEBER)
+    return NotCovered(
+        "dribbling",
+        share,
+        f"{_percent(share)} of what is poured leaves the lip at a Weber number below {DRIBBLING_WEBER:g} and may run "
+        "down the outside of the wall, which is not simulated. More may be spilled than predicted; tilt faster or "
+        "farther",
+    )
+
+
+def _wetting(course: FlowCourse, liquid: Liquid) -> NotCovered:
+    share = course.share(bond(liquid, course.film) < WETTING_BOND)
+    return NotCovered(
+        "wetting",
+        share,
+        f"{_percent(share)} of what is poured leaves in a film thinner than the capillary length "
+        f"({1e3 * capillary_length(liquid):.1f} mm; Bond number below {WETTING_BOND:g}). How the liquid wets the lip "
+        "decides when such a film starts and stops to flow; contact angles are right for finer particles only",
+    )
+
+
+def _viscous(course: FlowCourse, liquid: Liquid) -> NotCovered:
+    if liquid.is_thick:
+        stiff, limit = liquid.dynamic_viscosity > CREEPING, f"was held against theory up to {CREEPING:g} Pa*s"
+        if not stiff:
+            limit = (
+                f"adds up to {1e6 * FLOOR:g} mm^2/s of its own, so that a liquid below that pours later than it "
+                "should; calibrate viscosity_factor on pours of this very liquid"
+            )
+        amount = f"{liquid.dynamic_viscosity:.3g} Pa*s ({1e6 * liquid.kinematic_viscosity:.3g} mm^2/s)"
+        share = float(stiff or liquid.kinematic_viscosity < FLOOR)
+        return NotCovered("viscous", share, f"the viscosity is {amount}; the simulator {limit}")
+    share = course.share(reynolds(liquid, course.velocity, course.film) < VISCOUS_REYNOLDS)
+    return NotCovered(
+        "viscous",
+        share,
+        f"{_percent(share)} of what is poured leaves the lip at a Reynolds number below {VISCOUS_REYNOLDS:g}: the "
+        f"liquid's viscosity ({1e3 * liquid.dynamic_viscosity:.3g} mPa*s) holds it back. Of a liquid this thin it is "
+        "not simulated; calibrate on pours of this very liquid",
+    )
+
+
+def _thin_stream(course: FlowCourse, liquid: Liquid, spacing: float) -> NotCovered:
+    """Told of the median: the first and the last of any pour is a thin stream."""
+    median = course.quantile(course.diameter, 0.5)
+    share = course.share(course.diameter < PARTICLES_ACROSS * spacing) if median < PARTICLES_ACROSS * spacing else 0.0
+    enough = liquid.volume * (PARTICLES_ACROSS / median) ** 3
+    return NotCovered(
+        "thin_stream",
+        share,
+        f"{_percent(share)} of what is poured falls in a stream of fewer than {PARTICLES_ACROSS:g} particles across "
+        f"({median / spacing:.1f} in the median, {1e3 * spacing:.1f} mm each, at the receiver's rim). Where it lands "
+        f"is told roughly; {_rounded_up(enough)} particles would resolve half of it",
+    )
+
+
+def _without_air(course: FlowCourse, liquid: Liquid, pourer: Vessel) -> NotCovered:
+    radius = pourer.opening_radius
+    if float(bond(liquid, radius)) < AIRTIGHT_BOND:
+        return NotCovered(
+            "airtight",
+            1.0,
+            f"the opening is {2e3 * radius:.1f} mm wide: so narrow that no air gets in past the liquid that fills it. "
+            "In truth hardly anything leaves; the simulator knows no air, and pours",
+        )
+    share = course.share(course.covered)
+    return NotCovered(
+        "glugging",
+        share,
+        f"{_percent(share)} of what is poured leaves while liquid covers the whole opening and air has to bubble in "
+        "against it. The simulator knows no air: in truth it leaves later and by fits and starts. Tilt less or more "
+        "slowly",
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f} %"
+
+
+def _rounded_up(number: float) -> str:
+    """To two digits, with a blank between thousands as elsewhere: '3 500'."""
+    digits = 10 ** max(math.floor(math.log10(number)) - 1, 0)
+    return f"{math.ceil(number / digits) * digits:,}".replace(",", " ")

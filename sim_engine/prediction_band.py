@@ -1,0 +1,236 @@
+"""How far a pour may come out from what was simulated of it: seeds, θ, shapes, what calibration left over, resolution.
+
+What lands beyond the rim is the tail of a stream whose landing places scatter about their median, to a good
+approximation normally: r = Φ(z), where z is the median's distance past the rim in the stream's own width. A simulator
+whose stream lands a little off is wrong by a shift of z, whatever spills: by next to nothing where the whole stream
+hits or misses, by most where half of it does. So errors of the simulator are stated as standard deviations of that
+shift. What calibration left over was found with coarse particles, and holds their error in its own scene: it is not
+added to what they are off in others, the larger of the two counts. A band is the interval of r in which a single pour
+lies with probability `LEVEL`.
+
+Source: ours, by the above; measured in `docs/validation.md` (landing, convergence), held against unseen pours in
+`docs/results.md`.
+Limitations: the shift of one pour says nothing about that of another, nor about liquid that stays in the pourer.
+
+What several seeds of one pour come to: a prediction is a mean, and how much a single pour differs from it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any
+
+from sim_engine.outcome import PourOutcome, normalised_spillage
+
+LEVEL = 0.9
+"""Probability that a single pour lies in its band."""
+
+RESOLUTION, RESOLUTION_AT = 0.25, 1_000
+"""Shift by which coarse particles are off (standard deviation), and the number of particles that it was measured with:
+the root mean square of Φ⁻¹(r) − Φ⁻¹(limit) over those of the nineteen pours of `sim_engine.validation.convergence`
+whose limit is above one in a thousand (fifteen). With 500 particles it was .32: the error falls with the spacing, as
+N^(−1/3)."""
+
+_NORMAL = NormalDist()
+_WIDEST = 8.0
+"""Φ is 0 or 1 to the last bit beyond it."""
+
+
+@dataclass(frozen=True)
+class PredictionInterval:
+    """Where the spillage of a single pour lies.
+
+    Attributes:
+        low, high: ends of the interval of r = spilled / poured; less than half a particle is nothing.
+        level: probability that a pour lies in it.
+        simulations: standard deviation of r over the seeds, with the θ and the vessels' shapes if they took turns.
+        discrepancy: that of what the best θ lacks beside weighed pours; None where nothing was calibrated.
+        resolution: that of the number of particles.
+    """
+
+    low: float
+    high: float
+    level: float
+    simulations: float
+    discrepancy: float | None
+    resolution: float
+
+    def holds(self, spillage: float) -> bool:
+        """Whether a pour lies in it."""
+        return self.low <= spillage <= self.high
+
+    def percent(self, decimals: int = 1) -> str:
+        """For people: '1.2 … 6.0 %'."""
+        return f"{100 * self.low:.{decimals}f} … {100 * self.high:.{decimals}f} %"
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON-ready mapping."""
+        return {
+            "low": self.low,
+            "high": self.high,
+            "level": self.level,
+            "deviations": {
+                "simulations": self.simulations,
+                "discrepancy": self.discrepancy,
+                "resolution": self.resolution,
+            },
+        }
+
+
+def resolution_shift(particles: int) -> float:
+    """Standard deviation of the shift by which a simulation with so many particles is off its limit."""
+    return float(RESOLUTION * (RESOLUTION_AT / particles) ** (1.0 / 3.0))
+
+
+def lacking_shift(particles: int, discrepancy: float | None) -> float:
+    """Standard deviation of the shift by which a pour is off its simulations.
+
+    By the number of particles, or by what calibration left over where that is more: it was found with coarse particles,
+    too, and holds their error.
+
+    Args:
+        particles: of a simulation.
+        discrepancy: see `left_over`; None where nothing was calibrated.
+    """
+    return max(resolution_shift(particles), discrepancy or 0.0)
+
+
+def shift_of(spillage: float, particles: int) -> float:
+    """z of a simulated spillage. None or all of the particles spilled stands for half a particle less than one.
+
+    Args:
+        spillage: r.
+        particles: that r was counted with.
+    """
+    least = 0.5 / (particles + 1)
+    return _NORMAL.inv_cdf(min(max(spillage, least), 1.0 - least))
+
+
+def left_over(pairs: Sequence[tuple[float, float]], fitted: int) -> float | None:
+    """The shift that a calibration left over: how far its θ* stays from the pours that it was fitted to.
+
+    Args:
+        pairs: measured and simulated r of every pour.
+        fitted: number of parameters that were fitted.
+
+    Returns:
+        Standard deviation of the shift about none; None where there are no more pours than parameters.
+    """
+    if len(pairs) <= fitted:
+        return None
+    shifts = [shift_of(measured, RESOLUTION_AT) - shift_of(simulated, RESOLUTION_AT) for measured, simulated in pairs]
+    return math.sqrt(math.fsum(z * z for z in shifts) / (len(pairs) - fitted))
+
+
+def band(
+    spillages: Sequence[float], particles: int, discrepancy: float | None = None, level: float = LEVEL
+) -> PredictionInterval:
+    """Where a single pour lies, given its simulations.
+
+    Args:
+        spillages: r of simulations of the pour with fresh seeds, which may take turns with θ of a posterior and with
+            shapes that the vessels may have; ≥ 1.
+        particles: of a simulation.
+        discrepancy: shift that the calibration left (standard deviation); None where nothing was calibrated.
+        level: probability that a pour lies in it.
+
+    Raises:
+        ValueError: no simulation, or a level that is not between 0 and 1.
+    """
+    if not spillages or not 0.0 < level < 1.0:
+        raise ValueError(f"a band needs simulations and a level between 0 and 1, not {len(spillages)} and {level}")
+    count = len(spillages)
+    places = [shift_of(r, particles) for r in spillages]
+    mean = math.fsum(places) / count
+    spread = math.fsum((z - mean) ** 2 for z in places) / (count - 1) if count > 1 else 0.0
+    coarse, lacking = resolution_shift(particles), lacking_shift(particles, discrepancy)
+    # The mixture of the simulations has a variance of s² (n − 1) / n; a further one differs from their mean by
+    # s² (n + 1) / n.
+    width = math.sqrt(lacking**2 + 2.0 * spread / count)
+    steep, half = _NORMAL.pdf(mean), 0.5 / (particles + 1)
+    low, high = (_NORMAL.cdf(_quantile(places, width, 0.5 * (1.0 + side * level))) for side in (-1.0, 1.0))
+    return PredictionInterval(
+        low if low > half else 0.0,
+        high if high < 1.0 - half else 1.0,
+        level,
+        steep * math.sqrt(spread),
+        None if discrepancy is None else steep * discrepancy,
+        steep * coarse,
+    )
+
+
+def band_of(outcomes: Sequence[PourOutcome], discrepancy: float | None = None) -> PredictionInterval | None:
+    """The band of one pour's simulations; None where none of them has a spillage.
+
+    Args:
+        outcomes: of the same action, with fresh seeds, perhaps of several θ and shapes.
+        discrepancy: as in `band`.
+    """
+    usable = [outcome for outcome in outcomes if outcome.invalid is None]
+    spillages = [r for outcome in usable if (r := normalised_spillage(outcome.fractions)) is not None]
+    return band(spillages, usable[0].particles, discrepancy) if spillages else None
+
+
+def _quantile(places: Sequence[float], width: float, share: float) -> float:
+    """The quantile of an even mixture of normal distributions, by bisection."""
+    low, high = -_WIDEST, _WIDEST
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        below = math.fsum(_NORMAL.cdf((middle - z) / width) for z in places) / len(places)
+        low, high = (middle, high) if below < share else (low, middle)
+    return 0.5 * (low + high)
+
+
+FRACTIONS = ("received", "spilled", "retained", "in_flight", "escaped")
+"""Fractions of a `PourOutcome`; they add up to 1."""
+
+
+@dataclass(frozen=True)
+class SampleStatistics:
+    """A quantity over seeds.
+
+    Attributes:
+        mean: of all seeds.
+        deviation: standard deviation of one seed (n − 1 in the denominator); None for a single one.
+        count: seeds.
+    """
+
+    mean: float
+    deviation: float | None
+    count: int
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> SampleStatistics | None:
+        """The spread of some values; None without any."""
+        if not values:
+            return None
+        mean = math.fsum(values) / len(values)
+        if len(values) == 1:
+            return cls(mean, None, 1)
+        return cls(mean, math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1)), len(values))
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON-ready mapping."""
+        return {"mean": self.mean, "deviation": self.deviation, "count": self.count}
+
+    def percent(self, decimals: int = 1) -> str:
+        """A fraction for people: '3.1 ± 0.4 %'; of a single seed '3.1 %'."""
+        spread = "" if self.deviation is None else f" ± {100 * self.deviation:.{decimals}f}"
+        return f"{100 * self.mean:.{decimals}f}{spread} %"
+
+
+def spreads(outcomes: Sequence[PourOutcome]) -> dict[str, SampleStatistics]:
+    """Every fraction of some outcomes of one pour, and 'spillage', r = spilled / poured, over seeds.
+
+    Args:
+        outcomes: of the same task but for the seed; invalid ones are left out. What has no valid outcome, and r where
+            too little was poured for it, is missing in the answer.
+    """
+    valid = [outcome for outcome in outcomes if outcome.invalid is None]
+    values = {name: [float(getattr(outcome, name)) for outcome in valid] for name in FRACTIONS}
+    values["spillage"] = [r for outcome in valid if (r := normalised_spillage(outcome.fractions)) is not None]
+    found = {name: SampleStatistics.of(seeds) for name, seeds in values.items()}
+    return {name: spread for name, spread in found.items() if spread is not None}

@@ -1,0 +1,230 @@
+"""Where results that are slow to compute wait for the next run: one directory, safe to delete at any time.
+
+Packages that only some installations have, by the extra that brings them.
+
+Where kernels run. Light to import: a backend is refused before Taichi starts.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import getpass
+import importlib.util
+import logging
+import os
+import stat
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_engine.errors import DecantError
+
+ENVIRONMENT_VARIABLE = "DECANT_CACHE_DIR"
+
+
+_log = logging.getLogger(__name__)
+_reported: set[Path] = set()
+
+
+def cache_directory() -> Path:
+    """The cache directory, created on demand: $DECANT_CACHE_DIR, else the platform's user cache under 'decant'.
+
+    If it can't be written, such as in a home directory that is read-only, a folder of this user in the directory for
+    temporary files takes its place. That is logged once, with the cause.
+
+    Raises:
+        OSError: neither can be written; the text names both.
+    """
+    directory = _configured()
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        if not os.access(directory, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(directory))
+    except OSError as error:
+        cause = f"{directory} can't be written ({error.filename}: {error.strerror})"
+        substitute = _temporary(cause)
+        if directory not in _reported:
+            _log.warning("the cache directory %s; %s is used. Set %s", cause, substitute, _CURE)
+            _reported.add(directory)
+        return substitute
+    return directory
+
+
+_CURE = f"${ENVIRONMENT_VARIABLE} to a folder that you can write"
+
+
+def _temporary(cause: str) -> Path:
+    """A folder that only this user can write: compiled kernels are executed, so that it must not be anybody else's."""
+    directory = Path(tempfile.gettempdir()) / f"decant-cache-{getpass.getuser() if os.name == 'nt' else os.getuid()}"
+    try:
+        directory.mkdir(mode=0o700, exist_ok=True)
+        found = directory.lstat()
+    except OSError as error:
+        text = f"the cache directory {cause}, and {directory} can't be made ({error.strerror}); set {_CURE}"
+        raise OSError(error.errno, text) from None
+    if not stat.S_ISDIR(found.st_mode) or (os.name != "nt" and (found.st_uid != os.getuid() or found.st_mode & 0o022)):
+        text = f"the cache directory {cause}, and {directory} belongs to another user; set {_CURE}"
+        raise OSError(errno.EPERM, text)
+    return directory
+
+
+def _configured() -> Path:
+    chosen = os.environ.get(ENVIRONMENT_VARIABLE)
+    if chosen:
+        directory = Path(chosen).expanduser()
+    elif sys.platform == "darwin":
+        directory = Path.home() / "Library" / "Caches" / "decant"
+    elif sys.platform == "win32":
+        directory = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local")) / "decant" / "Cache"
+    else:
+        directory = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").expanduser() / "decant"
+    return directory
+
+
+def load_arrays(name: str) -> dict[str, NDArray[np.generic]] | None:
+    """Arrays stored under a name, or None when there are none or the file is damaged (it is removed then).
+
+    Args:
+        name: file name without suffix.
+    """
+    try:
+        path = cache_directory() / f"{name}.npz"
+        with np.load(path, allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files}
+    except FileNotFoundError:
+        return None
+    except Exception:  # a truncated zip raises half a dozen kinds of error; none of them is worth a campaign
+        discard(name)
+        return None
+
+
+def discard(name: str) -> None:
+    """Remove what is stored under a name, if it is there and may be removed."""
+    try:
+        (cache_directory() / f"{name}.npz").unlink(missing_ok=True)
+    except OSError:
+        return
+
+
+def store_arrays(name: str, arrays: Mapping[str, NDArray[np.generic]], *, compressed: bool = True) -> bool:
+    """Store arrays under a name, atomically: readers see the old file, the new one or none, never half of one.
+
+    Args:
+        name: file name without suffix.
+        arrays: by name.
+        compressed: small on disk; what hardly gets any smaller is stored in a tenth of the time without.
+
+    Returns:
+        Whether they were stored. A full or read-only disk costs time on the next run, not this one.
+    """
+    temporary: Path | None = None
+    try:
+        directory = cache_directory()
+        with tempfile.NamedTemporaryFile(dir=directory, prefix=f"{name}-", suffix=".tmp", delete=False) as file:
+            temporary = Path(file.name)
+            (np.savez_compressed if compressed else np.savez)(file, **dict(arrays))  # type: ignore[arg-type]
+        temporary.replace(directory / f"{name}.npz")
+        return True
+    except OSError:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+        return False
+
+
+EXTRAS = {
+    "ray": "lab",
+    "serial": "lab",
+    "psutil": "lab",
+    "rtde_receive": "lab",
+    "rerun": "live",
+    "apprise": "daemon",
+    "fastapi": "daemon",
+    "httpx": "daemon",
+    "prometheus_client": "daemon",
+    "pythonjsonlogger": "daemon",
+    "uvicorn": "daemon",
+    "manifold3d": "vessels",
+    "skimage": "vessels",
+    "pandas": "tables",
+    "pyarrow": "tables",
+}
+"""Importable name → extra."""
+
+PACKAGES = {
+    "serial": "pyserial",
+    "rtde_receive": "ur-rtde",
+    "skimage": "scikit-image",
+    "pythonjsonlogger": "python-json-logger",
+}
+"""Importable name → name of the package that brings it, if they differ."""
+
+
+class MissingExtraError(DecantError, ImportError):
+    """A package that belongs to an extra is not installed; the text says what to install."""
+
+
+def installed(module: str) -> bool:
+    """Whether a package is there; it is not imported."""
+    return importlib.util.find_spec(module) is not None
+
+
+def require(module: str, what_for: str) -> None:
+    """Say which extra is missing before anything begins.
+
+    Args:
+        module: one of `EXTRAS`.
+        what_for: begins the sentence: 'a recording'.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    if not installed(module):
+        package, extra = PACKAGES.get(module, module), EXTRAS[module]
+        raise MissingExtraError(
+            f"{what_for} needs the package '{package}', which is not installed: pip install 'decant[{extra}]'"
+        )
+
+
+Backend = Literal["cpu", "cuda"]
+
+BACKENDS: tuple[Backend, ...] = ("cpu", "cuda")
+
+
+class BackendError(DecantError, RuntimeError):
+    """A backend was asked for that is not there."""
+
+
+def require_backend(backend: str) -> None:
+    """Make sure that this machine has a backend; Taichi itself would fall back to another without a word.
+
+    Args:
+        backend: one of `BACKENDS`.
+
+    Raises:
+        BackendError: with what to do.
+    """
+    if backend not in BACKENDS:
+        raise BackendError(f"there is no backend '{backend}'; there are {', '.join(BACKENDS)}")
+    if backend == "cuda" and cuda_devices() == 0:
+        raise BackendError(
+            "backend cuda: no CUDA device answers on this machine; use cpu, or install NVIDIA's driver (nvidia-smi "
+            "lists the devices that it finds)"
+        )
+
+
+def cuda_devices() -> int:
+    """How many devices NVIDIA's driver finds; 0 without a driver."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return 0
+    count = ctypes.c_int(0)
+    if driver.cuInit(0) != 0 or driver.cuDeviceGetCount(ctypes.byref(count)) != 0:
+        return 0
+    return count.value

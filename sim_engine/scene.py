@@ -1,0 +1,179 @@
+"""What is asked of a simulator: a scene, an action, θ_s and a seed. Small values without Taichi.
+
+A motion that an arm has executed, read back from it. Planned motions need a task's scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_engine.action import Action
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.vessel.shapes import VesselSpec
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SampledMotion:
+    """A motion read back from an arm: poses at times, interpolated in between.
+
+    Attributes:
+        times: (T,) increasing from 0 [s].
+        poses: (T, 7) x y z qw qx qy qz.
+    """
+
+    times: FloatArray
+    poses: FloatArray
+
+    def __post_init__(self) -> None:
+        if self.times.ndim != 1 or len(self.times) < 2 or np.any(np.diff(self.times) <= 0):
+            raise ValueError("times must increase and number at least two")
+        if self.poses.shape != (len(self.times), 7) or not np.all(np.isfinite(self.poses)):
+            raise ValueError(f"poses must be finite, shape ({len(self.times)}, 7), got {self.poses.shape}")
+
+    @property
+    def duration(self) -> float:
+        """[s]."""
+        return float(self.times[-1])
+
+    def sample(self, times: FloatArray) -> FloatArray:
+        """Linear in position; normalised linear in the quaternion (fine for samples a few degrees apart)."""
+        t = np.asarray(times, dtype=float)
+        out = np.stack([np.interp(t, self.times, self.poses[:, k]) for k in range(7)], axis=-1)
+        out[..., 3:] /= np.linalg.norm(out[..., 3:], axis=-1, keepdims=True)
+        return out
+
+    def tilt(self, times: FloatArray) -> FloatArray:
+        """Angle between the vessel's axis and the vertical, signed by the turn about +y, shape (T,) [rad]."""
+        q = self.sample(times)[..., 3:]
+        w, x, y, z = (q[..., k] for k in range(4))
+        return np.arctan2(2 * (x * z + w * y), 1 - 2 * (x * x + y * y))
+
+
+@dataclass(frozen=True)
+class Pivot:
+    """The horizontal line (along y) about which the pourer turns.
+
+    Attributes:
+        kind: `lip`: through the inner lip's lowest point in the pouring direction; `point`: through `x`, `z`.
+        x: in the vessel's frame, towards the receiver [m].
+        z: in the vessel's frame, above its underside [m].
+    """
+
+    kind: str = "lip"
+    x: float = 0.0
+    z: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything about a pour that is not chosen: vessels, liquid, pivot, fixed action dimensions.
+
+    Attributes:
+        name: key by which strategies and the journal refer to it.
+        fixed: action dimensions that are not searched, SI (None switches an optional one off).
+        hold_cap: longest hold 'until the predicted end of flow' [s].
+    """
+
+    name: str
+    pourer: VesselSpec
+    receiver: VesselSpec
+    liquid: Liquid
+    pivot: Pivot = Pivot()
+    fixed: dict[str, float | None] = field(default_factory=dict)
+    hold_cap: float = 5.0
+
+    def action(self, chosen: dict[str, float]) -> Action:
+        """The complete action of a searched point. Raises ValueError as `Action.compose` does."""
+        return Action.compose(self.fixed, chosen)
+
+    @property
+    def uncertain(self) -> bool:
+        """Whether it is known how far the shape of one of its vessels may be off."""
+        return self.pourer.uncertain or self.receiver.uncertain
+
+    def drawn(self, seed: int) -> Scene:
+        """The scene with vessels as they may as well be, see `VesselSpec.drawn`."""
+        return replace(self, pourer=self.pourer.drawn(seed), receiver=self.receiver.drawn(seed))
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """How the real placement differs from the intended one (the virtual bench's grip and placement errors).
+
+    Attributes:
+        x: the receiver stands that much further from the pourer [m].
+        y: … and that much sideways [m].
+        z: … and that much higher [m].
+        tilt: the pourer is held that much more tilted than commanded [rad].
+        speed_factor: executed over commanded angular velocity.
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    tilt: float = 0.0
+    speed_factor: float = 1.0
+    z: float = 0.0
+
+    @classmethod
+    def of(cls, parameters: SimulationParameters) -> PoseError:
+        """The nuisances of a bench as errors of placement and execution."""
+        return cls(
+            x=parameters.receiver_x,
+            y=parameters.receiver_y,
+            z=parameters.receiver_z,
+            tilt=parameters.tilt_zero,
+            speed_factor=parameters.speed_factor,
+        )
+
+    def and_then(self, other: PoseError) -> PoseError:
+        """Both errors together: places and tilts add up, speeds multiply."""
+        return PoseError(
+            x=self.x + other.x,
+            y=self.y + other.y,
+            z=self.z + other.z,
+            tilt=self.tilt + other.tilt,
+            speed_factor=self.speed_factor * other.speed_factor,
+        )
+
+
+@dataclass(frozen=True)
+class PourTask:
+    """One simulated pour.
+
+    Attributes:
+        seed: of the initial positions; same task, same seed → same bits on one CPU thread.
+        record_rate: frames of all particles kept per simulated second; 0 keeps none.
+        parameters: θ_s, and the bench's nuisances.
+        pose_error: deviations of this one pour, beside those nuisances; None for a plain simulation.
+        motion: what an arm did, read back from it, in place of the motion planned for `action`; what of `pose_error`
+            changes a motion must then be in it already.
+    """
+
+    scene: Scene
+    action: Action
+    parameters: SimulationParameters
+    seed: int
+    record_rate: float = 0.0
+    pose_error: PoseError | None = None
+    motion: SampledMotion | None = None
+
+    def __post_init__(self) -> None:
+        error = self.pose_error
+        if self.motion is not None and error is not None and (error.tilt != 0.0 or error.speed_factor != 1.0):
+            raise ValueError("an executed motion holds its own errors of tilt and speed; pose_error may only shift it")
+
+    @property
+    def placement(self) -> PoseError:
+        """How the pour truly goes: nuisances of the bench and `pose_error` together, the one place that joins them.
+
+        An executed motion tells its own tilt and speed; of the nuisances it leaves the receiver's place.
+        """
+        nuisances = PoseError.of(self.parameters)
+        if self.motion is not None:
+            nuisances = replace(nuisances, tilt=0.0, speed_factor=1.0)
+        return nuisances if self.pose_error is None else nuisances.and_then(self.pose_error)

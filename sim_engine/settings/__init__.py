@@ -1,0 +1,1 @@
+"""How anything declares a setting, a unit or an entry point."""

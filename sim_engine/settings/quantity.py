@@ -1,0 +1,264 @@
+"""Quantities with units: '15 deg/s' → 0.2618 rad/s. A laboratory that mixes degrees and radians pays in glass.
+
+Angle is a dimension of its own here: in pint's default registry it is a pure number, so that '15 Hz' would pass for
+an angular velocity.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+from orchestrator.config.yaml.yaml_errors import did_you_mean
+
+if TYPE_CHECKING:
+    import pint
+
+UNITS = """
+micro- = 1e-6 = µ- = u-
+milli- = 1e-3 = m-
+centi- = 1e-2 = c-
+kilo- = 1e3 = k-
+mega- = 1e6 = M-
+giga- = 1e9 = G-
+meter = [length] = m = metre
+second = [time] = s = sec
+gram = [mass] = g
+radian = [angle] = rad
+byte = [information] = B
+celsius = [celsius] = degC
+degree = 0.017453292519943295 * radian = deg = °
+revolution = 6.283185307179586 * radian = rev = turn
+minute = 60 * second = min
+hour = 3600 * second = h
+day = 86400 * second
+rpm = revolution / minute
+hertz = 1 / second = Hz
+newton = kilogram * meter / second ** 2 = N
+pascal = newton / meter ** 2 = Pa
+poise = 0.1 * pascal * second = P
+inch = 0.0254 * meter = in
+liter = 1e-3 * meter ** 3 = l = L
+percent = 0.01 = %
+"""
+"""What a pouring laboratory needs; a short list loads in milliseconds and has no surprising members."""
+
+FAMILIAR_UNITS = ("mm", "cm", "m", "in", "deg", "rad", "deg/s", "rad/s", "rpm", "deg/s^2", "rad/s^2", "s", "min", "ms",
+                  "mL", "g", "kg", "mg", "g/s", "kg/m^3", "g/cm^3", "N/m", "mN/m", "Pa*s", "mPa*s", "cP", "1/s", "Hz",
+                  "degC", "MB")  # fmt: skip
+
+KINDS = {
+    "m": "a length",
+    "rad": "an angle",
+    "rad/s": "an angular velocity",
+    "rad/s^2": "an angular acceleration",
+    "s": "a time",
+    "kg": "a mass",
+    "kg/s": "a mass per time",
+    "kg/m^3": "a density",
+    "N/m": "a surface tension",
+    "Pa*s": "a dynamic viscosity",
+    "1/s": "a rate",
+    "MB": "an amount of memory",
+    "degC": "a temperature in degrees Celsius",
+    "1": "a plain number",
+    "m/s": "a velocity",
+    "m^3": "a volume",
+    "m^2": "an area",
+    "N": "a force",
+}
+
+LONGEST = 80
+"""Characters of a quantity: patterns and units of longer ones are not worked out."""
+
+_QUANTITY = re.compile(r"\s*([-+−]?(?:[0-9][0-9_]*\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*(.*?)\s*\Z", re.DOTALL)
+
+_TERM = r"(?:[^\W\d_]+|[°%]|1)(?:\s*(?:\^|\*\*)\s*-?\d)?"
+_UNIT = re.compile(rf"{_TERM}(?:\s*[*/·\s]\s*{_TERM})*")
+"""Products of units with exponents of one digit: the parser would work out '9**9**9' first."""
+
+
+class QuantityError(ValueError):
+    """A text is not the quantity that is needed; the message says which would be."""
+
+
+@cache
+def registry() -> pint.UnitRegistry[Any]:
+    """The laboratory's units (pint is imported at the first quantity)."""
+    import pint
+
+    return pint.UnitRegistry(UNITS.strip().splitlines())
+
+
+def parse_quantity(value: Any, unit: str, example: str) -> float:
+    """Magnitude of '40 deg/s' in a unit.
+
+    Args:
+        value: as it stands in the file: text, or a bare number (an error unless `unit` is '1').
+        unit: SI unit that the number is wanted in.
+        example: a right quantity, for messages; its unit is the one that is suggested.
+
+    Raises:
+        QuantityError: no unit, unknown unit, another dimension, or no number at all.
+    """
+    preferred = example.split(" ", 1)[1] if " " in example else ""
+    kind = KINDS.get(unit, f"a quantity in {unit}")
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        raise QuantityError(f"should be {kind}, for example '{example}'")
+    if isinstance(value, str) and len(value) > LONGEST:
+        raise QuantityError(
+            f"a text of {len(value)} characters is not a quantity; should be {kind}, such as '{example}'"
+        )
+    match = _QUANTITY.match(value) if isinstance(value, str) else None
+    if isinstance(value, str) and match is None:
+        raise QuantityError(f"{value!r} is not a quantity; should be {kind}, for example '{example}'")
+    number = float(match[1].replace("−", "-").replace("_", "")) if match else float(value)
+    text = match[2] if match else ""
+    if not math.isfinite(number):
+        raise QuantityError(f"{value} is not finite; should be {kind}, for example '{example}'")
+    if unit == "1" and not text:
+        return number
+    if not text:
+        raise QuantityError(f"{value} has no unit; write '{value} {preferred}' if that is what is meant")
+    if text == unit:
+        return number
+    if re.match(r",\d", text):
+        raise QuantityError(f"{value!r} has a decimal comma; write '{str(value).replace(',', '.', 1)}'")
+    source = _unit(text, kind, example)
+    if source.dimensionality != registry().parse_units(unit if unit != "1" else "").dimensionality:
+        raise QuantityError(f"{value!r} is {_kind_of(source)}; should be {kind}, for example '{example}'")
+    return float(registry().convert(number, source, registry().parse_units(unit if unit != "1" else "")))
+
+
+def _unit(text: str, kind: str, example: str) -> Any:
+    try:
+        if not _UNIT.fullmatch(text.replace("(", "").replace(")", "")):
+            raise ValueError(text)
+        return registry().parse_units(text)
+    except Exception:  # the parser of units is one of Python expressions, and raises whatever those raise
+        guess = did_you_mean(text, FAMILIAR_UNITS)
+        meant = f"did you mean '{guess}'?" if guess else f"should be {kind}, for example '{example}'"
+        raise QuantityError(f"unknown unit {text!r}; {meant}") from None
+
+
+def _kind_of(source: Any) -> str:
+    for unit, kind in KINDS.items():
+        if source.dimensionality == registry().parse_units(unit if unit != "1" else "").dimensionality:
+            return kind
+    return f"of another kind ({source.dimensionality})"
+
+
+def format_quantity(value: float, unit: str, display: str) -> str:
+    """A quantity as a person would write it, or with all digits where the short text would not mean the same float."""
+    if unit == "1":
+        return repr(value)
+    factor = float(registry().convert(1.0, registry().parse_units(display), registry().parse_units(unit)))
+    for digits in (6, 9, 12, 15):
+        text = f"{value / factor:.{digits}g} {display}"
+        if parse_quantity(text, unit, text) == value:
+            return text
+    return f"{value!r} {unit}"
+
+
+FROM_FILE: dict[str, Any] = {"from": "file"}
+"""Validation context of what people wrote."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Pydantic annotation: a quantity with a unit, kept as a float in `unit`.
+
+    In a file (validated with `FROM_FILE`) the unit must be written; a program may also give the bare SI number.
+
+    Attributes:
+        unit: SI unit of the value; '1' for a plain number.
+        example: a right quantity; its unit is the one that messages suggest.
+        lower, upper: inclusive bounds in `unit`.
+        positive: the value must be above 0.
+        whole: it must be a whole number.
+        words: words that may stand in place of a quantity and are kept as they are.
+    """
+
+    unit: str
+    example: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    positive: bool = False
+    whole: bool = False
+    words: tuple[str, ...] = ()
+
+    @property
+    def display(self) -> str:
+        """Unit that people write."""
+        return self.example.split(" ", 1)[1] if " " in self.example else self.unit
+
+    def parse(self, value: Any) -> float | str:
+        """The value in `unit`, or one of the words.
+
+        Raises:
+            QuantityError: it is neither, or out of bounds.
+        """
+        if isinstance(value, str) and value.strip() in self.words:
+            return value.strip()
+        try:
+            number = parse_quantity(value, self.unit, self.example)
+        except QuantityError as error:
+            alternatives = "".join(f" or '{word}'" for word in self.words)
+            raise QuantityError(f"{error}{alternatives}") from None
+        if self.positive and number <= 0.0:
+            raise QuantityError(f"{value} should be above 0")
+        if self.whole and number != round(number):
+            raise QuantityError(f"{value} should be a whole number")
+        tolerance = 1e-9 * max(abs(bound) for bound in (self.lower, self.upper, 1.0) if math.isfinite(bound))
+        if not self.lower - tolerance <= number <= self.upper + tolerance:
+            raise QuantityError(f"{value} is outside {self.bounds()}")
+        return min(max(number, self.lower), self.upper)
+
+    def bounds(self) -> str:
+        """The bounds in the unit that people write."""
+        factor = 1.0
+        unit = "" if self.display == "1" else f" {self.display}"
+        if unit:
+            si = "" if self.unit == "1" else self.unit
+            factor = float(registry().convert(1.0, registry().parse_units(self.display), si))
+        if math.isinf(self.upper):
+            return f"{self.lower / factor:g}{unit} and more"
+        if math.isinf(self.lower):
+            return f"{self.upper / factor:g}{unit} and less"
+        return f"{self.lower / factor:g} … {self.upper / factor:g}{unit}"
+
+    def _validate(self, value: Any, info: ValidationInfo) -> float | str:
+        if info.context is not FROM_FILE and isinstance(value, int | float) and not isinstance(value, bool):
+            value = f"{value!r} {self.unit}" if self.unit != "1" else value
+        try:
+            return self.parse(value)
+        except QuantityError as error:
+            raise PydanticCustomError("quantity", "{text}", {"text": str(error)}) from None
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.with_info_plain_validator_function(self._validate)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        kind = KINDS.get(self.unit, self.unit)
+        if self.unit == "1":
+            bounds = {"minimum": self.lower, "maximum": self.upper}
+            number: dict[str, Any] = {"type": "integer" if self.whole else "number"} | {
+                key: bound for key, bound in bounds.items() if math.isfinite(bound)
+            }
+            if self.display == "1":
+                return number
+            share = {"type": "string", "pattern": r"^\s*(\d[\d_]*\.?\d*|\.\d+)\s*%\s*$", "examples": [self.example]}
+            return {"anyOf": [number, share]}
+        form: dict[str, Any] = {
+            "type": "string",
+            "pattern": r"^\s*[-+]?(\d[\d_]*\.?\d*|\.\d+)([eE][-+]?\d+)?\s*\S+",
+            "examples": [self.example],
+            "description": f"{kind} with its unit",
+        }
+        return {"anyOf": [form, {"enum": list(self.words)}]} if self.words else form

@@ -1,0 +1,590 @@
+"""PourTask → PourOutcome: sets the scene, runs the solver until nothing can change any more, and counts.
+
+Light to import; Taichi starts with the first simulation.
+
+Initial positions: a jittered lattice that fills the pourer from the bottom.
+
+The course of a simulated pour: slices of time, what is seen between them, when it is over, and what came of it.
+
+When a simulation has to begin: of liquid that lies level in a slowly turning cup hydrostatics knows all.
+
+A slow pour spends half of its time before anything can leave. Simulating that costs as much as the pour and decides
+nothing. So the lattice is laid level into the cup as it is tilted shortly before it may spill, and moves off with it.
+That is allowed only while the motion is slow: waves that it could have made must be low.
+
+Source: ours. Limitations: waves from before the begin are left out; `CALM` bounds them.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_engine.collision import contact_during, describe_contact, rotations
+from sim_engine.errors import InvalidSceneError, SimulationCancelled
+from sim_engine.fluid.scene_setup import POSE_STEP, SceneSetup, SolidWalls
+from sim_engine.hydrostatics import GRAVITY, level
+from sim_engine.motion import Motion, plan_motion
+from sim_engine.outcome import ESCAPED_LIMIT, ParticleState, PourOutcome, RecordedFrames, SimulatedPour
+from sim_engine.resources import Backend
+from sim_engine.scene import PoseError, PourTask, Scene
+from sim_engine.vessel.shapes import VesselError, VesselSpec
+from sim_engine.vessel.vessel import Vessel, build_vessel, check_holds, in_cavity
+from sim_engine.vessel.wall_correction import equivalent_distance, inside_mask
+
+if TYPE_CHECKING:
+    from sim_engine.action import Action
+    from sim_engine.fluid.engine import FluidEngine
+
+JITTER = 0.05
+"""Largest displacement from the lattice, in spacings; it makes seeds differ and breaks the crystal."""
+
+
+def spacing(volume: float, particles: int) -> float:
+    """d = (V/N)^(1/3) [m]."""
+    return float((volume / particles) ** (1.0 / 3.0))
+
+
+def fill(
+    vessel: Vessel, volume: float, particles: int, seed: int, wall_distance: float = 0.5, tilt: float = 0.0
+) -> NDArray[np.float32]:
+    """Positions of exactly `particles` particles of volume V/N each.
+
+    Args:
+        vessel: filled from below.
+        volume: of the liquid [m³].
+        particles: N.
+        wall_distance: lattice points keep about that many spacings from solid, as the density constraint will.
+        tilt: of the vessel when it is filled, towards +x [rad].
+        seed: shifts the lattice, jitters it, and chooses among the places of the topmost layer.
+
+    Returns:
+        Shape (N, 3), float32, in the vessel's frame [m].
+
+    Raises:
+        InvalidSceneError: at this number of particles the liquid does not fit under the rim.
+    """
+    rng = np.random.default_rng(seed)
+    d = spacing(volume, particles)
+    # A narrow or brimful vessel may leave the lattice too few places: then squeeze it, the solver relaxes it again.
+    # Rims are lowered for particles, so the uppermost spacing is used only if nothing else helps.
+    for top in (vessel.rim_height - d, vessel.rim_height):
+        for squeeze in (1.0, 0.98, 0.96, 0.94, 0.92, 0.9, 0.87, 0.84):
+            places = _lattice(vessel, d, d * squeeze, wall_distance, top, rng)
+            if len(places) >= particles:
+                order = np.lexsort((rng.random(len(places)), np.round(_height(places, tilt) / (d * squeeze))))
+                chosen = places[order[:particles]]
+                chosen += rng.uniform(-JITTER, JITTER, chosen.shape) * d
+                return chosen.astype(np.float32)
+    raise InvalidSceneError(
+        f"{vessel.name}: {1e6 * volume:.4g} mL as {particles} particles do not fit under the rim (it holds "
+        f"{1e6 * vessel.capacity:.4g} mL to the brim); pour less, use more particles, or a larger vessel"
+    )
+
+
+def _height(places: NDArray[np.float64], tilt: float) -> NDArray[np.float64]:
+    """Height of places of the vessel's frame in a tilted vessel, up to a constant (N,) [m]."""
+    height: NDArray[np.float64] = places[:, 2] * np.cos(tilt) - places[:, 0] * np.sin(tilt)
+    return height
+
+
+def _lattice(
+    vessel: Vessel, d: float, step: float, wall_distance: float, top: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Places of a cubic lattice, shifted at random, in the cavity below `top`, shape (M, 3) [m]."""
+    reach = vessel.outer_radius + step
+    across = np.arange(-reach, reach, step)
+    shift = rng.uniform(-0.5, 0.5, 2) * step
+    z = np.arange(vessel.inner_floor + wall_distance * d, top, step)
+    places = np.stack(np.meshgrid(across + shift[0], across + shift[1], z, indexing="ij"), axis=-1).reshape(-1, 3)
+    places = places[vessel.grid.sample(places) >= 0.9 * wall_distance * d]
+    return places[in_cavity(vessel.grid, places)]
+
+
+SLICE = 0.02
+"""The solver is called for so much simulated time at once; curve and frames are taken between calls [s]."""
+
+QUIET = 0.15
+"""With nothing in flight for so long after the motion (or with an empty pourer), the pour is over [s]."""
+
+LONGEST_TAIL = 1.0
+"""The pour ends so long after the motion even if something is still in flight [s]."""
+
+
+@dataclass
+class TimeLoop:
+    """One pour on its way.
+
+    Attributes:
+        task, motion: what is simulated.
+        start: time from which it is simulated, a multiple of `SLICE`; the liquid lies level before [s].
+        scene: its place in the engine.
+        times, poured, spilled: what was seen: [s], fractions.
+        frames: time, positions (N, 3) [m], states (N,).
+        slices: how far it is, in `SLICE`.
+        over: nothing can change any more.
+        cpu_s: that the process spent on it; for pours side by side an even share.
+
+    Raises:
+        ValueError: it would start within a slice.
+    """
+
+    task: PourTask
+    motion: Motion
+    start: float
+    scene: int
+    times: list[float] = field(default_factory=lambda: [0.0])
+    poured: list[float] = field(default_factory=lambda: [0.0])
+    spilled: list[float] = field(default_factory=lambda: [0.0])
+    frames: list[tuple[float, NDArray[np.float32], NDArray[np.uint8]]] = field(default_factory=list)
+    slices: int = 0
+    over: bool = False
+    cpu_s: float = 0.0
+    _next_frame: float = 0.0
+    _still_since: float | None = None
+
+    def __post_init__(self) -> None:
+        self.slices = round(self.start / SLICE)
+        if abs(self.start - self.clock) > 1e-9:
+            raise ValueError(f"a pour is simulated from a multiple of {SLICE:g} s on, not from {self.start:.6g} s")
+
+    @property
+    def clock(self) -> float:
+        """Time that was simulated to [s]."""
+        return self.slices * SLICE
+
+    def look(self, fluid: FluidEngine, counts: NDArray[np.int32]) -> None:
+        """Take down what is to be seen between two slices, and decide whether the pour is over.
+
+        Args:
+            fluid: the engine.
+            counts: particles in each state, shape (5,).
+        """
+        n = self.task.parameters.particles
+        now = fluid.time(self.scene)
+        if self.task.record_rate > 0.0 and self.clock >= self._next_frame:
+            self.frames.append((now, *fluid.particles(self.scene)))
+            while self._next_frame <= self.clock:
+                self._next_frame += 1.0 / self.task.record_rate
+        if now > self.times[-1]:
+            self.times.append(now)
+            self.poured.append(1.0 - float(counts[ParticleState.IN_POURER]) / n)
+            self.spilled.append(float(counts[ParticleState.SPILLED]) / n)
+        if fluid.fault(self.scene) is not None or self.clock >= self.motion.duration + LONGEST_TAIL:
+            self.over = True
+            return
+        # Over when nothing is in flight and nothing can start to fly.
+        if counts[ParticleState.IN_FLIGHT] > 0:
+            self._still_since = None
+        elif self._still_since is None:
+            self._still_since = self.clock
+        done = self.clock >= self.motion.duration or counts[ParticleState.IN_POURER] == 0
+        self.over = done and self._still_since is not None and self.clock - self._still_since >= QUIET
+
+
+def follow(fluid: FluidEngine, courses: Sequence[TimeLoop], cancelled: Callable[[], bool] | None) -> None:
+    """Advance neighbouring scenes slice by slice until all are over.
+
+    Raises:
+        SimulationCancelled: `cancelled` said so.
+    """
+    first, end = courses[0].scene, courses[-1].scene + 1
+    until = np.zeros(end)
+    for course in courses:
+        until[course.scene] = course.start
+    begun = time.process_time()
+    while True:
+        fluid.advance_many(until, first, end)
+        counts = fluid.census_all() if end - first > 1 else fluid.census(first)[None]
+        for course in courses:
+            if not course.over:
+                course.look(fluid, counts[course.scene - first])
+        now = time.process_time()
+        running = [course for course in courses if not course.over]
+        for course in running or courses[-1:]:
+            course.cpu_s += (now - begun) / max(len(running), 1)
+        begun = now
+        if not running:
+            return
+        if cancelled is not None and cancelled():
+            raise SimulationCancelled
+        for course in running:
+            course.slices += 1
+            until[course.scene] = course.clock
+
+
+def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome:
+    """Count where everybody ended.
+
+    Args:
+        fluid: the engine.
+        course: of a pour that is over.
+        loading: CPU seconds that setting it up took.
+    """
+    n, scene = course.task.parameters.particles, course.scene
+    counts = fluid.census(scene)
+    received, spilled, retained, in_flight, escaped = (
+        float(counts[state]) / n
+        for state in (
+            ParticleState.RECEIVED,
+            ParticleState.SPILLED,
+            ParticleState.IN_POURER,
+            ParticleState.IN_FLIGHT,
+            ParticleState.ESCAPED,
+        )
+    )
+    invalid = fluid.fault(scene)
+    if invalid is None and escaped > ESCAPED_LIMIT:
+        invalid = (
+            f"{100 * escaped:.2g} % of the particles crossed vessel walls "
+            f"(at most {100 * ESCAPED_LIMIT:g} % is accepted)"
+        )
+    return PourOutcome(
+        received=received,
+        spilled=spilled,
+        retained=retained,
+        in_flight=in_flight,
+        escaped=escaped,
+        particles=n,
+        spacing=spacing(course.task.scene.liquid.volume, n),
+        density_error=fluid.mean_compression(scene),
+        simulated_time=fluid.time(scene),
+        steps=fluid.steps(scene),
+        cpu_s=course.cpu_s + loading,
+        seed=course.task.seed,
+        curve_times=tuple(course.times),
+        curve_poured=tuple(course.poured),
+        curve_spilled=tuple(course.spilled),
+        invalid=invalid,
+    )
+
+
+Floats = NDArray[np.float64]
+
+LEAD = 0.3
+"""The simulation begins so long before the level is `FREEBOARD` below the lip [s]."""
+
+FREEBOARD = 0.12
+"""In opening radii: below that, no wave that `CALM` allows reaches the lip."""
+
+CALM = 0.06
+"""Waves may be so high, in opening radii: 2.4 mm in a cup of 40 mm, about what turning it at 30 deg/s makes."""
+
+STEP = SLICE
+"""Resolution [s]. A simulation can begin between two slices of its course only, and begins at a multiple of this."""
+
+FALL = 2e-3
+"""A tilt that has come down so far is on its way back; less is the tremor of an arm that was read back [rad]."""
+
+
+def wave_height(velocities: Floats, step: float, radius: float) -> float:
+    """Largest height of the waves in a cup that is moved about.
+
+    The first lateral mode as an undamped oscillator that accelerations push, ω² = 1.84 g / R (deep liquid):
+    |∫ a(t) exp(iωt) dt| / ω. A sudden start at a speed u raises u/ω, a steady acceleration a about 2 R a / (1.84 g).
+
+    Args:
+        velocities: of the cup, shape (T, 3), `step` apart; it is at rest before [m/s].
+        step: [s].
+        radius: R [m].
+
+    Returns:
+        At the wall [m].
+    """
+    frequency = math.sqrt(1.841 * GRAVITY / radius)
+    pushes = np.diff(velocities[:, :2], axis=0, prepend=0.0)
+    turned = pushes * np.exp(1j * frequency * step * np.arange(len(pushes)))[:, None]
+    response = np.linalg.norm(np.abs(np.cumsum(turned, axis=0)), axis=1)
+    return float(response.max()) / frequency
+
+
+def calm_until(motion: Motion, pourer: Vessel, volume: float) -> float:
+    """Time up to which the liquid lies level, and far enough below the lip, in the turning pourer.
+
+    Args:
+        motion: of the pourer.
+        pourer: the vessel.
+        volume: of the liquid [m³].
+
+    Returns:
+        A multiple of `STEP` [s]; 0 if the pour has to be simulated from its begin.
+    """
+    times = np.arange(0.0, motion.duration + STEP, STEP)
+    if len(times) < 4:
+        return 0.0
+    tilts = motion.tilt(times)
+    begin = _last_below(pourer, volume, tilts) - round(LEAD / STEP)
+    if begin <= 0:
+        return 0.0
+    velocities = np.diff(_middles(motion, pourer, times[: begin + 2]), axis=0) / STEP
+    height = wave_height(velocities, STEP, pourer.opening_radius)
+    return float(begin * STEP) if height <= CALM * pourer.opening_radius else 0.0
+
+
+def _last_below(pourer: Vessel, volume: float, tilts: Floats) -> int:
+    """Index up to which the level stays below the lip by the freeboard: bisection over the first rise of the tilt."""
+    limit = -FREEBOARD * pourer.opening_radius
+    falls = np.append((np.maximum.accumulate(tilts) - tilts > FALL)[1:], True)
+    low, high = 0, int(np.argmax(falls))
+    if level(pourer, volume, float(tilts[0])) > limit:
+        return 0
+    while high - low > 1:
+        middle = (low + high) // 2
+        if level(pourer, volume, float(tilts[middle])) > limit:
+            high = middle
+        else:
+            low = middle
+    return low
+
+
+def liquid_velocity(motion: Motion, pourer: Vessel, time: float) -> Floats:
+    """Velocity of the pourer's middle, shape (3,) [m/s]."""
+    places = _middles(motion, pourer, np.array([time, time + 1e-3]))
+    return np.asarray((places[1] - places[0]) / 1e-3)
+
+
+def _middles(motion: Motion, pourer: Vessel, times: Floats) -> Floats:
+    """The point at half height on the pourer's axis over time, shape (T, 3) [m]."""
+    poses = motion.sample(times)
+    w, x, y, z = poses[:, 3:7].T
+    axis = np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    return np.asarray(poses[:, :3] + 0.5 * (pourer.inner_floor + pourer.rim_height) * axis)
+
+
+__all__ = [
+    "InvalidSceneError",
+    "PourSimulator",
+    "SimulationCancelled",
+    "check_motion",
+]
+
+SETTLING = 0.15
+"""The lattice may settle so long before the motion begins [s]."""
+
+PLANES_KEPT = 16
+VESSELS_KEPT = 32
+"""About 3 MB each; a prediction draws the shapes of uncertain vessels anew for each of its simulations."""
+
+
+def check_motion(
+    motion: Motion, scene: Scene, action: Action, pourer: Vessel, receiver: Vessel, error: PoseError
+) -> None:
+    """Refuse a motion in which the vessels touch.
+
+    Raises:
+        InvalidSceneError: with where, how deep and at which tilt.
+    """
+    found = contact_during(motion, pourer, receiver, receiver_at=(error.x, error.y, error.z))
+    if found is not None:
+        contact, tilt = found
+        text = describe_contact(contact, tilt=tilt)
+        raise InvalidSceneError(f"{text} ({action.display('x_offset', 'y_offset', 'height')})")
+
+
+class PourSimulator:
+    """Simulates pours, one by one or many in a call. One per process: Taichi's arrays are shared.
+
+    Args:
+        backend: 'cpu' or 'cuda'.
+    """
+
+    def __init__(self, backend: Backend = "cpu") -> None:
+        self.backend = backend
+        self._vessels: dict[VesselSpec, Vessel] = {}
+        self._masks: dict[VesselSpec, NDArray[np.uint8]] = {}
+        self._planes: dict[tuple[VesselSpec, float], NDArray[np.float32]] = {}
+
+    def vessel(self, spec: VesselSpec) -> Vessel:
+        """A vessel, built once; the last few are kept.
+
+        Raises:
+            VesselError: it can't be built.
+        """
+        if spec not in self._vessels:
+            if len(self._vessels) >= VESSELS_KEPT:
+                oldest = next(iter(self._vessels))
+                del self._vessels[oldest]
+                self._masks.pop(oldest, None)
+                self._planes = {key: kept for key, kept in self._planes.items() if key[0] != oldest}
+            self._vessels[spec] = build_vessel(spec)
+        return self._vessels[spec]
+
+    def prepare(self, task: PourTask) -> Motion:
+        """Everything that can be refused before anything moves: load, vessels, contact.
+
+        Raises:
+            InvalidSceneError: with the reason.
+        """
+        scene, error = task.scene, task.placement
+        try:
+            pourer, receiver = self.vessel(scene.pourer), self.vessel(scene.receiver)
+            check_holds(pourer, scene.liquid.volume)
+        except VesselError as problem:
+            raise InvalidSceneError(str(problem)) from None
+        motion: Motion = task.motion or plan_motion(
+            scene, task.action, pourer, receiver, tilt_error=error.tilt, speed_factor=error.speed_factor
+        )
+        check_motion(motion, scene, task.action, pourer, receiver, error)
+        return motion
+
+    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
+        """Run one pour.
+
+        Args:
+            task: what to simulate. Recording frames does not change the outcome.
+            cancelled: polled every `SLICE` of simulated time.
+
+        Returns:
+            The outcome; `outcome.invalid` says why a result must not be used (leak, divergence).
+
+        Raises:
+            InvalidSceneError: the pour can't be made.
+            SimulationCancelled: `cancelled` said so.
+            BackendError: the backend is not there.
+        """
+        (run,) = self.simulate_many([task], cancelled=cancelled)
+        return run
+
+    def simulate_many(
+        self, tasks: Sequence[PourTask], *, cancelled: Callable[[], bool] | None = None
+    ) -> list[SimulatedPour]:
+        """Run many pours, of any actions, θ, vessels and seeds, in one set of kernels.
+
+        On a CPU the pours follow each other; on a GPU they run side by side, as many as there is memory for. Every
+        outcome is the one that the pour has alone.
+
+        Args:
+            tasks: what to simulate.
+            cancelled: polled every `SLICE` of simulated time.
+
+        Returns:
+            As many runs, in the same order.
+
+        Raises:
+            InvalidSceneError: one of the pours can't be made; nothing was simulated.
+            SimulationCancelled: `cancelled` said so.
+            BackendError: the backend is not there.
+        """
+        from sim_engine.fluid.engine import engine
+
+        motions = [self.prepare(task) for task in tasks]
+        fluid = engine(self.backend)
+        runs: list[SimulatedPour] = []
+        while len(runs) < len(tasks):
+            first = len(runs)
+            end = first + fluid.room_for([task.parameters.particles for task in tasks[first:]])
+            runs += self._batch(fluid, tasks[first:end], motions[first:end], cancelled)
+        return runs
+
+    def _batch(
+        self,
+        fluid: FluidEngine,
+        tasks: Sequence[PourTask],
+        motions: Sequence[Motion],
+        cancelled: Callable[[], bool] | None,
+    ) -> list[SimulatedPour]:
+        """Pours that fit into one load."""
+        begun = time.process_time()
+        starts = [
+            calm_until(motion, self.vessel(task.scene.pourer), task.scene.liquid.volume)
+            for task, motion in zip(tasks, motions, strict=True)
+        ]
+        fluid.load([self._setup(*one) for one in zip(tasks, motions, starts, strict=True)])
+        loading = (time.process_time() - begun) / len(tasks)
+        courses = [
+            TimeLoop(task, motion, start, scene)
+            for scene, (task, motion, start) in enumerate(zip(tasks, motions, starts, strict=True))
+        ]
+        if fluid.backend == "cpu":
+            # One after the other: a scene's arrays stay in the core's cache.
+            for course in courses:
+                follow(fluid, [course], cancelled)
+        else:
+            follow(fluid, courses, cancelled)
+        for course, task, motion in zip(courses, tasks, motions, strict=True):
+            if task.record_rate > 0.0:
+                course.frames[:0] = self._level_frames(task, motion, course.start)
+        return [
+            SimulatedPour(outcome(fluid, course, loading), recorded_frames(course, motion))
+            for course, motion in zip(courses, motions, strict=True)
+        ]
+
+    def _laid(self, task: PourTask, motion: Motion, at: float) -> NDArray[np.float32]:
+        """Positions of the liquid at rest in the pourer as it stands at a time [s], (N, 3) in the world [m]."""
+        # The lattice is laid into the upright cup; a tilt error of the grip then moves cup and liquid together.
+        tilt = float(motion.tilt(np.array([at]))[0]) if at > 0.0 else 0.0
+        pourer, parameters = self.vessel(task.scene.pourer), task.parameters
+        volume = task.scene.liquid.volume
+        local = fill(pourer, volume, parameters.particles, task.seed, parameters.wall_distance, tilt)
+        (pose,) = motion.sample(np.array([at]))
+        (rotation,) = rotations(pose[None])
+        placed: NDArray[np.float32] = (local @ rotation.T + pose[:3]).astype(np.float32)
+        return placed
+
+    def _level_frames(
+        self, task: PourTask, motion: Motion, start: float
+    ) -> list[tuple[float, NDArray[np.float32], NDArray[np.uint8]]]:
+        """Frames from before the simulation began, when the liquid lay level: time, positions, states."""
+        homes = np.full(task.parameters.particles, int(ParticleState.IN_POURER), np.uint8)
+        times = np.arange(0.0, start - 0.5 / task.record_rate, 1.0 / task.record_rate)
+        return [(float(t), self._laid(task, motion, float(t)), homes) for t in times]
+
+    def _setup(self, task: PourTask, motion: Motion, start: float) -> SceneSetup:
+        """The scene as the engine takes it, at the time from which it has to be simulated [s]."""
+        from sim_engine.fluid.state import SUPPORT
+
+        scene, parameters, error = task.scene, task.parameters, task.placement
+        liquid = scene.liquid
+        pourer, receiver = self.vessel(scene.pourer), self.vessel(scene.receiver)
+        d = spacing(liquid.volume, parameters.particles)
+        drift = liquid_velocity(motion, pourer, start) if start > 0.0 else np.zeros(3)
+        return SceneSetup(
+            positions=self._laid(task, motion, start),
+            spacing=d,
+            density=liquid.density,
+            parameters=parameters,
+            pourer=self._walls(scene.pourer, SUPPORT * d),
+            receiver=self._walls(scene.receiver, SUPPORT * d),
+            receiver_at=np.array([error.x, error.y, error.z]),
+            spill_level=receiver.rim_height + error.z - d,
+            poses=motion.sample(np.arange(0.0, motion.duration + LONGEST_TAIL + 0.1, POSE_STEP)),
+            settling=SETTLING,
+            start=start,
+            drift=(float(drift[0]), float(drift[1]), float(drift[2])),
+            viscosity=liquid.kinematic_viscosity * parameters.viscosity_factor if liquid.is_thick else 0.0,
+            tension=liquid.surface_tension if liquid.is_thick else None,
+            contact_angle=liquid.contact_angle,
+        )
+
+    def _walls(self, spec: VesselSpec, support: float) -> SolidWalls:
+        """The vessel's; the last few planes are kept, for calibration changes θ again and again."""
+        vessel = self.vessel(spec)
+        key = (spec, support)
+        if key not in self._planes:
+            if len(self._planes) >= PLANES_KEPT:
+                self._planes.pop(next(iter(self._planes)))
+            if spec not in self._masks:
+                self._masks[spec] = inside_mask(vessel.grid)
+            self._planes[key] = equivalent_distance(vessel.grid, self._masks[spec], vessel.rim_height, support)
+        return SolidWalls(vessel.grid, self._planes[key], self._masks[spec], vessel.wall_thickness, vessel.rim_height)
+
+    def close(self) -> None:
+        """End Taichi; compiled kernels are kept for the next process."""
+        from sim_engine.fluid.engine import close_engine
+
+        close_engine()
+
+
+def recorded_frames(course: TimeLoop, motion: Motion) -> RecordedFrames | None:
+    """The frames, if any were asked for."""
+    if not course.frames:
+        return None
+    times = np.array([t for t, _, _ in course.frames])
+    positions, states = [p for _, p, _ in course.frames], [s for _, _, s in course.frames]
+    return RecordedFrames(times, positions, states, motion.sample(times))

@@ -1,0 +1,339 @@
+"""The cases by name: what each is about, and at which resolutions it runs in short and in full."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from sim_engine.liquids import SimulationParameters
+from sim_engine.simulator import PourSimulator
+from sim_engine.validation import capillarity as droplet
+from sim_engine.validation import convergence, dam_break, sensitivity, sloshing, torricelli
+from sim_engine.validation import hydrostatic_cases as at_rest
+from sim_engine.validation import hydrostatic_cases as tilting
+from sim_engine.validation import jet_landing as landing
+from sim_engine.validation import viscous_flows as thick
+from sim_engine.validation import wall_tightness as walls
+from sim_engine.validation import whole_pours as pours
+from sim_engine.validation.case_result import CaseResult, Figure, Measurement, Series, at_least
+
+PLAIN = SimulationParameters(cohesion=0.0, viscosity=1.0, friction=0.0)
+"""θ of the cases: what their references assume. Water's own viscosity is not felt in a cup, a liquid has no dry
+friction, and tension acts on drips only; a little XSPH viscosity stands for what a finer solver would resolve."""
+
+LOAD = 200e-6
+"""What the cups hold [m³]."""
+
+SEEDS = 5
+"""So many loads of each are taken together where single ones scatter as much as a criterion allows."""
+
+
+@dataclass(frozen=True)
+class CaseEffort:
+    """How much to spend.
+
+    Attributes:
+        full: all resolutions and seeds; else the quick subset.
+        pours: random pours against walls; None: what the effort implies.
+        progress: long cases tell it how many of their simulations are done, and how many there are.
+    """
+
+    full: bool = False
+    pours: int | None = None
+    progress: Callable[[int, int], None] | None = None
+
+
+@dataclass(frozen=True)
+class Case:
+    """One case.
+
+    Attributes:
+        name: for the command line.
+        title: for tables and pages.
+        about: setup, reference and source, in a sentence or two.
+        work: runs it.
+    """
+
+    name: str
+    title: str
+    about: str
+    work: Callable[[PourSimulator, CaseEffort], tuple[list[Measurement], Figure | None]]
+
+    def run(self, simulator: PourSimulator, effort: CaseEffort) -> CaseResult:
+        """Run it and take the CPU time. A solver that stops with a fault is a criterion that is not met."""
+        begun = time.process_time()
+        try:
+            measurements, figure = self.work(simulator, effort)
+        except ArithmeticError as fault:
+            name = f"the solver ran to the end (1: yes); it stopped {fault}"
+            measurements, figure = [at_least(name, 0.0, 1.0, criterion="yes", particles=0)], None
+        return CaseResult(tuple(measurements), figure, time.process_time() - begun)
+
+
+def describe(parameters: SimulationParameters) -> str:
+    """θ but for its number of particles, as people read it."""
+    infos = SimulationParameters.info()
+    shown = [
+        f"{name.replace('_', ' ')} {value:g} {infos[name].unit}".removesuffix(" 1")
+        for name, value in parameters.model_dump().items()
+        if name != "particles" and not infos[name].nuisance
+    ]
+    return ", ".join(shown)
+
+
+def _at_rest(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+    found: list[Measurement] = []
+    curves: list[Series] = []
+    for n in (2_000, 5_000) if effort.full else (2_000,):
+        measurements, figure = at_rest.at_rest(n, PLAIN)
+        found += measurements
+        curves += figure.series
+    # the limit is drawn once
+    unique = {(s.name, s.kind): s for s in curves}
+    return found, replace(figure, series=tuple(unique.values()))
+
+
+def _retention(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+    found: list[Measurement] = []
+    curves: list[Series] = []
+    if effort.full:
+        runs = [
+            (tilting.straight_cup(), 500, tilting.ANGLES),
+            (tilting.straight_cup(), 1_000, tilting.ANGLES),
+            (tilting.straight_cup(), 2_000, tilting.ANGLES),
+            (tilting.straight_cup(), 5_000, tilting.ANGLES),
+            (tilting.conical_cup(), 2_000, tilting.ANGLES),
+            (tilting.mesh_jug(), 2_000, tilting.ANGLES),
+        ]
+    else:
+        runs = [(tilting.straight_cup(), 500, tilting.ANGLES[:1])]
+    for vessel, particles, angles in runs:
+        measurements, series = tilting.slow_tilt(vessel, LOAD, particles, PLAIN, angles, SEEDS if effort.full else 1)
+        found += measurements
+        curves += [s for s in series if s not in curves]
+    return found, tilting.retention_figure(curves)
+
+
+def _outflow(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+    found: list[Measurement] = []
+    curves: list[Series] = []
+    for n in (500, 1_000, 2_000, 5_000) if effort.full else (500, 1_000):
+        measurements, series = pours.outflow(simulator, n, PLAIN, seeds=3 if n <= 2_000 else 1)
+        found += measurements
+        curves += series
+    return found, pours.outflow_figure(curves)
+
+
+def _delivered(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
+    return pours.delivered(simulator, 2_000, PLAIN, seeds=10 if effort.full else 3), None
+
+
+def _jet(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+    return pours.free_jet(simulator, 5_000 if effort.full else 1_000, PLAIN)
+
+
+def _column(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
+    numbers = (2_000, 5_000, 10_000) if effort.full else (2_000,)
+    return [m for n in numbers for m in at_rest.tall_column(n, PLAIN)], None
+
+
+def _sloshing(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+    found: list[Measurement] = []
+    curves: list[Series] = []
+    for n in (2_000, 5_000, 10_000) if effort.full else (2_000,):
+        measurements, series = sloshing.sloshing(n, PLAIN)
+        found += measurements
+        curves += series
+    return found, sloshing.sloshing_figure(curves)
+
+
+def _torricelli(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+    found: list[Measurement] = []
+    curves: list[Series] = []
+    discharges: dict[int, float] = {}
+    for n in (6_000, 12_000) if effort.full else (6_000,):
+        measurements, series, discharges[n] = torricelli.torricelli(n, PLAIN)
+        found += measurements
+        curves += series
+    if len(discharges) > 1:
+        found.append(torricelli.steadiness(discharges))
+    return found, torricelli.torricelli_figure(curves)
+
+
+def _dam_break(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+    found: list[Measurement] = []
+    curves: list[Series] = []
+    for width in dam_break.MEASURED:
+        measurements, series = dam_break.dam_break(width, 16 if effort.full else 12, PLAIN)
+        found += measurements
+        curves += series
+    return found, dam_break.dam_figure(curves)
+
+
+def _cohesion(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+    free = PLAIN.model_copy(update={"viscosity": 0.0})
+    found = droplet.cube_to_sphere(2_000, free)
+    curves: list[Series] = []
+    tensions: dict[int, float] = {}
+    for n in (2_000, 10_000) if effort.full else (2_000,):
+        measurements, series, tensions[n] = droplet.oscillation(n, free)
+        found += measurements
+        curves += series
+    if len(tensions) > 1:
+        found.append(droplet.same_tension(tensions))
+    return found, droplet.droplet_figure(curves)
+
+
+def _landing(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+    if effort.full:
+        return landing.compared(simulator, (500, 1_000, 2_000), 10_000, PLAIN, SEEDS)
+    return landing.compared(simulator, (500,), 1_000, PLAIN)
+
+
+def _convergence(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+    if effort.full:
+        return convergence.convergence(simulator, convergence.POURS, (500, 1_000), 3, PLAIN)
+    return convergence.convergence(simulator, convergence.QUICK, (1_000,), 1, PLAIN)
+
+
+def _sensitivity(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+    extent = sensitivity.FULL if effort.full else sensitivity.QUICK
+    return sensitivity.sensitivity(simulator, extent, effort.progress)
+
+
+def _walls(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
+    many = effort.pours if effort.pours is not None else 40 if effort.full else 5
+    return walls.walls(many, 10_000 if effort.full else 1_500), None
+
+
+def _repeatability(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
+    return pours.repeatability(simulator, 2_000 if effort.full else 500, PLAIN), None
+
+
+def _of_thick_liquids(
+    work: thick.Work,
+) -> Callable[[PourSimulator, CaseEffort], tuple[list[Measurement], Figure | None]]:
+    return lambda simulator, effort: work(simulator, effort.full)
+
+
+CASES: tuple[Case, ...] = (
+    Case(
+        "rest",
+        "Liquid at rest",
+        "200 mL in a cup of radius 40 mm stand 39.8 mm high (hydrostatics). Means over 0.2 s after the first second; "
+        "the height is twice that of the mass centre, the density inside is that of Voronoi cells.",
+        _at_rest,
+    ),
+    Case(
+        "column",
+        "Tall column at rest",
+        "240 mL in a slim cup (R 27 mm) stand 105 mm high, up to 36 layers of particles, and stay where they are.",
+        _column,
+    ),
+    Case(
+        "retention",
+        "Slow-tilt retention",
+        "A cup tilted at 3 °/s or slower, and held at each angle until it has stopped to drain, keeps what lies below "
+        "the horizontal plane through its lip (numerical integration over the true geometry). Cylinder, cone and a "
+        "jug with a spout from a mesh. Means of five loads.",
+        _retention,
+    ),
+    Case(
+        "outflow",
+        "Outflow of the standard pour",
+        "200 mL, 30 °/s to 120° about the inner lip. Reference: the limit of fine particles, to which SPlisHSPlasH "
+        "(DFSPH) and Decant with two corrections of the lip extrapolate within .003.",
+        _outflow,
+    ),
+    Case(
+        "delivered",
+        "Delivery of the standard pour",
+        "The same pour into a cup that it can't miss, over seeds.",
+        _delivered,
+    ),
+    Case(
+        "jet",
+        "Free jet",
+        "Below the lip and above the receiver nothing acts on a parcel of liquid but gravity.",
+        _jet,
+    ),
+    Case(
+        "landing",
+        "Landing of the jet",
+        "Where the jet crosses the height 60 mm below the lip, with the receiver set aside, at 30 and at 90 °/s: "
+        "coarse particles against fine ones, five pours of each together.",
+        _landing,
+    ),
+    Case(
+        "sloshing",
+        "Sloshing",
+        "The cup at rest is pushed aside by 6 mm; the velocities are projected on the first lateral mode, whose "
+        "frequency is ω² = g k tanh(kH), k = 1.841/R. Its decay is the solver's own viscosity.",
+        _sloshing,
+    ),
+    Case(
+        "torricelli",
+        "Torricelli",
+        "200 mL leave the cup through a sharp round hole of radius 10 mm in its floor; C_d from the slope of √V from "
+        "0.8 to 0.2 of the load.",
+        _torricelli,
+    ),
+    Case(
+        "dam-break",
+        "Dam break",
+        "A column of width a and height 2a collapses in a channel ten spacings wide. Reference: Martin & Moyce 1952, "
+        "n² = 2. Their gate took a time to go that nobody measured: fronts are compared after the delay that fits "
+        "best. The floor rubs a little (friction 0.05) in place of the boundary layer that slows the small tank.",
+        _dam_break,
+    ),
+    Case(
+        "cohesion",
+        "Cohesion",
+        "Without gravity, at the tension of water: a cube of 0.5 mL becomes a sphere; a stretched drop of radius 5 mm "
+        "oscillates at Rayleigh's 10.9 Hz. Steps are a tenth of the capillary limit.",
+        _cohesion,
+    ),
+    Case(
+        "convergence",
+        "Convergence",
+        "Spillage of nineteen pours into four receivers, slow to fast, at few particles. Reference: the limit of fine "
+        "particles (`benchmarks/convergence.py`).",
+        _convergence,
+    ),
+    Case(
+        "sensitivity",
+        "What the parameters do",
+        "Each θ is turned alone, around the defaults, in a slow, a standard and a fast pour (20, 30 and 100 °/s) into "
+        "a tumbler a little too far away. For each: the widest interval in which spillage is monotone as far as the "
+        "seeds allow to tell (isotonic fit, χ² below its 95 % quantile), its change over that interval and its mean "
+        "slope, with standard errors. Nothing is judged; bands are the standard deviation of a single seed.",
+        _sensitivity,
+    ),
+    Case(
+        "walls",
+        "Walls",
+        "Random pours: walls from 1 mm, up to 180 °/s, 500 particles and more. Every particle that crosses a wall is "
+        "counted, never called spilled.",
+        _walls,
+    ),
+    Case(
+        "repeatability",
+        "Repeatability",
+        "The standard pour, twice with one seed and once with another.",
+        _repeatability,
+    ),
+    *(Case(name, title, about, _of_thick_liquids(work)) for name, title, about, work in thick.CASES),
+)
+
+
+def case(name: str) -> Case:
+    """A case by its name.
+
+    Raises:
+        KeyError: there is none; the message names those there are.
+    """
+    for candidate in CASES:
+        if candidate.name == name:
+            return candidate
+    raise KeyError(f"no case '{name}'; there are {', '.join(c.name for c in CASES)}")

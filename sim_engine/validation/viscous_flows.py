@@ -1,0 +1,474 @@
+"""Viscous liquids on walls: down a tube, down an incline, as a film that drains, as a puddle that spreads.
+
+What is exact about them: the flow in a tube (Hagen 1839, Poiseuille 1846) and down an incline (Nusselt 1916), where
+gravity and the wall's friction are in balance; the film that is left on a wall (Jeffreys 1930), e = √(νz/gt) below its
+upper edge; the radius of a puddle, .894 (g V³ t / 3ν)^⅛ (Huppert 1982), once it is flat.
+
+The cases of liquids with a viscosity in SI, and how large the solver's own viscosity is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_engine.action import DEG, Action
+from sim_engine.hydrostatics import GRAVITY
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.scene import PourTask, Scene
+from sim_engine.simulator import PourSimulator
+from sim_engine.validation import capillarity as wetting
+from sim_engine.validation.case_result import Figure, Measurement, Series, reported, within
+from sim_engine.validation.container_runs import MARGIN, Container, block, box, run, still_pose, stir
+from sim_engine.vessel.distance_grid import SignedDistanceGrid
+from sim_engine.vessel.shapes import cylinder
+
+Floats = NDArray[np.float64]
+
+WALL = 0.005
+"""Thickness of the tubes' walls [m]."""
+
+
+def tube(radius: float, top: float, bottom: float, spacing: float) -> Container:
+    """A straight tube along z, open at both ends.
+
+    Args:
+        radius: inside [m].
+        top, bottom: its ends [m].
+        spacing: of the grid [m].
+    """
+    half = int(np.ceil((radius + WALL + MARGIN) / spacing))
+    across = spacing * np.arange(-half, half + 1)
+    z = np.arange(bottom - MARGIN, top + MARGIN + spacing, spacing)
+    r = np.hypot(across[:, None], across[None, :])[:, :, None]
+    aside = np.abs(r - radius - 0.5 * WALL) - 0.5 * WALL
+    ends = np.maximum(z - top, bottom - z)[None, None, :]
+    outside = np.hypot(np.maximum(aside, 0.0), np.maximum(ends, 0.0))
+    values = np.asarray(outside + np.minimum(np.maximum(aside, ends), 0.0), dtype=np.float32)
+    inside = np.asarray((r < radius + 0.5 * WALL) & (z > bottom) & (z < top), dtype=np.uint8)
+    grid = SignedDistanceGrid(
+        np.array([across[0], across[0], z[0]]), spacing, values, (inside & (values > 0.0)).astype(np.uint8)
+    )
+    everywhere = np.ones(values.shape, dtype=np.uint8)
+    return Container(grid, np.ascontiguousarray(inside), WALL, open=everywhere)
+
+
+def ring(inner: float, outer: float, low: float, high: float, d: float, seed: int = 1) -> Floats:
+    """A jittered lattice in the space between two cylinders.
+
+    Args:
+        inner, outer: radii of the space that the liquid fills [m].
+        low, high: heights [m].
+        d: spacing [m].
+        seed: of the jitter.
+
+    Returns:
+        Positions (N, 3) [m], half a spacing inside.
+    """
+    points = []
+    layers = max(round((outer - inner) / d), 1)
+    levels = max(round((high - low) / d), 1)
+    for layer in range(layers):
+        r = outer - (layer + 0.5) * (outer - inner) / layers
+        many = max(round(2.0 * math.pi * r * (outer - inner) / layers * (high - low) / levels / d**3), 1)
+        for level in range(levels):
+            angle = 2.0 * math.pi * (np.arange(many) + 0.5 * (level % 2)) / many
+            height = np.full(many, low + (level + 0.5) * (high - low) / levels)
+            points.append(np.column_stack([r * np.cos(angle), r * np.sin(angle), height]))
+    found = np.concatenate(points)
+    return np.asarray(found + np.random.default_rng(seed).uniform(-0.05, 0.05, found.shape) * d)
+
+
+def down_a_tube(
+    layers: int, viscosity: float, parameters: SimulationParameters, radius: float = 0.015
+) -> tuple[list[Measurement], list[Series]]:
+    """A plug of liquid falls in a vertical tube that is open at both ends.
+
+    Args:
+        layers: spacings in the radius.
+        viscosity: kinematic [m²/s].
+        parameters: θ; its number of particles is not looked at.
+        radius: of the tube [m].
+    """
+    from sim_engine.fluid.engine import engine
+
+    d = radius / layers
+    length = 8.0 * radius
+    mean = GRAVITY * radius**2 / (8.0 * viscosity)
+    settled = 0.6 * radius**2 / viscosity
+    times = settled + np.linspace(0.0, 0.3 * radius / mean + 0.02, 8)
+    start = ring(0.0, radius, 0.0, length, d)
+    pipe = tube(radius, length + 0.05, -1.5 * mean * float(times[-1]) - 0.05, 0.4 * d)
+    places, speeds = [], []
+    for _ in run(start, d, pipe, parameters, times, viscosity=viscosity):
+        x, v = engine().particles()[0].astype(float), engine().velocities().astype(float)
+        middle = np.abs(x[:, 2] - np.median(x[:, 2])) < radius
+        places.append(np.hypot(x[middle, 0], x[middle, 1]))
+        speeds.append(-v[middle, 2])
+    r, u = np.concatenate(places), np.concatenate(speeds)
+    found = within(
+        f"mean velocity, {layers} spacings in the radius, ν = {_mm2(viscosity)}",
+        float(u.mean()),
+        mean,
+        0.10 * mean,
+        unit="m/s",
+        criterion="within 10 %",
+        particles=len(start),
+    )
+    bins = (np.arange(layers) + 0.5) * d
+    profile = [float(u[np.abs(r - b) < 0.5 * d].mean()) / mean for b in bins]
+    name = f"{layers} spacings"
+    fine = np.linspace(0.0, 1.0, 40)
+    return [found], [
+        Series(name, tuple((bins / radius).tolist()), tuple(profile)),
+        Series("Poiseuille", tuple(fine.tolist()), tuple((2.0 * (1.0 - fine**2)).tolist()), "reference"),
+    ]
+
+
+INCLINE = math.radians(20.0)
+
+
+def down_an_incline(
+    layers: int, viscosity: float, parameters: SimulationParameters, thickness: float = 0.01
+) -> tuple[list[Measurement], list[Series]]:
+    """A film on a plane of 20°; looked at in the middle of it, away from its edges and from the channel's sides.
+
+    Args:
+        layers: spacings in the film.
+        viscosity: kinematic [m²/s].
+        parameters: θ; its number of particles is not looked at.
+        thickness: of the film [m].
+    """
+    from sim_engine.fluid.engine import engine
+
+    d = thickness / layers
+    pull = GRAVITY * math.sin(INCLINE)
+    mean = pull * thickness**2 / (3.0 * viscosity)
+    settled = 0.8 * thickness**2 / viscosity
+    times = settled + np.linspace(0.0, 0.02, 5)
+    length, width = 12.0 * thickness, 8.0 * thickness
+    local, _ = block(
+        np.array([0.03, -width / 2.0, 0.0]), np.array([0.03 + length, width / 2.0, thickness]),
+        round(length * width * thickness / d**3), 1,
+    )  # fmt: skip
+    channel = box(length + 0.06 + 3.0 * mean * float(times[-1]), width, 3.0 * thickness, 0.5 * d)
+    cosine, sine = math.cos(INCLINE), math.sin(INCLINE)
+    turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+    poses = still_pose(float(times[-1]))
+    poses[:, 3], poses[:, 5] = math.cos(INCLINE / 2.0), math.sin(INCLINE / 2.0)
+    heights, speeds, deep = [], [], []
+    for _ in run(local @ turn.T, d, channel, parameters, times, poses=poses, viscosity=viscosity):
+        x = engine().particles()[0].astype(float) @ turn
+        v = engine().velocities().astype(float) @ turn
+        middle = (np.abs(x[:, 0] - np.median(x[:, 0])) < 2.0 * thickness) & (np.abs(x[:, 1]) < width / 4.0)
+        heights.append(x[middle, 2])
+        speeds.append(v[middle, 0])
+        deep.append(middle.sum() * d**3 / (4.0 * thickness * width / 2.0))
+    z, u = np.concatenate(heights), np.concatenate(speeds)
+    e = float(np.mean(deep))
+    wanted = pull * e**2 / (3.0 * viscosity)
+    found = within(
+        f"mean velocity of a film of {layers} spacings, ν = {_mm2(viscosity)}",
+        float(u.mean()),
+        wanted,
+        0.15 * wanted,
+        unit="m/s",
+        criterion="within 15 %",
+        particles=len(local),
+    )
+    bins = (np.arange(layers) + 0.5) * d
+    profile = [float(u[np.abs(z - b) < 0.5 * d].mean()) / wanted if np.any(np.abs(z - b) < 0.5 * d) else math.nan
+               for b in bins]  # fmt: skip
+    fine = np.linspace(0.0, 1.0, 40)
+    return [found], [
+        Series(f"{layers} spacings", tuple((bins / e).tolist()), tuple(profile)),
+        Series("Nusselt", tuple(fine.tolist()), tuple((3.0 * (fine - fine**2 / 2.0)).tolist()), "reference"),
+    ]
+
+
+def left_on_a_wall(
+    layers: int, viscosity: float, parameters: SimulationParameters, *, height: float = 0.1, radius: float = 0.03
+) -> tuple[list[Measurement], list[Series]]:
+    """A film inside a vertical tube drains.
+
+    Args:
+        layers: spacings in the film at first.
+        viscosity: kinematic [m²/s].
+        parameters: θ; its number of particles is not looked at.
+        height, radius: of the tube [m].
+    """
+    from sim_engine.fluid.engine import engine
+
+    first = 0.008
+    d = first / layers
+    times = np.linspace(0.05, 3.0, 30) * viscosity * height / (GRAVITY * first**2) * 9.0
+    start = ring(radius - first, radius, 0.0, height, d)
+    pipe = tube(radius, height + 0.01, 0.0, 0.4 * d)
+    left = []
+    for _ in run(start, d, pipe, parameters, times, viscosity=viscosity, spill_level=-0.02):
+        x = engine().particles()[0].astype(float)
+        left.append(float(np.mean(x[:, 2] > 0.0)))
+    wanted = [jeffreys(float(t), first, height, radius, viscosity) for t in times]
+    far = [abs(a - b) for a, b in zip(left, wanted, strict=True)]
+    thin = math.sqrt(viscosity * height / (GRAVITY * float(times[-1])))
+    return [
+        within(
+            f"largest distance of what is left on the wall, a film of {layers} spacings, ν = {_mm2(viscosity)}",
+            max(far),
+            0.0,
+            0.05,
+            criterion="within 0.05 of the film at first",
+            particles=len(start),
+        ),
+        reported(f"left at the end, where the film is {thin / d:.1f} spacings", left[-1], reference=wanted[-1],
+                 particles=len(start)),
+    ], [
+        Series(f"ν = {_mm2(viscosity)}, {layers} spacings", tuple(times.tolist()), tuple(left)),
+        Series(f"ν = {_mm2(viscosity)}", tuple(times.tolist()), tuple(wanted), "reference"),
+    ]  # fmt: skip
+
+
+def jeffreys(time: float, first: float, height: float, radius: float, viscosity: float) -> float:
+    """What is left of a film after a time, over what it was: e = min(first, √(νz/gt)) at z below its upper edge."""
+    z = (np.arange(2_000) + 0.5) / 2_000 * height
+    e = np.minimum(first, np.sqrt(viscosity * z / (GRAVITY * time)))
+    return float(np.sum(e * (2.0 * radius - e)) / (2_000 * first * (2.0 * radius - first)))
+
+
+def spreading(
+    particles: int, viscosity: float, parameters: SimulationParameters, volume: float = 250e-6
+) -> tuple[list[Measurement], list[Series]]:
+    """A cylinder of liquid is let go on a plane: a viscous dam break.
+
+    Args:
+        particles: N.
+        viscosity: kinematic [m²/s].
+        parameters: θ; its number of particles is replaced.
+        volume: of the liquid [m³].
+    """
+    from sim_engine.fluid.engine import engine
+
+    d = (volume / particles) ** (1.0 / 3.0)
+    radius = (volume / math.pi) ** (1.0 / 3.0)
+    start = ring(0.0, radius, 0.0, radius, d)
+    volume = len(start) * d**3
+    plain = box(0.5, 0.5, 2.0 * radius, 0.002)
+    times = np.linspace(0.05, 2.0, 40)
+    at = np.array([0.25, 0.0, 0.0])
+    radii = []
+    for _ in run(start + at, d, plain, parameters, times, viscosity=viscosity):
+        x = engine().particles()[0].astype(float) - at
+        r = np.sort(np.hypot(x[:, 0], x[:, 1]))
+        # a puddle's profile (1 − r²/R²)^⅓ has its mean square of r at R²·3/7
+        radii.append(math.sqrt(float(np.mean(r**2)) * 7.0 / 3.0))
+    wanted = 0.894 * (GRAVITY * volume**3 * times / (3.0 * viscosity)) ** 0.125
+    late = times > 0.5
+    error = float(np.max(np.abs(np.array(radii)[late] / wanted[late] - 1.0)))
+    power = float(np.polyfit(np.log(times[late]), np.log(np.array(radii)[late]), 1)[0])
+    name = f"ν = {_mm2(viscosity)}"
+    return [
+        within(f"largest error of the radius from 0.5 s on, {name}", error, 0.0, 0.1, criterion="within 10 %",
+               particles=len(start)),
+        reported(f"power of time that the radius grows with, {name}", power, reference=0.125, particles=len(start)),
+    ], [
+        Series(f"{name}, {len(start):,} particles", tuple(times.tolist()), tuple(radii)),
+        Series(name, tuple(times.tolist()), tuple(wanted.tolist()), "reference"),
+    ]  # fmt: skip
+
+
+def _mm2(viscosity: float) -> str:
+    """A kinematic viscosity as people read it; mm²/s are centistokes."""
+    return f"{1e6 * viscosity:.0f} mm²/s"
+
+
+THETA = SimulationParameters(cohesion=0.0, viscosity=0.0)
+
+FLOOR = (
+    "Taylor and Green's vortices in a tank with slippery walls die away as exp(−2νk²t), whatever their speed. What is "
+    "found above the given viscosity is the solver's own: under pressure the packing of particles is a weak solid, and "
+    "what is taken out of its stress inside is left beside walls and the surface."
+)
+FILM = "A film of 10 mm, ν = 1,000 mm²/s, runs down a plane of 20°: mean velocity g sin α e²/3ν (Nusselt 1916)."
+TUBE = (
+    "A plug of ν = 2,000 mm²/s falls in a vertical tube of radius 15 mm, open at both ends: mean velocity gR²/8ν "
+    "(Poiseuille). No pressure holds the particles together there, nor against the wall."
+)
+DRAINAGE = "A film of 8 mm, ν = 1,000 mm²/s, drains from a vertical wall of 100 mm: e = √(νz/gt) (Jeffreys 1930)."
+PUDDLE = "250 mL are let go on a plane: the radius is 0.894 (gV³t/3ν)^⅛ once they are flat (Huppert 1982)."
+CUP = (
+    "The standard pour with .1 and 1 Pa s, at 1,000 kg/m³. Reference: SPlisHSPlasH 2.19 with the implicit viscosity of "
+    "Weiler et al. 2018, in the liquid and on walls."
+)
+
+SIDE, VOLUME = 0.07, 200e-6
+"""Of the tank in which the solver's own viscosity is measured [m], [m³]."""
+
+
+def own_viscosity(particles: int, viscosity: float, speed: float) -> tuple[float, float, int]:
+    """Viscosity at which four vortices side by side die away in a tank whose walls are slippery.
+
+    Taylor and Green's vortices: u = (sin kx cos ky, −cos kx sin ky) U, k = 2π/side, decay as exp(−2νk²t), whatever U.
+
+    Args:
+        particles: N.
+        viscosity: kinematic, that the liquid is given; 0: none [m²/s].
+        speed: U [m/s].
+
+    Returns:
+        Viscosity by the decay [m²/s], spacing [m] and N.
+    """
+    from sim_engine.fluid.engine import engine
+
+    k = 2.0 * math.pi / SIDE
+    depth = VOLUME / SIDE**2
+    start, d = block(np.array([0.0, -SIDE / 2.0, 0.0]), np.array([SIDE, SIDE / 2.0, depth]), particles, 1)
+    tank = box(SIDE, SIDE, 2.0 * depth, 0.5 * d)
+    lasts = min(0.8, 0.75 / ((max(viscosity, 3e-5) + 3e-5) * k**2))
+
+    def vortices(x: Floats) -> Floats:
+        a, b = k * x[:, 0], k * (x[:, 1] + SIDE / 2.0)
+        return np.column_stack([np.sin(a) * np.cos(b), -np.cos(a) * np.sin(b), 0.0 * a])
+
+    times = 0.3 + np.linspace(0.0, lasts, 21)
+    found = []
+    for step in run(start, d, tank, THETA, times, viscosity=viscosity, no_slip=False):
+        if step == 0:
+            stir(lambda x: speed * vortices(x))
+        x, v = engine().particles()[0].astype(float), engine().velocities().astype(float)
+        w = vortices(x)
+        found.append(float((v * w).sum() / (w * w).sum()))
+    left = np.array(found) / found[0]
+    clear = left > 0.1
+    rate = -float(np.polyfit(times[clear], np.log(left[clear]), 1)[0])
+    return rate / (2.0 * k**2), d, len(start)
+
+
+def floor(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+    """What the solver adds to the viscosity that a liquid is given, by spacing and speed."""
+    speed = 0.2
+    found: list[Measurement] = []
+    curves: list[Series] = []
+    given = (1e-5, 1e-4, 5e-4, 2e-3) if full else (1e-4, 2e-3)
+    for wanted in (2_000, 8_000) if full else (2_000,):
+        values = []
+        for nu in given:
+            value, d, n = own_viscosity(wanted, nu, speed)
+            values.append(value)
+            found.append(
+                reported(f"viscosity by decay at U = {speed:g} m/s, d = {1e3 * d:.1f} mm, given {1e6 * nu:.0f} mm²/s",
+                         value, unit="m²/s", reference=nu, particles=n)
+            )  # fmt: skip
+        curves.append(Series(f"{n:,} particles", tuple(1e6 * nu for nu in given), tuple(1e6 * v for v in values)))
+    curves.append(Series("given", tuple(1e6 * nu for nu in given), tuple(1e6 * nu for nu in given), "reference"))
+    if full:
+        value, d, n = own_viscosity(2_000, 1e-4, 0.05)
+        found.append(reported("the same at U = 0.05 m/s, given 100 mm²/s", value, unit="m²/s", reference=1e-4,
+                              particles=n))  # fmt: skip
+    thick = next(m for m in found if "given 2000" in m.name)
+    found.append(within("what it adds to 2,000 mm²/s, over it", thick.value / 2e-3 - 1.0, 0.0, 0.2,
+                        criterion="within 20 %", particles=thick.particles))  # fmt: skip
+    return found, Figure(
+        ("The solver's own viscosity",), ("given [mm²/s]",), ("by decay [mm²/s]",), tuple(curves), log_x=True
+    )
+
+
+def film(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+    """Down an incline."""
+    return _figure(
+        [down_an_incline(layers, 1e-3, THETA) for layers in ((2, 3, 4, 6) if full else (4,))],
+        ("Film on an incline", "height over the film's", "velocity over the mean's"),
+    )
+
+
+def tube_flow(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+    """Down a tube."""
+    return _figure(
+        [down_a_tube(layers, 2e-3, THETA) for layers in ((3, 5, 8) if full else (3,))],
+        ("Plug in a tube", "radius over the tube's", "velocity over the mean's"),
+    )
+
+
+def drainage(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+    """A film on a wall."""
+    return _figure(
+        [left_on_a_wall(layers, 1e-3, THETA) for layers in ((2, 4) if full else (2,))],
+        ("What is left on a wall", "time [s]", "over the film at first"),
+    )
+
+
+def puddle(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+    """Spreading on a plane."""
+    cases = ((2_000, 2e-3), (8_000, 2e-3), (2_000, 2e-4)) if full else ((1_000, 2e-3),)
+    return _figure([spreading(n, nu, THETA) for n, nu in cases], ("Puddle", "time [s]", "radius [m]"))
+
+
+def _figure(
+    runs: list[tuple[list[Measurement], list[Series]]], words: tuple[str, str, str]
+) -> tuple[list[Measurement], Figure]:
+    curves: list[Series] = []
+    for _, series in runs:
+        curves += [one for one in series if (one.name, one.kind) not in [(c.name, c.kind) for c in curves]]
+    title, x, y = words
+    return [m for measurements, _ in runs for m in measurements], Figure((title,), (x,), (y,), tuple(curves))
+
+
+PEER: dict[float, tuple[float, ...]] = {
+    1e-4: (0.985, 0.922, 0.796, 0.632, 0.462, 0.296, 0.149, 0.043),
+    1e-3: (0.987, 0.933, 0.822, 0.671, 0.501, 0.339, 0.195, 0.090),
+}
+"""Left in the pourer at `TIMES` by kinematic viscosity [m²/s]: SPlisHSPlasH 2.19 (DFSPH, volume maps, viscosity of
+Weiler et al. 2018 in the liquid and on walls), 2,000 and 1,000 particles, `benchmarks/peer.py`. For water it
+has less by at most .015: .1 Pa s change next to nothing there."""
+TIMES = (2.1, 2.3, 2.5, 2.7, 2.9, 3.1, 3.3, 3.5)
+FAR = 0.05
+
+
+def cup(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+    """The standard pour of thicker and thicker liquids."""
+    found: list[Measurement] = []
+    curves: list[Series] = []
+    scene = Scene(
+        "standard",
+        cylinder("pourer", inner_radius=0.04, inner_height=0.1),
+        cylinder("receiver", inner_radius=0.045, inner_height=0.09),
+        Liquid(mass=0.2, density=1000.0, surface_tension=0.033),
+    )
+    action = Action(
+        angular_velocity=30 * DEG, x_offset=0.080, height=0.110, max_angle=120 * DEG, angular_acceleration=None,
+        hold_time=2.0, return_velocity=None,
+    )  # fmt: skip
+    for particles in (2_000, 5_000) if full else (1_000,):
+        theta = SimulationParameters(particles=particles)
+        for nu in (1e-4, 1e-3):
+            liquid = scene.liquid.model_copy(update={"dynamic_viscosity": 1e3 * nu})
+            outcome = simulator.simulate(PourTask(replace(scene, liquid=liquid), action, theta, 1)).outcome
+            left = 1.0 - np.interp(TIMES, outcome.curve_times, outcome.curve_poured)
+            name = f"{nu * 1e3:g} Pa s"
+            curves.append(Series(f"{name}, {particles:,} particles", TIMES, tuple(left.tolist())))
+            if nu in PEER:
+                far = float(np.max(np.abs(left - np.array(PEER[nu]))))
+                found.append(
+                    within(f"largest distance of what is left from SPlisHSPlasH's, {name}", far, 0.0, FAR,
+                           criterion=f"within {FAR:g}", particles=particles)
+                )  # fmt: skip
+            found.append(reported(f"left at 3.1 s, {name}", float(left[TIMES.index(3.1)]), particles=particles))
+    curves += [Series(f"{nu * 1e3:g} Pa s", TIMES, values, "reference") for nu, values in PEER.items()]
+    return found, Figure(("Thick liquids leave a cup",), ("time [s]",), ("left in the pourer",), tuple(curves))
+
+
+Work = Callable[[PourSimulator, bool], tuple[list[Measurement], Figure | None]]
+
+CASES: tuple[tuple[str, str, str, Work], ...] = (
+    ("floor", "The solver's own viscosity", FLOOR, floor),
+    ("film", "Film on an incline", FILM, film),
+    ("tube", "Tube", TUBE, tube_flow),
+    ("drainage", "Drainage of a wall film", DRAINAGE, drainage),
+    ("puddle", "Viscous dam break", PUDDLE, puddle),
+    ("wetting", "Contact angle", wetting.ABOUT, wetting.wetting),
+    ("thick-outflow", "Outflow of thick liquids", CUP, cup),
+)
+"""Name, title, what it is about, and what runs it, in short or in full."""

@@ -1,0 +1,177 @@
+"""The cavity: what a rain of liquid would fill, up to the brim.
+
+For every free place let its level be the lowest height that a way from it to the outside must climb to. Liquid stands
+where the level is higher than the place itself. Horizontal slices fall into a few connected parts each, so the levels
+are found on the small graph of those parts. Handles, feet and dents need no special treatment: they hold no pool, or a
+smaller one than the cavity.
+
+Limitations: air that an overhang would trap counts as liquid; holes narrower than the grid's spacing are not seen.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_engine.vessel.mesh_distance import Crossings, GridLayout
+
+Floats = NDArray[np.float64]
+Part = tuple[int, int]
+"""Slice and label of a connected part of it."""
+
+
+@dataclass(frozen=True)
+class CavityFill:
+    """The largest pool that rain leaves in a solid.
+
+    Attributes:
+        pool: its nodes, shape of the grid.
+        brim: first slice at which it runs over; 0 without a pool.
+        outside: nodes that drain below the brim, shape of the grid.
+        enclosed: nodes in voids that no liquid reaches.
+        drained: nodes surrounded by solid in their slice that hold nothing all the same, because it runs out below.
+        drain: lowest slice with such a node; −1 without any.
+    """
+
+    pool: NDArray[np.bool_]
+    brim: int
+    outside: NDArray[np.bool_]
+    enclosed: int
+    drained: int
+    drain: int
+
+
+def flood(free: NDArray[np.bool_]) -> CavityFill:
+    """Find the largest pool.
+
+    Args:
+        free: nodes without solid; the grid's outermost ones are free, shape (nx, ny, nz).
+    """
+    from scipy import ndimage
+
+    depth = free.shape[2]
+    labels = np.zeros(free.shape, dtype=np.int32)
+    sizes: dict[Part, int] = {}
+    open_parts: set[Part] = set()
+    neighbours: dict[Part, set[Part]] = defaultdict(set)
+    for k in range(depth):
+        labels[:, :, k], count = ndimage.label(free[:, :, k])
+        layer = labels[:, :, k]
+        number = np.bincount(layer.ravel(), minlength=count + 1)
+        sizes.update({(k, part): int(number[part]) for part in range(1, count + 1)})
+        border = np.concatenate([layer[0], layer[-1], layer[:, 0], layer[:, -1]])
+        open_parts |= {(k, int(part)) for part in np.unique(border) if part}
+        if k:
+            below = labels[:, :, k - 1]
+            both = (layer > 0) & (below > 0)
+            for upper, lower in np.unique(np.column_stack([layer[both], below[both]]), axis=0).tolist():
+                neighbours[(k, upper)].add((k - 1, lower))
+                neighbours[(k - 1, lower)].add((k, upper))
+    levels = _levels(open_parts, neighbours)
+    wet = {part for part in sizes if part[0] < levels.get(part, -1)}
+    best = _largest_pool(wet, neighbours, sizes)
+    brim = levels[next(iter(best))] if best else 0
+    drained = [part for part in sizes if part not in open_parts and part in levels and part not in wet]
+    outside = {part for part, level in levels.items() if level < brim}
+    return CavityFill(
+        pool=_nodes(labels, best),
+        brim=brim,
+        outside=_nodes(labels, outside),
+        enclosed=sum(size for part, size in sizes.items() if part not in levels),
+        drained=sum(sizes[part] for part in drained),
+        drain=min((part[0] for part in drained), default=-1),
+    )
+
+
+def _levels(open_parts: set[Part], neighbours: dict[Part, set[Part]]) -> dict[Part, int]:
+    """Level of every part from which a way leads outside (Dijkstra's method with the highest slice as length)."""
+    levels: dict[Part, int] = {}
+    queue = [(part[0], part) for part in open_parts]
+    heapq.heapify(queue)
+    while queue:
+        level, part = heapq.heappop(queue)
+        if part in levels:
+            continue
+        levels[part] = level
+        for other in neighbours[part]:
+            if other not in levels:
+                heapq.heappush(queue, (max(level, other[0]), other))
+    return levels
+
+
+def _largest_pool(wet: set[Part], neighbours: dict[Part, set[Part]], sizes: dict[Part, int]) -> set[Part]:
+    best: set[Part] = set()
+    best_size, left = 0, set(wet)
+    while left:
+        pool, stack = set(), [left.pop()]
+        while stack:
+            part = stack.pop()
+            pool.add(part)
+            found = neighbours[part] & left
+            left -= found
+            stack.extend(found)
+        size = sum(sizes[part] for part in pool)
+        if size > best_size:
+            best, best_size = pool, size
+    return best
+
+
+def _nodes(labels: NDArray[np.int32], parts: set[Part]) -> NDArray[np.bool_]:
+    mask = np.zeros(labels.shape, dtype=bool)
+    by_slice: dict[int, list[int]] = defaultdict(list)
+    for k, part in parts:
+        by_slice[k].append(part)
+    for k, chosen in by_slice.items():
+        mask[:, :, k] = np.isin(labels[:, :, k], chosen)
+    return mask
+
+
+def brim_height(found: CavityFill, free: NDArray[np.bool_], layout: GridLayout, hits: Crossings) -> float:
+    """Exact height of the brim: the lowest saddle of the rim between the last dry slice and the first that runs over.
+
+    Args:
+        found: with a pool.
+        free: as given to `flood`.
+        layout: of the grid.
+        hits: where columns cross the surface.
+
+    Returns:
+        z [m].
+    """
+    from scipy import ndimage
+
+    k = found.brim
+    below, above = (layout.origin[2] + layout.spacing * (k - 1), layout.origin[2] + layout.spacing * k)
+    height = np.where(free[:, :, k - 1], -math.inf, math.inf)
+    within = (hits.z > below) & (hits.z <= above)
+    top = np.full(height.shape, -math.inf)
+    np.maximum.at(top, (hits.i[within], hits.j[within]), hits.z[within])
+    covered = ~free[:, :, k - 1] & free[:, :, k]
+    height[covered] = np.where(np.isfinite(top[covered]), top[covered], above)
+    candidates = np.unique(height[np.isfinite(height)])
+    first, last = 0, len(candidates) - 1
+    while first < last:
+        middle = (first + last) // 2
+        labels, _ = ndimage.label(height <= candidates[middle])
+        joined = np.intersect1d(labels[found.pool[:, :, k - 1]], labels[found.outside[:, :, k - 1]])
+        if joined.any():
+            last = middle
+        else:
+            first = middle + 1
+    return float(candidates[last]) if len(candidates) else above
+
+
+def floor_height(found: CavityFill, layout: GridLayout, hits: Crossings) -> float:
+    """Lowest z of the pool: where its columns meet the solid below them [m]."""
+    wet = found.pool.any(axis=2)
+    lowest = layout.origin[2] + layout.spacing * np.argmax(found.pool, axis=2)
+    floor = np.full(wet.shape, -math.inf)
+    under = (hits.z <= lowest[hits.i, hits.j]) & (hits.z > lowest[hits.i, hits.j] - layout.spacing)
+    np.maximum.at(floor, (hits.i[under], hits.j[under]), hits.z[under])
+    known = wet & np.isfinite(floor)
+    return float(floor[known].min()) if known.any() else float(lowest[wet].min())

@@ -1,0 +1,1 @@
+"""Vessel shapes from measurements: outlines, photographs, point clouds, meshes."""

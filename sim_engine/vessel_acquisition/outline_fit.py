@@ -1,0 +1,322 @@
+"""The inner profile of a turned vessel from several kinds of evidence at once, with what is uncertain about it.
+
+The radius r(z) at heights between floor and rim is a Gaussian process; each piece of evidence says something about it
+with a standard deviation: a radius at a height, the volume below a level, what a tilted vessel still holds. The
+profile is the most likely one given all of them (Gauss–Newton), its covariance that of the linearised problem.
+
+Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2 and 3.4 (Laplace).
+Limitations: a surface of revolution whose inner wall nowhere turns back below itself; the floor is flat or rises
+towards the wall as r(z) does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_engine.vessel.profile import volume
+from sim_engine.vessel.shapes import NARROWEST, ProfileShape, VesselError
+
+Floats = NDArray[np.float64]
+
+NODES = 48
+"""Heights at which the radius is sought."""
+
+CROWDING = 1.5
+"""Power by which they crowd towards the floor, where profiles bend."""
+
+LENGTHS = (0.15, 0.4, 1.2)
+"""Lengths over which a profile changes, as shares of the way from floor to rim; the evidence chooses."""
+
+BENDS = (0.01, 0.06, 0.3)
+"""Standard deviations of the radius about its mean, as shares of that mean; likewise."""
+
+LEVEL = 0.5
+"""Standard deviation of that mean before anything is known, as a share of the first guess."""
+
+KEPT = 0.9
+"""Share of the radii's variance that a vessel's file keeps."""
+
+ITERATIONS = 30
+
+
+class Evidence(Protocol):
+    """Something that was measured of a vessel."""
+
+    @property
+    def name(self) -> str:
+        """For people: 'callipers'."""
+        ...
+
+    @property
+    def observed(self) -> Floats:
+        """What was measured, shape (n,)."""
+        ...
+
+    @property
+    def deviations(self) -> Floats:
+        """Standard deviations of that, shape (n,)."""
+        ...
+
+    def predict(self, heights: Floats, radii: Floats) -> Floats:
+        """What would be measured of a profile, shape (n,).
+
+        Args:
+            heights: above the inner floor, ascending from 0 to the rim, shape (k,) [m].
+            radii: there, shape (k,) [m].
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How one piece of evidence agrees with the profile that was found.
+
+    Attributes:
+        count: of measurements.
+        rms: of the differences, in standard deviations of the measurements; about 1 where these were stated well.
+    """
+
+    name: str
+    count: int
+    rms: float
+
+
+@dataclass(frozen=True)
+class FittedOutline:
+    """An inner profile with its uncertainty.
+
+    Attributes:
+        heights: above the inner floor, from 0 to the rim, shape (k,) [m].
+        radii: there, shape (k,) [m].
+        covariance: of the radii, shape (k, k) [m²].
+        wall, floor: thickness [m].
+        fits: of all evidence.
+        height_deviation: standard deviation of the height of the rim [m].
+    """
+
+    heights: Floats
+    radii: Floats
+    covariance: Floats
+    wall: float
+    floor: float
+    fits: tuple[Fit, ...]
+    height_deviation: float = 0.0
+
+    @property
+    def deviations(self) -> Floats:
+        """Standard deviations of the radii, shape (k,) [m]."""
+        result: Floats = np.sqrt(np.diag(self.covariance))
+        return result
+
+    @property
+    def capacity(self) -> float:
+        """Brimful volume [m³]."""
+        return float(volume_below(self.heights, self.radii, self.heights[-1:])[0])
+
+    @property
+    def capacity_deviation(self) -> float:
+        """Standard deviation of the brimful volume [m³]."""
+        slope = _jacobian(lambda radii: volume_below(self.heights, radii, self.heights[-1:]), self.radii)[0]
+        rim = np.pi * self.radii[-1] ** 2 * self.height_deviation
+        return float(np.sqrt(slope @ self.covariance @ slope + rim**2))
+
+    @property
+    def radius_deviation(self) -> float:
+        """Standard deviation of the radius, mean over the height [m]."""
+        return float(np.sqrt(np.trapezoid(self.deviations**2, self.heights) / self.heights[-1]))
+
+    def shape(self, tolerance: float = 5e-5) -> ProfileShape:
+        """As a vessel's file has it: as few points as stay within a tolerance [m] of the curve and of its deviations.
+
+        Those are the covariance's leading eigenvectors, so many that `KEPT` of the variance is in them at each height.
+        """
+        from sim_engine.vessel.profile import simplified
+
+        variances, ways = np.linalg.eigh(self.covariance)
+        variances, ways = variances[::-1], ways[:, ::-1]
+        rows = np.sqrt(np.maximum(variances, 0.0))[:, None] * ways.T
+        held = np.cumsum(rows**2, axis=0) >= KEPT * self.deviations**2 - tolerance**2
+        rows = rows[: 1 + int(np.argmax(held.all(axis=1)))]
+        curve = np.vstack([[0.0, 0.0], np.column_stack([self.radii, self.heights])])
+        z = simplified(curve, tolerance)[1:, 1]
+        for row in rows:
+            z = np.union1d(z, simplified(np.column_stack([row, self.heights]), tolerance)[:, 1])
+
+        def at(values: Floats) -> list[float]:
+            return [float(x) for x in np.round(np.interp(z, self.heights, values), 5)]
+
+        points = [(0.0, 0.0), *zip(at(self.radii), at(self.heights), strict=True)]
+        deviations = tuple((0.0, *at(row)) for row in rows)
+        return ProfileShape(
+            inner=tuple(points),
+            wall=self.wall,
+            floor=self.floor,
+            radius_deviations=tuple(row for row in deviations if any(row)),
+            height_deviation=self.height_deviation,
+        )
+
+
+def find_outline(
+    height: float, evidence: Sequence[Evidence], wall: float, floor: float, *, height_deviation: float
+) -> FittedOutline:
+    """The most likely profile given everything that was measured.
+
+    Where the measurements scatter more than was given, the uncertainty grows accordingly.
+
+    Args:
+        height: from the inner floor to the rim [m].
+        evidence: at least one piece.
+        wall: thickness of the wall [m].
+        floor: thickness of the floor [m].
+        height_deviation: standard deviation of the height [m].
+
+    Raises:
+        VesselError: nothing was measured, or nothing fits it.
+    """
+    if not evidence or sum(len(piece.observed) for piece in evidence) == 0:
+        raise VesselError("nothing says how wide the vessel is; give diameters, a photograph, points or a fill table")
+    share = np.linspace(0.0, 1.0, NODES)
+    heights = height * share**CROWDING
+    observed = np.concatenate([piece.observed for piece in evidence])
+    deviations = np.concatenate([piece.deviations for piece in evidence])
+
+    def predict(radii: Floats) -> Floats:
+        return np.concatenate([piece.predict(heights, radii) for piece in evidence])
+
+    middle = _first_guess(height, evidence, heights)
+    problem = _Problem(predict, observed, deviations, middle)
+    gaps = np.abs(share[:, None] - share[None, :])
+    found = max(
+        (problem.solve(length, bend, gaps) for length in LENGTHS for bend in BENDS), key=lambda each: each.likelihood
+    )
+    excess = float(found.residual @ found.residual) / max(len(observed) - found.determined, 1.0)
+    fits = tuple(_fits(evidence, found.residual))
+    return FittedOutline(heights, found.radii, found.covariance * max(excess, 1.0), wall, floor, fits, height_deviation)
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """The most likely radii under one prior.
+
+    Attributes:
+        residual: observed − predicted, in standard deviations.
+        determined: how many numbers the measurements have determined.
+        likelihood: logarithm of the evidence, but for a constant.
+    """
+
+    radii: Floats
+    covariance: Floats
+    residual: Floats
+    determined: float
+    likelihood: float
+
+
+@dataclass(frozen=True)
+class _Problem:
+    predict: Callable[[Floats], Floats]
+    observed: Floats
+    deviations: Floats
+    middle: float
+
+    def solve(self, length: float, bend: float, gaps: Floats) -> _Solution:
+        """Gauss–Newton with halved steps, then Laplace's approximation.
+
+        Args:
+            length, bend: see `LENGTHS` and `BENDS`.
+            gaps: between nodes, on the way from floor to rim, shape (k, k).
+        """
+        scaled = np.sqrt(5.0) * gaps / length
+        kernel = (1.0 + scaled + scaled**2 / 3.0) * np.exp(-scaled)
+        prior = self.middle**2 * (bend**2 * kernel + LEVEL**2 + 1e-8 * np.eye(len(gaps)))
+        precision = np.linalg.inv(prior)
+        radii, damping = np.full(len(gaps), self.middle), 1.0
+        cost = self._cost(radii, precision)
+        for _ in range(ITERATIONS):
+            slope, residual = self._slope(radii), self._residual(radii)
+            pull = slope.T @ residual - precision @ (radii - self.middle)
+            step = np.linalg.solve(slope.T @ slope + precision, pull)
+            damping = min(1.0, 4.0 * damping)
+            while (found := self._cost(tried := np.maximum(radii + damping * step, NARROWEST), precision)) > cost:
+                damping /= 2.0
+                if damping < 1e-4:
+                    break
+            if damping < 1e-4:
+                break
+            change, radii, cost = float(np.abs(tried - radii).max()), tried, found
+            if change < 1e-6:
+                break
+        slope = self._slope(radii)
+        curvature = slope.T @ slope + precision
+        covariance: Floats = np.linalg.inv(curvature).astype(np.float64)
+        likelihood = -0.5 * (cost + np.linalg.slogdet(curvature)[1] - np.linalg.slogdet(precision)[1])
+        determined = float(np.trace(slope @ covariance @ slope.T))
+        return _Solution(radii, covariance, self._residual(radii), determined, float(likelihood))
+
+    def _residual(self, radii: Floats) -> Floats:
+        return (self.observed - self.predict(radii)) / self.deviations
+
+    def _slope(self, radii: Floats) -> Floats:
+        return _jacobian(self.predict, radii) / self.deviations[:, None]
+
+    def _cost(self, radii: Floats, precision: Floats) -> float:
+        residual, offset = self._residual(radii), radii - self.middle
+        return float(residual @ residual + offset @ precision @ offset)
+
+
+def _fits(evidence: Sequence[Evidence], residual: Floats) -> list[Fit]:
+    fits, begin = [], 0
+    for piece in evidence:
+        count = len(piece.observed)
+        part = residual[begin : begin + count]
+        fits.append(Fit(piece.name, count, float(np.sqrt(np.mean(part**2))) if count else 0.0))
+        begin += count
+    return fits
+
+
+def _first_guess(height: float, evidence: Sequence[Evidence], heights: Floats) -> float:
+    """The radius of the cylinder that fits best [m]."""
+    tried = np.geomspace(0.05 * height, 3.0 * height, 60)
+    costs = [
+        sum(
+            float(np.sum(((p.predict(heights, np.full(NODES, radius)) - p.observed) / p.deviations) ** 2))
+            for p in evidence
+        )
+        for radius in tried
+    ]
+    return float(tried[int(np.argmin(costs))])
+
+
+def _jacobian(predict: Callable[[Floats], Floats], radii: Floats) -> Floats:
+    step = 1e-6
+    base = predict(radii)
+    columns = []
+    for k in range(len(radii)):
+        moved = radii.copy()
+        moved[k] += step
+        columns.append((predict(moved) - base) / step)
+    return np.stack(columns, axis=1)
+
+
+def volume_below(heights: Floats, radii: Floats, levels: Floats) -> Floats:
+    """Volume of the cavity below levels [m³].
+
+    Args:
+        heights: ascending from 0, shape (k,) [m].
+        radii: there, shape (k,) [m]; straight between.
+        levels: between 0 and the rim, shape (n,) [m].
+
+    Returns:
+        Shape (n,).
+    """
+    found = np.empty(len(levels))
+    for i, level in enumerate(np.clip(levels, 0.0, heights[-1])):
+        inside = heights < level
+        z = np.append(heights[inside], level)
+        r = np.append(radii[inside], np.interp(level, heights, radii))
+        found[i] = volume(np.column_stack([r, z])) if len(z) > 1 else 0.0
+    return found
