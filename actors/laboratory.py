@@ -105,7 +105,8 @@ def open_laboratory(
             private Ray would be. Where a bench is needed, or a cluster named, it is as ever.
         make: makes simulators, where they run.
         operator: who answers questions, where a person does.
-        kept: simulators that outlive the laboratory, in place of its own (`actors.simulators.warm_pool`). Not on a cluster, whose
+        kept: simulators that outlive the laboratory, in place of its own (`actors.simulators.shared_pool`). Not on a
+        cluster, whose
             members come and go.
         optimizer: likewise, in place of one of its own: it keeps no state that matters.
 

@@ -42,11 +42,11 @@ from orchestrator.results.pool_occupancy import RESTS, Occupancy
 from orchestrator.runs.events import DecisionMade, Event
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan, OutputPlan
+from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_check import TrustSettings
-from orchestrator.strategies.deployment.time_costs import PricesSettings
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss, PourMeasurement, SimulatedPour
 from sim_engine.scene import PourTask, Scene

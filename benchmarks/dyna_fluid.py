@@ -30,11 +30,11 @@ from actors.interfaces import InvalidActionError, ProgressCallback
 from orchestrator.results.pool_occupancy import Occupancy
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.strategies.campaign_plan import DeploymentPlan, OutputPlan
+from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_check import Compared
-from orchestrator.strategies.deployment.time_costs import PricesSettings
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_plan import StudyPlan
 from sim_engine.errors import InvalidSceneError

@@ -87,7 +87,7 @@ class KeptPours(InProcessSimulatorPool):
 def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
     """One campaign: every pour with what was expected of it, what it recommends, and why it ended."""
     from actors.laboratory import open_laboratory
-    from decant.campaigns import build_campaign, load_campaign
+    from decant.running import build_campaign, load_campaign
     from orchestrator.results.stage_views import deployments_of
     from orchestrator.runs.run_engine import run_campaign
     from orchestrator.runs.run_folder import create_run

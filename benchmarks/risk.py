@@ -23,8 +23,8 @@ from machine import describe, pin, say, show
 from numpy.typing import NDArray
 
 from actors.optimizer.suggest import propose
+from orchestrator.config.action_ranges import PoseNoiseSection
 from orchestrator.config.file_loading import load_campaign, load_vessel
-from orchestrator.config.pose_errors import PoseNoiseSection
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.costing import Costing

@@ -25,7 +25,7 @@ from scipy.stats import qmc
 from actors.optimizer.questions import Data, SuggestProblem
 from actors.optimizer.risk_measures import conditional_value_at_risk, tail_weights
 from actors.optimizer.suggest import propose
-from orchestrator.config.pose_errors import PoseNoiseSection
+from orchestrator.config.action_ranges import PoseNoiseSection
 from orchestrator.requests import Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning, RobustPlanning

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from actors.interfaces import LaboratoryError
-    from decant.campaigns import build_campaign, load_campaign, load_vessel, shipped, starting_set
     from decant.catalogue_tables import find_pours, find_runs
     from decant.run_results import Run, open_run, publish
-    from decant.running import calibrate, plan, run
+    from decant.running import build_campaign, calibrate, load_campaign, load_vessel, plan, run, shipped, starting_set
     from decant.simulation import Simulation, simulate
     from orchestrator.config.action_assignments import AssignmentError
     from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -60,9 +59,11 @@ __all__ = [
 ]
 
 _HOMES = {
-    "decant.campaigns": ("build_campaign", "load_campaign", "load_vessel", "shipped", "starting_set"),
     "decant.catalogue_tables": ("find_pours", "find_runs"),
-    "decant.running": ("calibrate", "plan", "run"),
+    "decant.running": (
+        *("build_campaign", "load_campaign", "load_vessel", "shipped", "starting_set"),
+        *("calibrate", "plan", "run"),
+    ),
     "decant.run_results": ("Run", "open_run", "publish"),
     "decant.simulation": ("Simulation", "simulate"),
     "actors.interfaces": ("LaboratoryError",),

@@ -1,12 +1,15 @@
 """Campaigns that run: whole ones, calibration on a table of weighed pours, plans for a vessel.
 
 Coroutines from plain functions, also in a notebook, whose thread has a loop already.
+
+Campaigns and vessels: loaded from files, built in a program, or taken from the set that Decant comes with.
 """
 
 from __future__ import annotations
 
 import asyncio
 import csv
+import json
 import tempfile
 import warnings
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
@@ -17,10 +20,10 @@ from typing import Any, TypeVar
 
 from actors.laboratory import check_laboratory, open_laboratory
 from actors.laboratory_settings import LaboratorySpec
-from decant.campaigns import build_campaign
 from decant.run_results import Run
-from orchestrator.config.file_loading import load_vessel
+from orchestrator.config.file_loading import campaign_from, load_campaign, load_vessel
 from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.config.yaml.yaml_source import Document
 from orchestrator.live_view.live_server import recorder_of
 from orchestrator.results.publishing import not_simulated, publish
 from orchestrator.results.stage_views import evaluation_of
@@ -36,11 +39,29 @@ from orchestrator.runs.stages import (
     prediction_stages,
     stages_of,
 )
+from orchestrator.shipped import shipped, starting_set
 from orchestrator.strategies.calibration.calibration_scores import shift_left_over
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import SimulationParameters
 from sim_engine.vessel.shapes import VesselSpec
+
+__all__ = ["build_campaign", "load_campaign", "load_vessel", "shipped", "starting_set"]
+
+
+def build_campaign(content: Mapping[str, Any], folder: Path | str = ".") -> CampaignPlan:
+    """A campaign from the keys of a campaign file, with its defaults and its checks.
+
+    Args:
+        content: as in YAML: quantities are texts with units ('40 deg/s'), vessels and laboratory paths or mappings.
+        folder: that relative paths in it start from.
+
+    Raises:
+        ConfigError: anything is wrong with it; all problems at once, with their places.
+    """
+    path = Path(folder).expanduser().resolve() / "campaign.json"
+    return campaign_from(Document.parse(json.dumps(content, indent=2, ensure_ascii=False), path))
+
 
 T = TypeVar("T")
 

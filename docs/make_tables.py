@@ -19,13 +19,13 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from orchestrator.catalogue.catalogue_index import TABLES as CATALOGUE
+from orchestrator.config import action_ranges as pose
 from orchestrator.config import arm_file as arm_sections
 from orchestrator.config import arm_file as cell
 from orchestrator.config import campaign_file as campaign
 from orchestrator.config import laboratory_file as cluster
 from orchestrator.config import laboratory_file as laboratory
 from orchestrator.config import laboratory_file as operator
-from orchestrator.config import pose_errors as pose
 from orchestrator.config import vessel_file as vessel
 from orchestrator.config.arm_file import ARMS
 from orchestrator.config.scene_builder import DEFAULTS, NEEDED
@@ -35,6 +35,7 @@ from orchestrator.daemon import daemon_settings as daemon
 from orchestrator.daemon.notifications import NotifySection
 from orchestrator.results.solver_report import kept_records
 from orchestrator.states import State
+from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.disturbances import RiskSettings
 from orchestrator.strategies.deployment.model_check import TrustSettings
 from orchestrator.strategies.deployment.model_monitoring import (
@@ -44,7 +45,6 @@ from orchestrator.strategies.deployment.model_monitoring import (
 )
 from orchestrator.strategies.deployment.objectives import Objective
 from orchestrator.strategies.deployment.safe_window import WindowSettings
-from orchestrator.strategies.deployment.time_costs import PricesSettings
 from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES
 from orchestrator.study import study_file as study
 from sim_engine.action import ACTION_DIMENSIONS

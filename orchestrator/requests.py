@@ -25,7 +25,8 @@ class Prediction:
         mean: expected loss.
         deviation: standard deviation of that expectation: how well it is known.
         scatter: standard deviation of a single pour around it (in simulation: of a single seed); None if unknown.
-        band: the shortest interval that a single pour lies in with a probability of `sim_engine.prediction_band.LEVEL`; None if
+        band: the shortest interval that a single pour lies in with a probability of
+        `sim_engine.prediction_band.LEVEL`; None if
             unknown.
     """
 

@@ -8,7 +8,8 @@
 
 `StrategyHarness` answers every request at once: simulations and pours with functions of the action, questions to the
 optimiser with the optimiser itself. `check_strategy` is to a strategy what `ArmContract` is to an arm. There are no
-processes, clocks or files here: those belong to `orchestrator.runs.stage_scheduler`. Every failure is an AssertionError.
+processes, clocks or files here: those belong to `orchestrator.runs.stage_scheduler`. Every failure is an
+AssertionError.
 """
 
 from __future__ import annotations

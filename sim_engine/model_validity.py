@@ -1,6 +1,7 @@
 """What a planned pour calls for and the simulator does not have: told from dimensionless numbers, before it runs.
 
-The numbers are those of `sim_engine.lip_flow`. A warning is given when more than 5 % of what is poured leaves under such
+The numbers are those of `sim_engine.lip_flow`. A warning is given when more than 5 % of what is poured leaves under
+such
 conditions; every pour begins and ends with a trickle.
 
 Sources:

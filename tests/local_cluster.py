@@ -1,6 +1,7 @@
 """A Ray cluster of several nodes on this machine, started as people start one, whose nodes can be killed.
 
-Its processes carry the mark by which `actors.runtime.ray_cleanup` finds them: a warden ends them when the test's process is
+Its processes carry the mark by which `actors.runtime.ray_cleanup` finds them: a warden ends them when the test's
+process is
 gone, however it went.
 """
 

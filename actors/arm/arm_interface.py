@@ -1,6 +1,7 @@
 """What a pouring arm can be asked, and what it tells: one small protocol for every arm, and its values. No driver.
 
-A driver is a plain, blocking class; `actors.runtime.remote_object` puts it into a thread or a process, `actors.arm.arm_device` awaits it.
+A driver is a plain, blocking class; `actors.runtime.remote_object` puts it into a thread or a process,
+`actors.arm.arm_device` awaits it.
 What it must do is written down once more as tests: `actors.contract_tests.arm_contract`.
 
 Where things stand around an arm, and what it may do there. Plain values.

@@ -217,7 +217,7 @@ class UrArmSpec(ArmSpec):
     time_scale: float = 1.0
 
     kind: ClassVar[str] = "ur"
-    stand_in: ClassVar[str] = "actors.emulators.ur_controller.arm_emulator:UrStandIn"
+    stand_in: ClassVar[str] = "actors.emulators.ur_controller.controller_process:UrStandIn"
 
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
         """See `ArmSpec.driver`."""

@@ -137,7 +137,9 @@ class BalanceFaultError(BalanceError):
 
 _OUTSIDE = {
     ReadingStatus.OVER: "over range: more is on it than it weighs. Take something off, or use a larger balance",
-    ReadingStatus.UNDER: "under range: something that was on it when it was switched on is missing (its pan?), or it hangs",
+    ReadingStatus.UNDER: (
+        "under range: something that was on it when it was switched on is missing (its pan?), or it hangs"
+    ),
 }
 
 REFUSED = "it refuses the question"

@@ -13,8 +13,8 @@ from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from actors.balance.balance_interface import BalanceDriver
+from actors.balance.dialect_registry import dialects
 from actors.balance.dialects.dialect import Dialect, LineSettings
-from actors.balance.dialects.dialect_registry import dialects
 from actors.balance.simulated_balance import PATIENCE, BalanceSettings, ScaleSettings, VirtualBalance
 from actors.balance.weighing_plan import Placement
 from actors.interfaces import DeviceCheck, LaboratoryError
@@ -159,7 +159,8 @@ class BalanceDevice(ABC):
 
     @abstractmethod
     def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
-        """The class of the driver (an `actors.balance.balance_interface.BalanceDriver`), importable by name, and its arguments.
+        """The class of the driver (an `actors.balance.balance_interface.BalanceDriver`), importable by name, and its
+        arguments.
 
         Args:
             name: for messages.

@@ -1,4 +1,5 @@
-"""A balance on a serial line: one driver for all dialects. Plain and blocking; `actors.runtime.remote_object` puts it in a process.
+"""A balance on a serial line: one driver for all dialects. Plain and blocking; `actors.runtime.remote_object` puts
+it in a process.
 
 Every call has a deadline. What counts has settled (`settling`), and a tare is believed once it is read back. What only
 watches (`read`, `stream`) never fails and never disturbs.

@@ -1,6 +1,7 @@
 """What a virtual bench has in place of hardware: what stands in for its arm, a balance on a pseudo-terminal.
 
-Plain and blocking; `actors.runtime.remote_object` puts it on the machine that the bench is on, beside the drivers that talk to it.
+Plain and blocking; `actors.runtime.remote_object` puts it on the machine that the bench is on, beside the drivers
+that talk to it.
 
 The stand-ins of a virtual bench from the event loop: the same calls, awaited.
 """

@@ -99,7 +99,8 @@ class SimulatedBench(GroundTruth):
         await self._balance.pass_time(seconds)
 
     async def settle(self, seconds: float) -> None:
-        """See `GroundTruth.settle`: drops may fall for longer than the arm moves; a settled tray carries all of them."""
+        """See `GroundTruth.settle`: drops may fall for longer than the arm moves; a settled tray carries all of
+        them."""
         assert self._pour is not None
         last = (await self._spill()).times[-1]
         await self.wait(max(last - self._pour.path.pour_time, 0.0) + self._spec.settling_time)

@@ -74,7 +74,7 @@ from actors.optimizer import acquisition
 from actors.optimizer.feasible_region import Feasibility, Region
 from actors.optimizer.gaussian_process import GaussianProcess
 from actors.optimizer.model_discrepancy import ModelAveragedProcess, clipped_moments, shortfall
-from actors.optimizer.question_arrays import Asked, tuples
+from actors.optimizer.question_checks import Asked, tuples
 from actors.optimizer.questions import BenchOffset, DiscrepancyFound, ModelDiscrepancy, SuggestProblem
 
 Array = NDArray[np.float64]

@@ -20,8 +20,7 @@ from actors.optimizer.experimental_design import WeighedDesign, expected_reducti
 from actors.optimizer.feasible_region import Feasibility, Region
 from actors.optimizer.gaussian_process import constant_mean_process
 from actors.optimizer.knowledge_gradient import KnowledgeGradient, found, most_instructive, proposals
-from actors.optimizer.question_arrays import Asked, array, tuples
-from actors.optimizer.question_checks import check
+from actors.optimizer.question_checks import Asked, array, check, tuples
 from actors.optimizer.questions import (
     DesignQuestion,
     Point,

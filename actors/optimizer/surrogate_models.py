@@ -23,7 +23,7 @@ from actors.optimizer.gaussian_process import (
     zero_mean_process,
 )
 from actors.optimizer.model_discrepancy import ModelAveragedProcess
-from actors.optimizer.question_arrays import Asked, array
+from actors.optimizer.question_checks import Asked, array
 from actors.optimizer.questions import SuggestProblem
 from actors.optimizer.risk_measures import RiskProcess
 

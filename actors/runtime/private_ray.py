@@ -2,7 +2,8 @@
 
 It runs with stated memory, without dashboard, autoscaler or usage statistics, on the loopback interface, with a token
 of its own, in a short private folder that is removed at the end. Folders of clusters whose program is gone are removed
-at the next start. `actors.runtime.ray_cleanup` cleans up behind a program that was killed. `actors.runtime.ray_runtime` decides when.
+at the next start. `actors.runtime.ray_cleanup` cleans up behind a program that was killed.
+`actors.runtime.ray_runtime` decides when.
 
 Ray's settings, which it reads from the environment.
 """

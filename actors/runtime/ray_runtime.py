@@ -1,4 +1,5 @@
-"""Starts and ends Ray for this process: a private one (`actors.runtime.private_ray`), or a cluster that is there already.
+"""Starts and ends Ray for this process: a private one (`actors.runtime.private_ray`), or a cluster that is there
+already.
 
 A cluster is joined with the environment as it is (its token is the user's) and left running. Ray itself removes the
 actors of a program that leaves it or dies.

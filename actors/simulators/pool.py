@@ -277,7 +277,8 @@ class RaySimulatorPool:
 
     Each busy member has the next job with it already. Where a member runs out of work while another one still has a
     job waiting, the job is taken back and given to the idle one. Simulations are idempotent, so a job whose member
-    died is done again by another one. Needs a running Ray (`actors.runtime.ray_runtime`), and is made inside an event loop.
+    died is done again by another one. Needs a running Ray (`actors.runtime.ray_runtime`), and is made inside an
+    event loop.
 
     Args:
         size: number of members.

@@ -84,7 +84,8 @@ def calibrate(path: Path, options: RunOptions) -> None:
 
 
 def calibration_json(finished: Finished) -> dict[str, Any]:
-    """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see `CalibrationEvaluation`."""
+    """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see
+    `CalibrationEvaluation`."""
     from orchestrator.journal.stage_results import result_of
     from orchestrator.results.stage_views import rival_scores
     from orchestrator.runs.stages import CALIBRATION, EVALUATION, calibrated_theta, deployed_theta
@@ -220,8 +221,8 @@ def _run(
     plan: CampaignPlan, verb: str, path: Path, options: RunOptions, stages: list[StageDefinition] | None = None
 ) -> Finished:
     from orchestrator.cli.foreground_run import check_somebody_is_there
-    from orchestrator.cli.live_option import live_view
     from orchestrator.cli.motion_approval import arm_campaign
+    from orchestrator.cli.view_command import live_view
     from orchestrator.runs.stages import stages_of
 
     if options.answer is not None and not options.resume:

@@ -338,7 +338,7 @@ def _desk(daemon: bool) -> Iterator[CatalogueClient]:
     try:
         if daemon:
             from orchestrator.cli.queue_actions import talking
-            from orchestrator.daemon.remote_catalogue import RemoteCatalogueClient
+            from orchestrator.daemon.daemon_client import RemoteCatalogueClient
 
             with talking((None, None)) as client, _refusing():
                 yield RemoteCatalogueClient(client)

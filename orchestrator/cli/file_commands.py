@@ -57,8 +57,8 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
         case "laboratory":
             return f"laboratory, {load_laboratory(path).mode}", []
         case "study":
-            from orchestrator.study.cells import cells_of
             from orchestrator.study.study_file import load_study
+            from orchestrator.study.study_plan import cells_of
 
             study = load_study(path)
             return f"study, {len(cells_of(study))} cells, seed {study.seed}", []

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 from orchestrator.cli.console import INTERRUPTED, RefusalError, Refused, mention, print_json
 
 if TYPE_CHECKING:
-    from orchestrator.study.cells import StudyCell
-    from orchestrator.study.study_plan import StudyPlan
+    from orchestrator.study.study_plan import StudyCell, StudyPlan
     from orchestrator.study.study_runner import CellStatus
 
 SHOWN_FAILURES = 5
@@ -25,8 +24,8 @@ def study(path: Path, *, jobs: int | None, dry_run: bool, report_only: bool, as_
     Raises:
         RefusalError: the file can't be used (2), a cell failed (1), or it was interrupted (130).
     """
-    from orchestrator.study.cells import cells_of
     from orchestrator.study.study_folder import StudyError, check_settings, opened
+    from orchestrator.study.study_plan import cells_of
 
     plan = read_study(path)
     cells = cells_of(plan)
@@ -71,8 +70,8 @@ def read_study(path: Path) -> StudyPlan:
 
 
 def _tell_what_is_left(plan: StudyPlan, cells: tuple[StudyCell, ...], as_json: bool) -> None:
-    from orchestrator.study.cells import estimated_seconds
     from orchestrator.study.study_folder import is_finished
+    from orchestrator.study.study_plan import estimated_seconds
 
     left = [cell for cell in cells if not is_finished(plan.folder, cell.id)]
     simulations, pours = sum(cell.simulations for cell in left), sum(cell.pours for cell in left)
@@ -108,8 +107,8 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> CellStatus:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-    from orchestrator.study.cells import cells_of
     from orchestrator.study.study_folder import finished_results, warning
+    from orchestrator.study.study_plan import cells_of
     from orchestrator.study.study_runner import run_cells
 
     cells = cells_of(plan)

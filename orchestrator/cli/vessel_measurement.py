@@ -133,7 +133,7 @@ def _volume(sources: Sources, mass: float) -> float:
 
 def _turned(out: Path, name: str, sources: Sources) -> Made:
     """A surface of revolution from everything that was measured of it."""
-    from orchestrator.results.vessel_figures import draw_outline
+    from orchestrator.results.pour_figures import draw_outline
     from sim_engine.vessel.shapes import VesselSpec
     from sim_engine.vessel.vessel import build_vessel
     from sim_engine.vessel_acquisition.outline_fit import find_outline
@@ -269,8 +269,7 @@ def _points(sources: Sources, wall: float | None, floor: float | None, notes: li
 def _scanned(sources: Sources) -> tuple[Scan, float]:
     """What was scanned, and how large a pixel of a depth image is on it [m]; 0 of points."""
     from orchestrator.cli.vessel_tables import read_depth, read_points
-    from sim_engine.vessel_acquisition.depth_image import points_on_table
-    from sim_engine.vessel_acquisition.point_cloud import scan_of
+    from sim_engine.vessel_acquisition.point_cloud import points_on_table, scan_of
 
     if sources.points is not None and sources.depth is not None:
         raise RefusalError("--depth goes without --points: give one of them", BAD_INPUT)
@@ -377,7 +376,7 @@ def _written_mesh(
     """A mesh in millimetres beside the vessel's file, once it is seen to hold liquid."""
     import trimesh
 
-    from orchestrator.results.vessel_figures import draw_solid
+    from orchestrator.results.pour_figures import draw_solid
     from sim_engine.vessel.shapes import MeshShape, VesselSpec
     from sim_engine.vessel.vessel import build_vessel
 

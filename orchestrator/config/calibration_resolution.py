@@ -11,10 +11,10 @@ from pathlib import Path
 from actors.laboratory_settings import LaboratorySpec
 from actors.optimizer.questions import Linear
 from orchestrator.config.campaign_file import CalibrationSection, DataSection
-from orchestrator.config.placed_problems import PlacedProblems
 from orchestrator.config.scene_builder import SceneBuilder
 from orchestrator.config.weighed_pours import column_name, read_records, read_table, resolve_records
 from orchestrator.config.yaml.file_access import missing_file, out_of_bounds, resolved
+from orchestrator.config.yaml.section_validation import PlacedProblems
 from orchestrator.config.yaml.yaml_errors import did_you_mean
 from orchestrator.config.yaml.yaml_source import Place, Report
 from orchestrator.journal.codec import CodecError

@@ -14,11 +14,11 @@ from orchestrator.config.calibration_resolution import resolve_calibration, reso
 from orchestrator.config.campaign_checks import check_ranges
 from orchestrator.config.campaign_file import CampaignFile, DeploymentSection, LearningSection, LossSection
 from orchestrator.config.parameter_ranges import ParametersBase
-from orchestrator.config.placed_problems import PlacedProblems
 from orchestrator.config.run_snapshot import campaign_record
 from orchestrator.config.scene_builder import SceneBuilder
 from orchestrator.config.yaml.file_access import resolved
 from orchestrator.config.yaml.references import References
+from orchestrator.config.yaml.section_validation import PlacedProblems
 from orchestrator.config.yaml.yaml_source import Place, Report
 from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan, OutputPlan, Premises
 from orchestrator.strategies.deployment.objectives import STOPS, Objectives

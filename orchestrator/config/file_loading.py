@@ -138,7 +138,8 @@ def predicts_with_posterior(path: Path) -> bool:
 
 
 def load_discrepancy(path: Path) -> float | None:
-    """The shift that a calibration left over (`sim_engine.prediction_band`), from a run's `theta.json`; None if it has none.
+    """The shift that a calibration left over (`sim_engine.prediction_band`), from a run's `theta.json`; None if it
+    has none.
 
     Raises:
         ConfigError: what stands there is not a number from 0 on.

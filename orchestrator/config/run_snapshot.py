@@ -10,10 +10,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from orchestrator.config.action_ranges import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.campaign_file import CalibrationSection, CampaignFile, LearningSection
 from orchestrator.config.laboratory_file import HiddenLiquid
 from orchestrator.config.parameter_ranges import Parameters
-from orchestrator.config.pose_errors import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from orchestrator.config.yaml.yaml_writer import as_file

@@ -1,4 +1,7 @@
-"""The daemon from the command line, on this machine or another: HTTP calls whose refusals are passed on as they are."""
+"""The daemon from the command line, on this machine or another: HTTP calls whose refusals are passed on as they are.
+
+The catalogue of a daemon's machine, asked over HTTP.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +9,20 @@ import json
 import os
 import ssl
 import time
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import httpx
 
 from orchestrator.catalogue.run_registry import state_directory
 from orchestrator.daemon.access_control import Role, token_of
 from orchestrator.daemon.daemon_settings import PORT
+from orchestrator.journal.run_record import Row
 from orchestrator.run_errors import RunError
 
 V1 = "/api/v1"
@@ -195,3 +202,55 @@ def _token(state: Path) -> str:
             2,
         )
     return found
+
+
+class RemoteCatalogueClient:
+    """`CatalogueClient` of a daemon.
+
+    Args:
+        client: open.
+    """
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    def runs(self, conditions: Mapping[str, Any]) -> list[Row]:
+        """See `CatalogueClient`."""
+        return list(self._client.get("/runs", **conditions))
+
+    def pours(self, conditions: Mapping[str, Any]) -> list[Row]:
+        """See `CatalogueClient`."""
+        return list(self._client.get("/pours", **conditions))
+
+    def run(self, name: str) -> Row:
+        """See `CatalogueClient`."""
+        return dict(self._client.get(_of(name)))
+
+    def compare(self, names: Sequence[str]) -> Row:
+        """See `CatalogueClient`."""
+        return dict(self._client.get("/runs/compare", run=list(names)))
+
+    def tag(self, name: str, add: Sequence[str], remove: Sequence[str]) -> Row:
+        """See `CatalogueClient`."""
+        return dict(self._client.post(f"{_of(name)}/tags", {"add": list(add), "remove": list(remove)}))
+
+    def note(self, name: str, text: str) -> Row:
+        """See `CatalogueClient`."""
+        return dict(self._client.post(f"{_of(name)}/notes", {"text": text}))
+
+    def export(self, folder: Path, conditions: Mapping[str, Any], formats: Sequence[str]) -> Row:
+        """See `CatalogueClient`."""
+        found = self._client.fetch("/runs/export", format=list(formats), **conditions)
+        folder.mkdir(parents=True, exist_ok=True)
+        files = []
+        with zipfile.ZipFile(BytesIO(found)) as archive:
+            counts: Row = json.loads(archive.comment)
+            for name in archive.namelist():
+                path = folder / Path(name).name
+                path.write_bytes(archive.read(name))
+                files.append(str(path))
+        return {"files": files, **counts}
+
+
+def _of(name: str) -> str:
+    return f"/runs/{quote(name, safe='')}"

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from actors.bench.bench_factory import needs_person
 from actors.interfaces import Laboratory, LaboratoryError, Stoppable
 from actors.laboratory import open_laboratory
-from actors.simulators.warm_pool import WarmSimulators
+from actors.simulators.shared_pool import WarmSimulators
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.campaign_progress import CampaignProgress
 from orchestrator.daemon.daemon_settings import DaemonSettings, Rig

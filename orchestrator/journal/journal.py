@@ -4,8 +4,10 @@ Every entry is one row: sequence number, stage, time, kind, JSON body. Nothing i
 refuse it). Entries written together (`append_all`) are there together or not at all, whenever the process dies. Pours
 are flushed to the disk before the arm moves and before their outcome is used (synchronous=FULL), everything else
 survives the death of the process, and a power cut but for its last moments. At a pour the write-ahead log is copied
-into the file, and the entry is repeated in a ledger (`orchestrator.journal.pour_ledger`), so that a lost or changed journal is
-detected: see `orchestrator.journal.journal_check`. A full disk takes no pour's records away: see `orchestrator.journal.disk_reserve`.
+into the file, and the entry is repeated in a ledger (`orchestrator.journal.pour_ledger`), so that a lost or changed
+journal is
+detected: see `orchestrator.journal.journal_check`. A full disk takes no pour's records away: see
+`orchestrator.journal.disk_reserve`.
 """
 
 from __future__ import annotations
@@ -162,7 +164,8 @@ class JournalReader:
         return last
 
     def stage_results(self) -> dict[str, dict[str, Any]]:
-        """Results of the closed stages by name, in the order in which they were closed; see `orchestrator.journal.stage_results`."""
+        """Results of the closed stages by name, in the order in which they were closed; see
+        `orchestrator.journal.stage_results`."""
         return {entry.stage: entry.body["result"] for entry in self.entries(kinds=[Kind.STAGE_CLOSED])}
 
     def last_id(self) -> int:

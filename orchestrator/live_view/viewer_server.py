@@ -1,6 +1,7 @@
 """Rerun's own server and web viewer, in a process that ends with the one that started it.
 
-`python -m orchestrator.live_view.viewer_server ADDRESS PORT WEB_PORT MEMORY` runs it until its input ends. It is Rerun's own
+`python -m orchestrator.live_view.viewer_server ADDRESS PORT WEB_PORT MEMORY` runs it until its input ends. It is
+Rerun's own
 program and not its Python package, which serves the viewer's page on all addresses, asked or not.
 """
 

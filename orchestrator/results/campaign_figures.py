@@ -12,7 +12,6 @@ from orchestrator.results import figure_style as style
 from orchestrator.results.figure_style import safe_name
 from orchestrator.results.loss_units import deployment_unit
 from orchestrator.results.model_check_figures import draw_trust
-from orchestrator.results.posterior_figures import draw_posterior
 from orchestrator.results.spillage_figures import draw_discrepancy, draw_spillage
 from orchestrator.results.stage_views import (
     calibration_of,
@@ -25,7 +24,7 @@ from orchestrator.results.stage_views import (
     receiver_name,
     theta_of,
 )
-from orchestrator.results.surrogate_figures import draw_surrogate, draw_trials, draw_window
+from orchestrator.results.surrogate_figures import draw_posterior, draw_surrogate, draw_trials, draw_window
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.deployment.model_check import Compared
 

@@ -16,9 +16,9 @@ from orchestrator.journal.run_record import PourMade, Record
 from orchestrator.results import figure_style as style
 from orchestrator.results.html_page import HtmlTable, Picture, Row, render
 from orchestrator.results.loss_units import DISCREPANCY, deployment_unit, is_calibration, loss_of_pour, unit_of_pour
-from orchestrator.results.posterior_figures import posterior_lines
 from orchestrator.results.run_summary import RunSummary
 from orchestrator.results.stage_views import SPLITS, receiver_names
+from orchestrator.results.surrogate_figures import posterior_lines
 from orchestrator.results.wording import advice, standing, unknown_of_all, what_was_asked
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan

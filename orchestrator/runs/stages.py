@@ -12,8 +12,8 @@ import numpy as np
 from orchestrator.journal.stage_results import Results, result_of
 from orchestrator.requests import Order
 from orchestrator.run_errors import RunError
+from orchestrator.strategies.calibration.action_prior import drawn_benches
 from orchestrator.strategies.calibration.active_design import ActivePours
-from orchestrator.strategies.calibration.bench_draws import drawn_benches
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.calibration_scores import (
     DRAWS,
@@ -60,7 +60,8 @@ class StageDefinition:
         build: makes the strategy from the former stages' results and the stage's seed.
         order: in which outcomes are told.
         pours: whether it needs a bench.
-        stand_in: what takes its result's place where later stages are acted out beforehand (`orchestrator.runs.speculative_requests`).
+        stand_in: what takes its result's place where later stages are acted out beforehand
+        (`orchestrator.runs.speculative_requests`).
     """
 
     name: str

@@ -8,7 +8,7 @@ from dataclasses import replace
 from actors.optimizer.questions import Suggestion, SuggestProblem
 from orchestrator.requests import Failed, Outcome, Suggest, Suggested
 from orchestrator.run_errors import LearningError
-from orchestrator.strategies.seeds import SeedStream
+from orchestrator.strategies.trials import SeedStream
 
 
 class OptimizerQueries:

@@ -8,9 +8,9 @@ from typing import Literal
 
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Progress
+from orchestrator.strategies.trials import SeedStream
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourOutcome

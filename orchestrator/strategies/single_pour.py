@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
-from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from orchestrator.strategies.strategy import Progress
+from orchestrator.strategies.trials import SeedStream
 from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement, normalised_spillage
 from sim_engine.scene import Scene

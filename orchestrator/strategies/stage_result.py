@@ -24,7 +24,8 @@ class ResultPart(BaseModel):
 class StageResult(ResultPart):
     """What a strategy has learnt so far. A subclass declares its own `kind`, a text that no other one bears.
 
-    Journals, the studies' files and `summary.json` hold dumps; `orchestrator.journal.stage_results` reads them back by their kind.
+    Journals, the studies' files and `summary.json` hold dumps; `orchestrator.journal.stage_results` reads them back
+    by their kind.
     """
 
     KINDS: ClassVar[dict[str, type[StageResult]]] = {}

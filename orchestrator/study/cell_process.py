@@ -25,10 +25,9 @@ from orchestrator.journal.journal_check import has_begun
 from orchestrator.run_errors import RunError
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import CALIBRATION
-from orchestrator.study.cells import StudyCell, cells_of
 from orchestrator.study.study_campaigns import campaign_of
 from orchestrator.study.study_folder import CellResult, code_now, read_result, run_folder, write_result
-from orchestrator.study.study_plan import StudyPlan
+from orchestrator.study.study_plan import StudyCell, StudyPlan, cells_of
 
 Make = Callable[[LaboratorySpec, bool], Laboratory]
 """Makes the laboratory of a cell, with a bench or without."""

@@ -35,8 +35,7 @@ from orchestrator.strategies.campaign_plan import CampaignPlan, OutputPlan, Reco
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.strategy import Strategy
-from orchestrator.study.cells import FINAL, GRID, StudyCell
-from orchestrator.study.study_plan import StudyPlan
+from orchestrator.study.study_plan import FINAL, GRID, StudyCell, StudyPlan
 from orchestrator.study.study_strategies import AnsweredByTable, FinalPour, SimulatedTable, Tabled
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters

@@ -12,10 +12,10 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, create_model
 
+from orchestrator.config.action_ranges import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.laboratory_file import HiddenLiquid, LaboratoryFile
 from orchestrator.config.parameter_ranges import Parameters, ParametersBase
-from orchestrator.config.pose_errors import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.section_validation import validate

@@ -22,8 +22,7 @@ from orchestrator.journal.journal_file import locked_alone
 from orchestrator.journal.stage_results import decode_result
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.stage_result import ResultPart, StageResult
-from orchestrator.study.cells import StudyCell
-from orchestrator.study.study_plan import StudyPlan, study_fingerprint
+from orchestrator.study.study_plan import StudyCell, StudyPlan, study_fingerprint
 
 CELLS, RESULT, LOG, SETTINGS = "cells", "result.json", "process-{}.log", "study.json"
 SOURCE = "study-file.txt"

@@ -1,13 +1,23 @@
-"""A study with everything resolved: the base campaign, levels of mismatch, strategies with budgets and repetitions."""
+"""A study with everything resolved: the base campaign, levels of mismatch, strategies with budgets and repetitions.
+
+The cells of a study: small campaigns, each with a folder of its own. A pure function of the study's plan.
+
+What a repetition resamples: the errors of grip and placement, the liquid's initial positions and the balance's noise of
+every pour; which of the calibration's actions are kept for testing; and the strategies' own seeds. The calibration's
+actions are those of the study, the same in every repetition: so C1's grid is simulated once and only scored anew.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from actors.laboratory_settings import VirtualBenchSpec
 from orchestrator.runs.fingerprint import deciding, fingerprint
+from orchestrator.runs.stages import stage_seed
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 
 ALL = "all"
@@ -126,3 +136,104 @@ def study_fingerprint(study: StudyPlan) -> dict[str, Any]:
         "pours": [study.pour_count, study.holdout],
         "compared": study.compared,
     }
+
+
+Kind = Literal["grid", "pours", "calibration", "uncalibrated", "deployment", "final"]
+
+GRID, FINAL = "grid", "final"
+"""Stages that only a study has."""
+
+PARTICLE_SECONDS = 0.0007
+"""CPU seconds of a simulation by particle, for a first estimate; pours of a known study are timed instead."""
+
+
+@dataclass(frozen=True)
+class StudyCell:
+    """One small campaign.
+
+    Attributes:
+        id: unique in the study, good as a folder's name.
+        kind: what is done: C1's grid, calibration pours, a calibration, the score of the uncalibrated θ, a deployment,
+            one more pour of the action that a deployment recommends.
+        level: of mismatch; '' for the grid, which knows no bench.
+        arm: label of a calibration or deployment; '' otherwise.
+        receiver: name of a deployment's scene.
+        repetition: from 1; 0 for the grid.
+        again: number of a final action's pour, from 1; 0 of all others. Each has a cell of its own, so that more may be
+            added later.
+        needs: ids of the cells whose results it is made from.
+        simulations, pours: at most.
+        seed: of its campaign.
+    """
+
+    id: str
+    kind: Kind
+    needs: tuple[str, ...]
+    simulations: int
+    pours: int
+    seed: int
+    level: str = ""
+    arm: str = ""
+    receiver: str = ""
+    repetition: int = 0
+    again: int = 0
+
+
+def cells_of(study: StudyPlan) -> tuple[StudyCell, ...]:
+    """All cells, each after those that it needs; repetition by repetition, so that an unfinished study is balanced."""
+    train = study.pour_count - study.holdout
+    cells: list[StudyCell] = []
+
+    def add(kind: Kind, simulations: int, pours: int, *needs: str, **place: str | int) -> str:
+        parts = [str(place[key]) for key in ("level", "arm", "receiver") if place.get(key)]
+        numbers = [int(place[key]) for key in ("repetition", "again") if place.get(key)]
+        name = _name(kind, *parts, numbers=numbers)
+        # Arms of a repetition share a seed: what they are scored by then differs by what they found alone.
+        shared = [str(place[key]) for key in ("level", "receiver") if place.get(key)]
+        family = "calibration" if kind == "uncalibrated" else kind
+        seed = stage_seed(study.seed, _name(family, *shared, numbers=numbers))
+        cells.append(StudyCell(name, kind, needs, simulations, pours, seed, **place))  # type: ignore[arg-type]
+        return name
+
+    if any(arm.plan.strategy == "C1" for arm in study.calibrations):
+        add("grid", study.calibration("C1").plan.settings.simulations_on(study.pour_count), 0)
+    numbers = [arm.repetitions for arm in study.calibrations] + [arm.repetitions for arm in study.deployments]
+    for number in range(1, max(numbers) + 1):
+        for level in study.levels:
+            place: dict[str, str | int] = {"level": level.name, "repetition": number}
+            arms = [a for a in study.calibrations if number <= a.repetitions and level.name in a.levels]
+            if arms:
+                pours = add("pours", 0, study.pour_count, **place)
+                if study.compares(level.name):
+                    add("uncalibrated", study.pour_count, 0, pours, **place)
+            for arm in arms:
+                known = arm.plan.strategy == "C1"
+                spent = 0 if known else arm.plan.settings.simulations_on(train)
+                made_of = (pours, GRID) if known else (pours,)
+                if arm.pours:
+                    made_of = (pours, add("pours", arm.plan.design_simulations, arm.pours, **place, arm=arm.label))
+                add("calibration", spent + study.pour_count, 0, *made_of, **place, arm=arm.label)
+            for deployment in (a for a in study.deployments if number <= a.repetitions):
+                plan = deployment.plan
+                theta = f"calibration.{level.name}.C4.{number:02d}"
+                needs = (theta,) if plan.settings.simulates else ()
+                for scene in plan.scenes:
+                    there: dict[str, str | int] = {**place, "arm": deployment.label, "receiver": scene.name}
+                    learnt = add("deployment", plan.settings.simulations, plan.pours, *needs, **there)
+                    for again in range(1, study.confirm + 1):
+                        add("final", 0, 1, learnt, *needs, **there, again=again)
+    return tuple(cells)
+
+
+def _name(*parts: str, numbers: Sequence[int]) -> str:
+    return ".".join([*parts, *(f"{number:02d}" for number in numbers)])
+
+
+def estimated_seconds(study: StudyPlan, cell: StudyCell) -> float:
+    """CPU seconds that a cell may take, from how many particles are simulated [s]. Rough: within a factor of two."""
+    axes = {axis.name: axis for arm in study.calibrations for axis in arm.plan.parameters.axes}
+    usual = float(study.base.parameters.particles)
+    if "particles" in axes:
+        usual = math.sqrt(axes["particles"].lower * axes["particles"].upper)
+    hidden = study.level(cell.level).bench.liquid.particles if cell.level else 0
+    return PARTICLE_SECONDS * (cell.simulations * usual + cell.pours * hidden) + 3.0

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
-from orchestrator.config.placed_problems import PlacedProblems
+from orchestrator.config.yaml.section_validation import PlacedProblems
 from orchestrator.config.yaml.yaml_source import Place, Report
 from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan, Premises
 from orchestrator.strategies.strategy_registry import calibrations, deployments

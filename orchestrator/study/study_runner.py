@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from actors.runtime.child_process import ChildProcess, python_module
-from orchestrator.study.cells import StudyCell, cells_of, estimated_seconds
 from orchestrator.study.study_folder import LOG, is_finished
-from orchestrator.study.study_plan import StudyPlan
+from orchestrator.study.study_plan import StudyCell, StudyPlan, cells_of, estimated_seconds
 
 WAKE = 0.1
 """Seconds between two looks at the cells' processes."""

@@ -8,10 +8,10 @@ from typing import Literal
 
 from orchestrator.requests import Decision, Failed, Outcome, Poured, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.single_pour import OnePour
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from orchestrator.strategies.strategy import Progress, Strategy, is_sound
+from orchestrator.strategies.trials import SeedStream
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourOutcome, normalised_spillage

@@ -7,7 +7,7 @@ import pytest
 
 from actors.optimizer.gaussian_process import highest_density_intervals
 from actors.optimizer.knowledge_gradient import foreseen
-from actors.optimizer.question_arrays import Asked
+from actors.optimizer.question_checks import Asked
 from actors.optimizer.questions import BenchOffset, Data, Limit, ModelDiscrepancy, Play, SuggestProblem
 from actors.optimizer.suggest import propose
 from actors.optimizer.surrogate_models import fit

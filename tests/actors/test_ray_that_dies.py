@@ -22,7 +22,7 @@ import asyncio, json, sys
 from actors.laboratory import open_laboratory
 from actors.optimizer.questions import Data, SuggestProblem
 from actors.laboratory_settings import LaboratorySpec
-from actors.simulators.warm_pool import WarmSimulators
+from actors.simulators.shared_pool import WarmSimulators
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
 from sim_engine.scene import PourTask

@@ -24,9 +24,8 @@ from orchestrator.runs.stages import prediction_stages, stage_seed, stages_of
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Strategy
-from orchestrator.study.cells import cells_of
 from orchestrator.study.study_file import load_study
-from orchestrator.study.study_plan import study_fingerprint
+from orchestrator.study.study_plan import cells_of, study_fingerprint
 from tests.golden.golden import DATA, ROOT, Changes, Golden, columns, compact, normalised
 from tests.golden.world import outcome_of
 

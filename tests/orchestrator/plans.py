@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from orchestrator.config.pose_errors import PoseNoiseSection
+from orchestrator.config.action_ranges import PoseNoiseSection
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.posterior_summary import PosteriorFound, RemainingDiscrepancy
 from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from orchestrator.cli.console import RefusalError
-from orchestrator.cli.live_option import live_view, parsed
+from orchestrator.cli.view_command import live_view, parsed
 from orchestrator.live_view.blueprints import put_beside
 from orchestrator.live_view.live_server import LiveError, LiveView, answers
 from orchestrator.live_view.recording_sink import SENDING

@@ -1,4 +1,5 @@
-"""Forward and inverse kinematics of whole paths: the closed forms of `actors.emulators.ur_controller.robot_kinematics` on arrays.
+"""Forward and inverse kinematics of whole paths: the closed forms of
+`actors.emulators.ur_controller.robot_kinematics` on arrays.
 
 The virtual controller works out one pose every 2 ms; a planner a thousand at once, and keeps apart the postures that a
 pose can be reached in. Both have the robots' lengths from one table, and tests hold them against each other.

@@ -1,4 +1,5 @@
-"""`python -m actors.arm.ur.rtde_worker FD`: the process that holds the client library, until its driver hangs up or dies.
+"""`python -m actors.arm.ur.rtde_worker FD`: the process that holds the client library, until its driver hangs up or
+dies.
 
 Whatever the library prints goes where standard output goes: the driver reads it if things go wrong. Requests are done
 one after the other; stops and signs of life are taken by a thread of their own.

@@ -1,1 +1,2 @@
-"""How balances talk: bytes to readings and back, one dialect a file, no ports. `actors.balance.dialects.dialect_registry` finds them."""
+"""How balances talk: bytes to readings and back, one dialect a file, no ports. `actors.balance.dialect_registry`
+finds them."""

@@ -36,8 +36,16 @@ from actors.balance.readings import LineError, Reading, ReadingStatus, Reply
 SHORT, LONG = 14, 20
 """Widths of the two layouts without CR LF."""
 
-_WORDS = {"High": ReadingStatus.OVER, "H": ReadingStatus.OVER, "Low": ReadingStatus.UNDER, "L": ReadingStatus.UNDER, "--": ReadingStatus.BUSY,
-          "Cal.Int.": ReadingStatus.BUSY, "Cal.Ext.": ReadingStatus.BUSY, "C": ReadingStatus.BUSY}  # fmt: skip
+_WORDS = {
+    "High": ReadingStatus.OVER,
+    "H": ReadingStatus.OVER,
+    "Low": ReadingStatus.UNDER,
+    "L": ReadingStatus.UNDER,
+    "--": ReadingStatus.BUSY,
+    "Cal.Int.": ReadingStatus.BUSY,
+    "Cal.Ext.": ReadingStatus.BUSY,
+    "C": ReadingStatus.BUSY,
+}
 _FAULT = re.compile(r"(?:Err|ERR) *(?P<number>[0-9]{1,4})|(?P<word>(?:APP|DIS|PRT)\.ER)")
 _BRACKETS = re.compile(r"\[([0-9]+)\]")
 

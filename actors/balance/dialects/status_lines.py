@@ -46,8 +46,15 @@ _LETTERS = {
     ReadingStatus.OVER: "+",
     ReadingStatus.UNDER: "-",
 }
-ANSWERS = {"A": ReadingReply.DONE, "S": ReadingReply.DONE, "D": ReadingReply.DONE, "I": ReadingReply.BUSY, "+": ReadingReply.OVER,
-           "-": ReadingReply.UNDER, "L": ReadingReply.REFUSED}  # fmt: skip
+ANSWERS = {
+    "A": ReadingReply.DONE,
+    "S": ReadingReply.DONE,
+    "D": ReadingReply.DONE,
+    "I": ReadingReply.BUSY,
+    "+": ReadingReply.OVER,
+    "-": ReadingReply.UNDER,
+    "L": ReadingReply.REFUSED,
+}
 REFUSALS = {
     "ES": "syntax error: it does not know the command",
     "ET": "transmission error: it received damaged characters",

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.balance.balance_settings import AUTO, BalanceDevice, SerialBalanceSpec
-from actors.balance.dialects.dialect_registry import voices
+from actors.balance.dialect_registry import voices
 from actors.balance.simulated_balance import Load, ScaleSettings
 from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ChildProcess, python_module

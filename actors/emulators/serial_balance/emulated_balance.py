@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from actors.balance.dialects.dialect_registry import voices
+from actors.balance.dialect_registry import voices
 from actors.balance.dialects.protocol_encoder import Cancel, Follow, PendingReply, Repeat, weight_line
 from actors.balance.readings import Reading, ReadingStatus
 from actors.balance.simulated_balance import EmulatedScale, Load, ScaleSettings

@@ -9,10 +9,9 @@ import sys
 from math import radians
 
 from actors.emulators.ur_controller.control_clock import Host, until_orphaned
-from actors.emulators.ur_controller.controlled_models import HOME, MODELS
 from actors.emulators.ur_controller.controller import Controller
 from actors.emulators.ur_controller.fault_injection import FaultServer
-from actors.emulators.ur_controller.robot import RobotMode
+from actors.emulators.ur_controller.robot import HOME, MODELS, RobotMode
 from actors.emulators.ur_controller.safety_system import SafetyConfiguration
 
 _STATES = {"running": RobotMode.RUNNING, "idle": RobotMode.IDLE, "off": RobotMode.POWER_OFF}

@@ -8,10 +8,9 @@ from enum import IntEnum
 
 from actors.arm.ur.robot_models import Joints
 from actors.emulators.ur_controller.commands import commands_of
-from actors.emulators.ur_controller.controlled_models import HOME, ControlledModel
 from actors.emulators.ur_controller.motion.mover import ViolationError
 from actors.emulators.ur_controller.registers import Registers, Signals, Watchdogs
-from actors.emulators.ur_controller.robot import Power, Robot, RobotMode
+from actors.emulators.ur_controller.robot import HOME, ControlledModel, Power, Robot, RobotMode
 from actors.emulators.ur_controller.safety_system import Safety, SafetyConfiguration, SafetyMode
 from actors.emulators.ur_controller.servers.primary_messages import ControllerMessage, Listener
 from actors.emulators.ur_controller.urscript.lexer import ScriptError

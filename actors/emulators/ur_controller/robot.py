@@ -1,15 +1,19 @@
 """The arm itself: where it is commanded to be, where it is, what it carries, what it reports of itself.
 
 From switched off to running: modes and how long they take.
+
+The robots with the controllers that they pretend to have.
 """
 
 from __future__ import annotations
 
 import random
 from collections import deque
+from dataclasses import dataclass
 from enum import IntEnum
-from math import exp
+from math import exp, radians
 
+from actors.arm.ur import robot_models as models
 from actors.arm.ur.robot_models import Joints, RobotModel
 from actors.emulators.ur_controller.motion.motion_lines import KinematicArm
 from actors.emulators.ur_controller.motion.mover import Mover, ViolationError
@@ -313,3 +317,40 @@ class Power:
         """Let time pass."""
         while self._plan and now >= self._plan[0][0]:
             self.mode = self._plan.pop(0)[1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlledModel(RobotModel):
+    """One model of robot with its controller.
+
+    Attributes:
+        version: of the controller's software: major, minor, bugfix, build.
+        remote_control: whether the controller knows the remote-control mode.
+        serial: its number; digits only.
+        primary_type: robot type and subtype in configuration data.
+    """
+
+    version: tuple[int, int, int, int]
+    remote_control: bool
+    serial: str
+    primary_type: tuple[int, int]
+
+    @property
+    def e_series(self) -> bool:
+        """Whether the controller belongs to the generation after CB3."""
+        return self.version[0] >= 5
+
+
+UR10 = ControlledModel(
+    **vars(models.UR10), version=(3, 15, 8, 106339), remote_control=False, serial="2016300123", primary_type=(2, 2)
+)
+
+UR10E = ControlledModel(
+    **vars(models.UR10E), version=(5, 12, 6, 1102099), remote_control=True, serial="20205300456", primary_type=(2, 1)
+)
+
+MODELS = {"ur10": UR10, "ur10e": UR10E}
+"""By the name that starts them."""
+
+HOME: Joints = tuple(radians(v) for v in (0.0, -90.0, 90.0, -90.0, -90.0, 0.0))  # type: ignore[assignment]
+"""Where a robot stands when its controller is started: a pose in the middle of its reach, away from singularities."""

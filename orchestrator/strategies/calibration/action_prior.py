@@ -1,12 +1,15 @@
 """The prior g over actions, where they meet the constraints: uniform, or along some dimensions normal; drawn evenly.
 
 Whoever reads a campaign's file loads this; scipy is loaded by those who draw.
+
+Benches as they may be: draws of θ with nuisances, from a calibration or from what is thought beforehand.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import math
+from collections.abc import Collection, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -15,6 +18,7 @@ from numpy.typing import NDArray
 
 from actors.optimizer.questions import Linear, Point
 from orchestrator.strategies.campaign_plan import NormalPrior
+from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Space
 
 if TYPE_CHECKING:
@@ -100,3 +104,54 @@ def _distributed(uniform: Array, actions: Space, prior: Sequence[NormalPrior]) -
         places = [axis.encode(value) for value in np.clip(values, axis.lower, axis.upper)]
         points[:, i] = np.rint(np.array(places) * FINENESS) / FINENESS
     return points
+
+
+FARTHEST = 3.0
+"""Standard deviations beyond which no nuisance is drawn."""
+
+
+def drawn_benches(
+    best: SimulationParameters,
+    count: int,
+    seed: int,
+    *,
+    posterior: Sequence[SimulationParameters] = (),
+    known: Collection[str] = (),
+) -> tuple[SimulationParameters, ...]:
+    """Equally likely θ of the bench that is to be poured on, its nuisances among them; pure.
+
+    A posterior's draws are taken evenly, again and again if there are fewer than wanted. Nuisances that the calibration
+    did not search differ between benches by their declared tolerances, around their values in those draws: normal,
+    independent of each other, by a scrambled Sobol sequence, and within their bounds.
+
+    Args:
+        best: θ*, or whatever is in force: what all draws are where there is no posterior, nuisances aside.
+        count: of draws, at least 1.
+        seed: same seed, same draws.
+        posterior: complete θ, equally likely.
+        known: nuisances that are not to be drawn: the calibration has searched them, or a person vouches for them.
+
+    Returns:
+        `count` complete θ.
+    """
+    from scipy.special import ndtri
+    from scipy.stats import qmc
+
+    if count < 1:
+        raise ValueError(f"at least one draw is needed, got {count}")
+    nuisances = [info for name, info in SimulationParameters.nuisances().items() if name not in known]
+    rows = [posterior[(i * len(posterior)) // count] if count <= len(posterior) else posterior[i % len(posterior)]
+            for i in range(count)] if posterior else [best] * count  # fmt: skip
+    if not nuisances:
+        return tuple(rows)
+    sampler = qmc.Sobol(len(nuisances), scramble=True, rng=np.random.default_rng([seed % 2**64, *b"bench"]))
+    uniform = sampler.random_base2(math.ceil(math.log2(count)) if count > 1 else 0)[:count]
+    z = np.clip(ndtri(uniform), -FARTHEST, FARTHEST)
+    benches = []
+    for row, theta in zip(z, rows, strict=True):
+        moved = {
+            info.name: min(max(getattr(theta, info.name) + info.tolerance * float(u), info.lower), info.upper)
+            for info, u in zip(nuisances, row, strict=True)
+        }
+        benches.append(theta.model_copy(update=moved))
+    return tuple(benches)

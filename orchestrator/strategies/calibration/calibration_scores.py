@@ -22,9 +22,9 @@ from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulate
 from orchestrator.strategies.calibration.pointwise_calibration import LEAST_DEFINED
 from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.campaign_plan import MeasuredPour
-from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from orchestrator.strategies.strategy import Progress, is_sound
+from orchestrator.strategies.trials import SeedStream
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import normalised_spillage
 from sim_engine.prediction_band import left_over

@@ -13,9 +13,9 @@ from actors.optimizer.questions import Linear, Point
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.strategies.calibration.action_prior import region_of
 from orchestrator.strategies.campaign_plan import MeasuredPour
-from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.stage_result import ResultPart, StageResult, displayed_action
 from orchestrator.strategies.strategy import Progress, is_sound
+from orchestrator.strategies.trials import SeedStream
 from sim_engine.action import Action, described
 from sim_engine.outcome import normalised_spillage
 from sim_engine.scene import Scene

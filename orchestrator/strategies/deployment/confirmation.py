@@ -7,9 +7,9 @@ from typing import Literal
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Prediction, Request, Slots
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Recommended
-from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from orchestrator.strategies.strategy import Progress, is_sound
+from orchestrator.strategies.trials import SeedStream
 from sim_engine.outcome import normalised_spillage
 from sim_engine.prediction_band import SampleStatistics
 

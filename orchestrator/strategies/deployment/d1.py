@@ -272,7 +272,8 @@ class OneShotPlanning(Deployment[D1Settings]):
         return Progress(answered, self._settings.rounds * repeats + checks, self._counted, pours)
 
     def _spillage(self, point: Point) -> SampleStatistics | None:
-        """These seeds took part in choosing the action; `orchestrator.strategies.repeated_simulation` has fresh ones."""
+        """These seeds took part in choosing the action; `orchestrator.strategies.repeated_simulation` has fresh
+        ones."""
         tried = [trial for trial in self._searched if trial.point == point]
         return SampleStatistics.of(
             [r for trial in tried for q in trial.requests if (r := self._spillages.get(q)) is not None]
@@ -296,7 +297,8 @@ class RobustPlanning(OneShotPlanning):
 
     Every iteration simulates one action m1 times: first as planned with θ*, then under the next draws of a quasi-random
     sequence. A GP of the single losses, over what was executed, pools them over all actions; what it minimises is the
-    measure of its mean over the same J draws for every action (`actors.optimizer.risk_measures`). The raw CVaR of m1 losses
+    measure of its mean over the same J draws for every action (`actors.optimizer.risk_measures`). The raw CVaR of m1
+    losses
     would be their worst one: biased, and mostly luck.
 
     Cups that touch under an error are the worst loss of that draw: that is the risk. Cups that touch as planned make

@@ -25,6 +25,7 @@ from actors.optimizer.questions import (
 from orchestrator.requests import Answered, Ask, Decision, Outcome, Pour, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.campaign_plan import DeploymentPlan, Premises
 from orchestrator.strategies.deployment.bench_offset import play_of, thinned
+from orchestrator.strategies.deployment.costing import Prices, PricesSettings
 from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_check import Compared, TrustCheck, TrustOrAlways, TrustSettings
@@ -37,7 +38,6 @@ from orchestrator.strategies.deployment.model_monitoring import (
     Trust,
 )
 from orchestrator.strategies.deployment.real_pours import Foretold, PourTrial
-from orchestrator.strategies.deployment.time_costs import Prices, PricesSettings
 from orchestrator.strategies.strategy import Progress, Strategy
 from sim_engine.action import described
 from sim_engine.liquids import SimulationParameters

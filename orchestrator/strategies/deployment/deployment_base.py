@@ -22,10 +22,9 @@ from orchestrator.strategies.deployment.real_pours import Foretold, PourTrial, e
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from orchestrator.strategies.deployment.scalarization import Scalarization
 from orchestrator.strategies.optimizer_queries import OptimizerQueries
-from orchestrator.strategies.seeds import SeedStream
 from orchestrator.strategies.stage_result import displayed_map
 from orchestrator.strategies.strategy import Progress
-from orchestrator.strategies.trials import Trial, Trials
+from orchestrator.strategies.trials import SeedStream, Trial, Trials
 from sim_engine.action import Action, described
 from sim_engine.liquids import SimulationParameters
 from sim_engine.prediction_band import SampleStatistics

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from actors.optimizer.questions import Disturbance, Point, Risk
-from orchestrator.config.pose_errors import PoseNoiseSection
+from orchestrator.config.action_ranges import PoseNoiseSection
 from orchestrator.strategies.campaign_plan import Draw
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseError

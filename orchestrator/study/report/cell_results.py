@@ -11,9 +11,8 @@ from orchestrator.runs.stages import CALIBRATION, EVALUATION
 from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.calibration.calibration_scores import CALIBRATED, UNCALIBRATED, Scores
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.study.cells import FINAL, cells_of
 from orchestrator.study.study_folder import CellResult
-from orchestrator.study.study_plan import StudyPlan
+from orchestrator.study.study_plan import FINAL, StudyPlan, cells_of
 from orchestrator.study.study_strategies import FinalPoured
 
 RANDOM = "random θ"

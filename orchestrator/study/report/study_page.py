@@ -12,7 +12,6 @@ from pathlib import Path
 from orchestrator.results import html_page as page
 from orchestrator.results.html_report import minutes
 from orchestrator.results.loss_units import deployment_unit
-from orchestrator.study.cells import cells_of
 from orchestrator.study.report.calibration_figures import draw_calibrations
 from orchestrator.study.report.cell_results import Gathered, gather
 from orchestrator.study.report.deployment_figures import draw_deployments, draw_finals
@@ -20,7 +19,7 @@ from orchestrator.study.report.figure_panels import Drawn, level_words, write_cs
 from orchestrator.study.report.statistics import ALL, FEWEST, Estimate
 from orchestrator.study.report.study_tables import StudyTable, tables
 from orchestrator.study.study_folder import finished_results, told, write_whole
-from orchestrator.study.study_plan import Level, StudyPlan
+from orchestrator.study.study_plan import Level, StudyPlan, cells_of
 
 
 def plain_words(shown: Sequence[StudyTable]) -> list[str]:

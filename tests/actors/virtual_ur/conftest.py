@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from actors.emulators.ur_controller import VirtualController
-from actors.emulators.ur_controller.controlled_models import UR10E
 from actors.emulators.ur_controller.controller import Controller, RuntimeState
+from actors.emulators.ur_controller.robot import UR10E
 from actors.emulators.ur_controller.servers.primary_messages import ControllerMessage
 from actors.runtime.child_process import child_environment
 

@@ -10,7 +10,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from actors.arm.ur.robot_models import RobotModel
-from actors.emulators.ur_controller.controlled_models import HOME, MODELS, UR10E
 from actors.emulators.ur_controller.poses import (
     IDENTITY,
     angle_between,
@@ -24,7 +23,7 @@ from actors.emulators.ur_controller.poses import (
     transform_of,
     transpose,
 )
-from actors.emulators.ur_controller.robot import Robot
+from actors.emulators.ur_controller.robot import HOME, MODELS, UR10E, Robot
 from actors.emulators.ur_controller.robot_kinematics import Kinematics
 from actors.emulators.ur_controller.safety_system import SafetyConfiguration
 

@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.emulators.ur_controller.controlled_models import HOME
 from actors.emulators.ur_controller.controller import RuntimeState
-from actors.emulators.ur_controller.rtde_fields import output_fields
+from actors.emulators.ur_controller.robot import HOME
+from actors.emulators.ur_controller.rtde_fields import OutputRecipe, output_fields
 from actors.emulators.ur_controller.safety_system import SafetyConfiguration, SafetyMode, SafetyPlane
-from actors.emulators.ur_controller.servers.rtde_recipes import OutputRecipe
 from tests.depth import examples
 
 from .conftest import Bench

@@ -7,9 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from actors.emulators.ur_controller.controlled_models import HOME, UR10
 from actors.emulators.ur_controller.controller import RuntimeState
-from actors.emulators.ur_controller.robot import BOOT_TIME, BRAKE_TIME, POWER_ON_TIME, RobotMode
+from actors.emulators.ur_controller.robot import BOOT_TIME, BRAKE_TIME, HOME, POWER_ON_TIME, UR10, RobotMode
 from actors.emulators.ur_controller.rtde_fields import write
 from actors.emulators.ur_controller.safety_system import SafetyMode
 from actors.emulators.ur_controller.servers.dashboard_server import DashboardServer

@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from actors.arm.ur import rtde
-from actors.emulators.ur_controller.controlled_models import UR10, UR10E
 from actors.emulators.ur_controller.controller import Controller
+from actors.emulators.ur_controller.robot import UR10, UR10E
 from actors.emulators.ur_controller.servers import primary_messages as primary
 from actors.emulators.ur_controller.servers.connections import MOST_UNSENT, Connection, Connections, ScriptConnection
 from actors.emulators.ur_controller.servers.dashboard_server import DashboardConnection, DashboardServer

@@ -21,10 +21,10 @@ from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.run_folder import create_run
 from orchestrator.strategies.calibration.continuous_calibration import C4Settings
 from orchestrator.strategies.campaign_plan import DeploymentSettings
+from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
-from orchestrator.strategies.deployment.time_costs import PricesSettings
 from orchestrator.study.study_file import load_study
 from sim_engine.action import DEG
 

@@ -18,10 +18,10 @@ from orchestrator.config.file_loading import load_campaign
 from orchestrator.requests import Pour, Simulate
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.stages import calibration_stages
+from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import FreeHybrid, Hybrid
-from orchestrator.strategies.deployment.time_costs import PricesSettings
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters

@@ -24,9 +24,9 @@ from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.study.cells import cells_of
 from orchestrator.study.study_campaigns import campaign_of
 from orchestrator.study.study_file import load_study
+from orchestrator.study.study_plan import cells_of
 from sim_engine.settings.model import Section
 from sim_engine.settings.quantity import Quantity
 from tests.depth import examples

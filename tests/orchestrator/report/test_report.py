@@ -19,7 +19,6 @@ from orchestrator.results.console_view import summary_table
 from orchestrator.results.figure_style import display_value, display_values, log_ticks
 from orchestrator.results.loss_units import loss_unit
 from orchestrator.results.model_check_figures import draw_trust, trust_title
-from orchestrator.results.posterior_figures import draw_posterior
 from orchestrator.results.spillage_figures import DiscrepancyGroup, PourSeries, draw_discrepancy, draw_spillage
 from orchestrator.results.stage_views import (
     calibration_picture,
@@ -29,7 +28,7 @@ from orchestrator.results.stage_views import (
     pour_series,
 )
 from orchestrator.results.summarise import summarise
-from orchestrator.results.surrogate_figures import SurrogatePicture, draw_surrogate, draw_trials
+from orchestrator.results.surrogate_figures import SurrogatePicture, draw_posterior, draw_surrogate, draw_trials
 from orchestrator.strategies.deployment.model_check import Compared, PourComparison
 from sim_engine.action import DEG, Action
 from sim_engine.outcome import Loss

@@ -29,11 +29,11 @@ from orchestrator.strategies.calibration.pointwise_calibration import (
 )
 from orchestrator.strategies.calibration.pour_design import DesignedPours
 from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.d1 import OneShotPlanning, RobustPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import FreeHybrid, Hybrid
 from orchestrator.strategies.deployment.objectives import Objectives, Retained, Spillage
-from orchestrator.strategies.deployment.time_costs import PricesSettings
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, SCENE, THETA, StrategyHarness, failures, replay
 from sim_engine.outcome import Loss, PourMeasurement
 from sim_engine.scene import PoseError

@@ -23,7 +23,6 @@ from orchestrator.config.file_loading import load_campaign
 from orchestrator.requests import Failed, Poured, Slots
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.study.cell_process import in_this_process, run_cell
-from orchestrator.study.cells import cells_of
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import (
     RESULT,
@@ -36,7 +35,7 @@ from orchestrator.study.study_folder import (
     run_folder,
     warning,
 )
-from orchestrator.study.study_plan import StudyPlan, study_fingerprint
+from orchestrator.study.study_plan import StudyPlan, cells_of, study_fingerprint
 from orchestrator.study.study_strategies import FinalPour
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement

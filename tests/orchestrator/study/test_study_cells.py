@@ -16,9 +16,9 @@ from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.strategies.deployment.d1 import D1Settings, RobustPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.study.cells import cells_of
 from orchestrator.study.study_campaigns import campaign_of
 from orchestrator.study.study_file import load_study
+from orchestrator.study.study_plan import cells_of
 from sim_engine.vessel.vessel import build_vessel
 from tests.orchestrator import plans
 from tests.orchestrator.study_files import ROOT, STUDIES, read, small, without, written

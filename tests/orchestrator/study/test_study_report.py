@@ -19,7 +19,6 @@ from orchestrator.strategies.calibration.calibration_scores import ScoredPair, S
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.real_pours import Foretold, PourRow
 from orchestrator.strategies.stage_result import DisplayedMap
-from orchestrator.study.cells import StudyCell, cells_of
 from orchestrator.study.report.calibration_figures import draw_calibrations
 from orchestrator.study.report.cell_results import at_pour, gather, running_least
 from orchestrator.study.report.deployment_figures import draw_deployments, draw_finals, means
@@ -29,7 +28,7 @@ from orchestrator.study.report.study_page import write_report
 from orchestrator.study.report.study_tables import pours_needed, tables
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import CellResult, code_now, run_folder, told, write_result
-from orchestrator.study.study_plan import StudyPlan
+from orchestrator.study.study_plan import StudyCell, StudyPlan, cells_of
 from orchestrator.study.study_strategies import FinalPoured
 from sim_engine.liquids import SimulationParameters
 from tests.orchestrator.reported import strays

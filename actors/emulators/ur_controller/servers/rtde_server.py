@@ -7,9 +7,15 @@ import struct
 from actors.arm.ur import rtde
 from actors.arm.ur.rtde import PackageError, PackageReader
 from actors.emulators.ur_controller.controller import Controller
-from actors.emulators.ur_controller.rtde_fields import INPUT_KINDS, output_fields, write
+from actors.emulators.ur_controller.rtde_fields import (
+    INPUT_KINDS,
+    InputRecipe,
+    OutputRecipe,
+    output_fields,
+    text_message,
+    write,
+)
 from actors.emulators.ur_controller.servers.connections import Connection, Connections
-from actors.emulators.ur_controller.servers.rtde_recipes import InputRecipe, OutputRecipe, text_message
 
 PORT = 30004
 

@@ -11,7 +11,7 @@ import pytest
 from orchestrator.config.file_loading import load_campaign, load_parameters, load_posterior
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.results.publishing import theta_file
-from orchestrator.strategies.calibration.bench_draws import drawn_benches
+from orchestrator.strategies.calibration.action_prior import drawn_benches
 from orchestrator.strategies.calibration.calibration_base import described
 from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
 from orchestrator.strategies.campaign_plan import MeasuredPour, NormalPrior

@@ -18,9 +18,9 @@ from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
 from orchestrator.results.pool_occupancy import RESTS, Occupancy, occupancies
 from orchestrator.strategies.deployment.bench_offset import thinned
+from orchestrator.strategies.deployment.costing import Prices, PricesSettings
 from orchestrator.strategies.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
 from orchestrator.strategies.deployment.model_check import TrustSettings
-from orchestrator.strategies.deployment.time_costs import Prices, PricesSettings
 from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
 from tests.orchestrator.killed import die_at, finished_times
 from tests.orchestrator.plans import deployment_plan
