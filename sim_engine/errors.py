@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class DecantError(Exception):
     """Base of all errors that Decant's public functions raise on purpose; the text is for the user.
@@ -20,3 +23,14 @@ class InvalidSceneError(DecantError, ValueError):
 
 class SimulationCancelled(Exception):  # noqa: N818 - a message, not a fault
     """Nobody waits for this simulation any more."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str | None:
+    """The known word that a misspelt one most resembles, if any does."""
+    candidates = list(known)
+    matches = difflib.get_close_matches(word, candidates, n=1, cutoff=0.6)
+    if matches:
+        return matches[0]
+    lowered = {candidate.lower(): candidate for candidate in candidates}
+    matches = difflib.get_close_matches(word.lower(), list(lowered), n=1, cutoff=0.6)
+    return lowered[matches[0]] if matches else None

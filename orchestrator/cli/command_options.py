@@ -112,7 +112,7 @@ def given(options: dict[str, Any], *left_out: str) -> dict[str, Any]:
 
 
 def _expanded(path: Path) -> Path:
-    from orchestrator.config.yaml.file_access import in_home
+    from sim_engine.settings.model import in_home
 
     try:
         return Path(in_home(str(path)))

@@ -10,9 +10,8 @@ from collections.abc import Iterable, Mapping
 
 from actors.optimizer.questions import Linear
 from orchestrator.config.action_ranges import dimension_quantity
-from orchestrator.config.yaml.yaml_errors import did_you_mean
 from sim_engine.action import ACTION_DIMENSIONS, Action
-from sim_engine.errors import DecantError
+from sim_engine.errors import DecantError, did_you_mean
 from sim_engine.search_space import Space
 from sim_engine.settings.quantity import KINDS, QuantityError, parse_quantity
 

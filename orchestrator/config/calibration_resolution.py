@@ -15,7 +15,6 @@ from orchestrator.config.scene_builder import SceneBuilder
 from orchestrator.config.weighed_pours import column_name, read_records, read_table, resolve_records
 from orchestrator.config.yaml.file_access import missing_file, out_of_bounds, resolved
 from orchestrator.config.yaml.section_validation import PlacedProblems
-from orchestrator.config.yaml.yaml_errors import did_you_mean
 from orchestrator.config.yaml.yaml_source import Place, Report
 from orchestrator.journal.codec import CodecError
 from orchestrator.journal.journal import JOURNAL_NAME
@@ -24,6 +23,7 @@ from orchestrator.runs.prior_data import PreviousRun, fitting, pours_in, read_fo
 from orchestrator.strategies.campaign_plan import CalibrationPlan, ExistingPours, NormalPrior, RecordedPour, RecordSet
 from orchestrator.strategies.strategy_registry import calibrations
 from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.errors import did_you_mean
 from sim_engine.scene import Scene
 from sim_engine.search_space import Axis, Space
 

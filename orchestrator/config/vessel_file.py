@@ -9,8 +9,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, create_model
 
 from orchestrator.config.yaml.file_access import missing_file, resolved
-from orchestrator.config.yaml.yaml_errors import did_you_mean
 from orchestrator.config.yaml.yaml_source import Place, Report
+from sim_engine.errors import did_you_mean
 from sim_engine.liquids import KNOWN, NEUTRAL, ROOM, Liquid, Properties, find, look_up, split_share
 from sim_engine.settings.model import MADE, FilePath, Name, Number, Section, Text
 from sim_engine.settings.quantity import Quantity, parse_quantity

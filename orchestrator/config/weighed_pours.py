@@ -18,10 +18,11 @@ from orchestrator.config.action_ranges import MotionBase
 from orchestrator.config.campaign_file import PoursSection
 from orchestrator.config.scene_builder import SceneBuilder
 from orchestrator.config.yaml.file_access import UnreadableError, missing_file, read_text, resolved
-from orchestrator.config.yaml.yaml_errors import Problem, did_you_mean, dotted
+from orchestrator.config.yaml.yaml_errors import Problem, dotted
 from orchestrator.config.yaml.yaml_source import Place
 from orchestrator.strategies.campaign_plan import RecordedPour, RecordSet
 from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
+from sim_engine.errors import did_you_mean
 from sim_engine.scene import Scene
 from sim_engine.search_space import Space
 from sim_engine.settings.model import MOST_POURS

@@ -14,6 +14,7 @@ import operator
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar
 
 from pydantic import (
@@ -29,8 +30,6 @@ from pydantic import (
 )
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError, PydanticKnownError, core_schema
-
-from orchestrator.config.yaml.file_access import in_home
 
 
 @dataclass(frozen=True)
@@ -168,6 +167,23 @@ class Choice:
 
 
 IN_FILE = FieldMark("a path, relative to the file that it is written in")
+
+
+def in_home(text: str) -> str:
+    """A path with the home directory for a leading `~`, as a shell writes it; other paths as they are.
+
+    Raises:
+        ValueError: `~name` and there is no such user, or `~` and this user has no home directory.
+    """
+    if not text.startswith("~"):
+        return text
+    try:
+        return str(Path(text).expanduser())
+    except RuntimeError:
+        user = text.partition("/")[0]
+        raise ValueError(
+            f"'{user}' is not the home directory of any user; write the whole path, or './{text}' for a name with a ~"
+        ) from None
 
 
 def _in_home(text: str) -> str:

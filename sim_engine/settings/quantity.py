@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from orchestrator.config.yaml.yaml_errors import did_you_mean
+from sim_engine.errors import did_you_mean
 
 if TYPE_CHECKING:
     import pint

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 
-from orchestrator.config.yaml.yaml_errors import did_you_mean
+from sim_engine.errors import did_you_mean
 
 SIZE_LIMIT = 500_000
 """Largest file that is read [bytes]: a campaign has 2,000, a theta.json with its posterior 15,000."""
@@ -54,23 +54,6 @@ def resolved(path: Path) -> Path:
         return Path(os.path.realpath(path))
     except (OSError, ValueError):
         return path.absolute()
-
-
-def in_home(text: str) -> str:
-    """A path with the home directory for a leading `~`, as a shell writes it; other paths as they are.
-
-    Raises:
-        ValueError: `~name` and there is no such user, or `~` and this user has no home directory.
-    """
-    if not text.startswith("~"):
-        return text
-    try:
-        return str(Path(text).expanduser())
-    except RuntimeError:
-        user = text.partition("/")[0]
-        raise ValueError(
-            f"'{user}' is not the home directory of any user; write the whole path, or './{text}' for a name with a ~"
-        ) from None
 
 
 def why_unreadable(path: Path) -> str | None:

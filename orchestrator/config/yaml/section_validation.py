@@ -13,9 +13,9 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from orchestrator.config.action_ranges import EXAMPLES
-from orchestrator.config.yaml.yaml_errors import did_you_mean
 from orchestrator.config.yaml.yaml_source import Loc, Place, Report
 from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.errors import did_you_mean
 from sim_engine.settings.model import Section
 from sim_engine.settings.quantity import FROM_FILE
 
