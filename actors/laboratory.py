@@ -44,13 +44,13 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = Fa
     Raises:
         LaboratoryError: with what is wrong and what would be right.
     """
-    if need_bench:
-        check_bench_packages(spec)
     if spec.arm is not None and need_bench and (missing := spec.arm.missing()) is not None:
         raise LaboratoryError(
             f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a bench of numbers "
             "(--laboratory configs/laboratories/twin.yaml)"
         )
+    if need_bench:
+        check_bench_packages(spec)
     if not _without_ray(spec, need_bench=need_bench, brief=brief) and not installed("ray"):
         raise LaboratoryError(
             f"laboratory {spec.name}: simulators side by side need Ray, which is not installed: pip install "

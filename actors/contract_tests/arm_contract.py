@@ -505,8 +505,13 @@ class ArmContract:
 
     @staticmethod
     def _true_time(bench: ArmBench) -> float:
-        """Now, by the clock of the witness [s]; 0 without one."""
-        return 0.0 if bench.true_poses is None else float(bench.true_poses(-math.inf)[0][-1])
+        """Now, by the clock of the witness [s]; 0 without one. Waits for its first measurement."""
+        if bench.true_poses is None:
+            return 0.0
+        end = time.monotonic() + PATIENCE
+        while not len(times := bench.true_poses(-math.inf)[0]):
+            assert time.monotonic() < end, f"ArmBench.true_poses has had no measurement for {PATIENCE:g} s"
+        return float(times[-1])
 
     def _rest(self, bench: ArmBench) -> FloatArray:
         """Wait until the arm truly stands; the pose of the pourer, shape (7,)."""

@@ -147,7 +147,7 @@ class ReportsNumbers(Simulates):
 class Unnamed(StageResult):
     """A result whose kind is replaced after its declaration, so that no journal can be read back."""
 
-    kind: str = "harness-unnamed"
+    kind: Literal["harness-unnamed", "harness-other"] = "harness-unnamed"
 
 
 class ReportsAnUnknownKind(Simulates):

@@ -110,7 +110,7 @@ def test_what_will_move_is_shown_the_name_arms_one_run_and_its_questions_come_to
 ) -> None:
     before = joints(controller)
     with Terminal("run", str(campaign), "--arm", "--in-process", cwd=str(campaign.parent)) as terminal:
-        for line in ("pours          up to 3", "box            x ", "mm/s", "deg/s (", "clearance", "emergency stop"):
+        for line in ("pours          up to 3", "box            x ", "mm/s", "deg/s, ", "clearance", "emergency stop"):
             terminal.expect(line)
         terminal.expect("> ")
         terminal.type("rig")
