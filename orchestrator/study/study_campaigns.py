@@ -199,10 +199,10 @@ def _final(
     study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load
 ) -> tuple[CampaignPlan, list[StageDefinition]]:
     """Stage for one pour of the recommended action, in the deployment's laboratory and with its loss."""
-    learnt, *calibrations = cell.needs
+    deployed, *calibrations = cell.needs
     plan, stages = _deployment(study, cell, plan, calibrations, load)
     assert plan.deployment is not None
-    recommended = result_of(load(learnt), stages[0].name, Deployed).recommended
+    recommended = result_of(load(deployed), stages[0].name, Deployed).recommended
     scene = plan.deployment.scenes[0]
     action = None if recommended is None else scene.action(dict(recommended.action_si))
     costing = Costing.of(plan.deployment, scene, plan.parameters)

@@ -228,9 +228,9 @@ def cells_of(study: StudyPlan) -> tuple[StudyCell, ...]:
                 needs = (theta,) if plan.settings.simulates else ()
                 for scene in plan.scenes:
                     there: dict[str, str | int] = {**place, "arm": deployment.label, "receiver": scene.name}
-                    learnt = add("deployment", plan.settings.simulations, plan.pours, *needs, **there)
+                    deployed = add("deployment", plan.settings.simulations, plan.pours, *needs, **there)
                     for again in range(1, study.confirm + 1):
-                        add("final", 0, 1, learnt, *needs, **there, again=again)
+                        add("final", 0, 1, deployed, *needs, **there, again=again)
     return tuple(cells)
 
 

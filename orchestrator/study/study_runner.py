@@ -188,7 +188,7 @@ def _end(processes: Iterable[CellProcess]) -> None:
     mine = list(processes)
     for process in mine:
         if process.cell is None:
-            process.child.close_input()  # an idle process can end by itself and keep its compiled kernels
+            process.child.close_input()  # it ends by itself, and its compiled kernels reach their cache
         else:
             process.child.terminate()
     deadline = time.monotonic() + GRACE

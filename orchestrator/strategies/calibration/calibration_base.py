@@ -184,11 +184,11 @@ class Calibration(ABC, Generic[S]):
         if isinstance(request, Suggest):
             self._questions.answer(request, outcome)
         elif isinstance(request, Simulate):
-            self._trials.settle(request, self._judged(request, outcome))
+            self._trials.settle(request, self._cost(request, outcome))
         else:
             raise ValueError(f"calibration asks for no {type(request).__name__}")
 
-    def _judged(self, request: Simulate, outcome: Outcome) -> float | None:
+    def _cost(self, request: Simulate, outcome: Outcome) -> float | None:
         if not isinstance(outcome, Simulated) or outcome.outcome.invalid is not None:
             return None
         if not is_sound(outcome.outcome.fractions):
@@ -212,11 +212,11 @@ class Calibration(ABC, Generic[S]):
     def _settle_at_minimum(self, suggestion: Suggestion) -> None:
         """Set θ* to the suggested minimiser of the posterior mean."""
         if not suggestion.means:
-            raise self._nothing_learnt()
+            raise self._no_discrepancies()
         self._final = suggestion
         self._settle(suggestion.points[0], suggestion.means[0], suggestion.deviations[0])
 
-    def _nothing_learnt(self) -> LearningError:
+    def _no_discrepancies(self) -> LearningError:
         return LearningError(
             f"calibration learnt nothing: of {self._trials.answered} simulations {self._trials.lost} gave no "
             "discrepancy (see their reasons in the journal)"
@@ -342,8 +342,8 @@ class DesignSettings(CalibrationSettings):
         key = given[0] if given else "simulations"
         cost, limit = found.simulations_on(train), self.simulations or MOST_SIMULATIONS
         if cost > limit:
-            said = "'simulations' allows" if self.simulations is not None else "at most are possible:"
-            text = f"makes {found.thetas} θ × {train} training pours = {cost} simulations; {said} {limit}"
+            limited_by = "'simulations' allows" if self.simulations is not None else "at most are possible:"
+            text = f"makes {found.thetas} θ × {train} training pours = {cost} simulations; {limited_by} {limit}"
             complaints.add(text, key)
             return None
         return found

@@ -499,11 +499,11 @@ class CalibrationEvaluation:
             raise ValueError(f"this simulation was not asked for: {request}")
         part.tell(request, outcome)
         if self.finished and self._uncalibrated is not None:
-            judged = [
+            compared = [
                 [pair for pair in one.result().pairs if pair.split != "transfer"]
                 for one in (self._calibrated, self._uncalibrated)
             ]
-            self._gain = calibration_gain(*judged)
+            self._gain = calibration_gain(*compared)
 
     def progress(self) -> Progress:
         """Simulations answered, and their total number."""

@@ -223,7 +223,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         def drawn(suggestion: Suggestion) -> None:
             self._posterior = suggestion.posterior
             if self._posterior is None:
-                raise self._nothing_learnt()
+                raise self._no_discrepancies()
             self.decisions += [Decision(text) for text in left_open(self._posterior, self._plan.parameters.names)]
             self._ask_expected(central(self._posterior))
 

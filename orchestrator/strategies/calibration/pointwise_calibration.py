@@ -131,7 +131,7 @@ class BestOfDesign(DiscrepancyOverPours[S]):
     def _conclude(self) -> None:
         scored = [(score, trial) for trial in self._trials.all if (score := _score(trial)) is not None]
         if not scored:
-            raise self._nothing_learnt()
+            raise self._no_discrepancies()
         mean, best = min(scored, key=lambda pair: pair[0])
         known = [cost for cost in best.costs.values() if cost is not None]
         variance = sum((cost - mean) ** 2 for cost in known) / max(len(known) - 1, 1)

@@ -94,7 +94,7 @@ def posterior_found(posterior: Posterior, space: Space) -> PosteriorFound:
     points = np.array(posterior.points)
     low, high = region(points)
     lower, upper, names = space.decode(tuple(low)), space.decode(tuple(high)), space.names
-    lacking = np.quantile(posterior.discrepancies, [(1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2])
+    remaining = np.quantile(posterior.discrepancies, [(1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2])
     return PosteriorFound(
         level=LEVEL,
         mean=space.decode(tuple(points.mean(axis=0))),
@@ -103,7 +103,7 @@ def posterior_found(posterior: Posterior, space: Space) -> PosteriorFound:
         correlation=tuple(tuple(row) for row in _correlation(points).tolist()),
         directions=tuple(_ties(points, names)),
         remaining_discrepancy=RemainingDiscrepancy(
-            low=float(lacking[0]), median=float(lacking[1]), high=float(lacking[2])
+            low=float(remaining[0]), median=float(remaining[1]), high=float(remaining[2])
         ),
         effective=posterior.effective,
         thetas=tuple(space.decode(tuple(point)) for point in posterior.points),

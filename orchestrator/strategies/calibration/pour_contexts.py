@@ -27,12 +27,12 @@ class Contexts:
         self._actions, self._scenes = actions, tuple(scenes)
         self._names = {scene.name: i for i, scene in enumerate(self._scenes)}
         count = len(self._scenes)
-        beside = 0 if count == 1 else 1 if count == 2 else count
+        extra = 0 if count == 1 else 1 if count == 2 else count
         self._marks = [
-            tuple(float(i) for _ in range(beside)) if count == 2 else tuple(float(i == j) for j in range(beside))
+            tuple(float(i) for _ in range(extra)) if count == 2 else tuple(float(i == j) for j in range(extra))
             for i in range(count)
         ]
-        self.space = Space((*actions.axes, *(Axis(f"scene{j + 1}", 0.0, 1.0) for j in range(beside))))
+        self.space = Space((*actions.axes, *(Axis(f"scene{j + 1}", 0.0, 1.0) for j in range(extra))))
 
     @classmethod
     def of(cls, plan: CalibrationPlan) -> Contexts:

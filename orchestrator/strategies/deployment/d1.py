@@ -257,9 +257,9 @@ class OneShotPlanning(Deployment[D1Settings]):
         if of_means is None or suggestion.best_mean is None:
             return None
         of_seeds = of_means * math.sqrt(self._settings.simulations_per_iteration)
-        return math.hypot(of_seeds, self._lacking(suggestion.best_mean))
+        return math.hypot(of_seeds, self._inaccuracy(suggestion.best_mean))
 
-    def _lacking(self, loss: float) -> float:
+    def _inaccuracy(self, loss: float) -> float:
         """Deviation of a pour from its simulations caused by the simulator's inaccuracy, in the unit of the loss. The
         loss is treated as spilled liquid whose stream is shifted (`sim_engine.prediction_band`)."""
         if self._plan.objectives is not None:
@@ -308,8 +308,8 @@ class RobustPlanning(OneShotPlanning):
     Cups that touch under an error give this draw the worst loss. An action with which the cups touch as planned is
     never recommended.
 
-    Source: Cakmak et al., Bayesian optimization of risk measures, 2020; compared with the raw measures of m1 draws in
-    docs/how-it-works.md.
+    Source: Cakmak et al., Bayesian optimization of risk measures, 2020; docs/how-it-works.md compares it with the raw
+    measures of m1 draws.
     Limitations: errors are normal and independent, and drawn once for a whole pour. Inaccuracies that the simulator has
     for every θ are not included.
     """
@@ -420,7 +420,7 @@ class RobustPlanning(OneShotPlanning):
         of_seeds, known = Deployment._scatter(self, suggestion, noise), self._answer(suggestion)
         if of_seeds is None or known is None:
             return None
-        return math.hypot(of_seeds, known[1], self._lacking(known[0]))
+        return math.hypot(of_seeds, known[1], self._inaccuracy(known[0]))
 
     def _answer(self, suggestion: Suggestion) -> tuple[float, float] | None:
         """Mean and standard deviation over the disturbances for the recommended action."""

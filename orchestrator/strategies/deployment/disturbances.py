@@ -166,8 +166,8 @@ class Disturbances:
         error = draw.error or PoseError()
         for name, index in self._moves.items():
             scales[index], shifts[index] = _moved(self._actions.axes[index], name, error)
-        beside = [0.5 + z / WIDTH for name, z in zip(self.errors, draw.z, strict=True) if name not in self._moves]
-        return Disturbance(tuple(scales), tuple(shifts), (*beside, *self._coordinates(draw.parameters)))
+        extra = [0.5 + z / WIDTH for name, z in zip(self.errors, draw.z, strict=True) if name not in self._moves]
+        return Disturbance(tuple(scales), tuple(shifts), (*extra, *self._coordinates(draw.parameters)))
 
     def executed(self, point: Point, draw: Draw) -> Point:
         """Point of the surrogate for a simulation of an action (in its unit cube) under a draw."""

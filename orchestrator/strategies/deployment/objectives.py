@@ -1,7 +1,7 @@
 """Several objectives of a pour: little spillage, little liquid left, short duration, a given volume.
 
 - `Objective` is the base class; `Spillage`, `Retained`, `Time` and `TargetVolume` are the built-in objectives.
-- `Objectives` combines them to a weighted sum or a Pareto front.
+- `Objectives` combines them into a weighted sum or a Pareto front.
 
 The search for the front is in `scalarization`.
 """

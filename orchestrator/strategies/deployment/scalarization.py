@@ -25,7 +25,7 @@ from orchestrator.strategies.trials import Trial
 from sim_engine.search_space import Space
 
 AUGMENTATION = 0.05
-"""Fraction of the weighted sum in a scalarisation; without it, weakly dominated points would be rated as equal."""
+"""Fraction of the weighted sum in a scalarization; without it, weakly dominated points would be rated as equal."""
 
 
 def random_weights(count: int, rng: np.random.Generator) -> Vector:

@@ -119,7 +119,7 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
         found.cpu_s += data.cpu_s
         found.seconds += data.seconds
         if cell.kind in ("calibration", "uncalibrated") and study.compares(cell.level):
-            # a repetition counts once on each bench: its number differs between benches
+            # repetitions on different benches count separately: each has its own number
             number = cell.repetition + LEVEL * levels.index(cell.level)
             _note_random(found.calibrated.setdefault(RANDOM, Found()), number, data)
             _note_calibration(found.calibrated.setdefault(cell.arm or UNCALIBRATED, Found()), number, data)

@@ -124,14 +124,14 @@ def level_note(study: StudyPlan, level: str) -> str:
     """Differences of a level's bench from the others: 'particles 600, friction 0.05, receiver -2 mm'."""
     benches = {one.name: one.bench for one in study.levels}
     liquids = {name: bench.liquid.model_dump() for name, bench in benches.items()}
-    told = [
+    parts = [
         f"{name} {value:g}".replace("_", HARD_SPACE).replace(" ", HARD_SPACE)
         for name, value in liquids[level].items()
         if len({liquid[name] for liquid in liquids.values()}) > 1
     ]
     if len({bench.pose_error.x for bench in benches.values()}) > 1:
-        told.append(f"receiver{HARD_SPACE}{round(1e3 * benches[level].pose_error.x):+d}{HARD_SPACE}mm")
-    return ", ".join(told)
+        parts.append(f"receiver{HARD_SPACE}{round(1e3 * benches[level].pose_error.x):+d}{HARD_SPACE}mm")
+    return ", ".join(parts)
 
 
 def level_title(study: StudyPlan, level: str) -> str:

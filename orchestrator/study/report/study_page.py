@@ -138,18 +138,18 @@ def _caption(one: Drawn) -> str:
 def _unknown(study: StudyPlan, found: Gathered) -> list[str]:
     """Limitations that a reader must consider."""
     counts = [arm.repetitions for arm in study.calibrations] + [arm.repetitions for arm in study.deployments]
-    said = ["All benches are VIRTUAL: what a real robot, cup and liquid would do is not in these numbers."]
+    notes = ["All benches are VIRTUAL: what a real robot, cup and liquid would do is not in these numbers."]
     if counts and min(counts) < FEWEST:
-        said.append(
+        notes.append(
             f"Some strategies have {min(counts)} repetitions: below {FEWEST} no difference is tested, and intervals "
             "are wide or missing. Such numbers show that everything works, and nothing more."
         )
     if found.finished < found.cells:
-        said.append("Cells are missing: what is compared may change when they are there.")
+        notes.append("Cells are missing: what is compared may change when they are there.")
     receivers = sorted({scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes})
     if receivers:
-        said.append(f"It holds for these receivers ({', '.join(receivers)}), this liquid and these ranges of actions.")
-    return said
+        notes.append(f"It holds for these receivers ({', '.join(receivers)}), this liquid and these ranges of actions.")
+    return notes
 
 
 def _summary(study: StudyPlan, found: Gathered) -> str:
