@@ -1,1 +1,1 @@
-"""Pure decision makers: what to simulate, pour and ask next."""
+"""Strategies: they decide which simulations, pours and suggestions to request next. Pure: no I/O, no clock, no Ray."""

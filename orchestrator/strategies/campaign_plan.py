@@ -1,9 +1,16 @@
-"""A campaign with everything resolved: scenes, spaces, budgets, seeds as plain values. What the YAML means.
+"""Plans and strategy settings: a resolved campaign as plain values.
 
-What a strategy declares of itself: one class with its settings, their checks, and how it is made.
+- `CampaignPlan`, `CalibrationPlan` and `DeploymentPlan` hold the scenes, spaces, budgets and seeds that the YAML file
+  defines.
+- `StrategySettings` is the base of the settings of all strategies. Its two subclasses, `CalibrationSettings` and
+  `DeploymentSettings`, check the settings and build the strategy.
+- `RecordedPour`, `MeasuredPour`, `RecordSet` and `ExistingPours` hold weighed pours.
 
-The class stands beside the strategy and is registered at the door `decant.strategies` under its `strategy`. From it
-come the YAML keys with their errors, the JSON schema, the tables of the docs, the run's record and its fingerprint.
+A settings class is defined in the module of its strategy. It is registered as an entry point of the group
+`decant.strategies` under the value of its field `strategy`. The YAML keys with their errors, the JSON schema, the
+tables of the documentation, the run's record and its fingerprint are derived from this class.
+
+This module does not read files and runs no strategy.
 """
 
 from __future__ import annotations
@@ -32,67 +39,67 @@ if TYPE_CHECKING:
 
 
 class StrategySettings(Section):
-    """What the settings of all strategies have in common."""
+    """Settings that all strategies have in common."""
 
     tag: ClassVar[str] = "strategy"
 
     strategy: str = ""
-    """Which strategy; a literal in each class, and its name at the door."""
+    """Name of the strategy: a literal in each class, equal to the name of its entry point."""
 
     @classmethod
     def like(cls, other: StrategySettings, without: Sequence[str] = (), **changes: Any) -> Self:
-        """Settings with what another strategy has of the same name, and defaults for the rest.
+        """Build settings from those of another strategy: shared fields are copied, the others keep their defaults.
 
         Args:
-            without: names that keep their defaults.
-            changes: values of further names.
+            without: names of fields that keep their defaults.
+            changes: values of further fields.
         """
         shared = cls.model_fields.keys() & type(other).model_fields.keys() - {"strategy", *without}
         return cls().model_copy(update={name: getattr(other, name) for name in shared} | changes)
 
     @classmethod
     def unknown_tag(cls, word: str) -> str:
-        """Which plug-in would have it, if it could be loaded."""
+        """Report which plug-in has this name if it could not be loaded; otherwise an empty text."""
         strategies = resolve_name("orchestrator.strategies.strategy_registry:STRATEGIES")
         return next((str(broken) for broken in strategies.broken if broken.name == word), "")
 
 
 class CalibrationSettings(StrategySettings):
-    """Settings of a calibration: which θ reproduces the weighed spills."""
+    """Settings of a calibration, which fits θ to the weighed spills."""
 
     has_prior: ClassVar[bool] = False
-    """Whether it averages over a prior of actions, so that `actions` may have one."""
+    """Whether the strategy averages over a prior of actions, so that `actions` may define one."""
 
     def settled(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
-        """The settings with every number filled in; what is wrong is complained of, and then there are none.
+        """Fill in all numbers. Problems are added to `complaints`, and the result is then None.
 
         Args:
             searched: names of the searched θ.
-            train: pours that a θ can be simulated on; 0 where that is not known, because something else is wrong.
+            train: number of training pours on which a θ can be simulated; 0 if another problem leaves it unknown.
         """
         return self
 
     @property
     def makes_posterior(self) -> bool:
-        """Whether its result has draws of θ given the pours."""
+        """Whether the result has draws of θ given the pours."""
         return False
 
     @abstractmethod
     def simulations_on(self, train: int) -> int:
-        """Single simulated pours that it may spend on so many training pours."""
+        """Number of single simulated pours that the strategy may spend on `train` training pours."""
 
     @abstractmethod
     def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
-        """The strategy itself."""
+        """Build the strategy."""
 
 
 @dataclass(frozen=True)
 class Premises:
-    """What of a deployment its settings may be checked against.
+    """Properties of a deployment that its settings are checked against.
 
     Attributes:
-        actions: that are searched; None where something is wrong with them.
-        objectives: whether there are objectives in place of a loss.
+        actions: searched action space; None if it is invalid.
+        objectives: whether the deployment minimises objectives instead of a loss.
     """
 
     actions: Space | None
@@ -100,25 +107,25 @@ class Premises:
 
 
 class DeploymentSettings(StrategySettings):
-    """Settings of a deployment: how to pour into vessels that calibration never saw."""
+    """Settings of a deployment, which pours into vessels that calibration has not used."""
 
     learns_on_pours: ClassVar[bool] = True
-    """Whether real pours, also those of before, enter what it knows; if not, it may also only plan (`pours: 0`)."""
+    """Whether the strategy learns from real pours, including existing ones. If not, `pours: 0` makes it plan only."""
 
     simulates: ClassVar[bool] = True
-    """Whether θ matters to it."""
+    """Whether the strategy depends on θ."""
 
     pours: PourCount | None = None
     """Real pours per receiver."""
 
     noise: Literal["constant", "varying"] = "constant"
-    """Scatter of a pour: the same everywhere, or varying with the action where at least 20 observations show it."""
+    """Scatter of a pour: the same for all actions, or varying with the action if at least 20 observations show it."""
 
     on_failed_pour: Literal["penalise", "ignore"] = "penalise"
     """How a failed pour enters the data."""
 
     def check(self, premises: Premises, complaints: Problems) -> None:
-        """Complain of what does not make sense together."""
+        """Add a problem for each combination of values that is invalid."""
         if not self.learns_on_pours:
             return
         if self.pours is None:
@@ -132,60 +139,61 @@ class DeploymentSettings(StrategySettings):
 
     @property
     def order(self) -> Order:
-        """The order in which outcomes are told: 'completion' only where the clock takes part in the decisions."""
+        """Order in which outcomes are reported; 'completion' only for a strategy whose decisions depend on wall-clock
+        time."""
         return "logical"
 
     @property
     def needs_posterior(self) -> bool:
-        """Whether it plans with draws of θ given the pours of a calibration."""
+        """Whether the strategy plans with draws of θ given the pours of a calibration."""
         return False
 
     @property
     def learns_of_benches(self) -> bool:
-        """Whether it goes by what calibration, or pours into another receiver, said about the bench."""
+        """Whether the strategy uses estimates of the bench from calibration or from pours into another receiver."""
         return False
 
     def draws(self, plan: DeploymentPlan, parameters: SimulationParameters, count: int, seed: int) -> Sequence[Draw]:
-        """Ways in which what it recommends may go otherwise than planned, for a prediction; none: as planned."""
+        """Deviations from the plan under which a recommended action is predicted; empty: none."""
         return ()
 
     @property
     def simulations(self) -> int:
-        """Simulations that it makes into one receiver, at most."""
+        """Maximum number of simulations per receiver."""
         return 0
 
     @property
     def simulations_before(self) -> int:
-        """Those of them before the first pour."""
+        """Simulations before the first pour."""
         return self.simulations
 
     @property
     def simulations_beside(self) -> int:
-        """Those beside every pour."""
+        """Simulations that run during each pour."""
         return 0
 
     @property
     def spending(self) -> str:
-        """What it spends into one receiver, in words."""
+        """The budget per receiver, as text."""
         return f"{self.pours} pours"
 
     @abstractmethod
     def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
-        """The strategy itself."""
+        """Build the strategy."""
 
 
 Design = Literal["stratified", "active"]
-"""How calibration pours are chosen: spread evenly, or each by what it will tell about deployment."""
+"""How calibration pours are chosen: spread evenly, or each by its expected information about deployment."""
 
 
 @dataclass(frozen=True)
 class RecordedPour:
-    """One weighed pour read from a file.
+    """A weighed pour read from a file.
 
     Attributes:
         poured, spilled, retained: masses [kg].
         split: 'train', 'test' or 'transfer'.
-        scene: name of the one that it was made in; '' for that of its `RecordSet`.
+        scene: name of the scene of this pour; '' for the scene of its `RecordSet`.
     """
 
     action: Action
@@ -197,24 +205,24 @@ class RecordedPour:
 
     @property
     def poured_fraction(self) -> float:
-        """Poured over loaded."""
+        """Poured mass divided by loaded mass."""
         return self.poured / (self.poured + self.retained)
 
     @property
     def normalised_spillage(self) -> float | None:
-        """r = spilled / poured, None where too little was poured for it."""
+        """r = spilled / poured; None if too little was poured to define it."""
         return None if self.poured_fraction < MINIMUM_POURED else self.spilled / self.poured
 
 
 @dataclass(frozen=True)
 class MeasuredPour:
-    """A weighed pour as calibration and evaluation need it.
+    """A weighed pour in the form that calibration and evaluation use.
 
     Attributes:
         spillage: r = spilled / poured; None below 5 % poured, where it is undefined.
         poured: fraction of the load that left the pourer.
         split: 'train', 'test' or 'transfer'.
-        scene: name of the one that it was made in; '' for the first of its calibration.
+        scene: name of the scene of this pour; '' for the first scene of its calibration.
     """
 
     action: Action
@@ -225,17 +233,17 @@ class MeasuredPour:
 
     @classmethod
     def from_record(cls, record: RecordedPour) -> MeasuredPour:
-        """From a row of a file of recorded pours."""
+        """Convert one row of a file of recorded pours."""
         return cls(record.action, record.normalised_spillage, record.poured_fraction, record.split, record.scene)
 
 
 @dataclass(frozen=True)
 class KnownSimulation:
-    """One that was made before a calibration, in one of its scenes.
+    """A simulation from before a calibration, in one of its scenes.
 
     Attributes:
         theta: values of the searched parameters.
-        spillage: c_s.
+        spillage: simulated spillage c_s.
     """
 
     theta: dict[str, float]
@@ -249,9 +257,10 @@ class RecordSet:
     """Weighed pours in one scene.
 
     Attributes:
-        path: the CSV file, or the journal of the run that made them.
-        lip_radius: what turned the file's lip_to_receiver_axis_mm into x_offset [m]; None if it has x_offset_mm.
-        columns: columns that have another name in the file, {name that Decant knows: name in the file}.
+        path: the CSV file, or the journal of the run that made the pours.
+        lip_radius: radius used to convert the file's lip_to_receiver_axis_mm to x_offset [m]; None if the file has
+            x_offset_mm.
+        columns: renamed columns, {Decant's name: name in the file}.
     """
 
     scene: Scene
@@ -262,19 +271,19 @@ class RecordSet:
 
     @property
     def training_pours(self) -> int:
-        """Pours that a θ can be simulated and compared on."""
+        """Number of training pours on which a θ can be simulated and compared."""
         return sum(pour.split == "train" and pour.normalised_spillage is not None for pour in self.pours)
 
 
 @dataclass(frozen=True)
 class ExistingPours:
-    """Pours weighed before the campaign, from which deployment learns as from its own.
+    """Pours weighed before the campaign. Deployment learns from them as from its own pours.
 
     Attributes:
-        pours: by the name of the scene they were made in; all inside the action space.
-        path: the CSV file, or the journal of the run that made them.
-        counts: whether they count against the budget of pours.
-        left_out: why others of the file or run were not used, one text each.
+        pours: pours by name of their scene; all lie inside the action space.
+        path: the CSV file, or the journal of the run that made the pours.
+        counts: whether the pours count against the pour budget.
+        left_out: reasons why other pours of the file or run are not used, one text each.
         lip_radius, columns: as in `RecordSet`.
     """
 
@@ -288,11 +297,11 @@ class ExistingPours:
 
 @dataclass(frozen=True)
 class NormalPrior:
-    """A prior along one dimension of an action or of θ: normal, cut off at the ends of its range.
+    """Prior along one dimension of an action or of θ: a normal distribution, truncated to the dimension's range.
 
     Attributes:
-        name: of the dimension or parameter.
-        mean, deviation: of the normal before it is cut off, in SI.
+        name: name of the dimension or parameter.
+        mean, deviation: moments of the normal distribution before truncation, in SI units.
     """
 
     name: str
@@ -302,10 +311,10 @@ class NormalPrior:
 
 @dataclass(frozen=True)
 class StagePlan:
-    """What all plans for one strategy have in common.
+    """Base of the plans for one strategy.
 
     Attributes:
-        settings: which strategy, and its own settings.
+        settings: the settings, which also name the strategy.
     """
 
     settings: StrategySettings
@@ -316,31 +325,31 @@ class StagePlan:
         return self.settings.strategy
 
     def with_settings(self, **changes: Any) -> Self:
-        """The plan with other settings of the same strategy."""
+        """Copy the plan with changed settings of the same strategy."""
         return replace(self, settings=self.settings.model_copy(update=changes))
 
 
 @dataclass(frozen=True)
 class CalibrationPlan(StagePlan):
-    """Which θ_s reproduces the weighed spills.
+    """Plan of a calibration: find the θ_s that reproduces the weighed spills.
 
     Attributes:
-        actions: space in which calibration pours are designed and the prior g draws.
+        actions: space in which calibration pours are designed and from which the prior g draws.
         parameters: searched θ_s.
-        fixed_parameters: θ_s values that are not searched.
+        fixed_parameters: values of the θ_s that are not searched.
         pour_count: pours to be made on the bench (0 with `records`).
-        holdout: how many of them are kept for testing.
-        records: weighed pours to calibrate on in place of new ones (split 'train' and 'test').
-        transfer: weighed pours in another scene, scored only.
-        random_baseline: how many random θ are scored for comparison.
-        constraints: on actions, beside the bounds of their space.
+        holdout: number of these pours that are kept for testing.
+        records: existing weighed pours to calibrate on instead of new ones (split 'train' and 'test').
+        transfer: weighed pours in another scene; they are scored only.
+        random_baseline: number of random θ that are scored for comparison.
+        constraints: constraints on actions in addition to the bounds of their space.
         prior: dimensions along which g is not uniform.
-        parameter_prior: searched parameters that were measured beforehand, each with its tolerance.
-        further: scenes beside the first one, with other receivers, into which pours are made by turns.
-        tested: scenes that the pours kept for testing are made in; none: in the same.
+        parameter_prior: searched parameters that were measured before, each with its tolerance.
+        further: scenes in addition to the first one, with other receivers; pours alternate between all of them.
+        tested: scenes of the pours that are kept for testing; empty: the same scenes.
         design: how the pours are chosen.
-        design_simulations: made to choose them, where they are chosen actively.
-        known: simulations that were made before, filled in when the calibration begins.
+        design_simulations: simulations spent on choosing the pours of an active design.
+        known: existing simulations that are added when the calibration begins.
     """
 
     settings: CalibrationSettings
@@ -364,17 +373,18 @@ class CalibrationPlan(StagePlan):
 
     @property
     def scenes(self) -> tuple[Scene, ...]:
-        """All scenes that calibration learns in."""
+        """All scenes that calibration learns from."""
         return (self.scene, *self.further)
 
     @property
     def poured(self) -> tuple[Scene, ...]:
-        """All scenes that calibration pours are made in, those that only score it too."""
+        """All scenes of calibration pours, including those that are used for scoring only."""
         return (*self.scenes, *self.tested)
 
     @property
     def simulations(self) -> int:
-        """Single simulated pours that the strategy may spend; of pours still to be made some may be lost."""
+        """Number of single simulated pours that the strategy may spend. Pours that are still to be made may partly be
+        lost."""
         records = self.records
         return self.settings.simulations_on(
             self.pour_count - self.holdout if records is None else records.training_pours
@@ -383,19 +393,20 @@ class CalibrationPlan(StagePlan):
 
 @dataclass(frozen=True)
 class DeploymentPlan(StagePlan):
-    """How to pour into vessels that calibration never saw.
+    """Plan of a deployment: pour into vessels that calibration has not used.
 
     Attributes:
         scenes: one per receiver.
         actions: searched action space.
-        data: pours of before the campaign.
-        objectives: what is minimised in place of the loss.
-        constraints: on actions, beside the bounds of their space.
-        confirm: how often the recommended action is poured again in each scene, after the strategy has ended.
-        thetas: draws of a posterior, equally likely, for settings that need them, where no calibration of the same
-            campaign makes them.
-        bench: how the bench may differ from the simulator, equally likely, as far as anything is known of it.
-        left_over: shift that a calibration left (`sim_engine.prediction_band`), likewise; None where nobody knows.
+        data: pours from before the campaign.
+        objectives: objectives to minimise instead of the loss.
+        constraints: constraints on actions in addition to the bounds of their space.
+        confirm: number of repetitions of the recommended action in each scene after the strategy has ended.
+        thetas: equally likely draws of a posterior, for settings that need them. They are given if no calibration of
+            the same campaign provides them.
+        bench: equally likely offsets of the bench from the simulator; empty if nothing is known about it.
+        left_over: residual shift of a calibration (`sim_engine.prediction_band`), given in the same case as `thetas`;
+            None if unknown.
     """
 
     settings: DeploymentSettings
@@ -416,25 +427,25 @@ class DeploymentPlan(StagePlan):
         return self.settings.pours or 0
 
     def wanted(self, scene: Scene) -> float:
-        """Volume that should arrive in a scene's receiver [m³]: the load, unless less is asked for."""
+        """Volume that should arrive in a scene's receiver [m³]: the whole load unless the objectives request less."""
         share = 1.0 if self.objectives is None else self.objectives.wanted(scene)
         return share * scene.liquid.volume
 
     @property
     def loss_name(self) -> str:
-        """What results call that which is minimised."""
+        """Name of the minimised quantity in results."""
         return self.loss.name if self.objectives is None else "objectives"
 
 
 @dataclass(frozen=True)
 class OutputPlan:
-    """What is written beside the journal.
+    """Outputs in addition to the journal.
 
     Attributes:
-        directory: in which each run gets a folder.
-        rrd, figures: whether the recording, the figures are made.
+        directory: parent directory; each run gets a folder in it.
+        rrd, figures: whether the recording and the figures are made.
         record_rate: frames of a recorded simulation per simulated second [1/s]; 0 records none.
-        recorded_simulations: how many of a stage keep their frames.
+        recorded_simulations: number of simulations of a stage that keep their frames.
     """
 
     directory: Path
@@ -450,12 +461,12 @@ class CampaignPlan:
 
     Attributes:
         source: the YAML file.
-        laboratory_source: the file that describes the laboratory; None where that is the campaign's own.
-        parameters: θ_s in force where nothing is calibrated.
-        parallel_simulations: logical slots of the simulation lane; part of the plan (not of the machine), so that the
-            same seed asks for the same things anywhere.
-        on_unknown: what happens on resume to a pour that had started and has no outcome.
-        resolved: the YAML with everything filled in, JSON-ready, as kept with the run.
+        laboratory_source: the file that describes the laboratory; None if the campaign's file does.
+        parameters: θ_s that is used if nothing is calibrated.
+        parallel_simulations: number of logical simulation slots. It belongs to the plan and not to the machine, so that
+            a seed leads to the same requests on every machine.
+        on_unknown: treatment, on resume, of a pour that had started and has no outcome.
+        resolved: the YAML file with all defaults filled in, ready for JSON, as stored with the run.
     """
 
     name: str
@@ -474,11 +485,11 @@ class CampaignPlan:
 
 @dataclass(frozen=True)
 class Draw:
-    """One way in which a pour may go otherwise than planned.
+    """One deviation of a pour from its plan.
 
     Attributes:
-        error: of execution; None: as planned.
-        z: standardised errors, those of `Disturbances.errors`.
+        error: pose error of the execution; None: as planned.
+        z: standardised errors, in the order of `Disturbances.errors`.
     """
 
     error: PoseError | None

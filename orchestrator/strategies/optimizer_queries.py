@@ -1,4 +1,5 @@
-"""Questions to the optimiser that are out, and what to do with their answers."""
+"""Pending queries to the optimiser and the continuation of each. It keeps no data and does not contact the
+optimiser."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from orchestrator.strategies.trials import SeedStream
 
 
 class OptimizerQueries:
-    """Suggest requests with the continuation of each."""
+    """Suggest requests, each with a function that handles its answer."""
 
     def __init__(self, seeds: SeedStream) -> None:
         self._seeds = seeds
@@ -20,27 +21,27 @@ class OptimizerQueries:
         self._then: dict[Suggest, Callable[[Suggestion], None]] = {}
 
     def put(self, problem: SuggestProblem, purpose: str, then: Callable[[Suggestion], None]) -> None:
-        """Queue a question; its seed is drawn here."""
+        """Queue a query and draw its seed."""
         request = Suggest(replace(problem, seed=self._seeds.next()), purpose)
         self._unissued.append(request)
         self._then[request] = then
 
     def issue(self) -> list[Suggest]:
-        """The questions not asked yet."""
+        """Return the queries that have not been issued yet."""
         issued, self._unissued = self._unissued, []
         return issued
 
     @property
     def out(self) -> bool:
-        """Some answer is waited for."""
+        """Whether an answer is pending."""
         return bool(self._then)
 
     def answer(self, request: Suggest, outcome: Outcome) -> None:
-        """Go on with an answer.
+        """Pass an answer to the continuation of its request.
 
         Raises:
-            ValueError: it was not asked for.
-            LearningError: there is no answer: without one there is nothing sensible to try.
+            ValueError: the request was not made or has been answered already.
+            LearningError: the optimiser returned no suggestion, so that there is no next point to try.
         """
         then = self._then.pop(request, None)
         if then is None:

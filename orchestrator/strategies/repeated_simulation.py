@@ -1,4 +1,7 @@
-"""The prediction for one action: the same pour simulated with several fresh seeds."""
+"""Prediction for one action: the same pour is simulated with several new seeds.
+
+`RepeatedSimulation` requests the simulations; `Foreseen` is its result. It does not search for better actions.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,10 @@ from sim_engine.scene import PoseError
 
 
 class Foreseen(StageResult):
-    """What fresh seeds of one action came to.
+    """Statistics of repeated simulations of one action with new seeds.
 
-    The loss counts cups that touched because of an error; the fractions, of which nothing is known then, do not.
+    The loss includes simulations in which the cups touched because of an error. The fractions do not, because they are
+    undefined in that case.
     """
 
     kind: Literal["prediction"] = "prediction"
@@ -30,31 +34,31 @@ class Foreseen(StageResult):
     """Name of the scene."""
 
     simulations: int
-    """Those that were answered."""
+    """Number of simulations with an answer."""
 
     simulations_lost: int
-    """Those of them that could not be used."""
+    """Number of answered simulations that could not be used."""
 
     thetas: int
-    """Different θ of a posterior that the seeds took turns with; 0 where θ is one."""
+    """Number of different posterior θ that the seeds cycle through; 0 if a single θ is used."""
 
     touching: int
-    """Simulations whose cups touched because of an error, of the pose or of a shape."""
+    """Number of simulations whose cups touched because of a pose error or a shape error."""
 
     over_seeds: dict[str, SampleStatistics]
     """Mean and standard deviation of every fraction, of 'spillage' r = spilled / poured, and of the 'loss'."""
 
     band: PredictionInterval | None = None
-    """The band in which r of a single pour lies; null where no simulation has an r."""
+    """Prediction interval for r of a single pour; null if no simulation has an r."""
 
 
 class RepeatedSimulation:
-    """Simulate an action again, for a prediction with its spread.
+    """Simulate an action again to predict its mean and scatter.
 
-    Vessels of which a file says how far their shape may be off have another one in each simulation.
+    Vessels with a declared shape tolerance get a different shape in each simulation.
 
-    An action was chosen because its simulations spilled little: part of that was luck. Seeds that took no part in the
-    choice tell what to expect, and how much a single pour differs from it.
+    An action is selected because its simulations spilled little, which is partly chance. Seeds that were not used for
+    the selection give an unbiased prediction, and the scatter of a single pour around it.
     """
 
     def __init__(
@@ -67,16 +71,17 @@ class RepeatedSimulation:
         errors: Sequence[PoseError | None] = (),
         discrepancy: float | None = None,
     ) -> None:
-        """Plan.
+        """Queue the simulations.
 
         Args:
             costing: scene, θ and loss.
-            action: None: nothing was found that could be repeated, and nothing is asked for.
-            count: of seeds.
-            thetas: that the seeds take turns with, in place of the one θ: draws of a posterior.
-            errors: that they take turns with, too. Cups that touch because of one are the worst loss, not a lost
-                simulation.
-            discrepancy: shift that the calibration left over (`sim_engine.prediction_band`); None: nobody knows.
+            action: action to simulate. None if the search found no action that can be repeated; nothing is requested
+                then.
+            count: number of seeds.
+            thetas: draws of a posterior that the seeds cycle through instead of the single θ.
+            errors: pose errors that the seeds cycle through. If the cups touch because of such an error, the simulation
+                has the worst loss; it does not count as lost.
+            discrepancy: residual shift of the calibration (`sim_engine.prediction_band`); None if unknown.
         """
         scene, parameters = costing.scene, costing.parameters
         seeds = SeedStream(seed, f"prediction {scene.name}")
@@ -108,16 +113,16 @@ class RepeatedSimulation:
         return not self._unissued and not self._open
 
     def ask(self, slots: Slots) -> list[Request]:
-        """The next simulations."""
+        """Return the next simulations."""
         now, self._unissued = self._unissued[: slots.simulations], self._unissued[slots.simulations :]
         self._open.update(now)
         return list(now)
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """What came of a simulation.
+        """Record the outcome of a simulation.
 
         Raises:
-            ValueError: it was not asked for.
+            ValueError: the simulation was not requested or has been answered already.
         """
         if not isinstance(request, Simulate) or request not in self._open:
             raise ValueError(f"this simulation was not asked for, or has been answered already: {request}")
@@ -134,7 +139,7 @@ class RepeatedSimulation:
             self._lost += 1
 
     def progress(self) -> Progress:
-        """Simulations answered, simulations in all."""
+        """Simulations answered, and their total number."""
         answered = len(self._losses) + self._lost
         return Progress(answered, answered + len(self._open) + len(self._unissued))
 

@@ -1,4 +1,7 @@
-"""A single pour that a person has chosen."""
+"""A single pour with an action that the user chooses.
+
+`OnePour` requests the pour; `OnePoured` is its result. It neither simulates nor repeats a failed pour.
+"""
 
 from __future__ import annotations
 
@@ -14,49 +17,49 @@ from sim_engine.scene import Scene
 
 
 class WeighedPour(ResultPart):
-    """What the balance said of a pour."""
+    """Weights and derived quantities of a pour."""
 
     loaded: float
-    """Mass in the pourer before [kg]."""
+    """Mass in the pourer before the pour [kg]."""
 
     spilled: float
-    """Mass beside the receiver [kg]."""
+    """Mass outside the receiver [kg]."""
 
     retained: float
     """Mass left in the pourer [kg]."""
 
     delivered_g: float
-    """In the receiver: what is neither beside it nor left in the pourer."""
+    """Mass in the receiver [g]: neither spilled nor left in the pourer."""
 
     delivered_ml: float
-    """The same by the liquid's density."""
+    """The same as a volume [ml], from the liquid's density."""
 
     poured_fraction: float
-    """Share of the load that left the pourer."""
+    """Fraction of the load that left the pourer."""
 
     spillage: float | None
     """r = spilled / poured; None below 5 % poured, where it is undefined."""
 
 
 class OnePoured(StageResult):
-    """A single pour that a person has chosen."""
+    """Result of a single pour with a user's action."""
 
     kind: Literal["pour"] = "pour"
 
     weighed: WeighedPour | None = None
-    """None before it was weighed, or where it failed."""
+    """The weights; None before the weighing and after a failure."""
 
     failed: str | None = None
-    """Why nothing was weighed."""
+    """Reason why there are no weights."""
 
 
 class OnePour:
-    """Pour once, and keep what was weighed.
+    """Pour once and keep the weights.
 
     Args:
-        scene: to pour in.
-        action: how.
-        seed: of a virtual bench's chance.
+        scene: scene to pour in.
+        action: action of the pour.
+        seed: seed of a virtual bench's random numbers.
     """
 
     def __init__(self, scene: Scene, action: Action, seed: int) -> None:
@@ -68,21 +71,21 @@ class OnePour:
 
     @property
     def finished(self) -> bool:
-        """It was poured, or came to nothing."""
+        """The pour has been made or has failed."""
         return self._outcome is not None
 
     def ask(self, slots: Slots) -> list[Request]:
-        """The pour, once."""
+        """Return the pour, once."""
         if self._asked or slots.pours < 1:
             return []
         self._asked = True
         return [self._request]
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """What came of it.
+        """Record the outcome of the pour.
 
         Raises:
-            ValueError: it was not asked for.
+            ValueError: the pour was not requested.
         """
         if request != self._request or not self._asked:
             raise ValueError(f"this pour was not asked for: {request}")
@@ -95,11 +98,11 @@ class OnePour:
                 raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
 
     def progress(self) -> Progress:
-        """Pours done, pours in all."""
+        """Pours done, and their total number."""
         return Progress(pours=int(self.finished), of_pours=1)
 
     def result(self) -> OnePoured:
-        """What was weighed, or why there is nothing."""
+        """The weights, or the reason why there are none."""
         match self._outcome:
             case PourMeasurement() as measured:
                 fractions = measured.fractions

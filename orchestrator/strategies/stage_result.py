@@ -1,6 +1,9 @@
-"""What a stage learnt: the base of all results. Each kind is declared beside the strategy that learns it.
+"""Base of all stage results, and the form in which results show actions and surrogates.
 
-Actions and surrogate maps as results show them: units in the keys.
+- `StageResult` is the base class. Each kind is defined in the module of its strategy.
+- `displayed_action` and `displayed_map` convert actions and surrogates for display; the units are part of the keys.
+
+Reading and writing of results is in `orchestrator.journal.stage_results`.
 """
 
 from __future__ import annotations
@@ -16,29 +19,29 @@ from sim_engine.search_space import Space
 
 
 class ResultPart(BaseModel):
-    """A piece of a result: it can't be changed, and its JSON form has exactly the declared fields."""
+    """Part of a result. It is immutable, and its JSON form has exactly the declared fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, defer_build=True)
 
 
 class StageResult(ResultPart):
-    """What a strategy has learnt so far. A subclass declares its own `kind`, a text that no other one bears.
+    """Result of a strategy so far. Each subclass declares its own unique `kind`.
 
-    Journals, the studies' files and `summary.json` hold dumps; `orchestrator.journal.stage_results` reads them back
-    by their kind.
+    Journals, study files and `summary.json` hold dumps; `orchestrator.journal.stage_results` reads them back by their
+    kind.
     """
 
     KINDS: ClassVar[dict[str, type[StageResult]]] = {}
-    """All that have been declared in the imported modules, by kind."""
+    """All kinds that are declared in the imported modules."""
 
     kind: str
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Make the kind known.
+        """Register the kind.
 
         Raises:
-            TypeError: another class has it already, or this one names none.
+            TypeError: another class has this kind already, or this class declares none.
         """
         super().__pydantic_init_subclass__(**kwargs)
         kind = cls.model_fields["kind"].default
@@ -50,29 +53,29 @@ class StageResult(ResultPart):
 
 
 class DisplayedMap(ResultPart):
-    """A surrogate over two axes: row i of `mean` and `deviation` is the second axis' i-th value."""
+    """A surrogate over two axes: row i of `mean` and `deviation` belongs to the i-th value of the second axis."""
 
     over: tuple[str, ...]
     """Names of the two axes."""
 
     held: dict[str, float]
-    """Values [SI] of the others, at which the surrogate was cut."""
+    """Values [SI] of the other dimensions at which the surrogate is evaluated."""
 
     axes: dict[str, tuple[float, ...]]
-    """Values [SI] along each of the two."""
+    """Values [SI] along each of the two axes."""
 
     mean: tuple[tuple[float, ...], ...]
-    """Posterior mean, in the cost's own unit."""
+    """Posterior mean, in the unit of the cost."""
 
     deviation: tuple[tuple[float, ...], ...]
-    """Posterior standard deviation, in the cost's own unit."""
+    """Posterior standard deviation, in the unit of the cost."""
 
 
 _SUFFIX = {"deg/s": "deg_s", "deg/s^2": "deg_s2", "deg": "deg", "mm": "mm", "s": "s"}
 
 
 def displayed_action(values: Mapping[str, float | None]) -> dict[str, float | None]:
-    """Action dimensions [SI] in the units that people read: {'angular_velocity_deg_s': 41.2, …}."""
+    """Convert action dimensions from SI to display units: {'angular_velocity_deg_s': 41.2, …}."""
     shown: dict[str, float | None] = {}
     for name, value in values.items():
         dimension = ACTION_DIMENSIONS[name]
@@ -81,7 +84,7 @@ def displayed_action(values: Mapping[str, float | None]) -> dict[str, float | No
 
 
 def displayed_map(surrogate: SurrogateMap | None, space: Space) -> DisplayedMap | None:
-    """A surrogate as results show it; None without one."""
+    """Convert a surrogate to its form in results; None if there is none."""
     if surrogate is None:
         return None
     size = len(surrogate.mean)

@@ -1,8 +1,11 @@
-"""The seam between deciding and doing: ask and tell.
+"""Interface between strategies and the scheduler: ask and tell.
 
-How far a strategy is: pours and simulations apart, for one takes a hundred times as long as the other.
+- `Strategy` is the protocol that every strategy implements.
+- `Progress` counts pours and simulations separately, because a pour takes about a hundred times as long as a
+  simulation.
+- `is_sound` rejects outcomes that are NaN or infinite, because one such value would corrupt a surrogate permanently.
 
-Whether the numbers of an outcome are numbers: what enters a surrogate once stays in all it says.
+This module does not run requests.
 """
 
 from __future__ import annotations
@@ -18,11 +21,11 @@ from sim_engine.outcome import Fractions
 
 @dataclass(frozen=True)
 class Progress:
-    """Requests that count.
+    """Number of requests answered and in total.
 
     Attributes:
-        simulations, of_simulations: answered, and in all.
-        pours, of_pours: made, and in all.
+        simulations, of_simulations: simulations answered, and in total.
+        pours, of_pours: pours made, and in total.
     """
 
     simulations: int = 0
@@ -32,22 +35,22 @@ class Progress:
 
     @property
     def simulations_left(self) -> int:
-        """Simulations that are still to be answered."""
+        """Number of simulations without an answer."""
         return max(self.of_simulations - self.simulations, 0)
 
     @property
     def pours_left(self) -> int:
-        """Pours that are still to be made."""
+        """Number of pours that are still to be made."""
         return max(self.of_pours - self.pours, 0)
 
     @property
     def done(self) -> int:
-        """Requests answered, of either kind, for bars."""
+        """Requests of both kinds that are answered, for progress bars."""
         return self.simulations + self.pours
 
     @property
     def total(self) -> int:
-        """Requests in all, of either kind, for bars."""
+        """Requests of both kinds in total, for progress bars."""
         return self.of_simulations + self.of_pours
 
     def __add__(self, other: Progress) -> Progress:
@@ -59,7 +62,7 @@ class Progress:
         )
 
     def __str__(self) -> str:
-        """'3/6 pours · 20/40 simulations', without what there is none of."""
+        """'3/6 pours · 20/40 simulations'; a kind without requests is omitted."""
         parts = []
         if self.of_pours:
             parts.append(f"{self.pours}/{self.of_pours} pours")
@@ -70,38 +73,38 @@ class Progress:
 
 @runtime_checkable
 class Strategy(Protocol):
-    """A pure decision maker: no I/O, no clock, no Ray. Same seed, same slots and outcomes in → same requests out.
+    """A pure decision maker: no I/O, no clock, no Ray. The same seed, slots and outcomes lead to the same requests.
 
-    The scheduler calls `ask` whenever slots are free and `tell` once for every request that was asked for. `ask`
-    may answer with nothing while it waits for outcomes; a strategy that is neither finished nor waiting for an
-    outcome and asks for nothing is an error.
+    The scheduler calls `ask` whenever slots are free, and `tell` once for every request. `ask` may return no requests
+    while outcomes are pending. A strategy that is not finished, has no pending request and returns no request is an
+    error.
     """
 
     @property
     def finished(self) -> bool:
-        """Nothing more to ask, nothing more to wait for."""
+        """Whether no request is left to make and none is pending."""
         ...
 
     def ask(self, slots: Slots) -> list[Request]:
-        """The next requests; at most `slots.simulations` simulations and `slots.pours` pours.
+        """Return the next requests: at most `slots.simulations` simulations and `slots.pours` pours.
 
-        While a pour is asked for together with simulations, these run beside it.
+        Simulations that are returned together with a pour run at the same time as the pour.
         """
         ...
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """What came of a request."""
+        """Record the outcome of a request."""
         ...
 
     def progress(self) -> Progress:
-        """What is done and what there is to do in all."""
+        """Requests done, and their total number."""
         ...
 
     def result(self) -> StageResult:
-        """What was learnt so far: shown live; at the end kept in the journal, and reported."""
+        """The result so far. It is shown live; the final result is stored in the journal and reported."""
         ...
 
 
 def is_sound(fractions: Fractions) -> bool:
-    """No fraction is NaN or infinite, as those of a simulation that diverged or of a balance that lost its mind."""
+    """Whether all fractions are finite. A simulation that diverged or a faulty balance yields NaN or infinity."""
     return all(math.isfinite(value) for value in (fractions.poured, fractions.spilled, fractions.retained))

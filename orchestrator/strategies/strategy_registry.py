@@ -1,4 +1,4 @@
-"""The doors for strategies and objectives: what is installed, ours as everybody's."""
+"""Plug-in registries of strategies and objectives, built-in and third-party; both use the same entry points."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ def _check_tag(annotation: object, tag: str, name: str) -> None:
 
 
 STRATEGIES: PluginRegistry[type[StrategySettings]] = PluginRegistry("decant.strategies", "strategy", _strategy)
-"""Settings of all strategies that are installed, calibrations and deployments."""
+"""Settings classes of all installed strategies, calibrations and deployments."""
 
 
 OBJECTIVES: PluginRegistry[type[Objective]] = PluginRegistry("decant.objectives", "objective", _objective)
-"""All objectives that are installed."""
+"""All installed objectives."""
 
 
 def calibrations() -> dict[str, type[CalibrationSettings]]:
-    """Those of the calibrations, by name."""
+    """Settings classes of the calibrations, by name."""
     return {name: found for name, found in STRATEGIES.all.items() if issubclass(found, CalibrationSettings)}
 
 
 def deployments() -> dict[str, type[DeploymentSettings]]:
-    """Those of the deployments, by name."""
+    """Settings classes of the deployments, by name."""
     return {name: found for name, found in STRATEGIES.all.items() if issubclass(found, DeploymentSettings)}

@@ -1,6 +1,10 @@
-"""Simulated trials in the order in which they were asked for, so that decisions don't depend on who finishes first.
+"""Simulated trials in the order of their requests, and the seeds that strategies use.
 
-Seeds that strategies hand out: one stream per strategy, no number twice.
+- `Trial` is one searched point with its simulations; `Trials` is the sequence of all trials.
+- `SeedStream` yields seeds for one strategy, without repetition.
+
+The order of the requests, and not that of completion, defines the data of each decision. Decisions therefore do not
+depend on which simulation finishes first.
 """
 
 from __future__ import annotations
@@ -16,14 +20,15 @@ from orchestrator.requests import Simulate
 
 @dataclass
 class Trial:
-    """One searched point and the simulations that judge it.
+    """A searched point with the simulations that evaluate it.
 
     Attributes:
-        point: in the searched space's unit cube.
-        requests: to be averaged over.
-        costs: of each request: a number, None if it came to nothing; missing while its answer is out.
+        point: point in the unit cube of the searched space.
+        requests: simulations whose costs are averaged.
+        costs: cost of each answered request, by index; None if the request yielded no cost.
         context: further coordinates of the observation; see `SuggestProblem.context`.
-        refused: some request was, as one that can't be made: it has no cost, and is not lost either.
+        refused: whether some request was refused because its action is impossible. It has no cost and is not counted as
+            lost.
     """
 
     point: Point
@@ -34,21 +39,21 @@ class Trial:
 
     @property
     def closed(self) -> bool:
-        """All answers are in."""
+        """Whether all answers have arrived."""
         return len(self.costs) == len(self.requests)
 
     @property
     def cost(self) -> float | None:
-        """Mean cost of the simulations that gave one; None if none did."""
+        """Mean cost of the simulations that have one; None if none has."""
         known = [cost for _, cost in sorted(self.costs.items()) if cost is not None]
         return sum(known) / len(known) if known else None
 
 
 class Trials:
-    """A window of trials: simulations run several at a time, their outcomes count in the order of asking.
+    """Sequence of trials with a fixed look-back: simulations run in parallel, their outcomes count in request order.
 
-    With `width` trials in flight, trial t is chosen from the outcomes of the trials up to t − width; later ones are
-    pending even if they have been answered. So the requests of a seeded campaign depend on no stopwatch.
+    With `width` trials running, trial t is chosen from the outcomes of the trials up to t − width. Later trials count
+    as pending even if they have been answered. The requests of a seeded campaign therefore do not depend on timing.
     """
 
     def __init__(self) -> None:
@@ -66,7 +71,7 @@ class Trials:
         self.all.append(trial)
 
     def issue(self, limit: int) -> list[Simulate]:
-        """The next simulations to ask for, at most `limit`."""
+        """Return the next simulations to request, at most `limit`."""
         issued = []
         for _ in range(min(limit, len(self._unissued))):
             trial, index = self._unissued.popleft()
@@ -76,10 +81,10 @@ class Trials:
         return issued
 
     def settle(self, request: Simulate, cost: float | None, *, refused: bool = False) -> Trial:
-        """Enter what came of a simulation (None: nothing), or that it was refused.
+        """Record the cost of a simulation (None: no cost), or that it was refused.
 
         Raises:
-            ValueError: it was not asked for, or has been answered already.
+            ValueError: the simulation was not requested or has been answered already.
         """
         waiting = self._open.get(request)
         if not waiting:
@@ -93,28 +98,28 @@ class Trials:
 
     @property
     def idle(self) -> bool:
-        """Nothing queued and nothing in flight."""
+        """Whether no simulation is queued or running."""
         return not self._unissued and not self._open
 
     @property
     def queued(self) -> bool:
-        """Simulations wait to be asked for."""
+        """Whether simulations are queued."""
         return bool(self._unissued)
 
     @property
     def waiting(self) -> int:
-        """How many simulations wait to be asked for."""
+        """Number of queued simulations."""
         return len(self._unissued)
 
     def withdraw(self) -> None:
-        """Forget the trials of which nothing has been asked for yet."""
+        """Remove the latest trials of which no simulation has been requested yet."""
         while self.all and len(self.all[-1].requests) == sum(t == len(self.all) - 1 for t, _ in self._unissued):
             for _ in self.all.pop().requests:
                 self._unissued.pop()
 
     @property
     def ready(self) -> bool:
-        """Everything that the choice of the next trial depends on has been answered."""
+        """Whether everything that the choice of the next trial depends on has been answered."""
         return not self._unissued and all(trial.closed for trial in self.all[: self._horizon])
 
     @property
@@ -122,28 +127,28 @@ class Trials:
         return max(0, len(self.all) - self.width + 1)
 
     def counting(self, *, everything: bool = False) -> list[Trial]:
-        """Closed trials that the next choice may use, in the order of asking; `everything`: all that are closed."""
+        """Closed trials that the next choice may use, in request order; with `everything`, all closed trials."""
         trials = self.all if everything else self.all[: self._horizon]
         return [trial for trial in trials if trial.closed]
 
     def data(self, *, everything: bool = False) -> Data:
-        """Observations that the next choice may use; `everything`: all answers that are in."""
+        """Observations that the next choice may use; with `everything`, all closed trials."""
         observed = [(t, cost) for t in self.counting(everything=everything) if (cost := t.cost) is not None]
         return Data(tuple((*t.point, *t.context) for t, _ in observed), tuple(cost for _, cost in observed))
 
     def pending(self, *, everything: bool = False) -> tuple[Point, ...]:
-        """Points whose answers are out, or don't count yet."""
+        """Points that are not answered or whose answers do not count yet."""
         trials = self.all if everything else self.all[self._horizon :]
         return tuple(t.point for t in trials if not (everything and t.closed))
 
     @property
     def answered(self) -> int:
-        """Simulations answered."""
+        """Number of simulations answered."""
         return sum(len(trial.costs) for trial in self.all)
 
     @property
     def lost_in_a_row(self) -> int:
-        """How many of the latest trials that were answered came to nothing, one after the other."""
+        """Number of consecutive latest closed trials without a cost."""
         count = 0
         for trial in reversed(self.all):
             if trial.closed:
@@ -154,16 +159,16 @@ class Trials:
 
     @property
     def lost(self) -> int:
-        """Simulations that came to nothing, though they were not refused."""
+        """Number of simulations without a cost that were not refused."""
         return sum(cost is None for trial in self.all if not trial.refused for cost in trial.costs.values())
 
 
 class SeedStream:
-    """Distinct seeds below 2³¹, the same for the same root seed and name.
+    """Distinct seeds below 2³¹; the same root seed and name yield the same seeds.
 
     Args:
-        seed: of the campaign.
-        name: of the strategy's stage, so that two stages of one campaign share no seeds.
+        seed: seed of the campaign.
+        name: name of the strategy's stage, so that two stages of one campaign have different streams.
     """
 
     def __init__(self, seed: int, name: str) -> None:
@@ -171,7 +176,7 @@ class SeedStream:
         self._given: set[int] = set()
 
     def next(self) -> int:
-        """A seed that this stream has not given before."""
+        """Return a seed that this stream has not returned before."""
         while (seed := int(self._rng.integers(2**31))) in self._given:
             pass
         self._given.add(seed)
@@ -179,5 +184,5 @@ class SeedStream:
 
     @property
     def rng(self) -> np.random.Generator:
-        """For other random choices."""
+        """Random generator for other random choices."""
         return self._rng

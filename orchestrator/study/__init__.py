@@ -1,1 +1,1 @@
-"""Comparisons of strategies over many runs."""
+"""Studies: comparisons of strategies over many runs."""

@@ -1,4 +1,8 @@
-"""From a cell to the campaign that it is: the base campaign's plan with other pours, budget, θ, bench and seed."""
+"""Conversion of a study's cell to a campaign.
+
+`campaign_of` copies the plan of the base campaign with the cell's pours, budget, θ, bench and seed, and builds its
+stages. It runs nothing.
+"""
 
 from __future__ import annotations
 
@@ -41,17 +45,17 @@ from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 
 Load = Callable[[str], Results]
-"""What the stages of a finished cell learnt, by its id."""
+"""Loads the stage results of a finished cell by its id."""
 
 
 def campaign_of(
     study: StudyPlan, cell: StudyCell, load: Load, directory: Path
 ) -> tuple[CampaignPlan, list[StageDefinition]]:
-    """The campaign of a cell, with its stages.
+    """Campaign of a cell, with its stages.
 
     Args:
-        load: of the cells that it needs.
-        directory: of its run.
+        load: loads the results of the cells that this cell needs.
+        directory: directory of its run.
     """
     plan, stages = _planned(study, cell, load, directory)
     return replace(plan, resolved=record_of(study.base.resolved, plan)), stages
@@ -95,7 +99,7 @@ def _planned(
 
 
 def calibration_actions(study: StudyPlan) -> list[tuple[float, ...]]:
-    """The actions of all calibration pours, in the unit cube of the action space: the same in every repetition."""
+    """Actions of all calibration pours in the unit cube of the action space; they are equal in every repetition."""
     calibration = study.base.calibration
     assert calibration is not None
     rng = np.random.default_rng(stage_seed(study.seed, "actions"))
@@ -132,7 +136,8 @@ def _pours(study: StudyPlan, campaign: CampaignPlan, cell: StudyCell, seed: int)
 
 
 def _with_pours(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load, directory: Path) -> CampaignPlan:
-    """The plan with the repetition's weighed pours as records; of an arm that has its own, those of the test split."""
+    """The plan with the repetition's weighed pours as records. An arm with its own pours uses only the test split of
+    them."""
     calibration = plan.calibration if not cell.arm else study.calibration(cell.arm).plan
     assert calibration is not None
     mass, pours = calibration.scene.liquid.mass, []
@@ -193,11 +198,11 @@ def _deployment(
 def _final(
     study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load
 ) -> tuple[CampaignPlan, list[StageDefinition]]:
-    """The deployment's laboratory and loss, and one pour of what it recommends."""
-    learnt, *calibrations = cell.needs
+    """Stage for one pour of the recommended action, in the deployment's laboratory and with its loss."""
+    deployed, *calibrations = cell.needs
     plan, stages = _deployment(study, cell, plan, calibrations, load)
     assert plan.deployment is not None
-    recommended = result_of(load(learnt), stages[0].name, Deployed).recommended
+    recommended = result_of(load(deployed), stages[0].name, Deployed).recommended
     scene = plan.deployment.scenes[0]
     action = None if recommended is None else scene.action(dict(recommended.action_si))
     costing = Costing.of(plan.deployment, scene, plan.parameters)

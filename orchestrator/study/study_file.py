@@ -1,6 +1,11 @@
-"""Studies as written in files: which strategies are compared, how often, and on benches that are how far off.
+"""Study files: the YAML sections of a study and their conversion to a plan.
 
-The strategies that a study compares, as written in its file: those of Decant, and those that packages add.
+- `StudyFile` is the whole file; `LevelSection` is a level of mismatch between bench and simulator.
+- `CalibrationsBase` and `DeploymentsBase` list the compared strategies. Keys for strategies of installed packages are
+  added to them.
+- `load_study` reads a file and returns its `StudyPlan`.
+
+Levels and strategies are resolved in `study_resolution`.
 """
 
 from __future__ import annotations
@@ -50,21 +55,21 @@ from sim_engine.settings.model import (
 
 
 class ArmSection(Section):
-    """A strategy that is compared: how often, and what it may spend."""
+    """A compared strategy: its number of repetitions and its budget."""
 
     required: ClassVar[dict[str, str]] = {"repetitions": "10"}
 
     repetitions: Annotated[PositiveCount, Field(le=10_000)] | None = None
-    """How often it is run: a calibration each time on pours of its own, a deployment into each receiver."""
+    """Number of runs: each run of a calibration has its own pours, a deployment runs once per receiver."""
 
     def changes(self) -> dict[str, Any]:
-        """Settings of the strategy that are given here."""
+        """Settings of the strategy that the arm gives."""
         own = type(self).model_fields.keys() - ArmSection.model_fields.keys()
         return {name: value for name in own if (value := getattr(self, name)) is not None}
 
 
 def _arm(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
-    """The section of an arm: some of its strategy's settings, none of which has to be given but the required ones."""
+    """Make the section of an arm from some of its strategy's settings; only the given ones are required."""
     fields: Any = {}
     for key in keys:
         info = settings.model_fields[key]
@@ -85,35 +90,35 @@ D2Arm: Any = _arm(D2Settings, "pours", "mean", "initial", "kappa", pours="15")
 
 
 class D1ArmSection(_arm(D1Settings, "simulations_per_iteration", "initial", "kappa")):  # type: ignore[misc]
-    """A strategy that is compared: how often, and what it may spend."""
+    """A compared strategy: its number of repetitions and its budget."""
 
     iterations: list[PositiveSimulationCount] = Field(default=[15], min_length=1)
     """Iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
 
 
 class D3ArmSection(_arm(D3Settings, "pours", "prior_simulations", "initial", "kappa", pours="15")):  # type: ignore[misc]
-    """A strategy that is compared: how often, and what it may spend."""
+    """A compared strategy: its number of repetitions and its budget."""
 
     per_pour: SimulationCount | None = None
-    """Simulations told between two pours; not 'free', for then the clock would decide what is asked for."""
+    """Simulations between two pours; not 'free', because the requests would then depend on the clock."""
 
 
 class C4ActiveArmSection(_arm(C4Settings, "simulations", "initial", "kappa", simulations="108", pours="6")):  # type: ignore[misc]
-    """C4 on pours that it chooses itself, each by what it will tell about the deployments."""
+    """C4 with pours that it chooses itself, each by its expected information about the deployments."""
 
     pours: PositivePourCount | None = None
-    """Training pours that it chooses; it is scored on the repetition's test pours."""
+    """Number of training pours to choose; the score uses the repetition's test pours."""
 
     design_simulations: PositiveSimulationCount = 64
-    """Simulations to choose them with."""
+    """Number of simulations for the choice."""
 
     def changes(self) -> dict[str, Any]:
-        """Settings of C4 that are given here."""
+        """Settings of C4 that the arm gives."""
         return {name: value for name, value in super().changes().items() if name in C4Settings.model_fields}
 
 
 class CalibrationsBase(Section):
-    """The calibrations that are compared."""
+    """The compared calibrations."""
 
     C1: C1Arm | None = None
     """Uniform grid."""
@@ -125,36 +130,37 @@ class CalibrationsBase(Section):
     """Bayesian optimisation, each θ on all training pours."""
 
     C4: C4Arm | None = None
-    """Bayesian optimisation, one simulation an iteration; the θ that it recommends is what D1 and D3 simulate with."""
+    """Bayesian optimisation, one simulation per iteration; D1 and D3 simulate with the θ that it recommends."""
 
     C4_paper: C4Arm | None = None
-    """C4 as in the paper: the surrogate takes the action's influence for noise; compared, and used by nobody."""
+    """C4 as in the paper: the surrogate treats the action's influence as noise. It is compared only; no deployment uses
+    it."""
 
     C4_active: C4ActiveArmSection | None = None
-    """C4 on fewer pours that were chosen actively; compared, and used by nobody."""
+    """C4 on fewer pours that are chosen actively. It is compared only; no deployment uses it."""
 
 
 class DeploymentsBase(Section):
-    """The deployments that are compared, into each of the base campaign's receivers."""
+    """The compared deployments, into each of the base campaign's receivers."""
 
     D1: D1ArmSection | None = None
     """Plan in simulation, pour once."""
 
     D2: D2Arm | None = None
-    """Learn on real pours."""
+    """Learn from real pours."""
 
     D2_paper: D2Arm | None = None
     """D2 as in the paper: a surrogate with a zero mean."""
 
     D3: D3ArmSection | None = None
-    """Real pours with a simulated prior, the campaign's model of it and check of trust."""
+    """Real pours with a simulated prior; the campaign selects the model of the prior and its check."""
 
     D3_paper: D3ArmSection | None = None
-    """D3 as in the paper: a GP of the residual around the simulations' mean, always trusted."""
+    """D3 as in the paper: a GP of the residual around the simulations' mean, without a check."""
 
 
 def _with_others(base: type[Section], installed: Mapping[str, type[StrategySettings]]) -> Any:
-    """The section with a key for each strategy that a package adds; its settings are those of the strategy."""
+    """Add a key for each strategy of an installed package, with the settings of the strategy."""
     fields: Any = {}
     for name, settings in installed.items():
         if name not in base.model_fields:
@@ -170,12 +176,12 @@ DeploymentsSection: Any = _with_others(DeploymentsBase, deployments())
 
 
 class LevelSection(Section):
-    """How far the bench is from what the simulator can be."""
+    """Level of mismatch between the bench and the simulator."""
 
     required: ClassVar[dict[str, str]] = {"name": "moderate", "liquid": "{particles: 4000, cohesion: 0.05 N/m}"}
 
     name: Name | None = None
-    """Its name in figures and folders."""
+    """Name of the level in figures and folders."""
 
     liquid: HiddenLiquid | None = None
     """Hidden θ of the 'real' liquid; calibration never reads it."""
@@ -184,11 +190,11 @@ class LevelSection(Section):
     """Systematic error of grip and placement."""
 
     pose_noise: PoseNoiseSection = PoseNoiseSection()
-    """Its scatter, drawn anew for each pour."""
+    """Scatter of the pose error, drawn for each pour."""
 
 
 class StudyFile(Section):
-    """A study: a campaign's calibrations and deployments, repeated and compared."""
+    """A study: repeated and compared calibrations and deployments of a campaign."""
 
     required: ClassVar[dict[str, str]] = {
         "name": "paper",
@@ -196,39 +202,39 @@ class StudyFile(Section):
     }
 
     name: Name | None = None
-    """Its name; runs go to study-NAME."""
+    """Name of the study; runs are written to study-NAME."""
 
     seed: Seed = 0
-    """Seed of every random choice."""
+    """Seed of all random choices."""
 
     campaign: FilePath | None = None
     """File of the base campaign: vessels, motions, action spaces, ranges of θ, calibration pours, loss."""
 
     laboratory: PathOr[LaboratoryFile] | None = None
-    """In place of the campaign's; a virtual one, with a bench: of numbers, or over wires."""
+    """Laboratory that replaces the campaign's: a virtual one with a bench, simulated directly or over wires."""
 
     parameters: Parameters | None = None  # type: ignore[valid-type]
-    """In place of the campaign's parameters of the same names: a value fixes one, a range has it searched."""
+    """Parameters that replace the campaign's of the same names: a value fixes one, a range searches it."""
 
     search: list[Text] | None = None
-    """Which of the campaign's searched parameters are searched; the others keep the default, or what comes nearest to
-    it within the campaign's range."""
+    """Names of the campaign's searched parameters that the study searches. The others have their default, or the
+    nearest value in the campaign's range."""
 
     pours: PositivePourCount | None = None
-    """Calibration pours of a repetition, in place of the campaign's."""
+    """Calibration pours of a repetition, instead of the campaign's number."""
 
     holdout: PositivePourCount | None = None
-    """How many of them are kept for testing."""
+    """Number of these pours that are kept for testing."""
 
     mismatch: list[LevelSection] | None = None
-    """Levels of mismatch between bench and simulator; unless given, one: the laboratory's bench as it is, under its
-    name."""
+    """Levels of mismatch between bench and simulator. Unless given, there is one level: the laboratory's bench under
+    its own name."""
 
     compared: Text | None = None
-    """Level at which C1 to C4 are compared, or 'all'; the first unless given. C4 is run at all levels."""
+    """Level at which C1 to C4 are compared, or 'all'; unless given, the first level. C4 runs at all levels."""
 
     random_baseline: SimulationCount = 0
-    """Random parameters that each calibration is scored beside."""
+    """Number of random parameters that each calibration is compared with."""
 
     calibration: CalibrationsSection | None = None
     """The calibrations."""
@@ -237,18 +243,18 @@ class StudyFile(Section):
     """The deployments."""
 
     confirm: PourCount | None = None
-    """How often each deployment's recommended action is poured again at its end, on the same bench with fresh chance
-    errors; not at all unless given. May be raised later, as repetitions may."""
+    """Number of repetitions of each deployment's recommended action at its end, on the same bench with new random
+    errors; 0 unless given. The number can be raised later, like the repetitions."""
 
     directory: FilePath | None = None
-    """Where the study's folder goes; 'runs' in the working directory unless given."""
+    """Directory for the study's folder; unless given, 'runs' in the working directory."""
 
 
 def load_study(path: Path) -> StudyPlan:
-    """The plan of a study file, with everything that it refers to.
+    """Read the plan of a study file, with all files that it refers to.
 
     Raises:
-        ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
+        ConfigError: the file or one that it refers to is invalid; all problems are reported at once.
     """
     report = Report()
     place = Place(Document.read(resolved(path)))

@@ -1,6 +1,10 @@
-"""What a study leaves on the disk: one run folder for each cell, and what came of it in one file.
+"""The folder of a study: one run folder and one result file per cell, the settings and the code version.
 
-Which code made a cell: digests of what decides its numbers.
+- `CellResult` is the content of a result file; `read_result` and `write_result` access it.
+- `opened` locks the folder for one process and checks its settings.
+- `code_now` and `warning` compare the code that made the finished cells with the current one.
+
+Cells are run in `study_runner`.
 """
 
 from __future__ import annotations
@@ -29,7 +33,7 @@ SOURCE = "study-file.txt"
 
 
 class StudyError(RunError):
-    """The study can't begin or go on; the text says why."""
+    """The study can't begin or continue; the text gives the reason."""
 
 
 def run_folder(folder: Path, cell: str) -> Path:
@@ -38,33 +42,33 @@ def run_folder(folder: Path, cell: str) -> Path:
 
 
 def is_finished(folder: Path, cell: str) -> bool:
-    """Whether the cell's results are there."""
+    """Whether the cell has a result file."""
     return (run_folder(folder, cell) / RESULT).is_file()
 
 
 class CellResult(ResultPart):
-    """What came of a finished cell."""
+    """Result of a finished cell."""
 
     results: dict[str, SerializeAsAny[StageResult]]
-    """What each stage learnt, in order."""
+    """Result of each stage, in order."""
 
     simulations: int
-    """Finished ones, failed ones included."""
+    """Number of completed simulations, including failed ones."""
 
     pours: int
-    """Finished ones, failed ones included."""
+    """Number of completed pours, including failed ones."""
 
     cpu_s: float
     """CPU seconds of all simulations and suggestions."""
 
     seconds: float
-    """Wall time."""
+    """Wall time [s]."""
 
     expected: tuple[tuple[int, float], ...]
-    """C4: simulations asked for until a θ was chosen, and the mean |Δ| expected of it."""
+    """C4 only: number of simulations requested until a θ was chosen, and its expected mean |Δ|."""
 
     code: dict[str, str]
-    """Digests of what decides its numbers."""
+    """Digests of the code that determines the numbers."""
 
     @field_validator("results", mode="before")
     @classmethod
@@ -73,10 +77,10 @@ class CellResult(ResultPart):
 
 
 def read_result(folder: Path, cell: str) -> CellResult:
-    """What came of a finished cell.
+    """Read the result of a finished cell.
 
     Raises:
-        StudyError: it isn't finished, or its file is damaged.
+        StudyError: the cell isn't finished, or its file is damaged.
     """
     path = run_folder(folder, cell) / RESULT
     try:
@@ -86,13 +90,13 @@ def read_result(folder: Path, cell: str) -> CellResult:
 
 
 def write_result(folder: Path, cell: str, result: CellResult) -> None:
-    """Keep what came of a cell: all of it or nothing, whenever the process dies."""
+    """Write the result of a cell atomically: a crash leaves either the whole file or none."""
     path = run_folder(folder, cell) / RESULT
     write_whole(path, json.dumps(to_json(result.model_dump()), ensure_ascii=False))
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a file that is never seen half written."""
+    """Write a file atomically."""
     part = path.with_suffix(f".{os.getpid()}.part")
     with part.open("w", encoding="utf-8") as file:
         file.write(text)
@@ -102,13 +106,13 @@ def write_whole(path: Path, text: str) -> None:
 
 
 def finished_results(folder: Path, cells: tuple[StudyCell, ...]) -> dict[str, CellResult]:
-    """What came of all cells that are finished."""
+    """Results of all finished cells."""
     return {cell.id: read_result(folder, cell.id) for cell in cells if is_finished(folder, cell.id)}
 
 
 @contextlib.contextmanager
 def opened(study: StudyPlan) -> Iterator[Path]:
-    """The study's folder, for one process at a time.
+    """Open the study's folder for one process at a time.
 
     Raises:
         StudyError: another process runs the study, or it was begun with other settings.
@@ -133,10 +137,10 @@ def opened(study: StudyPlan) -> Iterator[Path]:
 
 
 def file_of(folder: Path) -> Path:
-    """The study's file, as it was called when the study ran last.
+    """Path of the study's file in its last run.
 
     Raises:
-        StudyError: nobody knows it, or it is not there any more.
+        StudyError: the path is not recorded, or the file no longer exists.
     """
     try:
         path = Path((folder / SOURCE).read_text(encoding="utf-8").strip())
@@ -148,10 +152,10 @@ def file_of(folder: Path) -> Path:
 
 
 def check_settings(study: StudyPlan) -> None:
-    """Whether what is in the study's folder was made with the same settings; repetitions may be added.
+    """Check that the contents of the study's folder were made with the same settings; repetitions may be added.
 
     Raises:
-        StudyError: it was not.
+        StudyError: the settings differ.
     """
     path = study.folder / SETTINGS
     if not path.is_file():
@@ -169,9 +173,9 @@ _ROOT = Path(__file__).parents[2]
 
 @functools.cache
 def code_now() -> dict[str, str]:
-    """Version of Decant, and digests of the optimiser, the strategies and the solver, as they are on the disk.
+    """Version of Decant, and digests of the optimiser, the strategies and the solver on the disk.
 
-    Cached: a process that was started with some code keeps it, whatever is written to the disk since.
+    The result is cached, because a running process keeps its code when files on the disk change.
     """
     here = versions()
     return {
@@ -183,15 +187,15 @@ def code_now() -> dict[str, str]:
 
 
 def made_by(results: Mapping[str, CellResult]) -> Counter[tuple[tuple[str, str], ...]]:
-    """How many cells each code has made."""
+    """Number of cells by the code that made them."""
     return Counter(tuple(result.code.items()) for result in results.values())
 
 
 def warning(results: Mapping[str, CellResult]) -> str | None:
-    """What to say where a study goes on with other code than its finished cells were made with; None: nothing.
+    """Warning for a study that continues with other code than that of its finished cells; None if the code is equal.
 
     Args:
-        results: of the finished cells.
+        results: results of the finished cells.
     """
     now, other, parts = code_now(), 0, dict[str, None]()
     for code, count in made_by(results).items():
@@ -207,7 +211,7 @@ def warning(results: Mapping[str, CellResult]) -> str | None:
 
 
 def told(results: Mapping[str, CellResult]) -> str:
-    """For the page: how many codes the cells have, and which."""
+    """Text for the page: the number of different codes of the cells, and their digests."""
     count = made_by(results)
     if not count:
         return "Code: no cell is finished."

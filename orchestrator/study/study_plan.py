@@ -1,10 +1,16 @@
-"""A study with everything resolved: the base campaign, levels of mismatch, strategies with budgets and repetitions.
+"""The plan of a study and its cells.
 
-The cells of a study: small campaigns, each with a folder of its own. A pure function of the study's plan.
+- `StudyPlan` holds the resolved study: base campaign, levels of mismatch, and strategies with budgets and repetitions.
+- `cells_of` derives the cells: small campaigns with one folder each. It is a pure function of the plan.
 
-What a repetition resamples: the errors of grip and placement, the liquid's initial positions and the balance's noise of
-every pour; which of the calibration's actions are kept for testing; and the strategies' own seeds. The calibration's
-actions are those of the study, the same in every repetition: so C1's grid is simulated once and only scored anew.
+A repetition resamples the following:
+
+- the errors of grip and placement, the liquid's initial positions and the balance's noise of every pour;
+- the selection of the calibration pours that are kept for testing;
+- the strategies' own seeds.
+
+The calibration's actions belong to the study and are equal in every repetition. C1's grid is therefore simulated once,
+and only scored again.
 """
 
 from __future__ import annotations
@@ -21,16 +27,16 @@ from orchestrator.runs.stages import stage_seed
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 
 ALL = "all"
-"""In place of a level's name: calibrations are compared at all of them."""
+"""Value used instead of a level's name: calibrations are compared at all levels."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """How far the bench is from what the simulator can be.
+    """Level of mismatch between the bench and the simulator.
 
     Attributes:
-        name: for people and folders.
-        bench: with the hidden θ, the errors of grip and placement, and their scatter.
+        name: name for display and folders.
+        bench: the bench with the hidden θ, the errors of grip and placement, and their scatter.
     """
 
     name: str
@@ -39,12 +45,13 @@ class Level:
 
 @dataclass(frozen=True)
 class CalibrationArm:
-    """One of C1 to C4 with its budget (in `plan`, which has no pours yet).
+    """A compared calibration with its budget (in `plan`, which has no pours yet).
 
     Attributes:
         label: the strategy; 'C4-paper' for C4 as in the paper.
         levels: names of the levels that it is run at.
-        pours: that it chooses itself, actively, in place of the repetition's; 0: it learns from those.
+        pours: number of pours that the arm chooses itself, actively, instead of the repetition's; 0: it uses the
+            repetition's.
     """
 
     label: str
@@ -56,10 +63,10 @@ class CalibrationArm:
 
 @dataclass(frozen=True)
 class DeploymentArm:
-    """One of D1 to D3 with its budget (in `plan`, which has all receivers).
+    """A compared deployment with its budget (in `plan`, which has all receivers).
 
     Attributes:
-        label: 'D1-15' for D1 with 15 iterations, 'D2-paper' and 'D3-paper' for those as in the paper, otherwise the
+        label: 'D1-15' for D1 with 15 iterations, 'D2-paper' and 'D3-paper' for the paper's forms, otherwise the
             strategy.
     """
 
@@ -74,12 +81,12 @@ class StudyPlan:
 
     Attributes:
         source: the YAML file.
-        base: the campaign that all cells are made from, with the study's laboratory.
+        base: the campaign that all cells are derived from, with the study's laboratory.
         pour_count: calibration pours of a repetition.
-        holdout: how many of them are kept for testing.
-        compared: level at which C1 to C4 and the uncalibrated simulator are compared; 'all': at all of them together.
-        confirm: how often each deployment's recommended action is poured again.
-        directory: in which the study has its folder.
+        holdout: number of these pours that are kept for testing.
+        compared: level at which C1 to C4 and the uncalibrated simulator are compared; 'all': at all levels together.
+        confirm: number of repeated pours of each deployment's recommended action.
+        directory: parent directory of the study's folder.
     """
 
     name: str
@@ -97,11 +104,11 @@ class StudyPlan:
 
     @property
     def folder(self) -> Path:
-        """Where everything of the study is."""
+        """Folder of the study."""
         return self.directory / f"study-{self.name}"
 
     def level(self, name: str) -> Level:
-        """A level by its name. Raises KeyError."""
+        """Level by name. Raises KeyError."""
         return {level.name: level for level in self.levels}[name]
 
     def compares(self, level: str) -> bool:
@@ -109,16 +116,17 @@ class StudyPlan:
         return self.compared in (ALL, level)
 
     def calibration(self, label: str) -> CalibrationArm:
-        """The arm by its label. Raises KeyError."""
+        """Calibration arm by label. Raises KeyError."""
         return {arm.label: arm for arm in self.calibrations}[label]
 
     def deployment(self, label: str) -> DeploymentArm:
-        """The arm by its label. Raises KeyError."""
+        """Deployment arm by label. Raises KeyError."""
         return {arm.label: arm for arm in self.deployments}[label]
 
 
 def study_fingerprint(study: StudyPlan) -> dict[str, Any]:
-    """JSON-ready copy of what decides what is asked for. Repetitions and `confirm` are left out: they may be raised.
+    """JSON-ready copy of everything that determines the requests. Repetitions and `confirm` can be raised: they are
+    left out.
 
     Raises:
         OSError: a mesh file can't be read.
@@ -144,7 +152,7 @@ GRID, FINAL = "grid", "final"
 """Stages that only a study has."""
 
 PARTICLE_SECONDS = 0.0007
-"""CPU seconds of a simulation by particle, for a first estimate; pours of a known study are timed instead."""
+"""CPU seconds of a simulation per particle, for a first estimate; later estimates use the measured speed."""
 
 
 @dataclass(frozen=True)
@@ -152,18 +160,18 @@ class StudyCell:
     """One small campaign.
 
     Attributes:
-        id: unique in the study, good as a folder's name.
-        kind: what is done: C1's grid, calibration pours, a calibration, the score of the uncalibrated θ, a deployment,
+        id: unique in the study and valid as a folder name.
+        kind: content: C1's grid, calibration pours, a calibration, the score of the uncalibrated θ, a deployment, or
             one more pour of the action that a deployment recommends.
-        level: of mismatch; '' for the grid, which knows no bench.
+        level: level of mismatch; '' for the grid, which does not depend on the bench.
         arm: label of a calibration or deployment; '' otherwise.
         receiver: name of a deployment's scene.
-        repetition: from 1; 0 for the grid.
-        again: number of a final action's pour, from 1; 0 of all others. Each has a cell of its own, so that more may be
+        repetition: number from 1; 0 for the grid.
+        again: number of a final action's pour, from 1; 0 for all others. Each has its own cell, so that pours can be
             added later.
-        needs: ids of the cells whose results it is made from.
-        simulations, pours: at most.
-        seed: of its campaign.
+        needs: ids of the cells whose results it needs.
+        simulations, pours: maximum numbers.
+        seed: seed of its campaign.
     """
 
     id: str
@@ -180,7 +188,8 @@ class StudyCell:
 
 
 def cells_of(study: StudyPlan) -> tuple[StudyCell, ...]:
-    """All cells, each after those that it needs; repetition by repetition, so that an unfinished study is balanced."""
+    """All cells, each after those that it needs. They are ordered by repetition, so that an unfinished study is
+    balanced."""
     train = study.pour_count - study.holdout
     cells: list[StudyCell] = []
 
@@ -188,7 +197,7 @@ def cells_of(study: StudyPlan) -> tuple[StudyCell, ...]:
         parts = [str(place[key]) for key in ("level", "arm", "receiver") if place.get(key)]
         numbers = [int(place[key]) for key in ("repetition", "again") if place.get(key)]
         name = _name(kind, *parts, numbers=numbers)
-        # Arms of a repetition share a seed: what they are scored by then differs by what they found alone.
+        # Arms of a repetition share a seed: their scores then differ only by their results.
         shared = [str(place[key]) for key in ("level", "receiver") if place.get(key)]
         family = "calibration" if kind == "uncalibrated" else kind
         seed = stage_seed(study.seed, _name(family, *shared, numbers=numbers))
@@ -219,9 +228,9 @@ def cells_of(study: StudyPlan) -> tuple[StudyCell, ...]:
                 needs = (theta,) if plan.settings.simulates else ()
                 for scene in plan.scenes:
                     there: dict[str, str | int] = {**place, "arm": deployment.label, "receiver": scene.name}
-                    learnt = add("deployment", plan.settings.simulations, plan.pours, *needs, **there)
+                    deployed = add("deployment", plan.settings.simulations, plan.pours, *needs, **there)
                     for again in range(1, study.confirm + 1):
-                        add("final", 0, 1, learnt, *needs, **there, again=again)
+                        add("final", 0, 1, deployed, *needs, **there, again=again)
     return tuple(cells)
 
 
@@ -230,7 +239,7 @@ def _name(*parts: str, numbers: Sequence[int]) -> str:
 
 
 def estimated_seconds(study: StudyPlan, cell: StudyCell) -> float:
-    """CPU seconds that a cell may take, from how many particles are simulated [s]. Rough: within a factor of two."""
+    """Estimate the CPU time of a cell from its number of particles [s]; accurate within a factor of two."""
     axes = {axis.name: axis for arm in study.calibrations for axis in arm.plan.parameters.axes}
     usual = float(study.base.parameters.particles)
     if "particles" in axes:

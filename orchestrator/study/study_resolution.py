@@ -1,4 +1,11 @@
-"""From levels and strategies of a study as written to its plans: benches, which keys are whose, what they may spend."""
+"""Resolution of a study's levels and strategies to plans.
+
+- `bench_of` and `levels_of` determine the benches.
+- `calibration_arms` and `deployment_arms` combine an arm's settings with those of the base campaign and check its
+  budget.
+
+Problems are added to the report; the file itself is read in `study_file`.
+"""
 
 from __future__ import annotations
 
@@ -28,17 +35,17 @@ BUDGETS = (
     *("pours", "iterations", "simulations_per_iteration", "prior_simulations", "per_pour", "prices", "mean"),
     *("risk_limit", "stop", "good_enough"),
 )
-"""Settings that an arm does not take over from the base campaign: a study says itself what each may spend."""
+"""Settings that an arm does not take from the base campaign, because the study defines each budget."""
 
 AS_IN_THE_PAPER: dict[str, dict[str, Any]] = {
     "D2_paper": {"mean": "zero"},
     "D3_paper": {"model": "residual", "trust": "always"},
 }
-"""What the paper's forms have otherwise than ours."""
+"""Settings in which the paper's forms differ from the defaults."""
 
 
 def bench_of(laboratory: LaboratorySpec, at: Place, report: Report) -> VirtualBenchSpec | None:
-    """The bench that a study can pour on; None, with the reason in the report, where there is none."""
+    """The bench of a study. Without a usable one, the reason is added to the report and the result is None."""
     if laboratory.mode != "virtual":
         report.add(at, HARDWARE.format(laboratory.name))
     elif laboratory.arm is not None and laboratory.operator.answers != "virtual":
@@ -54,20 +61,20 @@ def bench_of(laboratory: LaboratorySpec, at: Place, report: Report) -> VirtualBe
             "../laboratories/twin.yaml",
         )
     else:
-        # Numbers need not be waited for; an arm over wires needs its time.
+        # Simulated readings need no waiting; an arm over wires needs its real time.
         wired = laboratory.arm is not None
         return replace(laboratory.bench, time_scale=laboratory.bench.time_scale if wired else 0.0)
     return None
 
 
 def written_levels(sections: Sequence[Section] | None, root: Place, report: Report) -> list[Any] | None:
-    """The levels of mismatch that are complete; None where none are asked for. What is wrong goes to the report."""
+    """The complete levels of mismatch; None if the file has none. Problems are added to the report."""
     found: list[Any] = []
     if sections is not None and not sections:
         report.add(root.at("mismatch"), "is empty; name at least one level, or remove the key")
     for i, level in enumerate(sections or ()):
         if level.value("name") is None or level.value("liquid") is None:
-            continue  # reported as missing
+            continue  # already reported as missing
         if level.value("name") in [other.name for other in found]:
             report.add(root.at("mismatch", i), f"a level '{level.value('name')}' stands above already")
         found.append(level)
@@ -75,7 +82,7 @@ def written_levels(sections: Sequence[Section] | None, root: Place, report: Repo
 
 
 def levels_of(written: Sequence[Any] | None, laboratory: str, bench: VirtualBenchSpec) -> tuple[Level, ...]:
-    """The benches of all levels: as written, or the laboratory's own under its name."""
+    """The benches of all levels: as given, or the laboratory's own under its name."""
     if written is None:
         return (Level(laboratory, bench),)
     return tuple(
@@ -101,12 +108,12 @@ def calibration_arms(
     root: Place,
     report: Report,
 ) -> tuple[CalibrationArm, ...]:
-    """The calibrations of a study; what is wrong goes to the report.
+    """The calibrations of a study; problems are added to the report.
 
     Args:
-        base: with space and scene; pours and budget are filled in here and later.
-        train: pours that every θ of C1 to C3 is simulated on.
-        levels: all names; C4 is run at all of them, the others at `compared`.
+        base: plan with space and scene; pours and budget are filled in here and later.
+        train: number of pours on which every θ of C1 to C3 is simulated.
+        levels: names of all levels; C4 runs at all of them, the others at `compared`.
     """
     arms = []
     for written in () if section is None else type(section).model_fields:
@@ -147,7 +154,7 @@ def deployment_arms(
     root: Place,
     report: Report,
 ) -> tuple[DeploymentArm, ...]:
-    """The deployments of a study; what is wrong goes to the report."""
+    """The deployments of a study; problems are added to the report."""
     if section is None:
         return ()
     if base is None:
@@ -175,7 +182,7 @@ def deployment_arms(
         rounds = changes.pop("iterations", None)
         settings = kind.like(base.settings, without=BUDGETS, **changes)
         settings.check(Premises(base.actions, base.objectives is not None), PlacedProblems(at, report, frozenset()))
-        common = replace(base, settings=settings, data=None, confirm=0)  # a study has a 'confirm' of its own
+        common = replace(base, settings=settings, data=None, confirm=0)  # a study has its own 'confirm'
         if rounds is None:
             arms.append(DeploymentArm(_label(key), common, repetitions))
         for n in sorted(set(rounds or ())):
@@ -185,5 +192,5 @@ def deployment_arms(
 
 
 def _label(key: str) -> str:
-    """What figures and folders call an arm."""
+    """Name of an arm in figures and folders."""
     return key.replace("_", "-")

@@ -1,4 +1,8 @@
-"""Runs the cells of a study: those that are not finished, each as soon as what it needs is, several at a time."""
+"""Runs the unfinished cells of a study in child processes.
+
+`run_cells` starts each cell as soon as the cells that it needs are finished, several at a time. `CellProcess` is one
+child process, `CellStatus` the progress. Cells themselves are executed in `cell_process`.
+"""
 
 from __future__ import annotations
 
@@ -14,20 +18,20 @@ from orchestrator.study.study_folder import LOG, is_finished
 from orchestrator.study.study_plan import StudyCell, StudyPlan, cells_of, estimated_seconds
 
 WAKE = 0.1
-"""Seconds between two looks at the cells' processes."""
+"""Interval at which the cells' processes are polled [s]."""
 
 GRACE = 10.0
-"""Time that a cell's process has to end after it was asked to [s]."""
+"""Time that a cell's process has to end after a request to end [s]."""
 
 
 @dataclass
 class CellStatus:
-    """Where a study stands.
+    """Progress of a study.
 
     Attributes:
-        finished, failed, running: ids; `skipped`: cells that need a failed one.
-        cost_left, cost_done: estimated CPU seconds of what is left, and of what this process has finished.
-        seconds: since this process began.
+        finished, failed, running: ids of cells. `skipped`: cells that need a failed one.
+        cost_left, cost_done: estimated CPU seconds of the remaining cells, and of those that this process has finished.
+        seconds: time since this process began.
     """
 
     cells: int
@@ -40,7 +44,7 @@ class CellStatus:
     seconds: float = 0.0
 
     def seconds_left(self, jobs: int) -> float:
-        """Rough: by the estimate until something is finished, then by how fast that went [s]."""
+        """Rough remaining time [s]: by the estimate until a cell is finished, then by the measured speed."""
         if self.cost_done <= 0.0:
             return self.cost_left / max(jobs, 1)
         return self.cost_left * self.seconds / self.cost_done
@@ -50,7 +54,7 @@ Watch = Callable[[CellStatus], None]
 
 
 def cell_command(study: StudyPlan) -> list[str]:
-    """What runs cells in a process of its own."""
+    """Command that runs cells in a separate process."""
     return python_module("orchestrator.study.cell_process", str(study.source))
 
 
@@ -58,11 +62,11 @@ class CellProcess:
     """A process that runs cells, one at a time.
 
     Args:
-        command: that starts it; see `orchestrator.study.cell_process` for what it reads and writes.
-        log: file that takes what else it says.
+        command: command of the process; see `orchestrator.study.cell_process` for its input and output.
+        log: file for its other output.
 
     Attributes:
-        cell: that it runs now.
+        cell: the running cell.
     """
 
     def __init__(self, command: Sequence[str], log: Path) -> None:
@@ -72,16 +76,16 @@ class CellProcess:
         self.cell: StudyCell | None = None
 
     def begin(self, cell: StudyCell) -> None:
-        """Give it a cell."""
+        """Start a cell in the process."""
         self.cell = cell
-        with contextlib.suppress(BrokenPipeError):  # it has died; `ended` says so
+        with contextlib.suppress(BrokenPipeError):  # the process has died; `ended` reports it
             self.child.write(f"{cell.id}\n".encode())
 
     def ended(self) -> tuple[StudyCell, str | None] | None:
-        """The cell that has just ended, if one has, and what went wrong with it."""
+        """The cell that has just ended, if any, and its error."""
         if self.cell is None:
             return None
-        dead = self.dead  # before the last look at what it wrote
+        dead = self.dead  # before the last read of its output
         line = None
         with contextlib.suppress(TimeoutError, EOFError):
             line = self.child.read_line(0.0)
@@ -92,11 +96,11 @@ class CellProcess:
 
     @property
     def dead(self) -> bool:
-        """Its process has ended."""
+        """Whether the process has ended."""
         return not self.child.alive
 
     def close(self) -> None:
-        """Let go of its pipes."""
+        """Close the pipes of the process."""
         self.child.release()
 
 
@@ -108,13 +112,13 @@ def run_cells(
     watch: Watch = lambda status: None,
     command: Callable[[StudyPlan], list[str]] = cell_command,
 ) -> CellStatus:
-    """Run all cells that are not finished. What fails is noted, and the others go on.
+    """Run all cells that are not finished. A failed cell is recorded, and the others continue.
 
-    Interrupted (KeyboardInterrupt), the cells' processes are ended first: their journals say how far they came.
+    On an interrupt (KeyboardInterrupt) the cells' processes are ended first; their journals contain the progress.
 
     Args:
-        folder: of the study, held by this process.
-        jobs: cells at a time.
+        folder: folder of the study, locked by this process.
+        jobs: number of cells at a time.
     """
     cells = cells_of(study)
     cost = {cell.id: estimated_seconds(study, cell) for cell in cells}
@@ -164,7 +168,7 @@ def _note(cell: StudyCell, problem: str | None, folder: Path, cost: dict[str, fl
 
 
 def last_words(log: Path) -> str:
-    """The last line that a cell's process wrote."""
+    """Last line of a cell's log."""
     try:
         lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     except OSError:
@@ -173,7 +177,7 @@ def last_words(log: Path) -> str:
 
 
 def _skip(waiting: list[StudyCell], status: CellStatus) -> None:
-    """Cells that need one that failed: they can't be run now."""
+    """Skip the cells that need a failed or skipped one."""
     for cell in list(waiting):
         if any(need in status.failed or need in status.skipped for need in cell.needs):
             waiting.remove(cell)
@@ -184,7 +188,7 @@ def _end(processes: Iterable[CellProcess]) -> None:
     mine = list(processes)
     for process in mine:
         if process.cell is None:
-            process.child.close_input()  # it keeps what it has compiled
+            process.child.close_input()  # it ends by itself, and its compiled kernels reach their cache
         else:
             process.child.terminate()
     deadline = time.monotonic() + GRACE

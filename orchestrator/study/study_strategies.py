@@ -1,4 +1,8 @@
-"""What only a study asks for: simulations that many repetitions score, a strategy that they answer, final pours."""
+"""Strategies that only studies use.
+
+- `SimulatedTable` makes simulations that many repetitions score; `AnsweredByTable` answers another strategy from them.
+- `FinalPour` repeats the pour that a deployment recommends.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +31,11 @@ class TableRow(ResultPart):
     """All dimensions [SI]."""
 
     fractions: tuple[float, float, float, float] | None = None
-    """Received, spilled, retained, in flight; None where it was lost."""
+    """Received, spilled, retained, in flight; None if the simulation was lost."""
 
     particles: int = 0
     lost: str = ""
-    """Why there are no fractions."""
+    """Reason why there are no fractions."""
 
 
 class Tabled(StageResult):
@@ -40,31 +44,31 @@ class Tabled(StageResult):
     kind: Literal["table"] = "table"
 
     simulations: int
-    """Those that were answered."""
+    """Number of simulations with an answer."""
 
     rows: tuple[TableRow, ...]
-    """All of them, at the end."""
+    """All simulations; empty until the end."""
 
 
 class FinalPoured(StageResult):
-    """A pour of what a deployment recommends, with a seed that took no part in the choice."""
+    """A pour of the action that a deployment recommends, with a seed that was not used for its selection."""
 
     kind: Literal["final"] = "final"
 
     action_si: dict[str, float | None] | None
-    """All dimensions [SI]; None where nothing was recommended."""
+    """All dimensions [SI]; None if nothing was recommended."""
 
     loss: float
-    """In its own unit; the worst where nothing was weighed."""
+    """Loss in its own unit; the worst loss if nothing was weighed."""
 
     spillage: float
-    """r = spilled / poured; 1 where nothing was weighed."""
+    """r = spilled / poured; 1 if nothing was weighed."""
 
     made: bool
-    """Whether it was poured and weighed."""
+    """Whether the action was poured and weighed."""
 
     reason: str
-    """Why it was not, or hardly poured anything."""
+    """Reason why it was not made, or that almost nothing was poured."""
 
 
 class SimulatedTable:
@@ -87,13 +91,13 @@ class SimulatedTable:
         return not self._unissued and not self._open
 
     def ask(self, slots: Slots) -> list[Request]:
-        """The next simulations."""
+        """Return the next simulations."""
         asked = [self._unissued.popleft() for _ in range(min(slots.simulations, len(self._unissued)))]
         self._open += asked
         return list(asked)
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """What came of a simulation. Raises ValueError if it was not asked for."""
+        """Record the outcome of a simulation. Raises ValueError if it was not requested."""
         if not isinstance(request, Simulate) or request not in self._open:
             raise ValueError(f"this simulation was not asked for: {request}")
         self._open.remove(request)
@@ -107,39 +111,39 @@ class SimulatedTable:
                 self._rows.append(TableRow(theta=theta, action=action, lost=lost))
 
     def progress(self) -> Progress:
-        """Simulations answered, simulations in all."""
+        """Simulations answered, and their total number."""
         return Progress(len(self._rows), self._total)
 
     def result(self) -> Tabled:
-        """One row for each simulation, once all are there: watchers get their number until then."""
+        """One row per simulation when all are answered; until then only their number, which subscribers receive."""
         return Tabled(simulations=len(self._rows), rows=tuple(self._rows) if self.finished else ())
 
 
 class AnsweredByTable:
-    """A strategy whose simulations were made beforehand: only its other requests reach the laboratory."""
+    """Wraps a strategy and answers its simulations from a table; only its other requests reach the laboratory."""
 
     def __init__(self, inner: Strategy, rows: Sequence[TableRow]) -> None:
-        """Take over.
+        """Wrap a strategy.
 
         Args:
-            inner: any strategy that simulates at the θ and actions of the table alone.
-            rows: of a `SimulatedTable`.
+            inner: any strategy that simulates only at the θ and actions of the table.
+            rows: rows of a `SimulatedTable`.
         """
         self._inner = inner
         self._known = {_key(row.theta, row.action): row for row in rows}
 
     @property
     def finished(self) -> bool:
-        """The strategy is."""
+        """Whether the strategy is finished."""
         return self._inner.finished
 
     @property
     def decisions(self) -> list[Decision]:
-        """The strategy's."""
+        """Decisions of the strategy."""
         return list(getattr(self._inner, "decisions", ()))
 
     def ask(self, slots: Slots) -> list[Request]:
-        """What the strategy wants beside simulations."""
+        """Requests of the strategy other than simulations."""
         others: list[Request] = []
         while not self._inner.finished:
             requests = self._inner.ask(slots)
@@ -152,15 +156,15 @@ class AnsweredByTable:
         return others
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """Passed on."""
+        """Pass the outcome to the strategy."""
         self._inner.tell(request, outcome)
 
     def progress(self) -> Progress:
-        """The strategy's."""
+        """Progress of the strategy."""
         return self._inner.progress()
 
     def result(self) -> StageResult:
-        """The strategy's."""
+        """Result of the strategy."""
         return self._inner.result()
 
     def _answer(self, request: Simulate) -> Outcome:
@@ -189,21 +193,22 @@ class AnsweredByTable:
 
 
 class FinalPour:
-    """Pour what a deployment recommends once more, with a seed that took no part in the choice.
+    """Repeat the pour that a deployment recommends, with a seed that was not used for its selection.
 
-    The least loss that was measured is the luckiest of several pours; a single pour of another strategy had no such
-    choice. Pours of recommended actions can be compared.
+    The smallest of several measured losses is biased low, and a single pour of another strategy has no such bias. Pours
+    of recommended actions are comparable.
 
-    What can't be made, or goes wrong, has the worst loss and counts as all spilled, as does a pour that hardly left the
-    cup; so does a deployment that recommends nothing. In a study the strategies of a repetition share the seed.
+    An action that is impossible or fails has the worst loss and counts as all spilled. The same holds for a pour with
+    almost no flow, and for a deployment without a recommendation. In a study, the strategies of a repetition share the
+    seed.
     """
 
     def __init__(self, costing: Costing, action: Action | None, seed: int) -> None:
-        """Plan.
+        """Plan the pour.
 
         Args:
             costing: scene and loss of the deployment.
-            action: None: nothing was recommended, and nothing is poured.
+            action: recommended action; with None, nothing is poured.
         """
         self._costing = costing
         self._action = action
@@ -213,15 +218,15 @@ class FinalPour:
 
     @property
     def finished(self) -> bool:
-        """It was poured, or came to nothing."""
+        """Whether the pour has been made or has failed."""
         return self._made is not None
 
     def ask(self, slots: Slots) -> list[Request]:
-        """The pour, once."""
+        """Return the pour, once."""
         return [] if self._pour is None else self._pour.ask(slots)
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """What came of it. Raises ValueError if it was not asked for."""
+        """Record the outcome. Raises ValueError if the pour was not requested."""
         if self._pour is None or self._action is None:
             raise ValueError(f"this pour was not asked for: {request}")
         self._pour.tell(request, outcome)
@@ -242,11 +247,11 @@ class FinalPour:
                 self._made = self._lost(f"{kind}: {reason}")
 
     def progress(self) -> Progress:
-        """Pours done, pours in all."""
+        """Pours done, and their total number."""
         return Progress(pours=int(self.finished), of_pours=1)
 
     def result(self) -> FinalPoured:
-        """What came of it; as lost, until something has."""
+        """The outcome; until there is one, the result of a lost pour."""
         return self._lost("it has not been poured yet") if self._made is None else self._made
 
     def _lost(self, reason: str) -> FinalPoured:

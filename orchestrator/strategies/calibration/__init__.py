@@ -1,1 +1,1 @@
-"""Calibration (C1 to C4): which parameters θ of the simulator reproduce the weighed spills."""
+"""Calibration strategies C1 to C4: they fit the simulator's parameters θ to the weighed spills."""

@@ -1,8 +1,11 @@
-"""The prior g over actions, where they meet the constraints: uniform, or along some dimensions normal; drawn evenly.
+"""The prior g over actions, and draws of θ for uncertain benches.
 
-Whoever reads a campaign's file loads this; scipy is loaded by those who draw.
+- `actions_of_prior` draws actions from g: a scrambled Sobol sequence, restricted by the constraints. g is uniform,
+  except along dimensions with a normal prior.
+- `actions_all_over` selects actions from the whole space for checks.
+- `drawn_benches` draws complete θ with nuisances, from a calibration's posterior or from declared tolerances.
 
-Benches as they may be: draws of θ with nuisances, from a calibration or from what is thought beforehand.
+The module is loaded whenever a campaign file is read. It therefore imports scipy only inside the functions that draw.
 """
 
 from __future__ import annotations
@@ -27,23 +30,23 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 FINENESS = 2.0**30
-"""Places that a draw may have on an axis, those of a Sobol number: logarithms that differ between machines in their
-last bits still give the same action."""
+"""Number of values per axis of a draw, as for a Sobol number. Logarithms may differ between machines in their last
+bits; rounding to this grid yields the same action."""
 
 
 def actions_of_prior(
     actions: Space, count: int, seed: int, constraints: Sequence[Linear] = (), prior: Sequence[NormalPrior] = ()
 ) -> tuple[Point, ...]:
-    """A scrambled Sobol sequence over the unit cube of actions: every stretch of it covers g evenly.
+    """Draw actions from g: a scrambled Sobol sequence over the unit cube, any section of which covers g evenly.
 
-    Its numbers are binary fractions made by integer arithmetic, the same on every machine. Those of dimensions with a
-    normal prior are sent through the inverse of its distribution, and rounded to such fractions again.
+    Its numbers are binary fractions from integer arithmetic and thus equal on every machine. Along dimensions with a
+    normal prior they are transformed by the inverse distribution function and rounded to such fractions again.
 
     Args:
         prior: dimensions of `actions` along which g is not uniform.
 
     Raises:
-        ValueError: constraints and prior leave next to nothing.
+        ValueError: constraints and prior exclude almost all actions.
 
     Source: sampling by inversion: Devroye, Non-uniform random variate generation, 1986, chapter 2.
     """
@@ -63,11 +66,11 @@ def actions_of_prior(
 def actions_all_over(
     actions: Space, constraints: Sequence[Linear], *, corners: int, drawn: int
 ) -> list[dict[str, float]]:
-    """Allowed actions from everywhere, for checks: the middle, corners, some between. The same whenever asked.
+    """Select allowed actions from the whole space for checks: the centre, corners and random ones. Always the same.
 
     Args:
-        corners: of the box, at most.
-        drawn: actions between.
+        corners: maximum number of corners of the box.
+        drawn: number of random actions.
 
     Returns:
         Values of the searched dimensions [SI].
@@ -83,7 +86,7 @@ def actions_all_over(
 
 
 def region_of(actions: Space, constraints: Sequence[Linear]) -> Region | None:
-    """What the constraints leave of the space; None without any, and nothing slow is loaded then."""
+    """Region of the space that meets the constraints; None without constraints, which avoids a slow import."""
     if not constraints:
         return None
     from actors.optimizer.feasible_region import Region
@@ -92,7 +95,7 @@ def region_of(actions: Space, constraints: Sequence[Linear]) -> Region | None:
 
 
 def _distributed(uniform: Array, actions: Space, prior: Sequence[NormalPrior]) -> Array:
-    """Points (m, dimension) of the unit cube that are distributed as g is, from uniform ones."""
+    """Transform uniform points (m, dimension) of the unit cube to the distribution g."""
     from scipy.special import ndtr, ndtri
 
     points = uniform.copy()
@@ -107,7 +110,7 @@ def _distributed(uniform: Array, actions: Space, prior: Sequence[NormalPrior]) -
 
 
 FARTHEST = 3.0
-"""Standard deviations beyond which no nuisance is drawn."""
+"""Limit of drawn nuisances, in standard deviations."""
 
 
 def drawn_benches(
@@ -118,18 +121,18 @@ def drawn_benches(
     posterior: Sequence[SimulationParameters] = (),
     known: Collection[str] = (),
 ) -> tuple[SimulationParameters, ...]:
-    """Equally likely θ of the bench that is to be poured on, its nuisances among them; pure.
+    """Draw equally likely θ of the bench to be used, including its nuisances. Pure.
 
-    A posterior's draws are taken evenly, again and again if there are fewer than wanted. Nuisances that the calibration
-    did not search differ between benches by their declared tolerances, around their values in those draws: normal,
-    independent of each other, by a scrambled Sobol sequence, and within their bounds.
+    The posterior's draws are selected at equal steps; they repeat if there are fewer than `count`. Nuisances that the
+    calibration did not search vary around their values in these draws, with their declared tolerances. They are
+    normally distributed, independent, limited to their bounds and drawn from a scrambled Sobol sequence.
 
     Args:
-        best: θ*, or whatever is in force: what all draws are where there is no posterior, nuisances aside.
-        count: of draws, at least 1.
-        seed: same seed, same draws.
+        best: θ*, or the θ in use. Without a posterior, all draws equal it except for their nuisances.
+        count: number of draws, at least 1.
+        seed: the same seed yields the same draws.
         posterior: complete θ, equally likely.
-        known: nuisances that are not to be drawn: the calibration has searched them, or a person vouches for them.
+        known: nuisances that are not drawn, because the calibration searched them or the user declares them known.
 
     Returns:
         `count` complete θ.

@@ -1,4 +1,8 @@
-"""Calibration pours that are chosen one by one, each by what it will tell about the pours that are to be deployed."""
+"""Active design of calibration pours: each pour is chosen by its expected information about deployment.
+
+`ActivePours` is the strategy; `joint_contexts` builds the space of its surrogate. The variance reduction is calculated
+in `actors.optimizer.experimental_design`.
+"""
 
 from __future__ import annotations
 
@@ -30,21 +34,22 @@ from sim_engine.scene import Scene
 from sim_engine.search_space import Axis, Space
 
 CANDIDATES, TARGETS = 64, 48
-"""Actions that a pour is chosen from, and those that are to be predicted; in all scenes together."""
+"""Number of actions that a pour is chosen from, and number of actions to be predicted; each in all scenes together."""
 
 DRAWS = 128
-"""θ of the posterior that a choice is made with."""
+"""Number of posterior draws of θ that a choice is based on."""
 
 WEIGHED = 0.02
-"""Standard deviation of a weighed pour around what the bench does on average, in parts of what is poured."""
+"""Standard deviation of a weighed pour around the bench's mean, as a fraction of the poured liquid."""
 
 LEAST_SIMULATED = 8
-"""Simulations without which no surrogate is asked; the pours are then made evenly."""
+"""Minimum number of usable simulations for a surrogate. With fewer, the pours are taken from the candidates in
+order."""
 
 
 @dataclass(frozen=True)
 class ContextPlace:
-    """An action in a scene, and where the surrogate sees it."""
+    """An action in a scene, with its point in the surrogate's space and in the unit cube of actions."""
 
     scene: Scene
     action: Action
@@ -53,23 +58,24 @@ class ContextPlace:
 
 
 class ActivePours(DesignedPours):
-    """Weigh pours that teach most about deployment: first simulations, then pour by pour.
+    """Weigh the pours that are most informative about deployment: simulate first, then choose pour by pour.
 
-    A surrogate of the simulated spillage over θ, actions and receivers, those of deployment among them, is learnt from
-    `design_simulations` simulations. θ (with the bench's nuisances, if they are searched) has the posterior that the
-    pours made so far leave of it, the prior before the first one. Each pour is the candidate that is expected to lower
-    the variance of the predicted spillage most, in the mean over actions and receivers that are to be deployed; without
-    a deployment, over calibration's own. Simulations at candidates serve C4, too. Pours that are kept for testing are
-    those of an even design.
+    A surrogate of the simulated spillage over θ, actions and receivers is fitted to `design_simulations` simulations.
+    The receivers include those of deployment. θ has its posterior given the pours made so far, or the prior before the
+    first pour. It includes the bench's nuisances if they are searched.
 
-    A candidate that can't be made is left out; of a pour that failed nothing is learnt, and the design loses one.
+    Each pour is the candidate with the largest expected reduction of the variance of the predicted spillage. The
+    variance is averaged over the actions and receivers of deployment, or over calibration's own without a deployment.
+    Simulations at candidates also serve C4. Pours that are kept for testing follow an even design.
+
+    A candidate whose pour fails is removed. A failed pour yields no data, and the design loses one point.
 
     Source: as `actors.optimizer.experimental_design`; Kennedy & O'Hagan 2001 for the model.
     Limitations: the surrogate is not improved between pours; the order of magnitude of a pour's scatter is assumed.
     """
 
     def __init__(self, plan: CalibrationPlan, deployment: DeploymentPlan | None, seed: int) -> None:
-        """Plan; simulations of all scenes are queued."""
+        """Plan the pours and queue the simulations of all scenes."""
         super().__init__(
             plan.scenes,
             plan.actions,
@@ -99,7 +105,7 @@ class ActivePours(DesignedPours):
         constraints: Sequence[Linear],
         prior: Sequence[NormalPrior] = (),
     ) -> list[ContextPlace]:
-        """Actions in all scenes, evenly; their order is mixed, so that any stretch of it is even, too."""
+        """Distribute actions evenly over all scenes, in random order, so that any section is even as well."""
         places: list[ContextPlace] = []
         for scene, actions in where:
             each = max(count // len(where), 1)
@@ -109,7 +115,7 @@ class ActivePours(DesignedPours):
         return [places[i] for i in self._seeds.rng.permutation(len(places))]
 
     def _simulate(self) -> None:
-        """Queue the simulations: θ all over its box, by turns at candidates and at targets."""
+        """Queue the simulations: θ from the whole box, alternately at targets and at candidates."""
         space = self._plan.parameters
         for i, theta in enumerate(actions_of_prior(space, self._plan.design_simulations, self._seeds.next())):
             among = self._candidates if i % 2 else self._targets
@@ -121,7 +127,7 @@ class ActivePours(DesignedPours):
     # -- asking ----------------------------------------------------------------------------------------------------
 
     def ask(self, slots: Slots) -> list[Request]:
-        """Simulations first; then a question, and the pour that its answer names."""
+        """Return simulations first, then a query, and then the pour that its answer selects."""
         if not self._trials.idle:
             return list(self._trials.issue(slots.simulations))
         if self.finished or self._pouring is not None:
@@ -151,7 +157,7 @@ class ActivePours(DesignedPours):
         )
         problem = SuggestProblem(
             self._plan.parameters,
-            Data(data.points, tuple(-cost for cost in data.costs)),  # a difference to nothing weighed
+            Data(data.points, tuple(-cost for cost in data.costs)),  # difference to zero, because no pour belongs to it
             count=0,
             context=(self._targets[0].point,),
             posterior=weighed,
@@ -171,10 +177,10 @@ class ActivePours(DesignedPours):
         )
         self.decisions.append(Decision(text, {"variance": before, "gain": gain}))
 
-    # -- listening -------------------------------------------------------------------------------------------------
+    # -- outcomes --------------------------------------------------------------------------------------------------
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """What came of a simulation, a question or a pour."""
+        """Record the outcome of a simulation, a query or a pour."""
         if isinstance(request, Suggest):
             self._questions.answer(request, outcome)
         elif isinstance(request, Simulate):
@@ -186,7 +192,7 @@ class ActivePours(DesignedPours):
             self._aim = None
 
     def result(self) -> DesignPoured:
-        """The pours so far, in the order made, and the simulations that calibration can use as well."""
+        """The pours so far in the order made, and the simulations that calibration can also use."""
         own, names = {scene.name for scene in self._plan.scenes}, self._plan.actions.names
         simulated = []
         for trial in self._trials.all:
@@ -208,9 +214,9 @@ class ActivePours(DesignedPours):
 
 
 def joint_contexts(where: Sequence[tuple[Scene, Space]]) -> Contexts:
-    """All scenes with all dimensions that differ in or between them.
+    """Combine all scenes and all action dimensions that differ within or between them.
 
-    A dimension that is switched off somewhere has no axis: there the scene tells what it does.
+    A dimension that is switched off in some scene has no axis; the scene's own coordinate represents its effect.
     """
     axes: list[Axis] = []
     for name in ACTION_DIMENSIONS:
@@ -228,7 +234,7 @@ def joint_contexts(where: Sequence[tuple[Scene, Space]]) -> Contexts:
 
 
 def _spillage(outcome: Outcome) -> float | None:
-    """c_s of a simulation that came to something."""
+    """c_s of a valid simulation; otherwise None."""
     if not isinstance(outcome, Simulated) or outcome.outcome.invalid is not None:
         return None
     return normalised_spillage(outcome.outcome.fractions) if is_sound(outcome.outcome.fractions) else None

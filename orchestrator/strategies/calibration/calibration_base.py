@@ -1,6 +1,10 @@
-"""What the calibration strategies share: asking, listening, dropping what failed, reporting θ*.
+"""Base of the calibration strategies, with their results and the settings that they share.
 
-What the settings of calibrations share: how many θ are tried, and whether that fits what they may spend.
+- `Calibration` makes the requests, records the outcomes, drops failed simulations and reports θ*.
+- `Calibrated` is the result; `TriedOnPours` and `TriedOnce` describe one θ each.
+- `DesignSettings` derives the number of θ of C1 to C3 and checks it against the budget of simulations.
+
+The choice of the next θ belongs to the subclasses.
 """
 
 from __future__ import annotations
@@ -30,23 +34,23 @@ S = TypeVar("S", bound=CalibrationSettings)
 
 
 class CalibrationTrial(ResultPart):
-    """A θ that was tried, and how far the simulator was from the pours with it."""
+    """A θ with the discrepancy between simulator and pours."""
 
     theta: dict[str, float]
     """Searched parameters."""
 
     discrepancy: float | None
-    """Mean |r − c_s|, or of a single action; None where nothing could be compared."""
+    """Mean |r − c_s|, or |r − c_s| of a single action; None if nothing could be compared."""
 
 
 class TriedOnPours(CalibrationTrial):
     """C1 to C3: a θ that was simulated on every training pour."""
 
     defined: int
-    """Pours on which it could be compared."""
+    """Number of pours with a discrepancy."""
 
     largest: float | None
-    """The largest |r − c_s| among them."""
+    """Largest |r − c_s| of these pours."""
 
 
 class TriedOnce(CalibrationTrial):
@@ -56,73 +60,73 @@ class TriedOnce(CalibrationTrial):
     """Searched dimensions of the action."""
 
     measured: float
-    """What the regression of the weighed pours expects there, c_r."""
+    """Spillage c_r at the action, as predicted by the regression of the weighed pours."""
 
     difference: float | None
-    """c_r − c_s with its sign, where the surrogate sees the action; else None."""
+    """c_r − c_s with its sign if the surrogate includes the action; otherwise None."""
 
 
 class CalibratedTheta(ResultPart):
-    """θ*, and what is known of it."""
+    """θ* with its expected discrepancy and its posterior."""
 
     theta: SimulationParameters
-    """All parameters, those that were not searched too."""
+    """All parameters, including those that were not searched."""
 
     searched: tuple[str, ...]
-    """Names of the searched ones."""
+    """Names of the searched parameters."""
 
     predicted_discrepancy: float
-    """Expected mean |r − c_s| of it."""
+    """Expected mean |r − c_s| of θ*."""
 
     predicted_deviation: float
-    """Standard deviation of that expectation."""
+    """Standard deviation of the expected mean."""
 
     hyperparameters: dict[str, float] | None
-    """Those of the surrogate; None where there is none."""
+    """Hyperparameters of the surrogate; None without a surrogate."""
 
     map: DisplayedMap | None
-    """The discrepancy over the two parameters that matter most."""
+    """The discrepancy over the two most influential parameters."""
 
     posterior: PosteriorFound | None = None
-    """Which other θ fit the pours; only C4 says."""
+    """Posterior of the θ that fit the pours; C4 only."""
 
 
 class Calibrated(StageResult):
-    """What a calibration has learnt."""
+    """Result of a calibration."""
 
     kind: Literal["calibration"] = "calibration"
 
     strategy: str
-    """'C1' to 'C4', or another one's name."""
+    """'C1' to 'C4', or the name of another strategy."""
 
     simulations: int
-    """Those that were answered."""
+    """Number of simulations with an answer."""
 
     lost: int
-    """Those of them that gave no discrepancy."""
+    """Number of answered simulations without a discrepancy."""
 
     undefined: int
-    """Those that poured too little for a spillage."""
+    """Number of simulations that poured too little to define a spillage."""
 
     training_pours: int
-    """Weighed pours that it learnt from."""
+    """Number of weighed pours that were used for training."""
 
     trials: tuple[TriedOnPours | TriedOnce, ...]
-    """Every θ that has been answered, in the order of asking."""
+    """Every θ with all answers, in request order."""
 
     found: CalibratedTheta | None = None
     """θ*; None until the end."""
 
 
 class Calibration(ABC, Generic[S]):
-    """Base of C1 to C4. Subclasses say what to try next (`_next`) and what a simulation tells (`_discrepancy`).
+    """Base of C1 to C4. Subclasses choose the next trial (`_next`) and convert a simulation to a cost (`_discrepancy`).
 
-    Only pours of the split 'train' are used. A simulation that failed, or poured too little for c_s to be defined, says
-    nothing and is dropped.
+    Only pours of the split 'train' are used. A simulation that failed, or that poured too little to define c_s, is
+    dropped.
     """
 
     def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:
-        """Plan the campaign.
+        """Plan the calibration.
 
         Raises:
             LearningError: fewer than two usable pours.
@@ -150,40 +154,41 @@ class Calibration(ABC, Generic[S]):
 
     @property
     def finished(self) -> bool:
-        """θ* is known."""
+        """Whether θ* is known."""
         return self._best is not None and not self._questions.out
 
     def ask(self, slots: Slots) -> list[Request]:
-        """What is queued, and what comes next as soon as its premises are known."""
+        """Return the queued requests, and the next ones as soon as the data they depend on is complete."""
         if not self._width_known and slots.simulations > 0:
             self._trials.width, self._width_known = self._trials_at_once(slots.simulations), True
         simulations = self._trials.issue(slots.simulations)
         if not self.finished and not self._questions.out and not self._trials.queued:
             self._next()
             simulations += self._trials.issue(slots.simulations - len(simulations))
-        # questions come first: where outcomes are told in the order of asking, they then wait for no simulation
+        # queries come first: with outcomes in request order, a query then does not wait for simulations
         return [*self._questions.issue(), *simulations]
 
     @abstractmethod
     def _next(self) -> None:
-        """Put the next question, queue trials, or conclude. Nothing is queued and no question is out."""
+        """Put the next query, queue trials, or conclude. It is called when nothing is queued and no query is
+        pending."""
 
     def _trials_at_once(self, slots: int) -> int:
-        """Trials that are in flight at a time."""
+        """Number of trials that run at the same time."""
         return slots
 
-    # -- listening -------------------------------------------------------------------------------------------------
+    # -- outcomes --------------------------------------------------------------------------------------------------
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """What came of a question or a simulation."""
+        """Record the outcome of a query or a simulation."""
         if isinstance(request, Suggest):
             self._questions.answer(request, outcome)
         elif isinstance(request, Simulate):
-            self._trials.settle(request, self._judged(request, outcome))
+            self._trials.settle(request, self._cost(request, outcome))
         else:
             raise ValueError(f"calibration asks for no {type(request).__name__}")
 
-    def _judged(self, request: Simulate, outcome: Outcome) -> float | None:
+    def _cost(self, request: Simulate, outcome: Outcome) -> float | None:
         if not isinstance(outcome, Simulated) or outcome.outcome.invalid is not None:
             return None
         if not is_sound(outcome.outcome.fractions):
@@ -196,22 +201,22 @@ class Calibration(ABC, Generic[S]):
 
     @abstractmethod
     def _discrepancy(self, request: Simulate, simulated: float) -> float:
-        """What a simulation's c_s(a, θ) tells about Δ."""
+        """Contribution to Δ of a simulation with the result c_s(a, θ)."""
 
     def _settle(self, point: Point, mean: float, deviation: float) -> None:
-        """θ* is found: where, and what discrepancy is expected there."""
+        """Set θ*, with the mean and standard deviation of its expected discrepancy."""
         self._best, self._expected = point, (mean, deviation)
         text = f"θ* {described(self._values(point))}: |Δ| {max(mean, 0.0):.3f} ± {deviation:.3f}"
         self.decisions.append(Decision(text, {"mean": mean, "sd": deviation}))
 
     def _settle_at_minimum(self, suggestion: Suggestion) -> None:
-        """θ* is the proposed minimiser of the posterior mean."""
+        """Set θ* to the suggested minimiser of the posterior mean."""
         if not suggestion.means:
-            raise self._nothing_learnt()
+            raise self._no_discrepancies()
         self._final = suggestion
         self._settle(suggestion.points[0], suggestion.means[0], suggestion.deviations[0])
 
-    def _nothing_learnt(self) -> LearningError:
+    def _no_discrepancies(self) -> LearningError:
         return LearningError(
             f"calibration learnt nothing: of {self._trials.answered} simulations {self._trials.lost} gave no "
             "discrepancy (see their reasons in the journal)"
@@ -220,7 +225,7 @@ class Calibration(ABC, Generic[S]):
     # -- results ---------------------------------------------------------------------------------------------------
 
     def parameters_at(self, point: Point) -> SimulationParameters:
-        """θ_s of a place in the unit cube, with the plan's fixed values."""
+        """θ_s at a point of the unit cube, with the plan's fixed values."""
         return SimulationParameters.from_values({**self._plan.fixed_parameters, **self._values(point)})
 
     @property
@@ -240,22 +245,23 @@ class Calibration(ABC, Generic[S]):
     @property
     @abstractmethod
     def _budget(self) -> int:
-        """Simulations in all."""
+        """Total number of simulations."""
 
     def progress(self) -> Progress:
-        """Simulations answered, simulations in all."""
+        """Simulations answered, and their total number."""
         return Progress(self._trials.answered, self._budget)
 
     @abstractmethod
     def _row(self, number: int, trial: Trial) -> TriedOnPours | TriedOnce:
-        """What the result has of a trial."""
+        """Convert a trial to its row in the result."""
 
     def _posterior_found(self) -> PosteriorFound | None:
-        """Which other θ fit the pours."""
+        """Posterior of the θ that fit the pours, if the strategy has one."""
         return None
 
     def result(self) -> Calibrated:
-        """θ* with its expected discrepancy, every trial, and the discrepancy's map over the two θ that matter most."""
+        """θ* with its expected discrepancy, all trials, and the map of the discrepancy over the two most influential
+        θ."""
         return Calibrated(
             strategy=self._plan.strategy,
             simulations=self._trials.answered,
@@ -281,7 +287,7 @@ class Calibration(ABC, Generic[S]):
 
 
 def described(values: Mapping[str, float]) -> str:
-    """Parameters for people: 'particles 1200  cohesion 0.031  receiver_x 3.2 mm'."""
+    """Format parameters for display: 'particles 1200  cohesion 0.031  receiver_x 3.2 mm'."""
     infos = SimulationParameters.info()
     return "  ".join(
         f"{name} {value / infos[name].factor:.4g}" + (f" {infos[name].shown}" if infos[name].factor != 1.0 else "")
@@ -294,32 +300,34 @@ Kappa = Annotated[float, Quantity("1", "2.0", 0.0, 100.0)]
 
 
 class DesignSettings(CalibrationSettings):
-    """Settings of C1, C2 and C3: so many θ, each simulated on all training pours.
+    """Settings of C1, C2 and C3, which simulate a number of θ on all training pours each.
 
-    A number of θ is wanted; `simulations` is a limit to it, or alone says how many θ there are.
+    A key of the strategy gives the number of θ, and `simulations` limits it. If only `simulations` is given, it defines
+    the number of θ.
     """
 
     examples: ClassVar[dict[str, str]] = {}
-    """Keys that say how many θ are tried, each with an example; the last one is asked for where all are missing."""
+    """Keys that give the number of θ, each with an example. If all are missing, the error message suggests the last
+    one."""
 
     simulations: PositiveSimulationCount | None = None
-    """Single simulated pours: a limit, or, alone, all that says how many θ are tried."""
+    """Single simulated pours: a limit, or, if no other key is given, the number that defines how many θ are tried."""
 
     @property
     @abstractmethod
     def thetas(self) -> int:
-        """How many θ are tried, once settled."""
+        """Number of θ, once the settings are settled."""
 
     @abstractmethod
     def with_thetas(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
-        """The settings with the number of θ that is given, or that `simulations` allows."""
+        """Fill in the number of θ that is given or that `simulations` allows."""
 
     def simulations_on(self, train: int) -> int:
-        """Each θ on all of them."""
+        """Number of simulations: each θ is simulated on all training pours."""
         return self.thetas * train
 
     def settled(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
-        """The number of θ, from the one key that says it."""
+        """Derive the number of θ from the single key that gives it."""
         given = [key for key in self.examples if getattr(self, key) is not None]
         if len(given) > 1:
             complaints.add(f"stands beside '{given[0]}'; keep one of them", given[1], key=True)
@@ -334,14 +342,14 @@ class DesignSettings(CalibrationSettings):
         key = given[0] if given else "simulations"
         cost, limit = found.simulations_on(train), self.simulations or MOST_SIMULATIONS
         if cost > limit:
-            said = "'simulations' allows" if self.simulations is not None else "at most are possible:"
-            text = f"makes {found.thetas} θ × {train} training pours = {cost} simulations; {said} {limit}"
+            limited_by = "'simulations' allows" if self.simulations is not None else "at most are possible:"
+            text = f"makes {found.thetas} θ × {train} training pours = {cost} simulations; {limited_by} {limit}"
             complaints.add(text, key)
             return None
         return found
 
     def _counted(self, given: int | None, train: int, complaints: Problems) -> int | None:
-        """The number that is given, or that the simulations allow."""
+        """Number of θ that is given or that `simulations` allows."""
         if given is None and (self.simulations or 0) < train:
             text = f"allows not a single θ: each is simulated on all {train} training pours"
             complaints.add(text, "simulations")
@@ -352,7 +360,7 @@ class DesignSettings(CalibrationSettings):
 def check_initial(
     settings: CalibrationSettings, initial: int, budget: int, key: str, unit: str, complaints: Problems
 ) -> None:
-    """Random parameters must fit into the budget, which a key gives in a unit."""
+    """Check that the random parameters fit into the budget, which `key` gives in `unit`."""
     if initial > budget:
         at = "initial" if "initial" in settings.model_fields_set else key
         complaints.add(f"{initial} random parameters don't fit into {budget} {unit}", at)

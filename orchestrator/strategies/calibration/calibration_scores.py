@@ -1,8 +1,11 @@
-"""How well a θ reproduces weighed pours: one simulation for each θ and pour.
+"""Scores of a calibration: the discrepancy of θ* and of baselines on weighed pours.
 
-Predictions of spillage without a simulator, to compare a calibrated one with. Pure functions.
+- `Evaluation` simulates one or several θ on weighed pours, one simulation per θ and pour.
+- `CalibrationEvaluation` compares θ* with the uncalibrated θ, random θ and two predictors without a simulator.
+- `calibration_gain` decides whether the weighed pours justify θ*.
+- `Scores` is the result.
 
-The calibrated θ beside its rivals: what calibration was worth.
+The module does not fit parameters.
 """
 
 from __future__ import annotations
@@ -33,14 +36,14 @@ from sim_engine.search_space import Space
 
 @dataclass(frozen=True)
 class ScoredPour:
-    """A weighed pour and the scene it was made in."""
+    """A weighed pour and the scene in which it was made."""
 
     scene: str
     pour: MeasuredPour
 
 
 class ScoredPair(ResultPart):
-    """A weighed pour beside its simulation with one θ."""
+    """A weighed pour and its simulation with one θ."""
 
     theta: str
     """Label of the θ."""
@@ -49,20 +52,20 @@ class ScoredPair(ResultPart):
     """'train', 'test' or 'transfer'."""
 
     scene: str
-    """Where it was poured."""
+    """Name of the scene."""
 
     measured: float | None
-    """r, as weighed."""
+    """Weighed spillage r."""
 
     simulated: float | None
-    """c_s; None where it is not defined."""
+    """Simulated spillage c_s; None if it is undefined."""
 
     reason: str
-    """Why it is not."""
+    """Reason why c_s is undefined."""
 
 
 class CalibrationGain(ResultPart):
-    """How much closer to the weighed pours the calibrated θ is than the uncalibrated one, and which of them to use.
+    """Gain of the calibrated θ over the uncalibrated one on the weighed pours, and the recommended θ of the two.
 
     A pair is a weighed pour that both θ were simulated on, with the same seed. Differences are fractions of the liquid
     that was poured.
@@ -72,7 +75,7 @@ class CalibrationGain(ResultPart):
     """Weighed pours that were compared."""
 
     pairs: int
-    """Those of them on which both θ have a simulated spillage."""
+    """Pours for which both θ have a simulated spillage."""
 
     calibrated: float | None
     """Mean |r − c_s| of θ* over the pairs."""
@@ -81,37 +84,37 @@ class CalibrationGain(ResultPart):
     """Mean |r − c_s| of the uncalibrated θ over the pairs."""
 
     gain: float | None
-    """Mean over the pairs of the uncalibrated θ's |r − c_s| minus that of θ*; positive where θ* is closer."""
+    """Mean over the pairs of the uncalibrated θ's |r − c_s| minus that of θ*; positive if θ* is closer."""
 
     gain_error: float | None
-    """Standard error of that mean; None for fewer than two pairs."""
+    """Standard error of the mean; None for fewer than two pairs."""
 
     recommended: Literal["calibrated", "uncalibrated"]
     """The θ to use from now on."""
 
     text: str
-    """The same as one sentence, without a full stop."""
+    """Summary in one sentence, without a full stop."""
 
 
 class Scores(StageResult):
-    """How well one or several θ reproduce weighed pours."""
+    """Scores of one or several θ on weighed pours."""
 
     kind: Literal["evaluation"] = "evaluation"
 
     simulations: int
-    """Those that were answered."""
+    """Number of simulations with an answer."""
 
     undefined: dict[str, int]
-    """Simulations without c_s, by label of θ."""
+    """Number of simulations without c_s, by label of θ."""
 
     discrepancy: dict[str, dict[str, float | None]]
     """Mean |r − c_s| by label of θ and split."""
 
     random_median: dict[str, float | None]
-    """Median of the random θ's, by split."""
+    """Median over the random θ, by split."""
 
     posterior_mean: dict[str, float | None] = Field(default_factory=dict)
-    """Mean |r − c̄_s| by split, c̄_s being the mean of the simulations with draws of θ's posterior."""
+    """Mean |r − c̄_s| by split; c̄_s is the mean of the simulations with draws from θ's posterior."""
 
     thetas: dict[str, SimulationParameters]
     """The θ by label."""
@@ -120,13 +123,13 @@ class Scores(StageResult):
     """Every weighed pour with its simulation."""
 
     mean_predictor: dict[str, float | None] = Field(default_factory=dict)
-    """What the mean of the training pours comes to, by split."""
+    """Mean |r − r̄| by split; r̄ is the mean of the training pours."""
 
     regression: dict[str, float | None] = Field(default_factory=dict)
-    """What a GP regression of the training pours comes to, by split."""
+    """Mean |r − m| by split; m is a GP regression of the training pours."""
 
     gain: CalibrationGain | None = None
-    """Whether the pours justify θ*; None where it is the uncalibrated θ, or was not compared with it."""
+    """Comparison with the uncalibrated θ; None if θ* equals it or was not compared with it."""
 
 
 @dataclass
@@ -142,18 +145,19 @@ class _Case:
 class Evaluation:
     """Score one or several θ: mean |r − c_s(a, θ)| over the weighed pours of each split.
 
-    All θ are simulated with the same seeds, so that their differences are not those of the initial positions. Pours
-    with less than 5 % poured have no r and are left out; so are simulations without c_s, which are counted.
+    All θ are simulated with the same seeds, so that initial particle positions do not cause differences between them.
+    Pours with less than 5 % poured have no r and are left out. Simulations without c_s are left out as well, but
+    counted.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 4.1 (test discrepancy).
     """
 
     def __init__(self, thetas: Mapping[str, SimulationParameters], pours: Sequence[ScoredPour], seed: int) -> None:
-        """Plan.
+        """Plan the simulations.
 
         Args:
-            thetas: by label; 'random 1', 'random 2' … are the baseline whose median is reported, 'posterior 1',
-                'posterior 2' … draws of which the simulations' mean is scored, too.
+            thetas: θ by label. 'random 1', 'random 2' … form the baseline; their median is reported. 'posterior 1',
+                'posterior 2' … are draws; the mean of their simulations is scored as well.
         """
         seeds = SeedStream(seed, "evaluation")
         self._cases: list[_Case] = []
@@ -177,7 +181,7 @@ class Evaluation:
         return not self._unissued and not self._open
 
     def ask(self, slots: Slots) -> list[Request]:
-        """The next simulations."""
+        """Return the next simulations."""
         requests: list[Request] = []
         for _ in range(min(slots.simulations, len(self._unissued))):
             index = self._unissued.popleft()
@@ -187,7 +191,7 @@ class Evaluation:
         return requests
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """What came of a simulation."""
+        """Record the outcome of a simulation."""
         waiting = self._open.get(request) if isinstance(request, Simulate) else None
         if not waiting or not isinstance(request, Simulate):
             raise ValueError(f"this simulation was not asked for, or has been answered already: {request}")
@@ -202,11 +206,11 @@ class Evaluation:
             case.reason = getattr(outcome, "reason", "") or "invalid outcome"
 
     def progress(self) -> Progress:
-        """Simulations answered, simulations in all."""
+        """Simulations answered, and their total number."""
         return Progress(sum(case.answered for case in self._cases), len(self._cases))
 
     def discrepancy(self, theta: str, split: str) -> float | None:
-        """Mean |r − c_s| of a θ over a split's pours; None where nothing is defined."""
+        """Mean |r − c_s| of a θ over the pours of a split; None if no pair is defined."""
         differences = [
             abs(r - case.simulated)
             for case in self._cases
@@ -216,13 +220,14 @@ class Evaluation:
         return float(np.mean(differences)) if differences else None
 
     def random_median(self, split: str) -> float | None:
-        """Median over the θ labelled 'random …' of the mean discrepancy in a split."""
+        """Median of the mean discrepancies of the θ with labels 'random …' in a split."""
         scores = [self.discrepancy(label, split) for label in self._thetas if label.startswith("random ")]
         known = [score for score in scores if score is not None]
         return median(known) if known else None
 
     def posterior_mean(self, split: str) -> float | None:
-        """Mean |r − c̄_s| over a split's pours, c̄_s by all θ labelled 'posterior …'; None where nothing is defined."""
+        """Mean |r − c̄_s| over a split's pours; c̄_s averages all θ labelled 'posterior …'. None if nothing is
+        defined."""
         simulated: dict[tuple[float, int], list[float]] = {}
         for case in self._cases:
             if not case.theta.startswith("posterior ") or case.scored.pour.split != split:
@@ -263,13 +268,13 @@ class Evaluation:
 def random_parameters(
     space: Space, fixed: Mapping[str, float], count: int, seed: int
 ) -> dict[str, SimulationParameters]:
-    """θ drawn uniformly from the box, labelled 'random 1' … : what no calibration would give."""
+    """Draw θ uniformly from the box, labelled 'random 1' …, as a baseline without calibration."""
     rng = np.random.default_rng(np.random.SeedSequence([seed, *b"random theta"]))
     return {f"random {i + 1}": SimulationParameters.from_values({**fixed, **space.draw(rng)}) for i in range(count)}
 
 
 def mean_predictor_discrepancy(train: Sequence[MeasuredPour], test: Sequence[MeasuredPour]) -> float | None:
-    """Mean |r − r̄| over the test pours, r̄ the mean of the training pours; None where either is empty."""
+    """Mean |r − r̄| over the test pours, where r̄ is the mean of the training pours; None if either set is empty."""
     known, wanted = _spillages(train), _spillages(test)
     if not known or not wanted:
         return None
@@ -280,11 +285,12 @@ def mean_predictor_discrepancy(train: Sequence[MeasuredPour], test: Sequence[Mea
 def regression_discrepancy(
     contexts: Contexts, train: Sequence[MeasuredPour], test: Sequence[MeasuredPour]
 ) -> float | None:
-    """Mean |r − m(a)| over the test pours, m a GP regression of the training pours, clipped to [0, 1].
+    """Mean |r − m(a)| over the test pours, where m is a GP regression of the training pours, clipped to [0, 1].
 
-    scikit-learn's, and not ours: what the simulator is compared with should owe nothing to it. Matérn 5/2 with a
-    lengthscale for each dimension, and fitted noise. Hard to beat inside the scene it was fitted in, and no answer at
-    all for another vessel. None where there are fewer than two training pours, or no test pours.
+    The regression is scikit-learn's instead of Decant's own, so that the comparison is independent of the calibration
+    code. It has a Matérn 5/2 kernel with one lengthscale per dimension and fitted noise. It is a strong baseline within
+    the fitted scene, and gives no answer for another vessel. The result is None for fewer than two training pours, or
+    without test pours.
     """
     usable = [pour for pour in train if pour.spillage is not None]
     wanted = [pour for pour in test if pour.spillage is not None and contexts.knows(pour)]
@@ -299,7 +305,7 @@ def regression_discrepancy(
     kernel = ConstantKernel(1.0, (0.05, 50.0)) * lengths + WhiteKernel(0.01, (1e-6, 1.0))
     model = GaussianProcessRegressor(kernel, normalize_y=True)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # a dimension that hardly matters has a length at its bound
+        warnings.simplefilter("ignore", ConvergenceWarning)  # the length of an irrelevant dimension reaches its bound
         model.fit(points, _spillages(usable))
     predictions = model.predict([contexts.point(pour) for pour in wanted])
     errors = [abs(r - min(max(float(p), 0.0), 1.0)) for r, p in zip(_spillages(wanted), predictions, strict=True)]
@@ -316,29 +322,29 @@ CALIBRATED = "theta"
 """Label of θ* in the results."""
 
 DRAWS = 5
-"""θ of the posterior whose simulations' mean is scored beside θ*."""
+"""Number of posterior draws of θ whose mean simulation is scored in addition to θ*."""
 
 UNCALIBRATED = "uncalibrated"
-"""Label of the θ that one would take without calibrating."""
+"""Label of the θ that is used without a calibration."""
 
 JUSTIFIED = "the weighed pours justify θ*"
 NOT_JUSTIFIED = "the weighed pours do not justify a change of parameters; the uncalibrated ones are recommended"
-"""How the sentence about the gain of a calibration begins."""
+"""Beginnings of the sentence about the gain of a calibration."""
 
 
 STANDARD_ERRORS = 1.0
-"""Standard errors of the mean paired difference that the gain of θ* must exceed for θ* to be recommended."""
+"""Number of standard errors of the mean paired difference that the gain must exceed for θ* to be recommended."""
 
 
 def calibration_gain(calibrated: Sequence[ScoredPair], uncalibrated: Sequence[ScoredPair]) -> CalibrationGain:
-    """Whether weighed pours justify θ* instead of the uncalibrated θ.
+    """Decide whether weighed pours justify θ* instead of the uncalibrated θ.
 
     θ* is recommended if its mean |r − c_s| is smaller by more than one standard error of the paired difference. A θ
     that is defined on fewer than half of the pours is never recommended if the other one is defined on enough of them.
 
     Args:
         calibrated: pairs of θ*, one for each pour.
-        uncalibrated: those of the uncalibrated θ: the same pours in the same order, with the same seeds.
+        uncalibrated: pairs of the uncalibrated θ for the same pours in the same order, with the same seeds.
 
     Source: the one-standard-error rule of Breiman, Friedman, Olshen and Stone, Classification and Regression Trees,
     1984, section 3.4.3: of models whose errors differ by less than a standard error the simplest one is chosen.
@@ -380,21 +386,22 @@ def calibration_gain(calibrated: Sequence[ScoredPair], uncalibrated: Sequence[Sc
 
 
 def recommended_theta(theta: SimulationParameters, scores: Scores | None) -> SimulationParameters:
-    """θ to simulate with from now on: θ*, or the uncalibrated θ if the weighed pours do not justify θ*.
+    """θ for further simulations: θ*, or the uncalibrated θ if the weighed pours do not justify θ*.
 
     Args:
         theta: θ*.
-        scores: of a scorecard; None, or one of an older version without a comparison: θ*.
+        scores: result of an evaluation. With None, or a result of an older version without a comparison, θ* is
+            returned.
     """
     plain = scores is not None and scores.gain is not None and scores.gain.recommended == UNCALIBRATED
     return scores.thetas[UNCALIBRATED] if plain and scores is not None else theta
 
 
 def shift_left_over(scores: Scores, fitted: int) -> float | None:
-    """What the recommended θ left over of the training pours, as a shift (`sim_engine.prediction_band`).
+    """Residual of the recommended θ on the training pours, as a shift (`sim_engine.prediction_band`).
 
     Args:
-        scores: of a scorecard.
+        scores: result of an evaluation.
         fitted: number of parameters that were searched.
     """
     plain = scores.gain is not None and scores.gain.recommended == UNCALIBRATED
@@ -408,14 +415,17 @@ def shift_left_over(scores: Scores, fitted: int) -> float | None:
 
 
 class CalibrationEvaluation:
-    """Score θ* on all weighed pours, and its rivals on those that calibration did not see.
+    """Score θ* on all weighed pours, and the baselines on the pours that were not used for training.
 
-    The rivals are the uncalibrated θ, random θ from the same box (their median), the mean of the training pours, and a
-    GP regression of the training pours. The regression is judged in the calibration's scene only: of another vessel it
-    knows nothing. Random θ are not simulated on training pours, where nothing is to be won by it; the uncalibrated one
-    is, for it has seen no pour at all, and on the training and test pours it decides whether θ* is recommended
-    (`calibration_gain`). Beside θ* stands what bands are made of: the mean of the simulations over draws of its
-    posterior, where there is one.
+    The baselines are the uncalibrated θ, random θ from the same box (their median), the mean of the training pours and
+    a GP regression of the training pours.
+
+    - The regression is evaluated in the calibration's scenes only, because it has no data about other vessels.
+    - Random θ are not simulated on training pours.
+    - The uncalibrated θ is simulated on the training pours too, because it was fitted to none of them. Its comparison
+      with θ* on training and test pours decides which one is recommended (`calibration_gain`).
+    - If θ has a posterior, the mean of the simulations over its draws is scored as well. Prediction intervals are based
+      on these draws.
     """
 
     def __init__(
@@ -429,25 +439,25 @@ class CalibrationEvaluation:
         uncalibrated: SimulationParameters | None = None,
         drawn: Sequence[SimulationParameters] = (),
     ) -> None:
-        """Plan.
+        """Plan the simulations.
 
         Args:
-            random_thetas: by label, 'random 1' … .
-            pours: of the splits 'train', 'test' and 'transfer'.
-            contexts: in which the regression lives.
-            uncalibrated: θ that one would take without calibrating; None, or θ* itself, is not scored.
-            drawn: of θ's posterior.
+            random_thetas: θ by label, 'random 1' … .
+            pours: pours of the splits 'train', 'test' and 'transfer'.
+            contexts: contexts of the regression.
+            uncalibrated: θ that is used without a calibration; it is not scored if it is None or equals θ*.
+            drawn: draws from θ's posterior.
         """
         unseen = [scored for scored in pours if scored.pour.split != "train"]
         train = [scored for scored in pours if scored.pour.split == "train"]
-        # The unseen come first in both, so that θ* and random θ meet the same seeds on them.
+        # Unseen pours come first in both, so that θ* and random θ have the same seeds on them.
         self._calibrated = Evaluation({CALIBRATED: theta}, [*unseen, *train], seed)
         self._parts = [self._calibrated, Evaluation(random_thetas, unseen, seed)]
         self._uncalibrated: Evaluation | None = None
         if uncalibrated is not None and uncalibrated != theta:
             self._uncalibrated = Evaluation({UNCALIBRATED: uncalibrated}, [*unseen, *train], seed)
             self._parts.append(self._uncalibrated)
-        if drawn:  # with other seeds: a draw may be θ* itself
+        if drawn:  # with other seeds: a draw can be θ* itself
             draws = {f"posterior {k}": theta for k, theta in enumerate(drawn, 1)}
             self._parts.append(Evaluation(draws, unseen, seed + 1))
         self._owner: dict[Simulate, Evaluation] = {}
@@ -465,7 +475,7 @@ class CalibrationEvaluation:
 
     @property
     def decisions(self) -> list[Decision]:
-        """Why these simulations; at the end which θ is recommended."""
+        """Reasons for the simulations and, at the end, the recommended θ."""
         decisions = [decision for part in self._parts for decision in part.decisions]
         if self._gain is not None:
             numbers = {"gain": self._gain.gain, "gain_error": self._gain.gain_error}
@@ -474,7 +484,7 @@ class CalibrationEvaluation:
         return decisions
 
     def ask(self, slots: Slots) -> list[Request]:
-        """The next simulations, θ* first."""
+        """Return the next simulations, θ* first."""
         requests: list[Request] = []
         for part in self._parts:
             asked = part.ask(Slots(slots.simulations - len(requests), 0))
@@ -483,24 +493,24 @@ class CalibrationEvaluation:
         return requests
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """What came of a simulation. Raises ValueError if it was not asked for."""
+        """Record the outcome of a simulation. Raises ValueError if it was not requested."""
         part = self._owner.get(request) if isinstance(request, Simulate) else None
         if part is None:
             raise ValueError(f"this simulation was not asked for: {request}")
         part.tell(request, outcome)
         if self.finished and self._uncalibrated is not None:
-            judged = [
+            compared = [
                 [pair for pair in one.result().pairs if pair.split != "transfer"]
                 for one in (self._calibrated, self._uncalibrated)
             ]
-            self._gain = calibration_gain(*judged)
+            self._gain = calibration_gain(*compared)
 
     def progress(self) -> Progress:
-        """Simulations answered, simulations in all."""
+        """Simulations answered, and their total number."""
         return sum((part.progress() for part in self._parts), Progress())
 
     def result(self) -> Scores:
-        """Mean |r − c_s| by label and split, the random θ's median by split, and the rivals without a simulator."""
+        """Mean |r − c_s| by label and split, the random θ's median by split, and the baselines without a simulator."""
         parts = [part.result() for part in self._parts]
         mean_predictor, regression = self._without_simulator() if self.finished else ({}, {})
         return Scores(
@@ -517,7 +527,7 @@ class CalibrationEvaluation:
         )
 
     def _without_simulator(self) -> tuple[BySplit, BySplit]:
-        """What the mean predictor and the regression come to; worked out once."""
+        """Scores of the mean predictor and of the regression, calculated once."""
         if self._baselines is None:
             train = self._pours.get("train", [])
             unseen = {split: pours for split, pours in self._pours.items() if split != "train"}

@@ -1,4 +1,8 @@
-"""C4: Bayesian optimisation of O2, at one simulation per iteration."""
+"""C4: Bayesian optimisation of the objective O2 with one simulation per iteration.
+
+`C4Settings` holds the settings, `ContinuousBayesianCalibration` is the strategy. O1 and its strategies C1 to C3 are in
+`pointwise_calibration`.
+"""
 
 from __future__ import annotations
 
@@ -32,47 +36,47 @@ from sim_engine.outcome import MINIMUM_POURED
 from sim_engine.settings.model import PositiveSimulationCount, Problems
 
 CONTEXT_SIZE = 24
-"""Actions over which the surrogate's answer is averaged."""
+"""Number of actions over which the surrogate is averaged."""
 
 LIVE_MAP_EVERY = 10
-"""Simulations between two maps for those who watch; one costs about 20 ms."""
+"""Number of simulations between two maps for the live view; one map takes about 20 ms."""
 
 LIVE_MAP_RESOLUTION = 20
 
 
 class C4Settings(CalibrationSettings):
-    """C4: Bayesian optimisation of the mean discrepancy over the actions, one simulation an iteration."""
+    """C4: Bayesian optimisation of the mean discrepancy over the actions, one simulation per iteration."""
 
     has_prior: ClassVar[bool] = True
 
     strategy: Literal["C4"] = "C4"
-    """Bayesian optimisation of the mean discrepancy over the actions, one simulation an iteration."""
+    """Bayesian optimisation of the mean discrepancy over the actions, one simulation per iteration."""
 
     simulations: PositiveSimulationCount | None = None
     """Single simulated pours."""
 
     initial: PositiveSimulationCount = 8
-    """Random parameters before the surrogate takes over."""
+    """Random parameters before the surrogate is used."""
 
     kappa: Kappa = 2.0
     """κ of the lower confidence bound."""
 
     averaging: Literal["context", "noise"] = "context"
-    """context: the surrogate knows which action was simulated; noise, the paper's: its influence is noise."""
+    """context: the simulated action is an input of the surrogate; noise: its influence is noise, as in the paper."""
 
     @property
     def budget(self) -> int:
-        """Simulations, once settled."""
+        """Number of simulations, once the settings are settled."""
         assert self.simulations is not None, "settled settings have a budget"
         return self.simulations
 
     @property
     def makes_posterior(self) -> bool:
-        """Only a surrogate that knows the actions tells what else fits the pours."""
+        """Whether there is a posterior; it requires a surrogate with actions as inputs."""
         return self.averaging == "context"
 
     def settled(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
-        """As they are."""
+        """Check the settings; they are returned unchanged."""
         if self.simulations is None:
             text = "key 'simulations' is missing; add for example 'simulations: 108'"
             complaints.add(text, key=True, of="simulations")
@@ -81,11 +85,11 @@ class C4Settings(CalibrationSettings):
         return None if complaints.any else self
 
     def simulations_on(self, train: int) -> int:
-        """One an iteration, however many pours there are."""
+        """Number of simulations: one per iteration, independent of the number of pours."""
         return self.budget
 
     def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
-        """The strategy itself."""
+        """Build the strategy."""
         return ContinuousBayesianCalibration(plan, pours, seed)
 
 
@@ -93,34 +97,34 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
     """C4: minimise O2(θ) = E_{a~g} |c_r(a) − c_s(a, θ)| with one simulation per iteration.
 
     The measured spillage is first regressed by a GP, so that a discrepancy can be formed at any action. Every iteration
-    simulates one θ at one action of the prior g; the surrogate does the averaging. Two things are done
-    differently from the paper, because both lower the variance at the same price:
+    simulates one θ at one action of the prior g; the surrogate averages over actions. Two details differ from the
+    paper, because both lower the variance at the same cost:
 
-    * In place of independent draws the actions are a scrambled Sobol sequence: any run of consecutive iterations
-      covers g evenly.
-    * The discrepancy varies far more over actions than over θ, and |·| folds away its sign. So the surrogate is a GP of
-      the signed difference c_r − c_s over (θ, a), and what is minimised is the mean over g of the absolute
-      value that it predicts (the setting `averaging`: 'context'). With 'noise', as in the paper, the surrogate sees
-      |c_r − c_s| over θ alone and takes the action's influence for noise; κ is a constant then, too.
+    - The actions are a scrambled Sobol sequence instead of independent draws. Any run of consecutive iterations covers
+      g evenly.
+    - The discrepancy varies far more over actions than over θ, and |·| removes its sign. The surrogate is therefore a
+      GP of the signed difference c_r − c_s over (θ, a). The minimised quantity is the mean over g of the absolute value
+      that it predicts (the setting `averaging`: 'context'). With 'noise', as in the paper, the surrogate models |c_r −
+      c_s| over θ alone and treats the action's influence as noise. κ is a constant in that case, too.
 
-    g is uniform over the box of actions unless they have a `prior`, but limited to where c_r is defined: actions at
-    which less than 5 % is expected to be poured are left out. A simulation that failed, or poured too little for c_s to
-    be defined, says nothing about its neighbours and is dropped.
+    g is uniform over the box of actions unless they have a `prior`. It is limited to actions at which c_r is defined:
+    actions at which less than 5 % is expected to be poured are left out. A simulation that failed, or that poured too
+    little to define c_s, carries no information about its neighbours and is dropped.
 
-    θ* is the most central of the θ that fit the weighed pours: of the posterior's draws the one that is nearest to all
-    others. Where O2 is flat, its minimiser is a matter of chance, mostly at an edge of the box, and often excluded by
-    the very pours that it was found from. With 'noise' θ* minimises the surrogate's mean over the whole box, as in the
-    paper; the lowest observation would only be the luckiest.
+    θ* is the most central of the θ that fit the weighed pours: the posterior draw with the smallest distance to all
+    others. Where O2 is flat, its minimiser is arbitrary: it mostly lies at an edge of the box, and the weighed pours
+    often exclude it. With 'noise', θ* minimises the surrogate's mean over the whole box, as in the paper; the lowest
+    observation would be biased by noise.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C4); a surrogate over both arguments of an expected cost:
     Toscano-Palmerin & Frazier, Bayesian optimization with expensive integrands, 2018.
-    Limitations: θ that make the simulated pour stop short are judged only by the actions at which they do pour. With
-    `averaging` 'noise' the optimiser sees heteroscedastic noise, large where the discrepancy varies over g, and nothing
-    is known about θ beside θ*.
+    Limitations: a θ with which some simulated pours stop short is evaluated only at the actions at which it does pour.
+    With `averaging` 'noise' the optimiser sees heteroscedastic noise, large where the discrepancy varies over g. There
+    is no posterior of θ in that case.
     """
 
     def __init__(self, plan: CalibrationPlan, measured: Sequence[MeasuredPour], seed: int) -> None:
-        """Plan the campaign; only pours of the split 'train' are used.
+        """Plan the calibration; only pours of the split 'train' are used.
 
         Raises:
             LearningError: fewer than two usable pours.
@@ -139,7 +143,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
     # -- asking ----------------------------------------------------------------------------------------------------
 
     def _next(self) -> None:
-        """Regress c_r once; then θ by θ, one simulation each; last, θ*."""
+        """Regress c_r once, then choose θ one by one with one simulation each, and finally determine θ*."""
         if not self._started:
             self._started = True
             self._ask_regression()
@@ -147,7 +151,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             self._ask_parameters()
 
     def _ask_regression(self) -> None:
-        """c_r(a), and whether it is defined, along the prior's sequence of actions."""
+        """Predict c_r(a), and whether it is defined, along the prior's sequence of actions."""
         contexts = self._contexts
         sequence = contexts.sequence(self._plan, 2 * self._settings.budget, self._seeds.next())
         scenes = {scene.name: scene for scene in self._plan.scenes}
@@ -172,7 +176,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
                     f"at no action of the calibration's space would {MINIMUM_POURED:.0%} of the liquid be poured, as "
                     "far as the weighed pours tell; let it tilt farther (max_angle)"
                 )
-            # few places may be left where c_r is defined: they are used again
+            # c_r may be defined at a few places only: they are used repeatedly
             order = [keep[i % len(keep)] for i in range(self._settings.budget)]
             self._actions = tuple(sequence[i] for i in order)
             self._measured_at = tuple(min(max(regression.predictions[i], 0.0), 1.0) for i in order)
@@ -194,7 +198,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         self._questions.put(problem, "regress", with_spillage)
 
     def _ask_parameters(self) -> None:
-        """The next θ, or θ* once the budget is spent."""
+        """Query the next θ, or θ* once the budget is spent."""
         remaining = self._settings.budget - len(self._trials)
         if remaining <= 0:
             if self._trials.idle and self._knows_actions:
@@ -211,14 +215,15 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             self._questions.put(self._problem(resolution=self._live_resolution()), "calibrate", self._queue)
 
     def _ask_posterior(self) -> None:
-        """Draws of θ given the training pours: first what the regression says at them, for it is in the differences."""
+        """Query draws of θ given the training pours; first predict the regression at them, which the differences
+        contain."""
         places = tuple(self._contexts.point(pour) for pour in self._usable)
         weighed = tuple(pour.spillage for pour in self._usable if pour.spillage is not None)
 
         def drawn(suggestion: Suggestion) -> None:
             self._posterior = suggestion.posterior
             if self._posterior is None:
-                raise self._nothing_learnt()
+                raise self._no_discrepancies()
             self.decisions += [Decision(text) for text in left_open(self._posterior, self._plan.parameters.names)]
             self._ask_expected(central(self._posterior))
 
@@ -241,7 +246,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         )
 
     def _ask_expected(self, point: Point) -> None:
-        """What is expected of θ*, and the map through it."""
+        """Query the expected discrepancy of θ* and the map through it."""
 
         def settle(suggestion: Suggestion) -> None:
             self._final = suggestion
@@ -251,7 +256,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         self._questions.put(replace(problem, count=0, predict_at=(point,), map_at=point), "conclude", settle)
 
     def _live_resolution(self) -> int:
-        """Resolution of the map that the next answer carries for those who watch; mostly 0, for none."""
+        """Resolution of the map that the next answer carries for the live view; mostly 0, for no map."""
         if len(self._trials) - self._mapped < LIVE_MAP_EVERY:
             return 0
         self._mapped = len(self._trials)
@@ -272,7 +277,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             plain=not self._knows_actions,
         )
 
-    # -- listening -------------------------------------------------------------------------------------------------
+    # -- outcomes --------------------------------------------------------------------------------------------------
 
     def _queue(self, suggestion: Suggestion) -> None:
         for i, point in enumerate(suggestion.points):
@@ -288,7 +293,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
                 self.decisions.append(Decision(text, {"mean": suggestion.means[i], "sd": suggestion.deviations[i]}))
 
     def _discrepancy(self, request: Simulate, simulated: float) -> float:
-        """c_r(a) − c_s(a, θ); without its sign where the surrogate takes actions for noise."""
+        """c_r(a) − c_s(a, θ); its absolute value if the surrogate treats actions as noise."""
         difference = self._expected_at[request] - simulated
         return difference if self._knows_actions else abs(difference)
 

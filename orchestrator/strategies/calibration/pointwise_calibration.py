@@ -1,10 +1,11 @@
-"""O1: what C1, C2 and C3 minimise, every θ simulated on every training pour.
+"""C1, C2 and C3: calibrations that minimise O1, for which every θ is simulated on every training pour.
 
-C1: O1 on a dense uniform grid.
+- C1 (`UniformGrid`): a dense uniform grid.
+- C2 (`StratifiedSampling`): a stratified sample.
+- C3 (`BayesianCalibration`): Bayesian optimisation, every iteration on all training pours.
 
-C2: O1 on a stratified sample.
-
-C3: Bayesian optimisation of O1, every iteration on all training pours.
+`DiscrepancyOverPours` is their base, `BestOfDesign` that of C1 and C2. C4, which minimises O2, is in
+`continuous_calibration`.
 """
 
 from __future__ import annotations
@@ -33,21 +34,21 @@ from orchestrator.strategies.trials import Trial
 from sim_engine.settings.model import PositiveSimulationCount, Problems, Text
 
 LEAST_DEFINED = 0.5
-"""Share of the training pours on which a θ must have a discrepancy, to be compared with others at all."""
+"""Fraction of the training pours on which a θ must have a discrepancy to be compared with others."""
 
 MOST_MAPPED = 1_000
-"""θ from which a map is drawn: a Gaussian process of more takes minutes."""
+"""Maximum number of θ for which a map is made: a Gaussian process of more observations takes minutes."""
 
 
 S = TypeVar("S", bound=DesignSettings)
-"""Settings of a strategy that tries so many θ on all pours."""
+"""Settings of a strategy that tries a number of θ on all pours."""
 
 
 class DiscrepancyOverPours(Calibration[S]):
     """Base of C1, C2 and C3: O1(θ) = 1/n Σ_i |r_i − c_s(a_i, θ)| over the n training pours.
 
-    A pour has the same seed under every θ, so that two θ don't differ by their initial positions. A θ that failed, or
-    poured too little, on more than half of the pours is never θ*: the mean of the few others may be luck.
+    A pour has the same seed under every θ, so that two θ do not differ by initial positions. A θ that failed, or poured
+    too little, on more than half of the pours is never θ*, because the mean over the few others is unreliable.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (O1).
     """
@@ -85,7 +86,8 @@ class DiscrepancyOverPours(Calibration[S]):
         return abs(self._measured[request.seed] - simulated)
 
     def _observed(self, *, everything: bool = False) -> Data:
-        """O1 of the θ that count; a θ that can't be compared has the worst of them, so that the search leaves it."""
+        """O1 of the θ that count. A θ without a valid O1 gets the worst value, so that the search leaves its
+        neighbourhood."""
         trials = self._trials.counting(everything=everything)
         scores = [(trial.point, _score(trial)) for trial in trials]
         known = [score for _, score in scores if score is not None]
@@ -105,11 +107,11 @@ class DiscrepancyOverPours(Calibration[S]):
 
 
 class BestOfDesign(DiscrepancyOverPours[S]):
-    """Base of C1 and C2: all θ are chosen beforehand, and θ* is the one with the least O1.
+    """Base of C1 and C2: all θ are chosen in advance, and θ* is the one with the smallest O1.
 
-    An optimiser is asked only for the map. `predicted_deviation` is the standard error of θ*'s mean over the pours.
+    The optimiser is queried only for the map. `predicted_deviation` is the standard error of θ*'s mean over the pours.
 
-    Limitations: the least of many noisy means is somewhat lucky; θ* lies on the design, never between.
+    Limitations: the minimum of many noisy means is biased low; θ* is always a point of the design.
     """
 
     @abstractmethod
@@ -129,7 +131,7 @@ class BestOfDesign(DiscrepancyOverPours[S]):
     def _conclude(self) -> None:
         scored = [(score, trial) for trial in self._trials.all if (score := _score(trial)) is not None]
         if not scored:
-            raise self._nothing_learnt()
+            raise self._no_discrepancies()
         mean, best = min(scored, key=lambda pair: pair[0])
         known = [cost for cost in best.costs.values() if cost is not None]
         variance = sum((cost - mean) ** 2 for cost in known) / max(len(known) - 1, 1)
@@ -144,7 +146,7 @@ class BestOfDesign(DiscrepancyOverPours[S]):
 
 
 def _score(trial: Trial) -> float | None:
-    """O1 of a θ; None where it is defined on too few pours."""
+    """O1 of a θ; None if it is defined on too few pours."""
     known = sum(cost is not None for cost in trial.costs.values())
     return trial.cost if known >= LEAST_DEFINED * len(trial.requests) else None
 
@@ -159,24 +161,24 @@ class C1Settings(DesignSettings):
     """A uniform grid."""
 
     grid: dict[Text, PositiveSimulationCount] | None = None
-    """Values of every searched parameter: {particles: 5, cohesion: 6}."""
+    """Number of values of every searched parameter: {particles: 5, cohesion: 6}."""
 
     per_axis: PositiveSimulationCount | None = None
-    """Values of each searched parameter, in place of 'grid'."""
+    """Number of values of each searched parameter, instead of 'grid'."""
 
     @property
     def cells(self) -> dict[str, int]:
-        """Values tried of every searched θ, once settled."""
+        """Number of values of every searched θ, once the settings are settled."""
         assert self.grid is not None, "settled settings have a grid"
         return self.grid
 
     @property
     def thetas(self) -> int:
-        """All places of the grid."""
+        """Number of points of the grid."""
         return math.prod(self.cells.values())
 
     def with_thetas(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
-        """The grid: as it is written, or the finest with the same number on every axis that the simulations allow."""
+        """The grid as it is given, or the finest grid with equal numbers on all axes that the simulations allow."""
         if self.grid is not None:
             for name in self.grid:
                 if name not in searched:
@@ -199,18 +201,18 @@ class C1Settings(DesignSettings):
         return None if complaints.any else self.model_copy(update={"grid": grid, "per_axis": None})
 
     def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
-        """The strategy itself."""
+        """Build the strategy."""
         return UniformGrid(plan, pours, seed)
 
 
 class UniformGrid(BestOfDesign[C1Settings]):
     """C1: θ* = argmin O1(θ) over a uniform grid, each θ simulated on all training pours.
 
-    Every axis of θ's box is cut into equal cells (log-equal where its scale is), and θ tried at their middles: no place
-    of the box is then farther from the grid than half a cell.
+    Every axis of θ's box is divided into equal cells (log-equal for a logarithmic scale), and θ is tried at their
+    centres. Every point of the box is then within half a cell of the grid.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C1: 10 × 10 over two θ, 2800 simulations).
-    Limitations: the price grows with the power of the dimension.
+    Limitations: the cost grows exponentially with the dimension.
     """
 
     def _design(self) -> Sequence[Point]:
@@ -229,28 +231,28 @@ class C2Settings(DesignSettings):
     """Stratified sampling."""
 
     samples: PositiveSimulationCount | None = None
-    """θ in all, in equal strata where the number fits, else a Latin hypercube."""
+    """Number of θ: in equal strata if the number allows it, otherwise a Latin hypercube."""
 
     @property
     def thetas(self) -> int:
-        """All samples."""
+        """Number of samples."""
         return self.samples or 0
 
     def with_thetas(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
-        """As many samples as are given, or as the simulations allow."""
+        """Fill in the number of samples that is given or that the simulations allow."""
         samples = self._counted(self.samples, train, complaints)
         return None if samples is None else self.model_copy(update={"samples": samples})
 
     def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
-        """The strategy itself."""
+        """Build the strategy."""
         return StratifiedSampling(plan, pours, seed)
 
 
 class StratifiedSampling(BestOfDesign[C2Settings]):
     """C2: θ* = argmin O1(θ) over a jittered grid, each θ simulated on all training pours.
 
-    θ's box is cut into equal strata with two random θ in each (18 = 3 × 3 × 2 of two parameters, as in the paper), or
-    one, where the number of samples allows it; any other number becomes a Latin hypercube.
+    If the number of samples allows it, θ's box is divided into equal strata with two random θ each, or with one each.
+    The paper uses 18 = 3 × 3 × 2 for two parameters. Any other number becomes a Latin hypercube.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C2: 3 × 3 strata, 2 samples each, 504 simulations).
     """
@@ -270,21 +272,21 @@ class C3Settings(DesignSettings):
     """Bayesian optimisation, each θ on all training pours."""
 
     iterations: PositiveSimulationCount | None = None
-    """θ in all, each simulated on all training pours."""
+    """Number of θ, each simulated on all training pours."""
 
     initial: PositiveSimulationCount = 8
-    """Random parameters before the surrogate takes over."""
+    """Random parameters before the surrogate is used."""
 
     kappa: Kappa = 2.0
     """κ of the lower confidence bound."""
 
     @property
     def thetas(self) -> int:
-        """One for each iteration."""
+        """Number of iterations, one θ each."""
         return self.iterations or 0
 
     def with_thetas(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
-        """As many iterations as are given, or as the simulations allow."""
+        """Fill in the number of iterations that is given or that the simulations allow."""
         iterations = self._counted(self.iterations, train, complaints)
         if iterations is None:
             return None
@@ -293,14 +295,14 @@ class C3Settings(DesignSettings):
         return self.model_copy(update={"iterations": iterations})
 
     def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
-        """The strategy itself."""
+        """Build the strategy."""
         return BayesianCalibration(plan, pours, seed)
 
 
 class BayesianCalibration(DiscrepancyOverPours[C3Settings]):
     """C3: minimise O1(θ) = 1/n Σ_i |r_i − c_s(a_i, θ)| by Bayesian optimisation; one iteration costs n simulations.
 
-    Started at Sobol points; every further θ minimises the lower confidence bound of a Gaussian process of O1. θ*
+    The first θ are Sobol points. Every further θ minimises the lower confidence bound of a Gaussian process of O1. θ*
     minimises the posterior mean over the whole box.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 3.3 (C3: 59 iterations, 1652 simulations).

@@ -1,4 +1,11 @@
-"""What the weighed pours say about θ, for people: a region of each parameter, and which make up for each other."""
+"""Summary of a posterior of θ: a region for each parameter, and the correlations between parameters.
+
+- `posterior_found` summarises draws as a `PosteriorFound`; `PosteriorSummary` is the same without the draws.
+- `central` selects the draw that becomes θ*.
+- `unit_prior` converts the plan's parameter priors for the optimiser.
+
+The draws themselves are made by the optimiser.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +28,14 @@ LEVEL = 0.9
 """Probability level of the reported regions."""
 
 WIDE = 0.75
-"""Share of a searched range from which a region says next to nothing, in that of a uniform draw's region."""
+"""Relative width from which a region counts as undetermined; 1 is the width of a uniform distribution's region."""
 
 TIED = 0.6
-"""|Correlation| from which two parameters make up for each other."""
+"""|Correlation| from which two parameters compensate each other."""
 
 
 class RemainingDiscrepancy(ResultPart):
-    """How far θ that fit stay from the pours: the region's ends and the median of mean |r − c_s|."""
+    """Mean |r − c_s| of the θ that fit: the ends of the region and the median."""
 
     low: float
     median: float
@@ -36,13 +43,14 @@ class RemainingDiscrepancy(ResultPart):
 
 
 class PosteriorSummary(ResultPart):
-    """Which θ fit the weighed pours, without the draws.
+    """The θ that fit the weighed pours, without the draws.
 
-    Correlations are those of the searched box' unit cube, where logarithmic axes are by their logarithm.
+    Correlations refer to the unit cube of the searched box, in which logarithmic axes are represented by their
+    logarithm.
     """
 
     level: float
-    """Share of the posterior in the regions."""
+    """Fraction of the posterior in the regions."""
 
     mean: dict[str, float]
     """Mean of the draws."""
@@ -51,22 +59,22 @@ class PosteriorSummary(ResultPart):
     """Both ends of each parameter's region."""
 
     open: tuple[str, ...]
-    """Parameters of which the pours say next to nothing."""
+    """Parameters that the pours leave almost undetermined."""
 
     correlation: tuple[tuple[float, ...], ...]
-    """Rows and columns in the parameters' order."""
+    """Rows and columns in the order of the parameters."""
 
     directions: tuple[str, ...]
-    """Which parameters make up for each other, in words."""
+    """Parameters that compensate each other, as text."""
 
     remaining_discrepancy: RemainingDiscrepancy
 
     effective: float
-    """How many independent draws they are worth."""
+    """Effective number of independent draws."""
 
 
 class PosteriorFound(PosteriorSummary):
-    """Which θ fit the weighed pours."""
+    """The θ that fit the weighed pours."""
 
     thetas: tuple[dict[str, float], ...]
     """Draws of the searched parameters, of equal weight."""
@@ -77,7 +85,7 @@ class PosteriorFound(PosteriorSummary):
 
 
 def posterior_found(posterior: Posterior, space: Space) -> PosteriorFound:
-    """What draws of a posterior say.
+    """Summarise the draws of a posterior.
 
     Args:
         posterior: draws in the unit cube.
@@ -86,7 +94,7 @@ def posterior_found(posterior: Posterior, space: Space) -> PosteriorFound:
     points = np.array(posterior.points)
     low, high = region(points)
     lower, upper, names = space.decode(tuple(low)), space.decode(tuple(high)), space.names
-    lacking = np.quantile(posterior.discrepancies, [(1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2])
+    remaining = np.quantile(posterior.discrepancies, [(1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2])
     return PosteriorFound(
         level=LEVEL,
         mean=space.decode(tuple(points.mean(axis=0))),
@@ -95,7 +103,7 @@ def posterior_found(posterior: Posterior, space: Space) -> PosteriorFound:
         correlation=tuple(tuple(row) for row in _correlation(points).tolist()),
         directions=tuple(_ties(points, names)),
         remaining_discrepancy=RemainingDiscrepancy(
-            low=float(lacking[0]), median=float(lacking[1]), high=float(lacking[2])
+            low=float(remaining[0]), median=float(remaining[1]), high=float(remaining[2])
         ),
         effective=posterior.effective,
         thetas=tuple(space.decode(tuple(point)) for point in posterior.points),
@@ -103,7 +111,7 @@ def posterior_found(posterior: Posterior, space: Space) -> PosteriorFound:
 
 
 def unit_prior(plan: CalibrationPlan) -> tuple[tuple[float, float], ...]:
-    """What is known of the searched θ beforehand, as a `PosteriorQuestion` has it."""
+    """Prior knowledge of the searched θ in the form of a `PosteriorQuestion`: mean and deviation per axis."""
     known = {prior.name: prior for prior in plan.parameter_prior}
     if not known:
         return ()
@@ -116,10 +124,10 @@ def unit_prior(plan: CalibrationPlan) -> tuple[tuple[float, float], ...]:
 
 
 def region(points: Array) -> tuple[Array, Array]:
-    """An interval of each axis that holds at least nine tenths of the draws.
+    """Interval on each axis that holds at least nine tenths of the draws.
 
-    It reaches from the 5 % to the 95 % quantile, which by themselves would leave out the very bounds of the box at
-    which draws heap up: so it has the shortest interval that holds nine tenths in it, too.
+    It is the union of two intervals: from the 5 % to the 95 % quantile, and the shortest one that holds nine tenths.
+    The quantiles alone would exclude the bounds of the box, where draws can accumulate.
 
     Args:
         points: (count, dimension) draws in the unit cube.
@@ -138,18 +146,18 @@ def region(points: Array) -> tuple[Array, Array]:
 
 
 def central(posterior: Posterior) -> Point:
-    """The draw in the region that is nearest to all other draws (a medoid), each axis in its own standard deviation.
+    """The medoid: the draw in the region that is nearest to all other draws, each axis in its own standard deviation.
 
-    A draw, and not the mean: on a curved ridge the mean lies beside what fits.
+    A draw is used instead of the mean, because on a curved ridge the mean does not fit the pours.
 
     Source: Kaufman & Rousseeuw, Clustering by means of medoids, 1987.
     """
-    from scipy.spatial.distance import cdist  # for those who only read results it takes long to load
+    from scipy.spatial.distance import cdist  # slow import, not needed to read results
 
     points = np.array(posterior.points)
     low, high = region(points)
     inside = points[np.all((points >= low) & (points <= high), axis=1)]
-    if not len(inside):  # each axis leaves out a tenth: of more than nine parameters perhaps all
+    if not len(inside):  # each axis excludes a tenth: with more than nine parameters possibly all draws
         inside = points
     spread = points.std(axis=0)
     spread = np.where(spread > 0.0, spread, 1.0)
@@ -158,11 +166,12 @@ def central(posterior: Posterior) -> Point:
 
 
 def left_open(posterior: Posterior, names: tuple[str, ...]) -> list[str]:
-    """What the pours don't determine, in words: 'the pours leave friction open', 'cohesion and friction make up …'.
+    """Parameters that the pours leave undetermined, as text: 'the pours leave friction open', 'cohesion and friction
+    make up …'.
 
     Args:
         posterior: draws in the unit cube.
-        names: of the axes.
+        names: names of the axes.
     """
     points = np.array(posterior.points)
     return [*(f"the pours leave {name} open" for name in _open(points, names)), *_ties(points, names)]
@@ -187,7 +196,7 @@ def _ties(points: Array, names: tuple[str, ...]) -> list[str]:
 
 
 def _correlation(points: Array) -> Any:
-    """(d, d); an axis that doesn't vary is correlated with nothing."""
+    """Correlation matrix (d, d); a constant axis is uncorrelated with all others."""
     centred = points - points.mean(axis=0)
     spread = np.sqrt((centred**2).mean(axis=0))
     spread = np.where(spread > 0.0, spread, 1.0)

@@ -1,4 +1,7 @@
-"""What a calibration pour may differ in from the next: its action, and which receiver it goes into."""
+"""Coordinates of a calibration pour for a surrogate: its action and its receiver.
+
+`Contexts` converts pours, actions and scenes to points of a common space and back. It makes no prediction.
+"""
 
 from __future__ import annotations
 
@@ -13,26 +16,27 @@ from sim_engine.search_space import Axis, Space
 
 
 class Contexts:
-    """Actions of calibration as a surrogate sees them: points of the actions' unit cube, and the scene beside them.
+    """Maps actions and scenes to the inputs of a surrogate: the actions' unit cube, extended by scene coordinates.
 
-    One scene needs no coordinate. Two are the ends of one more axis; of three or more each has an axis of its own, on
-    which it alone is 1: what is learnt of one receiver tells of another as far as the fitted lengths of these axes say.
+    A single scene needs no coordinate. Two scenes are the ends of one additional axis. With three or more, each scene
+    has its own axis, which is 1 for this scene and 0 for the others. The fitted lengthscales of these axes determine
+    how much data from one receiver contributes to predictions for another.
     """
 
     def __init__(self, actions: Space, scenes: Sequence[Scene]) -> None:
         self._actions, self._scenes = actions, tuple(scenes)
         self._names = {scene.name: i for i, scene in enumerate(self._scenes)}
         count = len(self._scenes)
-        beside = 0 if count == 1 else 1 if count == 2 else count
+        extra = 0 if count == 1 else 1 if count == 2 else count
         self._marks = [
-            tuple(float(i) for _ in range(beside)) if count == 2 else tuple(float(i == j) for j in range(beside))
+            tuple(float(i) for _ in range(extra)) if count == 2 else tuple(float(i == j) for j in range(extra))
             for i in range(count)
         ]
-        self.space = Space((*actions.axes, *(Axis(f"scene{j + 1}", 0.0, 1.0) for j in range(beside))))
+        self.space = Space((*actions.axes, *(Axis(f"scene{j + 1}", 0.0, 1.0) for j in range(extra))))
 
     @classmethod
     def of(cls, plan: CalibrationPlan) -> Contexts:
-        """Those of a calibration."""
+        """The contexts of a calibration."""
         return cls(plan.actions, plan.scenes)
 
     def knows(self, pour: MeasuredPour) -> bool:
@@ -40,15 +44,15 @@ class Contexts:
         return not pour.scene or pour.scene in self._names
 
     def point(self, pour: MeasuredPour) -> Point:
-        """Where a weighed pour lies.
+        """Point of a weighed pour.
 
         Raises:
-            ValueError: a searched dimension is switched off in it.
+            ValueError: a searched dimension is switched off in the pour.
         """
         return self.at(self._encoded(pour.action), self._names.get(pour.scene, 0))
 
     def place(self, scene: Scene, action: Action) -> Point:
-        """Where an action in one of the scenes lies; raises as `point`."""
+        """Point of an action in one of the scenes; raises as `point`."""
         return self.at(self._encoded(action), self._names[scene.name])
 
     def _encoded(self, action: Action) -> Point:
@@ -56,17 +60,17 @@ class Contexts:
         return tuple(map(float, self._actions.encode(values)))
 
     def at(self, action: Point, scene: int) -> Point:
-        """An action of the unit cube in the scene with that number."""
+        """Point of an action of the unit cube in the scene with this index."""
         return (*action, *self._marks[scene])
 
     def request(self, point: Point) -> tuple[Scene, Action]:
-        """What has to be poured or simulated at a point."""
+        """Scene and action of a point."""
         dimension = self._actions.dimension
         scene = self._scenes[self._marks.index(tuple(point[dimension:]))]
         return scene, scene.action(self._actions.decode(point[:dimension]))
 
     def sequence(self, plan: CalibrationPlan, count: int, seed: int) -> tuple[Point, ...]:
-        """Actions of the prior g, along an even sequence, in the scenes by turns."""
+        """Actions of the prior g along an even sequence, alternating between the scenes."""
         actions = actions_of_prior(plan.actions, count, seed, plan.constraints, plan.prior)
         return tuple(self.at(action, i % len(self._scenes)) for i, action in enumerate(actions))
 

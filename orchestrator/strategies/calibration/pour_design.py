@@ -1,4 +1,10 @@
-"""Which pours to make for calibration: a stratified design, asked for one by one."""
+"""Stratified design of calibration pours, requested one by one.
+
+- `stratified` and `choose_holdout` build the design; `DesignedPours` is the strategy that weighs it.
+- `DesignPoured` is the result.
+
+`active_design` derives pours from this design that are chosen by their information instead.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +36,7 @@ MAX_TRIES = 12
 """Actions tried in one stratum before it is given up as impossible."""
 
 MAX_DRAWS = 100
-"""Points of a stratum of which none meets the constraints, before one from anywhere is taken."""
+"""Points of a stratum that may violate the constraints before a point of the whole region is used."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +47,7 @@ class Stratum:
     upper: tuple[float, ...]
 
     def draw(self, rng: np.random.Generator) -> Point:
-        """A uniform point of the cell."""
+        """Draw a uniform point of the cell."""
         u = rng.random(len(self.lower))
         return tuple(float(a + (b - a) * x) for a, b, x in zip(self.lower, self.upper, u, strict=True))
 
@@ -49,8 +55,8 @@ class Stratum:
 def stratified(count: int, dimension: int, rng: np.random.Generator) -> list[Stratum]:
     """Cells of a jittered design of `count` points, in random order.
 
-    The paper's: k^dimension equal cells with two points each (32 = 4×4×2), or one each where `count` is such a power;
-    any other number: a Latin hypercube, every axis cut into `count` slices used once.
+    As in the paper, there are k^dimension equal cells with two points each (32 = 4×4×2), or with one each if `count` is
+    such a power. Any other number yields a Latin hypercube: every axis is divided into `count` slices, each used once.
     """
     if count < 1:
         raise ValueError(f"a design needs at least one pour, got {count}")
@@ -68,7 +74,7 @@ def stratified(count: int, dimension: int, rng: np.random.Generator) -> list[Str
 
 
 def draw_allowed(stratum: Stratum, region: Region | None, rng: np.random.Generator) -> Point:
-    """A point of the stratum that lies in the region; one from anywhere in it where the stratum seems to have none."""
+    """Draw a point of the stratum that lies in the region; if none is found, draw one from the whole region."""
     point = stratum.draw(rng)
     if region is None:
         return point
@@ -92,13 +98,13 @@ class DesignPoint(ResultPart):
     """A pour of the design."""
 
     number: int
-    """From 1, in the order made."""
+    """Number of the pour, from 1, in the order made."""
 
     split: str
-    """'train', or 'test' for those that calibration does not see."""
+    """'train', or 'test' for a pour that calibration does not use."""
 
     scene: str = ""
-    """Where it was poured; '' for the calibration's first scene."""
+    """Name of the scene; '' for the calibration's first scene."""
 
 
 class PouredPoint(DesignPoint):
@@ -108,7 +114,7 @@ class PouredPoint(DesignPoint):
     """Searched dimensions in display units."""
 
     action_si: dict[str, float]
-    """The same in SI."""
+    """Searched dimensions in SI units."""
 
     spillage: float | None
     """r = spilled / poured; None below 5 % poured, where it is undefined."""
@@ -117,30 +123,30 @@ class PouredPoint(DesignPoint):
     """Fraction of the load that left the pourer."""
 
     invalid_tries: int
-    """Actions of the same stratum that could not be made."""
+    """Number of actions of the same stratum that were impossible."""
 
 
 class GivenUpPoint(DesignPoint):
-    """A pour that could not be made, or was not weighed."""
+    """A pour that was impossible or was not weighed."""
 
     given_up: str
-    """Why."""
+    """The reason."""
 
 
 class SimulatedPoint(ResultPart):
-    """A simulation that an active design made in a scene of the calibration, which C4 learns from as well."""
+    """A simulation by an active design in a scene of the calibration; C4 learns from it as well."""
 
     theta: dict[str, float]
     """Searched parameters."""
 
     scene: str
-    """Where."""
+    """Name of the scene."""
 
     action_si: dict[str, float]
     """Searched dimensions of the action."""
 
     spillage: float
-    """c_s."""
+    """Simulated spillage c_s."""
 
 
 class DesignPoured(StageResult):
@@ -149,14 +155,14 @@ class DesignPoured(StageResult):
     kind: Literal["pours"] = "pours"
 
     pours: tuple[PouredPoint | GivenUpPoint, ...]
-    """In the order made."""
+    """The pours in the order made."""
 
     simulated: tuple[SimulatedPoint, ...] = ()
-    """What an active design simulated in the calibration's scenes."""
+    """Simulations of an active design in the calibration's scenes."""
 
     @property
     def measured(self) -> tuple[PouredPoint, ...]:
-        """Those that were weighed."""
+        """The pours that were weighed."""
         return tuple(pour for pour in self.pours if isinstance(pour, PouredPoint))
 
 
@@ -175,9 +181,9 @@ class _Planned:
 class DesignedPours:
     """Weigh a stratified set of pours: two actions from each of 4×4 strata, as in the paper, or a Latin hypercube.
 
-    An action that turns out to be invalid (touching vessels) is replaced by another of its stratum; a stratum without
-    a possible action is given up after `MAX_TRIES`. A pour that failed is not repeated: its liquid is gone, and the
-    design loses one point.
+    An invalid action (touching vessels) is replaced by another one of its stratum. A stratum without a possible action
+    is given up after `MAX_TRIES` tries. A failed pour is not repeated, because its liquid is lost; the design loses one
+    point.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 4.1 (32 actions, stratified; 28 train, 4 test).
     """
@@ -194,13 +200,13 @@ class DesignedPours:
         constraints: Sequence[Linear] = (),
         tested: Sequence[Scene] = (),
     ) -> None:
-        """Plan.
+        """Plan the pours.
 
         Args:
-            scenes: into which pours are made by turns, train and test each; at least one.
-            points: the actions themselves, in the unit cube, in place of drawn ones: pours that are to be repeated.
-            constraints: that the actions meet, if drawn.
-            tested: scenes of the pours that are kept for testing, by turns; none: the same.
+            scenes: scenes between which the pours alternate, train and test separately; at least one.
+            points: actions in the unit cube to repeat instead of drawing new ones.
+            constraints: constraints on drawn actions.
+            tested: scenes between which the pours kept for testing alternate; empty: `scenes`.
         """
         self._actions = actions
         self._seeds = SeedStream(seed, "design")
@@ -231,7 +237,7 @@ class DesignedPours:
         return tuple(p.measured for p in self._planned if p.measured is not None)
 
     def ask(self, slots: Slots) -> list[Request]:
-        """The next pour, if none is under way."""
+        """Return the next pour, if none is running."""
         if self.finished or self._pouring is not None or slots.pours < 1:
             return []
         planned = self._planned[self._current]
@@ -249,7 +255,7 @@ class DesignedPours:
         return [self._pouring]
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """What the balance said, or why there is nothing to say."""
+        """Record the weights of a pour, or the reason of its failure."""
         if self._pouring is None or request != self._pouring:
             raise ValueError(f"this pour was not asked for: {request}")
         self._pouring = None
@@ -273,7 +279,7 @@ class DesignedPours:
         self._current += 1
 
     def progress(self) -> Progress:
-        """Pours done, pours in all."""
+        """Pours done, and their total number."""
         return Progress(pours=self._current, of_pours=len(self._planned))
 
     def result(self) -> DesignPoured:

@@ -1,1 +1,1 @@
-"""Deployment (D1 to D3): how to pour into a vessel, planned in simulation, learnt on real pours, or both."""
+"""Deployment strategies D1 to D3: pour into a vessel, based on simulations, on real pours, or on both."""

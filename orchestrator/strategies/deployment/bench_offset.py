@@ -1,6 +1,10 @@
-"""How far a bench may differ from what it is believed to be, by the units of what is searched.
+"""Offsets between a bench and the simulator, and the selection of simulations for a query.
 
-Which simulations a question carries where there are too many for a quick answer.
+- `play_of` returns the assumed deviation of each searched dimension, which depends on its unit.
+- `displacement` converts nuisances of a bench to an offset of the action.
+- `thinned` subsamples observations if there are too many for a fast answer.
+
+The types `Play` and `BenchOffset` belong to the optimiser's queries (`actors.optimizer.questions`).
 """
 
 from __future__ import annotations
@@ -16,36 +20,36 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
 
 LENGTH = 0.010
-"""Deviation of where something stands [m]: a receiver is placed by hand."""
+"""Standard deviation of a position [m]; receivers are placed by hand."""
 
 ANGLE = 2.0 * DEG
-"""Deviation of a tilt [rad]."""
+"""Standard deviation of a tilt [rad]."""
 
 CLOCK = 0.05
-"""Relative deviation of a speed, an acceleration or a time."""
+"""Relative standard deviation of a speed, an acceleration or a time."""
 
 UNKNOWN = 0.1
-"""Deviation of what has no unit of these, as a share of the searched range."""
+"""Standard deviation of a dimension with any other unit, as a fraction of the searched range."""
 
 
 def play_of(actions: Space) -> tuple[Play, ...]:
-    """The play of each searched dimension."""
+    """Assumed deviation of each searched dimension."""
     return tuple(_play(axis) for axis in actions.axes)
 
 
 def displacement(believed: SimulationParameters, bench: SimulationParameters, actions: Space) -> BenchOffset:
-    """Where a simulator with one set of nuisances does what a bench with another one does.
+    """Offset at which a simulator with one set of nuisances behaves like a bench with another set.
 
     Nuisances of dimensions that are not searched are left to the rest of the model.
 
     Args:
-        believed: what the simulator has.
-        bench: what the bench may have.
+        believed: parameters of the simulator.
+        bench: possible parameters of the bench.
     """
     scales, shifts = [], []
     moved = {
         "x_offset": bench.receiver_x - believed.receiver_x,
-        "y_offset": believed.receiver_y - bench.receiver_y,  # the receiver moves, so the pourer is off the other way
+        "y_offset": believed.receiver_y - bench.receiver_y,  # the receiver moves, which shifts the pourer the other way
         "height": believed.receiver_z - bench.receiver_z,
         "max_angle": bench.tilt_zero - believed.tilt_zero,
     }
@@ -66,7 +70,7 @@ def displacement(believed: SimulationParameters, bench: SimulationParameters, ac
 def _play(axis: Axis) -> Play:
     dimension = ACTION_DIMENSIONS.get(axis.name)
     unit = "" if dimension is None else dimension.unit
-    if axis.scale == "log":  # a factor is a shift there
+    if axis.scale == "log":  # a factor is a shift on a logarithmic axis
         return Play(shift=CLOCK / math.log(axis.upper / axis.lower) if unit not in ("m", "rad", "") else UNKNOWN)
     width = axis.upper - axis.lower
     match unit:
@@ -81,10 +85,10 @@ def _play(axis: Axis) -> Play:
 
 
 def thinned(data: Data, around: Sequence[Point], most: int) -> Data:
-    """At most `most` observations: half of them those nearest to some places, the others spread over the rest.
+    """Select at most `most` observations: half of them nearest to `around`, the others spread over the rest.
 
-    They are chosen by where they are and never by what they came to: leaving out high costs would make the others
-    look better than they are.
+    The selection depends on the points and never on the costs. Leaving out high costs would bias the remaining
+    observations towards low costs.
     """
     if len(data) <= most:
         return data

@@ -1,4 +1,7 @@
-"""What a deployment recommends, poured again: by pours that took no part in choosing it."""
+"""Confirmation: repetitions of the action that a deployment recommends, independent of its selection.
+
+`Confirmation` requests the pours; `Confirmed` is its result. It does not change the recommendation.
+"""
 
 from __future__ import annotations
 
@@ -21,26 +24,26 @@ class ConfirmingPour(ResultPart):
     """A pour of the recommended action."""
 
     number: int
-    """From 1."""
+    """Number of the pour, from 1."""
 
     failed: str
-    """Why nothing was weighed; '' where it was."""
+    """Reason why nothing was weighed; '' if it was weighed."""
 
     loss: float | None
-    """In its own unit; None where nothing was weighed."""
+    """Loss in its own unit; None if nothing was weighed."""
 
     spillage: float | None
-    """r = spilled / poured; None below 5 % poured, and where nothing was weighed."""
+    """r = spilled / poured; None below 5 % poured, and if nothing was weighed."""
 
     delivered_g: float | None
-    """In the receiver."""
+    """Mass in the receiver [g]."""
 
     delivered_ml: float | None
-    """The same by the liquid's density."""
+    """The same as a volume [ml], from the liquid's density."""
 
 
 class Confirmed(StageResult):
-    """How the recommended action pours, without the luck of having been chosen."""
+    """Losses of the recommended action, without the bias of its selection."""
 
     kind: Literal["confirmation"] = "confirmation"
 
@@ -48,34 +51,34 @@ class Confirmed(StageResult):
     """Name of the scene."""
 
     pours: tuple[ConfirmingPour, ...]
-    """All that are over, in the order made."""
+    """All completed pours, in the order made."""
 
     loss: SampleStatistics | None
-    """Mean of those that were weighed, and how much one of them differs from it; None without any."""
+    """Mean and scatter of the weighed pours; None without any."""
 
     delivered_g: SampleStatistics | None
-    """The same of what was in the receiver."""
+    """Mean and scatter of the mass in the receiver [g]."""
 
     delivered_ml: float | None
-    """Mean of that by the liquid's density."""
+    """Mean volume in the receiver [ml], from the liquid's density."""
 
 
 class Confirmation:
-    """Pour what a deployment recommends some more times.
+    """Repeat the pour that a deployment recommends.
 
-    The least loss that was measured is the luckiest of several pours. Pours of the recommended action that come after
-    the choice tell what to expect of it. One that goes wrong is kept as that, and the next one is made; where the
-    action is refused, there is no next one.
+    The smallest of several measured losses is biased low. Pours after the selection give an unbiased estimate of the
+    recommended action's loss. A failed pour is recorded as failed, and the next one is made. If the action is refused,
+    no further pour is made.
     """
 
     def __init__(self, costing: Costing, recommended: Recommended | None, count: int, seed: int) -> None:
-        """Plan.
+        """Plan the pours.
 
         Args:
             costing: scene and loss of the deployment.
-            recommended: None: nothing was recommended, and nothing is poured.
-            count: pours to make.
-            seed: of a virtual bench's chance.
+            recommended: the recommendation; with None, nothing is poured.
+            count: number of pours.
+            seed: seed of a virtual bench's random numbers.
         """
         self._costing = costing
         self._recommended = recommended
@@ -89,11 +92,11 @@ class Confirmation:
 
     @property
     def finished(self) -> bool:
-        """All pours are over."""
+        """Whether all pours are completed."""
         return len(self._pours) >= self._count
 
     def ask(self, slots: Slots) -> list[Request]:
-        """The next pour, if none is under way."""
+        """Return the next pour, if none is running."""
         recommended = self._recommended
         if recommended is None or self.finished or self._pouring is not None or slots.pours < 1:
             return []
@@ -106,10 +109,10 @@ class Confirmation:
         return [self._pouring]
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """What came of a pour.
+        """Record the outcome of a pour.
 
         Raises:
-            ValueError: it was not asked for.
+            ValueError: the pour was not requested.
         """
         pour = self._pouring
         if pour is None or request != pour:
@@ -140,11 +143,11 @@ class Confirmation:
         )
 
     def progress(self) -> Progress:
-        """Pours made, and in all."""
+        """Pours made, and their total number."""
         return Progress(pours=len(self._pours), of_pours=self._count)
 
     def result(self) -> Confirmed:
-        """What came of the pours so far."""
+        """Outcomes of the pours so far."""
         weighed = [pour for pour in self._pours if not pour.failed]
         volume = SampleStatistics.of([pour.delivered_ml for pour in weighed if pour.delivered_ml is not None])
         return Confirmed(

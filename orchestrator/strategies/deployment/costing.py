@@ -1,6 +1,9 @@
-"""From outcomes to the number that deployment minimises.
+"""Costs of outcomes: the minimised loss, and the time that pours and simulations take.
 
-What a pour and a simulation cost in seconds, and so what is worth its time: no clock, only what was told.
+- `Costing` converts outcomes to the number that deployment minimises.
+- `Prices` compares pours and simulations by their value per second.
+
+The module has no clock; durations come from settings and outcomes.
 """
 
 from __future__ import annotations
@@ -26,11 +29,11 @@ from sim_engine.settings.quantity import Quantity
 
 @dataclass(frozen=True)
 class Costing:
-    """A loss, or objectives, in a scene. A loss is a vector of one number.
+    """A loss, or objectives, in a scene. A loss is treated as a vector with one element.
 
     Attributes:
         parameters: θ_s of the simulations; their number of particles is the unit of the loss `particles`.
-        objectives: in place of the loss, with the action space that they are searched in.
+        objectives: objectives that replace the loss, with the action space that they are searched in.
     """
 
     loss: Loss
@@ -40,15 +43,15 @@ class Costing:
 
     @classmethod
     def of(cls, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters) -> Costing:
-        """What a plan minimises in one of its scenes."""
+        """Costing of a plan in one of its scenes."""
         objectives = None if plan.objectives is None else (plan.objectives, plan.actions)
         return cls(plan.loss, scene, parameters, objectives)
 
     @cached_property
     def worst_vector(self) -> Vector:
-        """The worst that can happen: everything spilled, or nothing poured, whichever is more.
+        """Worst possible costs: everything spilled or nothing poured, whichever is larger.
 
-        It stands for pours that failed, so that the optimiser keeps away.
+        They are assigned to failed pours, so that the optimiser avoids such actions.
         """
         if self.objectives is not None:
             return tuple(2.0 * value for value in self.limits)
@@ -58,7 +61,7 @@ class Costing:
 
     @property
     def worst(self) -> float:
-        """The number that is minimised at `worst_vector`."""
+        """The minimised number at `worst_vector`."""
         return self.total(self.worst_vector)
 
     @cached_property
@@ -70,7 +73,7 @@ class Costing:
         return objectives.worst(self.scene, actions)
 
     def simulated(self, outcome: Outcome, action: Action) -> Vector | None:
-        """Costs of a simulation: worst for an action that can't be made, None where it failed or is not to be used."""
+        """Costs of a simulation: the worst for an impossible action, None if it failed or is unusable."""
         match outcome:
             case Simulated(result) if result.invalid is None and is_sound(result.fractions):
                 return self._vector(result.fractions, action)
@@ -84,7 +87,7 @@ class Costing:
         return self._vector(measurement.fractions, action)
 
     def total(self, vector: Vector) -> float:
-        """The one number that is minimised."""
+        """The number that is minimised."""
         return vector[0] if self.objectives is None else self.objectives[0].total(vector)
 
     def _vector(self, fractions: Fractions, action: Action) -> Vector:
@@ -99,27 +102,28 @@ class Costing:
 
 
 LEARNT_FROM = 25
-"""Latest simulations whose median is their price: one that was slow by accident changes nothing."""
+"""Number of latest simulations whose median is the cost of a simulation; the median ignores single slow ones."""
 
 
 class PricesSettings(Section):
-    """D3 with `per_pour: free`: what things cost, by which simulations are chosen and ended."""
+    """D3 with `per_pour: free`: costs by which simulations are chosen and ended."""
 
     pour: Annotated[float, Quantity("s", "90 s", 0.0, 86400.0, positive=True)] = 90.0
-    """Time that a pour takes, refilling and wiping included."""
+    """Duration of a pour, including refilling and wiping."""
 
     simulation: Annotated[float, Quantity("s", "2 s", 0.0, 3600.0, positive=True)] = 2.0
-    """CPU time of a simulation, until their outcomes tell."""
+    """CPU time of a simulation, used until outcomes provide it."""
 
     worth: Annotated[float, Quantity("1", "0.005", 0.0, 1.0)] = 0.005
-    """Share of the worst loss: where all simulations that fit beside a pour promise less together, the pool rests."""
+    """Fraction of the worst loss. If all simulations that fit into one pour promise less in total, the workers stay
+    idle."""
 
 
 class Prices:
-    """Values in the loss' unit, over seconds of the wall clock.
+    """Compares values in the unit of the loss per second of wall time.
 
-    The price of a pour is a setting. That of a simulation is learnt from the CPU seconds in outcomes, which are
-    journalled, so that a replay learns the same.
+    The duration of a pour is a setting. The duration of a simulation is estimated from the CPU seconds in outcomes.
+    They are part of the journal, so that a replay yields the same estimate.
     """
 
     def __init__(self, settings: PricesSettings, worst: float) -> None:
@@ -127,23 +131,23 @@ class Prices:
         self._seen: deque[float] = deque(maxlen=LEARNT_FROM)
 
     def learn(self, seconds: float) -> None:
-        """A simulation took so many CPU seconds."""
+        """Record the CPU seconds of a simulation."""
         if seconds > 0.0:
             self._seen.append(seconds)
 
     @property
     def pour(self) -> float:
-        """Seconds that a pour takes."""
+        """Duration of a pour [s]."""
         return self._settings.pour
 
     def simulation(self, width: int) -> float:
-        """Seconds from one simulated outcome to the next with `width` of them at a time."""
+        """Seconds between two simulated outcomes with `width` simulations in parallel."""
         return (statistics.median(self._seen) if self._seen else self._settings.simulation) / max(width, 1)
 
     def prefers_pour(self, simulation: float, pour: float, width: int) -> bool:
-        """Whether a pour is worth more per second than a simulation, given what each is worth."""
+        """Whether a pour has more value per second than a simulation, given the value of each."""
         return simulation / self.simulation(width) <= pour / self.pour
 
     def is_idle(self, simulation: float, width: int) -> bool:
-        """Whether as many simulations as fit beside a pour are worth next to nothing together, given what one is."""
+        """Whether the simulations that fit into one pour have a negligible total value, given the value of one."""
         return simulation * self.pour / self.simulation(width) < self._settings.worth * self._worst

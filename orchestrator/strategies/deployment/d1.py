@@ -1,6 +1,10 @@
-"""D1: plan in simulation only.
+"""D1: plan in simulation only, then pour once.
 
-D1 where the robot misses, and θ is not known exactly: expected loss or CVaR in place of the loss of one pour.
+- `OneShotPlanning` minimises the simulated loss of one pour.
+- `RobustPlanning` minimises the expected loss or the CVaR under errors of execution and uncertain θ.
+- `D1Settings` holds the settings of both and selects one of them.
+
+D1 does not learn from real pours.
 """
 
 from __future__ import annotations
@@ -28,7 +32,8 @@ from sim_engine.scene import Scene
 from sim_engine.settings.model import PositiveSimulationCount, PourCount, Problems
 
 FEWEST_CHECKS = 2
-"""Simulations of an action that is to lie inside the safe window; `simulations_per_iteration` where that is more."""
+"""Minimum number of simulations of an action in the safe window; `simulations_per_iteration` is used if it is
+larger."""
 
 
 class D1Settings(SearchSettings):
@@ -41,19 +46,19 @@ class D1Settings(SearchSettings):
     """Plan in simulation, then pour once."""
 
     pours: PourCount = 1
-    """Whether it pours what it has planned; 0 only plans."""
+    """Whether the planned action is poured; 0 only plans."""
 
     iterations: PositiveSimulationCount | None = None
     """Iterations of the optimiser; 15 unless given, 30 with 'risk'."""
 
     simulations_per_iteration: PositiveSimulationCount = 2
-    """Simulations averaged in each, under 'risk' one as planned and the others under errors."""
+    """Simulations averaged per iteration; with 'risk', one is as planned and the others are under errors."""
 
     risk: RiskSettings | None = None
-    """Errors of execution, and of θ, that the action has to bear."""
+    """Errors of execution and of θ under which the loss is minimised."""
 
     window: WindowSettings | None = None
-    """Look for the safe window around the action, and check it by simulations."""
+    """Search for the safe window around the action, and check it by simulations."""
 
     @property
     def rounds(self) -> int:
@@ -62,21 +67,21 @@ class D1Settings(SearchSettings):
 
     @property
     def needs_posterior(self) -> bool:
-        """If the action has to bear not knowing θ."""
+        """Whether the risk includes the uncertainty of θ."""
         return self.risk is not None and self.risk.theta == "posterior"
 
     @property
     def simulations(self) -> int:
-        """Those of all iterations."""
+        """Simulations of all iterations."""
         return self.rounds * self.simulations_per_iteration
 
     @property
     def spending(self) -> str:
-        """What it spends into one receiver, in words."""
+        """The budget per receiver, as text."""
         return f"{self.rounds} iterations of {self.simulations_per_iteration} simulations, one pour"
 
     def check(self, premises: Premises, complaints: Problems) -> None:
-        """Risk and window are about a loss, and risk names something that could go wrong."""
+        """Check that risk and window are combined with a loss, and that risk names at least one error."""
         for key, value in (("risk", self.risk), ("window", self.window)):
             if value is not None and premises.objectives:
                 complaints.add("is about a loss; it can't be combined with 'objectives'", key, key=True)
@@ -88,26 +93,26 @@ class D1Settings(SearchSettings):
             complaints.add(text, "simulations_per_iteration")
 
     def draws(self, plan: DeploymentPlan, parameters: SimulationParameters, count: int, seed: int) -> Sequence[Draw]:
-        """Errors and θ that the action had to bear."""
+        """Errors and θ of the planning."""
         if self.risk is None:
             return ()
         return Disturbances(self.risk, plan.actions, parameters, seed, plan.thetas).draws(count)
 
     def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
-        """The strategy itself."""
+        """Build the strategy."""
 
         return (OneShotPlanning if self.risk is None else RobustPlanning)(plan, scene, parameters, seed)
 
 
 class OneShotPlanning(Deployment[D1Settings]):
-    """D1: minimise the simulated loss, then pour once. Needs no sensor.
+    """D1: minimise the simulated loss, then pour once. No sensor is needed.
 
-    Bayesian optimisation of f̄_s(a) = 1/m1 Σ_j f_s(a, seed_j), with m1 simulations an iteration, started at Sobol points
-    in place of random ones. The last iteration simulates the minimiser of the posterior mean over the whole box;
-    what is recommended, and poured if there is a budget for it, is the best simulated action by posterior mean: an
-    action that was at least tried in simulation, and not merely the luckiest.
+    Bayesian optimisation of f̄_s(a) = 1/m1 Σ_j f_s(a, seed_j) with m1 simulations per iteration, starting at Sobol
+    points instead of random ones. The last iteration simulates the minimiser of the posterior mean over the whole box.
+    The recommended action is the simulated action with the smallest posterior mean, and it is poured if the budget
+    allows. It has thus been simulated, and is not selected by a single low observation.
 
-    Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D1); that m1 simulations are averaged is our reading.
+    Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D1); that m1 simulations are averaged is our interpretation.
     Limitations: an error of the simulator is an error of the plan.
     """
 
@@ -118,13 +123,13 @@ class OneShotPlanning(Deployment[D1Settings]):
         self._searched: list[Trial] = []
 
     def ask(self, slots: Slots) -> list[Request]:
-        """As every deployment; checks of the window, and the pour after them, follow from no answer of the optimiser:
-        they are asked for at once."""
+        """As in the base class, except that window checks and the following pour are requested at once: they do not
+        depend on an answer of the optimiser."""
         requests = super().ask(slots)
         return requests if requests or self._window is None else super().ask(slots)
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """As every deployment; and how much each simulation spilled, whatever the loss is."""
+        """As in the base class; the spillage of each simulation is recorded as well, whatever the loss is."""
         super().tell(request, outcome)
         if (
             isinstance(request, Simulate)
@@ -138,7 +143,7 @@ class OneShotPlanning(Deployment[D1Settings]):
         done, wanted = self._spent, self._settings.rounds
         repeats = self._settings.simulations_per_iteration
         if self._width_known and self._trials.all == []:
-            # slots count simulations, a trial takes `repeats` of them
+            # slots count simulations; a trial takes `repeats` of them
             self._trials.width = math.ceil(self._trials.width / repeats)
 
         def simulate(suggestion: Suggestion) -> None:
@@ -150,9 +155,9 @@ class OneShotPlanning(Deployment[D1Settings]):
         elif self._final is not None:
             if self._pouring is not None:
                 return
-            if self._counted == 0 and self._pours_left:  # it was refused
+            if self._counted == 0 and self._pours_left:  # the pour was refused
                 self._recommend_again()
-            else:  # the one pour has been weighed
+            else:  # the only pour has been weighed
                 self._finish()
         elif len(self._trials) == 0:
             count = min(max(self._settings.initial, 1), max(wanted - 1, 1))
@@ -179,7 +184,7 @@ class OneShotPlanning(Deployment[D1Settings]):
     def _recommend(self, suggestion: Suggestion) -> None:
         self._final, self._searched = suggestion, list(self._trials.all)
         if suggestion.best_point is None:
-            self._finish()  # too few simulations succeeded; the result says how many were lost
+            self._finish()  # too few simulations succeeded; the result reports how many were lost
         elif self._settings.window is None:
             self._use(suggestion)
         else:
@@ -190,14 +195,14 @@ class OneShotPlanning(Deployment[D1Settings]):
             self._questions.put(problem, "window", lambda outline: self._outlined(window, problem, outline))
 
     def _use(self, suggestion: Suggestion) -> None:
-        """Pour what is recommended, or leave it at that."""
+        """Pour the recommended action, or finish if no pour is planned."""
         if self._plan.pours < 1 or suggestion.best_point is None:
             self._finish()
         else:
             self._pour(suggestion.best_point, self._prediction(suggestion))
 
     def _prediction(self, suggestion: Suggestion) -> Prediction | None:
-        """Prediction for the pour of what is recommended."""
+        """Prediction for the pour of the recommended action."""
         if suggestion.best_mean is None or suggestion.best_deviation is None:
             return None
         return Prediction(
@@ -207,7 +212,7 @@ class OneShotPlanning(Deployment[D1Settings]):
     # -- the safe window -------------------------------------------------------------------------------------------
 
     def _tolerated(self, share: float) -> float:
-        """A share of what spilling everything would cost, in the loss' own unit."""
+        """Tolerated loss: a fraction of the loss of spilling everything, in the unit of the loss."""
         all_spilled = self._plan.loss(
             Fractions(1.0, 1.0, 0.0),
             loaded_mass=self._scene.liquid.mass,
@@ -217,13 +222,13 @@ class OneShotPlanning(Deployment[D1Settings]):
         return share * all_spilled
 
     def _outlined(self, window: SafeWindow, problem: SuggestProblem, outline: Suggestion) -> None:
-        """The surrogate's answer for the window's places is there: go on with checks."""
+        """Continue with checks when the surrogate's answer for the window's places has arrived."""
         window.outline(outline.predictions, () if outline.risk is None else outline.risk.worst)
         self._window = window
         self._check_window(window)
 
     def _check_window(self, window: SafeWindow) -> None:
-        """Judge what was simulated of the window; simulate what is left to check, or conclude."""
+        """Evaluate the simulated checks; queue the remaining ones, or conclude."""
         if window.waiting:
             tried = self._trials.all[-len(window.waiting) :]
             for check, trial in zip(tuple(window.waiting), tried, strict=True):
@@ -238,33 +243,33 @@ class OneShotPlanning(Deployment[D1Settings]):
 
     @property
     def _checks(self) -> int:
-        """Simulations of one place."""
+        """Number of simulations per place."""
         return max(self._settings.simulations_per_iteration, FEWEST_CHECKS)
 
     def _checking(self, action: Action, worst: Sequence[int], repeats: int) -> tuple[Simulate, ...]:
-        """Simulations that tell whether an action is inside the window; `worst`: see `RiskAnswer`."""
+        """Simulations that check whether an action is inside the window; `worst`: see `RiskAnswer`."""
         return self._repeated(action, "window", repeats)
 
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
-        """Scatter of a single pour: from seed to seed, for what is observed here are means of m1 of them, and by what
-        the simulator lacks."""
+        """Scatter of a single pour: between seeds, and by the simulator's inaccuracy. The observations are means over
+        m1 seeds, so their scatter is scaled by √m1."""
         of_means = super()._scatter(suggestion, noise)
         if of_means is None or suggestion.best_mean is None:
             return None
         of_seeds = of_means * math.sqrt(self._settings.simulations_per_iteration)
-        return math.hypot(of_seeds, self._lacking(suggestion.best_mean))
+        return math.hypot(of_seeds, self._inaccuracy(suggestion.best_mean))
 
-    def _lacking(self, loss: float) -> float:
-        """How far a pour may be from its simulations by what the simulator lacks [the loss' unit]: a loss is taken for
-        spilled liquid, whose stream is shifted (`sim_engine.prediction_band`)."""
+    def _inaccuracy(self, loss: float) -> float:
+        """Deviation of a pour from its simulations caused by the simulator's inaccuracy, in the unit of the loss. The
+        loss is treated as spilled liquid whose stream is shifted (`sim_engine.prediction_band`)."""
         if self._plan.objectives is not None:
-            return 0.0  # not a loss
+            return 0.0  # objectives are not a loss
         worst, particles = self._tolerated(1.0), self._parameters.particles
         shift = lacking_shift(particles, self._plan.left_over)
         return worst * NormalDist().pdf(shift_of(loss / worst, particles)) * shift
 
     def progress(self) -> Progress:
-        """Simulations and pours done, and in all."""
+        """Simulations and pours done, and their total numbers."""
         repeats = self._settings.simulations_per_iteration
         pours = 1 if self._plan.pours else 0
         answered = self._trials.answered - repeats * self._unspent
@@ -272,7 +277,7 @@ class OneShotPlanning(Deployment[D1Settings]):
         return Progress(answered, self._settings.rounds * repeats + checks, self._counted, pours)
 
     def _spillage(self, point: Point) -> SampleStatistics | None:
-        """These seeds took part in choosing the action; `orchestrator.strategies.repeated_simulation` has fresh
+        """Statistics over seeds that took part in the selection; `orchestrator.strategies.repeated_simulation` uses new
         ones."""
         tried = [trial for trial in self._searched if trial.point == point]
         return SampleStatistics.of(
@@ -286,28 +291,27 @@ class OneShotPlanning(Deployment[D1Settings]):
 
 
 FRESH = 2
-"""Stream of draws for checks of the window; the surrogate's own, and those that are simulated, are others."""
+"""Stream of the draws for window checks, different from those of the surrogate and of the simulations."""
 
 FEWEST_DRAWS = 4
-"""With which an action that is to lie inside the safe window is simulated, unless m1 is more."""
+"""Minimum number of draws per place in the safe window; m1 is used if it is larger."""
 
 
 class RobustPlanning(OneShotPlanning):
     """D1 under disturbances: minimise the mean or the CVaR of the loss over errors of execution and θ.
 
     Every iteration simulates one action m1 times: first as planned with θ*, then under the next draws of a quasi-random
-    sequence. A GP of the single losses, over what was executed, pools them over all actions; what it minimises is the
-    measure of its mean over the same J draws for every action (`actors.optimizer.risk_measures`). The raw CVaR of m1
-    losses
-    would be their worst one: biased, and mostly luck.
+    sequence. A GP of the single losses over executed actions pools the data of all actions. The minimised quantity is
+    the measure of its mean over the same J draws for every action (`actors.optimizer.risk_measures`). The raw CVaR of
+    m1 losses would equal their maximum, which is biased and has a large variance.
 
-    Cups that touch under an error are the worst loss of that draw: that is the risk. Cups that touch as planned make
-    the action one that is never recommended.
+    Cups that touch under an error give this draw the worst loss. An action with which the cups touch as planned is
+    never recommended.
 
-    Source: Cakmak et al., Bayesian optimization of risk measures, 2020; beside the raw measures of m1 draws in
-        docs/how-it-works.md.
-    Limitations: errors are normal and independent of each other, and drawn once for a whole pour; what the simulator
-        lacks at any θ is not among them.
+    Source: Cakmak et al., Bayesian optimization of risk measures, 2020; docs/how-it-works.md compares it with the raw
+    measures of m1 draws.
+    Limitations: errors are normal and independent, and drawn once for a whole pour. Inaccuracies that the simulator has
+    for every θ are not included.
     """
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
@@ -325,12 +329,12 @@ class RobustPlanning(OneShotPlanning):
     # -- asking ----------------------------------------------------------------------------------------------------
 
     def _repeated(self, action: Action, purpose: str, repeats: int) -> tuple[Simulate, ...]:
-        """As planned, and under the sequence's next draws."""
+        """One simulation as planned, and the others under the sequence's next draws."""
         begin, self._used = self._used, self._used + repeats - 1
         return self._under(action, purpose, [self._disturbances.nominal, *self._sequence[begin : self._used]])
 
     def _outlined(self, window: SafeWindow, problem: SuggestProblem, outline: Suggestion) -> None:
-        """For a mean, what the surrogate expects of just the draws that checks are made with has to be known, too."""
+        """For the mean, the surrogate's expectation over the draws of the checks is needed, too."""
         if problem.risk is None or problem.risk.level > 0.0:
             super()._outlined(window, problem, outline)
             return
@@ -351,8 +355,8 @@ class RobustPlanning(OneShotPlanning):
         return self._disturbances.draws(self._checks, FRESH)
 
     def _checking(self, action: Action, worst: Sequence[int], repeats: int) -> tuple[Simulate, ...]:
-        """For a mean, the same few draws at every place; for CVaR, some of those that the surrogate has for the worst:
-        the mean over any choice of as large a share of all is no more than CVaR."""
+        """For the mean, the same few draws at every place. For CVaR, draws that are the worst according to the
+        surrogate: the mean over any subset of this share of all draws is at most CVaR."""
         if not worst:
             return self._under(action, "window", self._check_draws)
         tried = self._disturbances.tried(max(worst) + 1)
@@ -367,7 +371,7 @@ class RobustPlanning(OneShotPlanning):
         return tuple(requests)
 
     def _simulated(self, *, everything: bool = False) -> Data:
-        """Single losses, where the surrogate sees them: at what was executed."""
+        """Single losses at the executed actions, where the surrogate observes them."""
         data = Data()
         for trial in self._trials.counting(everything=everything):
             for index, request in enumerate(trial.requests):
@@ -383,7 +387,7 @@ class RobustPlanning(OneShotPlanning):
         return replace(problem, risk=self._disturbances.risk, predict_at=places)
 
     def _allowed(self, *, everything: bool) -> tuple[Point, ...]:
-        """Tried actions that may be recommended: something came of them, and their cups don't touch as planned."""
+        """Tried actions that may be recommended: they have a cost, and the cups do not touch as planned."""
         tried = [t for t in self._trials.counting(everything=everything) if t.cost is not None]
         return tuple(dict.fromkeys(t.point for t in tried if t.requests[0].action not in self._touching))
 
@@ -393,10 +397,10 @@ class RobustPlanning(OneShotPlanning):
             suggestion = replace(suggestion, best_point=None)
         super()._recommend(suggestion)
 
-    # -- listening -------------------------------------------------------------------------------------------------
+    # -- outcomes --------------------------------------------------------------------------------------------------
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """As D1; cups that touch without an error rule the action out."""
+        """As in D1; cups that touch without an error exclude the action."""
         super().tell(request, outcome)
         match request, outcome:
             case Simulate(action=action, pose_error=None), Failed(kind="invalid_action"):
@@ -405,21 +409,21 @@ class RobustPlanning(OneShotPlanning):
     # -- results ---------------------------------------------------------------------------------------------------
 
     def _prediction(self, suggestion: Suggestion) -> Prediction | None:
-        """Prediction for one pour: the mean over the disturbances, whatever was minimised, and their spread."""
+        """Prediction for one pour: mean and scatter over the disturbances, whatever measure is minimised."""
         known = self._answer(suggestion)
         if known is None or suggestion.best_deviation is None:
             return None
         return Prediction(known[0], suggestion.best_deviation, self._scatter(suggestion, suggestion.best_noise))
 
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
-        """Scatter of a single pour: from seed to seed, from one error and θ to the next, by what simulations lack."""
+        """Scatter of a single pour: between seeds, between errors and θ, and by the simulator's inaccuracy."""
         of_seeds, known = Deployment._scatter(self, suggestion, noise), self._answer(suggestion)
         if of_seeds is None or known is None:
             return None
-        return math.hypot(of_seeds, known[1], self._lacking(known[0]))
+        return math.hypot(of_seeds, known[1], self._inaccuracy(known[0]))
 
     def _answer(self, suggestion: Suggestion) -> tuple[float, float] | None:
-        """Mean and standard deviation over the disturbances, of what is recommended."""
+        """Mean and standard deviation over the disturbances for the recommended action."""
         if suggestion.risk is None or suggestion.best_point is None:
             return None
         index = min(range(len(suggestion.predictions)), key=suggestion.predictions.__getitem__)
@@ -432,7 +436,7 @@ class RobustPlanning(OneShotPlanning):
         return super()._gave_up
 
     def _risk_found(self, final: Suggestion) -> RiskFound | None:
-        """The measure, and mean and spread over the disturbances."""
+        """The measure, and mean and scatter over the disturbances."""
         known = self._answer(final)
         if known is None or final.best_mean is None:
             return None

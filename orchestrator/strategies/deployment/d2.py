@@ -1,4 +1,4 @@
-"""D2: learn from real pours only."""
+"""D2: learn from real pours only, without simulation. `D2Settings` holds the settings, `RealOnly` is the strategy."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from sim_engine.scene import Scene
 
 
 class D2Settings(SearchSettings):
-    """D2: learn on real pours."""
+    """D2: learn from real pours."""
 
     required: ClassVar[dict[str, str]] = {"strategy": "D2"}
     simulates: ClassVar[bool] = False
 
     strategy: Literal["D2"] = "D2"
-    """Learn on real pours."""
+    """Learn from real pours."""
 
     mean: Literal["constant", "zero"] = "constant"
-    """Prior mean of the surrogate; the paper's is 'zero'."""
+    """Prior mean of the surrogate; the paper uses 'zero'."""
 
     def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
-        """The strategy itself."""
+        """Build the strategy."""
         return RealOnly(plan, scene, parameters, seed)
 
 
 class RealOnly(Deployment[D2Settings]):
-    """D2: Bayesian optimisation on weighed pours, without simulation: the baseline.
+    """D2: Bayesian optimisation on weighed pours, without simulation; the baseline.
 
-    The surrogate has a constant mean by default; `mean: zero` is the paper's. On a cost in [0, 1] that is minimised, a
-    zero mean takes everything unexplored for perfect and explores corners for ever.
+    The surrogate has a constant mean by default; the paper uses `mean: zero`. For a minimised cost in [0, 1], a zero
+    mean rates every unexplored action as perfect, so that the search explores corners without end.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D2).
     """
@@ -46,7 +46,7 @@ class RealOnly(Deployment[D2Settings]):
             made = [p for p in self._pours if p.status != "refused"]
             known = [*(point for point, _ in self._former), *(p.point for p in made)]
             if len(known) < min(self._settings.initial, self._plan.pours):
-                # one Sobol sequence, point by point, each far from those poured
+                # one Sobol sequence, point by point, each far from the points already poured
                 tried = Data(tuple(known), tuple(0.0 for _ in known))
                 self._questions.put(self._problem(tried, acquisition="sobol"), "start", self._start)
             else:

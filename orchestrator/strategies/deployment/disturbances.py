@@ -1,4 +1,8 @@
-"""Errors of execution and θ that an action has to bear: their draws, and how a surrogate sees them."""
+"""Disturbances of a pour: errors of execution and uncertain θ, their draws, and their representation in a surrogate.
+
+`RiskSettings` holds the settings; `Disturbances` makes the draws. The risk measure itself is calculated in the
+optimiser.
+"""
 
 from __future__ import annotations
 
@@ -21,41 +25,41 @@ from sim_engine.settings.quantity import Quantity
 ERRORS = ("x", "y", "tilt", "speed_factor", "z")
 
 FARTHEST = 3.5
-"""Standard deviations beyond which no error is drawn: less than one in two thousand."""
+"""Limit of drawn errors, in standard deviations; less than one draw in two thousand exceeds it."""
 
 SLOWEST, FASTEST = 0.5, 1.5
-"""Bounds of a drawn speed factor, those of the virtual bench."""
+"""Bounds of a drawn speed factor, equal to those of the virtual bench."""
 
 WIDTH = 8.0
-"""Standard deviations on the unit interval, for what the surrogate sees beside the action. The optimiser's prior for
-lengthscales, 0.35, is then 2.8 of them: an error of one changes the spillage smoothly."""
+"""Number of standard deviations in the unit interval, for coordinates in addition to the action. The optimiser's prior
+for lengthscales, 0.35, then equals 2.8 of them: an error of one changes the spillage smoothly."""
 
 FEWEST, MOST, IN_TAIL = 32, 256, 6
-"""Draws over which the surrogate's measure is formed: at least, at most, and so many in the tail of CVaR."""
+"""Minimum and maximum number of draws for the surrogate's measure, and the number in the tail of CVaR."""
 
 
 EXACT = PoseError(speed_factor=0.0)
-"""Standard deviations of errors that are none."""
+"""Standard deviations without any error."""
 
 
 class RiskSettings(Section):
-    """Plan for a robot that misses, and for not knowing θ, in place of one pour that goes exactly as planned."""
+    """Plan for errors of execution and uncertain θ, instead of one pour that is executed exactly."""
 
     measure: Literal["expected", "cvar"] = "expected"
-    """expected: mean loss over the errors; cvar: mean over the worst share 1 − level of them."""
+    """expected: mean loss over the errors; cvar: mean over the worst fraction 1 − level of them."""
 
     level: Annotated[float, Quantity("1", "0.9", 0.01, 0.99)] | None = None
-    """cvar: between 0, the mean of all, and 1, the very worst; 0.9 unless given."""
+    """cvar: from 0, the mean of all, to 1, the single worst; 0.9 unless given."""
 
     pose_error: PoseNoiseSection = PoseNoiseSection()
     """Standard deviations of the errors, normal and independent."""
 
     theta: Literal["best", "posterior"] = "best"
-    """best: θ* alone; posterior: draws of what else fits the weighed pours, from C4 or from `--parameters`."""
+    """best: θ* alone; posterior: draws of all θ that fit the weighed pours, from C4 or from `--parameters`."""
 
     @property
     def tail(self) -> float:
-        """β, and 0 for the mean, which is CVaR at level 0."""
+        """β; 0 for the mean, which is CVaR at level 0."""
         return (0.9 if self.level is None else self.level) if self.measure == "cvar" else 0.0
 
     @property
@@ -64,7 +68,7 @@ class RiskSettings(Section):
         return PoseError(**self.pose_error.model_dump())
 
     def check(self, complaints: Problems) -> None:
-        """A level belongs to CVaR, and something has to be uncertain."""
+        """Check that a level is given for CVaR only, and that at least one quantity is uncertain."""
         if self.level is not None and self.measure != "cvar":
             complaints.add(
                 "belongs to 'measure: cvar'; remove it, or ask for cvar", "risk", "level", key=True, of="risk"
@@ -79,12 +83,12 @@ class RiskSettings(Section):
 
 
 class Disturbances:
-    """Draws of errors and θ: quasi-random, normal by the inverse of its distribution.
+    """Draws of errors and θ: quasi-random, normal by the inverse distribution function.
 
-    An error that only moves a searched dimension (x: x_offset, y: y_offset, z: height, speed: angular_velocity) is to
-    the surrogate just that, an action a little beside the one that was asked for: what is executed is what is observed.
-    So these errors cost no dimension, and every simulation tells about its neighbours. Other errors (tilt, or a
-    dimension that is not searched), and θ, are coordinates beside the action.
+    Some errors only shift a searched dimension (x: x_offset, y: y_offset, z: height, speed: angular_velocity). The
+    surrogate represents such an error as a shifted action, and observes the executed action. These errors therefore add
+    no dimension, and every simulation is informative about its neighbours. Other errors (tilt, or a dimension that is
+    not searched) and θ are additional coordinates.
 
     Source: quasi-random normal draws: Glasserman, Monte Carlo methods in financial engineering, 2003, chapter 5.
     """
@@ -97,12 +101,12 @@ class Disturbances:
         seed: int,
         thetas: tuple[SimulationParameters, ...] = (),
     ) -> None:
-        """Draw.
+        """Prepare the draws.
 
         Args:
             best: θ*.
-            seed: of the draws.
-            thetas: draws of a posterior, equally likely, used if `risk` asks for them.
+            seed: seed of the draws.
+            thetas: equally likely draws of a posterior, used if `risk` selects them.
         """
         self._tail, self._deviations = risk.tail, risk.errors
         self._actions, self._best, self._seed = actions, best, seed
@@ -113,15 +117,15 @@ class Disturbances:
 
     @property
     def nominal(self) -> Draw:
-        """As planned, with θ*."""
+        """The draw without errors, with θ*."""
         return Draw(None, self._best, (0.0,) * len(self.errors))
 
     def draws(self, count: int, stream: int = 0) -> list[Draw]:
-        """The first draws of a sequence, of which any stretch covers errors and θ evenly.
+        """The first draws of a sequence, any section of which covers errors and θ evenly.
 
         Args:
-            count: at least 1.
-            stream: which sequence; those of different streams have nothing to do with each other.
+            count: number of draws, at least 1.
+            stream: index of the sequence; different streams are independent.
         """
         dimension = len(self.errors) + bool(self._thetas)
         if dimension == 0:
@@ -143,30 +147,30 @@ class Disturbances:
             parameters = self._thetas[min(int(row[-1] * len(self._thetas)), len(self._thetas) - 1)]
         return Draw(PoseError(**drawn) if self.errors else None, parameters, z)
 
-    # -- as the surrogate sees them --------------------------------------------------------------------------------
+    # -- representation in the surrogate ---------------------------------------------------------------------------
 
     @cached_property
     def risk(self) -> Risk:
-        """What a question minimises: the same disturbances whichever the action is."""
+        """Disturbances of a query; they are the same for every action."""
         wanted = IN_TAIL / (1.0 - self._tail)
         count = min(max(2 ** math.ceil(math.log2(wanted)), FEWEST), MOST)
         return Risk(tuple(self.disturbance(draw) for draw in self.tried(count)), self._tail)
 
     def tried(self, count: int) -> list[Draw]:
-        """The draws that `risk` is made of, in its order."""
+        """The draws of `risk`, in the same order."""
         return self.draws(count, stream=1)
 
     def disturbance(self, draw: Draw) -> Disturbance:
-        """How a draw changes an action in its unit cube."""
+        """Change of an action in its unit cube caused by a draw."""
         scales, shifts = [1.0] * self._actions.dimension, [0.0] * self._actions.dimension
         error = draw.error or PoseError()
         for name, index in self._moves.items():
             scales[index], shifts[index] = _moved(self._actions.axes[index], name, error)
-        beside = [0.5 + z / WIDTH for name, z in zip(self.errors, draw.z, strict=True) if name not in self._moves]
-        return Disturbance(tuple(scales), tuple(shifts), (*beside, *self._coordinates(draw.parameters)))
+        extra = [0.5 + z / WIDTH for name, z in zip(self.errors, draw.z, strict=True) if name not in self._moves]
+        return Disturbance(tuple(scales), tuple(shifts), (*extra, *self._coordinates(draw.parameters)))
 
     def executed(self, point: Point, draw: Draw) -> Point:
-        """Where the surrogate sees a simulation of an action (in its unit cube) under a draw."""
+        """Point of the surrogate for a simulation of an action (in its unit cube) under a draw."""
         one = self.disturbance(draw)
         moved = [s * u + t for u, s, t in zip(point, one.scales, one.shifts, strict=True)]
         return (*moved, *one.context)
@@ -178,7 +182,7 @@ class Disturbances:
 
     @cached_property
     def _varying(self) -> tuple[tuple[str, float, float], ...]:
-        """Parameters that differ between the draws, with centre and spread."""
+        """Parameters that differ between the draws, with centre and standard deviation."""
         found = []
         for name in type(self._best).model_fields:
             values = [_number(theta, name) for theta in self._thetas]
@@ -188,13 +192,13 @@ class Disturbances:
 
 
 def _number(parameters: SimulationParameters, name: str) -> float:
-    """For the surrogate; a number of particles by its logarithm, for it spans decades."""
+    """Value for the surrogate; the number of particles as its logarithm, because it spans decades."""
     value = float(getattr(parameters, name))
     return math.log(value) if name == "particles" else value
 
 
 def _folded(error: str, actions: Space) -> int | None:
-    """Index of the searched axis that an error only moves; None: there is none."""
+    """Index of the searched axis that an error only shifts; None if there is none."""
     name = {"x": "x_offset", "y": "y_offset", "z": "height", "speed_factor": "angular_velocity"}.get(error)
     if name not in actions.names:
         return None
@@ -208,9 +212,9 @@ def _moved(axis: Axis, error: str, drawn: PoseError) -> tuple[float, float]:
     width = axis.upper - axis.lower
     if error == "x":
         return 1.0, drawn.x / width
-    if error == "y":  # the receiver moves, so the pourer is off the other way
+    if error == "y":  # the receiver moves, which shifts the pourer the other way
         return 1.0, -drawn.y / width
-    if error == "z":  # a receiver that stands higher: the lip is that much less above it
+    if error == "z":  # a higher receiver reduces the height of the lip above it
         return 1.0, -drawn.z / width
     if axis.scale == "log":
         return 1.0, math.log(drawn.speed_factor) / math.log(axis.upper / axis.lower)

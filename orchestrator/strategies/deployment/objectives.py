@@ -1,4 +1,10 @@
-"""Several things wanted of a pour at once: spilling little, leaving little, taking little time, pouring so much."""
+"""Several objectives of a pour: little spillage, little liquid left, short duration, a given volume.
+
+- `Objective` is the base class; `Spillage`, `Retained`, `Time` and `TargetVolume` are the built-in objectives.
+- `Objectives` combines them into a weighted sum or a Pareto front.
+
+The search for the front is in `scalarization`.
+"""
 
 from __future__ import annotations
 
@@ -20,46 +26,47 @@ if TYPE_CHECKING:
     from sim_engine.settings.model import Problems
 
 Vector = tuple[float, ...]
-"""One number for each objective, smaller is better."""
+"""One number for each objective; smaller is better."""
 
 STOPS = ("max_angle", "hold_time")
-"""Dimensions of an action that end a pour before the pourer is empty."""
+"""Dimensions of an action that can end a pour before the pourer is empty."""
 
 
 class Objective(Section):
-    """One thing wanted of a pour: dimensionless, and about 1 where it is bad.
+    """One objective of a pour: dimensionless, and about 1 for a bad pour.
 
-    A class derived from it is one objective: its settings, its equation, its worst value. It is registered at the door
-    `decant.objectives` under its `name`, a literal. It must follow from fractions, action and scene alone.
+    A derived class defines one objective: its settings, its equation and its worst value. It is registered as an entry
+    point of the group `decant.objectives` under its `name`, a literal. Its value must be a function of fractions,
+    action and scene alone.
     """
 
     tag: ClassVar[str] = "name"
     required: ClassVar[dict[str, str]] = {"name": "spillage"}
 
     name: str = ""
-    """Which objective."""
+    """Name of the objective."""
 
     weight: Annotated[float, Quantity("1", "1.0", 1e-6, 1e6)] = 1.0
-    """In the weighted sum."""
+    """Weight in the weighted sum."""
 
     @abstractmethod
     def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:
-        """f of a pour that delivers enough."""
+        """Value f of a pour that delivers enough."""
 
     def worst(self, scene: Scene, actions: Space) -> float:
         """Largest f of a pour that delivers enough."""
         return 1.0
 
     def wanted(self, scene: Scene) -> float:
-        """Share of the load that should arrive."""
+        """Fraction of the load that should arrive."""
         return 1.0
 
     def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
-        """Complain of what does not make sense in a scene, or beside the other objectives."""
+        """Add problems that the objective has in a scene or in combination with the other objectives."""
 
     @classmethod
     def unknown_tag(cls, word: str) -> str:
-        """Which plug-in would have it, if it could be loaded."""
+        """Report which plug-in has this name if it could not be loaded; otherwise an empty text."""
         objectives = resolve_name("orchestrator.strategies.strategy_registry:OBJECTIVES")
         return next((str(broken) for broken in objectives.broken if broken.name == word), "")
 
@@ -68,10 +75,10 @@ class Spillage(Objective):
     """spilled / loaded."""
 
     name: Literal["spillage"] = "spillage"
-    """Share of the load that is spilled."""
+    """Fraction of the load that is spilled."""
 
     def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:
-        """The share that is spilled."""
+        """The spilled fraction."""
         return fractions.spilled
 
 
@@ -79,14 +86,14 @@ class Retained(Objective):
     """retained / loaded."""
 
     name: Literal["retained"] = "retained"
-    """Share of the load that stays in the pourer."""
+    """Fraction of the load that stays in the pourer."""
 
     def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:
-        """The share that is retained."""
+        """The retained fraction."""
         return fractions.retained
 
     def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
-        """It contradicts a volume to stop at."""
+        """Check that there is no target volume, which contradicts this objective."""
         if "target_volume" in beside:
             text = "wants the pourer to be emptied, and target_volume what is over to stay in it; keep one of them"
             complaints.add(text)
@@ -99,19 +106,19 @@ class Time(Objective):
     """Duration of the motion."""
 
     scale: Annotated[float, Quantity("s", "10 s", 0.01, 3600.0)] = 10.0
-    """A duration that is as bad as spilling everything."""
+    """Duration that is rated like spilling everything."""
 
     def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:
         """The duration in units of the scale."""
         return duration(action) / self.scale
 
     def worst(self, scene: Scene, actions: Space) -> float:
-        """The duration of the slowest corner of the action space."""
+        """Duration of the slowest corner of the action space, in units of the scale."""
         corners = itertools.product((0.0, 1.0), repeat=actions.dimension)
         return max(duration(scene.action(actions.decode(corner))) for corner in corners) / self.scale
 
     def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
-        """The hold has to last a known time."""
+        """Check that the hold has a known duration."""
         if "hold_time" not in actions.names and scene.fixed.get("hold_time") is None:
             text = "needs a hold that lasts a known time; search hold_time, or fix it under motion ('hold_time: 1.5 s')"
             complaints.add(text)
@@ -120,35 +127,36 @@ class Time(Objective):
 class TargetVolume(Objective):
     """max(|poured − V| − tolerance, 0) / loaded + spilled / loaded, in volumes.
 
-    The tilt has to stop at the right place (`max_angle`, `hold_time`); what still drips afterwards is in the outcome.
+    The action must be able to stop the pour (`max_angle`, `hold_time`). The outcome includes liquid that drips
+    afterwards.
     """
 
     name: Literal["target_volume"] = "target_volume"
-    """Pour so much, and stop."""
+    """Pour a given volume and stop."""
 
     volume: Annotated[float, Quantity("m^3", "150 mL", 1e-7, 0.1)] | None = None
-    """What should be poured; must be given."""
+    """Volume to pour; required."""
 
     tolerance: Annotated[float, Quantity("m^3", "2 mL", 0.0, 0.1)] = 0.0
-    """By how much it may be missed."""
+    """Deviation from the volume that is not penalised."""
 
     def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:
-        """What is poured beside the target, and spilled."""
+        """Deviation of the poured volume from the target, plus the spilled volume."""
         off = abs(fractions.poured - self.wanted(scene)) - self.tolerance / scene.liquid.volume
         return max(off, 0.0) + fractions.spilled
 
     def worst(self, scene: Scene, actions: Space) -> float:
-        """Nothing poured or everything, whichever is farther off, and all of it spilled."""
+        """Nothing or everything poured, whichever is farther from the target, and all of it spilled."""
         share = self.wanted(scene)
         return max(share, 1.0 - share) + 1.0
 
     def wanted(self, scene: Scene) -> float:
-        """The target's share of the load."""
+        """Target volume as a fraction of the load."""
         assert self.volume is not None, "checked"
         return self.volume / scene.liquid.volume
 
     def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
-        """The target is loaded, and an action can stop there."""
+        """Check that the target is within the load, and that an action can stop the pour."""
         if self.volume is None:
             text = "key 'volume' is missing; add for example 'volume: 150 mL'"
             complaints.add(text, key=True, of="volume")
@@ -164,15 +172,15 @@ class TargetVolume(Objective):
 
 @dataclass(frozen=True)
 class Objectives:
-    """What deployment minimises in place of a loss: Σ w_j f_j(a), or the front of all f_j that can't be had together.
+    """Objectives that deployment minimises instead of a loss: Σ w_j f_j(a), or the Pareto front of all f_j.
 
-    Not pouring spills nothing and takes no time. So a pour that delivers less than `floor` of what is wanted (the load,
-    or the target volume) into the receiver is worse in every objective than any that does: it has each one's worst
-    value, times 1 + the share of the floor that is missing. The slope leads back to pouring.
+    Not pouring spills nothing and takes no time. A pour that delivers less than `floor` of the wanted volume (the load,
+    or the target volume) is therefore worse in every objective than any pour that delivers enough. Its values are the
+    worst ones, times 1 + the missing fraction of the floor. The slope leads the search back to pouring.
 
     Attributes:
-        floor: share that must be delivered, > 0.
-        pareto: look for the front; the weights then only choose the one action that is recommended.
+        floor: fraction that must be delivered, > 0.
+        pareto: whether the front is searched; the weights then only select the recommended action.
     """
 
     parts: tuple[Objective, ...]
@@ -185,10 +193,10 @@ class Objectives:
         return tuple(part.name for part in self.parts)
 
     def vector(self, fractions: Fractions, action: Action, scene: Scene, worst: Vector) -> Vector:
-        """f_j of a pour.
+        """Values f_j of a pour.
 
         Args:
-            worst: as `worst` gives it.
+            worst: result of `worst`.
         """
         least = self.floor * self.wanted(scene)
         delivered = max(fractions.poured - fractions.spilled, 0.0)
@@ -208,7 +216,7 @@ class Objectives:
         return sum(part.weight * value for part, value in zip(self.parts, vector, strict=True))
 
     def wanted(self, scene: Scene) -> float:
-        """Share of the load that should arrive."""
+        """Fraction of the load that should arrive."""
         return min(part.wanted(scene) for part in self.parts)
 
 
@@ -216,7 +224,7 @@ def duration(action: Action) -> float:
     """Duration of an action's motion [s].
 
     Raises:
-        ValueError: it holds until the flow ends: when that is, the vessel decides.
+        ValueError: the action holds until the flow ends, so that its duration depends on the vessel.
     """
     if action.hold_time is None:
         raise ValueError("the duration of a hold 'until_flow_ends' is not known from the action")

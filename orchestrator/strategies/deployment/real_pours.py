@@ -1,4 +1,11 @@
-"""A real pour as a deployment remembers it, and how far pours were from what was predicted."""
+"""Real pours of a deployment: their records, their conversion to data, and a check of their predictions.
+
+- `PourTrial` is a pour with its prediction and outcome; `PourRow` is its form in results.
+- `former_pours` converts pours from before the campaign.
+- `trust` compares the first pours with their predictions.
+
+The module requests no pours.
+"""
 
 from __future__ import annotations
 
@@ -21,82 +28,82 @@ from sim_engine.search_space import Space
 
 TRUST_POURS = 5
 TRUST_LIMIT = 3.0
-"""Mean |z| of the first pours above which the predictions are called untrustworthy."""
+"""Mean |z| of the first pours above which the predictions are reported as unreliable."""
 
 
 Status = Literal["pouring", "weighed", "refused", "failed"]
 
 
 class PourRow(ResultPart):
-    """A real pour of a deployment: what was chosen and expected, and what came of it."""
+    """A real pour of a deployment: its action, its prediction and its outcome."""
 
     number: int
-    """From 1; a refused one does not count, and the next one bears its number."""
+    """Number from 1; a refused pour does not count, and the next one has the same number."""
 
     status: Status
-    """'refused': an invalid action, nothing was poured. 'failed': something went wrong under way."""
+    """'refused': an invalid action, nothing was poured. 'failed': an error occurred during the pour or the weighing."""
 
     reason: str
-    """Why it was refused or failed."""
+    """Reason of the refusal or failure."""
 
     action: dict[str, float | None]
     """Searched dimensions in display units."""
 
     action_si: dict[str, float]
-    """The same in SI."""
+    """Searched dimensions in SI units."""
 
     predicted: float | None
-    """Expected loss, in the loss' own unit; None where nothing was known."""
+    """Expected loss, in the unit of the loss; None without a prediction."""
 
     predicted_deviation: float | None
-    """How well that mean is known."""
+    """Standard deviation of the expected loss."""
 
     predicted_scatter: float | None
-    """How much a single pour differs from it."""
+    """Scatter of a single pour around the expected loss."""
 
     predicted_band: tuple[float, float] | None = None
-    """Where nine pours in ten should lie; None where nothing was expected."""
+    """Interval that should contain nine pours in ten; None without a prediction."""
 
     loss: float | None
-    """In its own unit; of a failed pour the worst, where it counts."""
+    """Loss in its own unit; the worst loss for a failed pour that is penalised."""
 
     objectives: dict[str, float]
-    """Each by its name, where there are several."""
+    """Values by name of objective, if there are several."""
 
     spillage: float | None
-    """r = spilled / poured; None below 5 % poured, and where nothing was weighed."""
+    """r = spilled / poured; None below 5 % poured, and if nothing was weighed."""
 
     spilled_g: float | None
-    """Beside the receiver."""
+    """Mass outside the receiver [g]."""
 
     retained_g: float | None
-    """Left in the pourer."""
+    """Mass left in the pourer [g]."""
 
     delivered_g: float | None = None
-    """In the receiver: what is neither beside it nor left in the pourer."""
+    """Mass in the receiver [g]: neither spilled nor left in the pourer."""
 
     delivered_ml: float | None = None
-    """The same by the liquid's density."""
+    """The same as a volume [ml], from the liquid's density."""
 
 
 class Foretold(ResultPart):
-    """How far the first pours were from what was predicted."""
+    """Deviation of the first pours from their predictions."""
 
     z_scores: tuple[float, ...]
     """Weighed minus predicted loss, in standard deviations."""
 
     alarm: bool
-    """They were so far from it that the predictions should not be trusted."""
+    """Whether the deviation is so large that the predictions are unreliable."""
 
 
 @dataclass
 class PourTrial:
-    """A real pour: what was chosen and expected, and what came of it.
+    """A real pour: its action, its prediction and its outcome.
 
     Attributes:
-        cost, vector: what enters the data, as one number and as objectives; None: nothing does.
+        cost, vector: value for the data, as one number and as objectives; None: the pour adds no data.
         status: 'pouring', 'weighed', 'refused' (an invalid action: nothing was poured) or 'failed'.
-        mishap: it failed under way, as it may where the vessels touch after all.
+        mishap: whether the pour failed during its execution, for example because the vessels touched.
     """
 
     number: int
@@ -112,16 +119,16 @@ class PourTrial:
     vector: Vector | None = None
 
     def take(self, outcome: Outcome, scene: Scene, costing: Costing, *, penalised: bool) -> None:
-        """What came of it.
+        """Record the outcome.
 
         Args:
-            outcome: the answer to its request.
-            scene: it was made in.
-            costing: says what it cost.
-            penalised: a failed one enters the data with the worst cost, else not at all.
+            outcome: answer to the request.
+            scene: scene of the pour.
+            costing: converts the outcome to a cost.
+            penalised: whether a failed pour enters the data with the worst cost; otherwise it adds no data.
 
         Raises:
-            ValueError: no pour is answered so.
+            ValueError: the outcome is not one of a pour.
         """
         match outcome:
             case Poured(measurement) if not is_sound(measurement.fractions):
@@ -141,7 +148,7 @@ class PourTrial:
             self.cost, self.vector = costing.worst, costing.worst_vector
 
     def row(self, objectives: tuple[str, ...], liquid: Liquid) -> PourRow:
-        """As results have it; `objectives` are their names, where there are any, `liquid` is what was poured."""
+        """The pour's form in results; `objectives` are their names, if any, and `liquid` is the poured liquid."""
         weighed, predicted = self.measurement, self.predicted
         return PourRow(
             number=self.number,
@@ -164,7 +171,7 @@ class PourTrial:
 
 
 def expecting(text: str, prediction: Prediction) -> Decision:
-    """A decision with what is expected of it, in words and numbers."""
+    """A decision with its prediction as text and numbers."""
     expected = {"mean": prediction.mean, "sd": prediction.deviation}
     text += f"  predicted {max(prediction.mean, 0.0):.4g} ± {prediction.deviation:.2g}"
     if prediction.scatter is not None:
@@ -179,7 +186,7 @@ def expecting(text: str, prediction: Prediction) -> Decision:
 def former_pours(
     data: ExistingPours, scene: Scene, actions: Space, costing: Costing
 ) -> tuple[tuple[Point, Vector], ...]:
-    """Place and objectives of the pours of before the campaign in a scene."""
+    """Points and objectives of the pours from before the campaign in a scene."""
     found = []
     for pour in data.pours.get(scene.name, ()):
         unit = actions.encode({name: getattr(pour.action, name) for name in actions.names})
@@ -190,9 +197,9 @@ def former_pours(
 
 
 def trust(weighed: Sequence[PourTrial]) -> Foretold:
-    """How far the first pours were from what was predicted, in predicted deviations (noise included).
+    """Compare the first pours with their predictions, in predicted standard deviations (noise included).
 
-    A prior from an untrustworthy simulation makes D3 worse than no prior at all, so people should be told.
+    An inaccurate simulator makes D3 worse than no prior at all. The user is therefore warned.
     """
     scores = []
     for trial in weighed[:TRUST_POURS]:

@@ -1,4 +1,10 @@
-"""The safe window: how far one may miss the planned action, dimension by dimension, before too much is spilled."""
+"""The safe window: permitted deviations from the planned action, per dimension, within a tolerated spillage.
+
+- `SafeWindow` determines the window from a surrogate and checks it by simulations.
+- `WindowFound` is the result; `WindowSettings` holds the tolerance.
+
+The simulations are requested by the strategy that owns the window.
+"""
 
 from __future__ import annotations
 
@@ -13,32 +19,32 @@ from sim_engine.settings.model import Section
 from sim_engine.settings.quantity import Quantity
 
 PLACES = 40
-"""Between the action and the box' end, on either side of every dimension: the window's resolution."""
+"""Number of places between the action and the end of the box, on either side of every dimension: the resolution."""
 
 ROUNDS = 4
-"""Most rounds of simulations: the surrogate's outline, and bisections of what it got wrong."""
+"""Maximum number of simulation rounds: one for the surrogate's outline, the others for bisections."""
 
 Way = Literal["low", "high"]
 _WAYS: tuple[Way, Way] = ("low", "high")
 
 
 class WindowSettings(Section):
-    """How far one may miss the planned action, in each dimension, before too much is spilled."""
+    """Find the permitted deviation from the planned action in each dimension, within a tolerated loss."""
 
     required: ClassVar[dict[str, str]] = {"tolerance": "2 %"}
 
     tolerance: Annotated[float, Quantity("1", "2 %", 1e-4, 1.0)] | None = None
-    """Largest loss, as a share of what spilling the whole load would cost."""
+    """Largest tolerated loss, as a fraction of the loss of spilling the whole load."""
 
     @property
     def tolerated(self) -> float:
-        """The tolerance, which settings without a complaint have."""
+        """The tolerance; valid settings have one."""
         assert self.tolerance is not None, "required"
         return self.tolerance
 
 
 class WindowEnds(ResultPart):
-    """How far one dimension may be missed."""
+    """Permitted interval of one dimension."""
 
     low: float
     """Lower end [SI]."""
@@ -47,65 +53,65 @@ class WindowEnds(ResultPart):
     """Upper end [SI]."""
 
     cut_off: tuple[Way, ...]
-    """The ends that are the searched box'."""
+    """Ends that coincide with those of the searched box."""
 
 
 class WindowOutline(ResultPart):
-    """What the surrogate expects along one dimension."""
+    """Expected loss along one dimension, according to the surrogate."""
 
     values: tuple[float, ...]
-    """Places, upwards [SI]."""
+    """Values of the dimension, ascending [SI]."""
 
     expected: tuple[float, ...]
-    """Losses there."""
+    """Expected losses at these values."""
 
 
 class CheckedAction(ResultPart):
-    """An action that was simulated to see whether it lies inside."""
+    """An action that was simulated to check whether it is inside."""
 
     axis: str | None
-    """The dimension that is missed; None for the action itself."""
+    """The dimension that deviates; None for the action itself."""
 
     action_si: dict[str, float]
     """Searched dimensions [SI]."""
 
     loss: float | None
-    """Mean loss; None where nothing could be used."""
+    """Mean loss; None if no simulation is usable."""
 
     inside: bool
-    """Whether it passed."""
+    """Whether the action passed the check."""
 
 
 class WindowFound(ResultPart):
-    """How far one may miss the planned action, one dimension at a time."""
+    """Permitted deviations from the planned action, one dimension at a time."""
 
     tolerance: float
-    """Largest loss inside, in the loss' own unit."""
+    """Largest loss inside, in the unit of the loss."""
 
     axes: dict[str, WindowEnds]
-    """By dimension; empty if the action itself is not inside."""
+    """Intervals by dimension; empty if the action itself is not inside."""
 
     outline: dict[str, WindowOutline]
-    """By dimension."""
+    """Outlines by dimension."""
 
     display: dict[Way, dict[str, float | None]]
-    """The ends in the units of people."""
+    """The ends in display units."""
 
     checks: tuple[CheckedAction, ...]
-    """All that was simulated."""
+    """All simulated checks."""
 
     simulations: int
-    """How many that took."""
+    """Number of simulations of the checks."""
 
 
 @dataclass(frozen=True)
 class WindowCheck:
-    """An action that is simulated to see whether it lies inside.
+    """An action to be simulated to check whether it is inside.
 
     Attributes:
-        axis: name of the dimension that is missed; empty for the action itself.
-        way: in which direction.
-        place: how far, 0 … PLACES.
+        axis: name of the dimension that deviates; empty for the action itself.
+        way: direction of the deviation.
+        place: distance, 0 … PLACES.
     """
 
     point: Point
@@ -115,17 +121,17 @@ class WindowCheck:
 
     @property
     def what(self) -> str:
-        """For people."""
+        """Description for display."""
         return f"the window of {self.axis}" if self.axis else "the action itself"
 
 
 @dataclass
 class _Side:
-    """One end of one dimension's interval: places outwards from the action.
+    """One end of the interval of a dimension: places outwards from the action.
 
     Attributes:
-        edge: farthest place that is still believed to be inside.
-        passed, failed: places that were simulated.
+        edge: farthest place that is still assumed to be inside.
+        passed, failed: simulated places.
     """
 
     edge: int = 0
@@ -134,7 +140,7 @@ class _Side:
 
     @property
     def inside(self) -> int:
-        """Farthest place that passed with nothing failed before it."""
+        """Farthest place that passed, with no failed place before it."""
         nearest = min(self.failed, default=PLACES + 1)
         return max(place for place in self.passed if place < nearest)
 
@@ -152,21 +158,22 @@ class _Side:
 class SafeWindow:
     """Intervals around an action, one for each dimension with the others as planned.
 
-    The surrogate outlines them: as far as what it expects stays within the tolerance, starting from the action. Then
-    the action, both ends and the places halfway to them are simulated; an end that fails is moved halfway to
-    the farthest place that passed, until it passes or the rounds are over. What is reported ends at simulated places.
+    The surrogate provides the outline: from the action outwards, as far as its expected loss is within the tolerance.
+    Then the action, both ends and the places halfway to them are simulated. An end that fails is moved halfway to the
+    farthest place that passed, until it passes or the rounds are used up. The reported ends are always simulated
+    places.
 
-    Limitations: dimensions are missed one at a time; missing several at once, each within its interval, may spill more.
-    An interval is cut off where the searched box ends. Between the simulated places the surrogate is believed.
+    Limitations: dimensions deviate one at a time; several deviations at once, each within its interval, may spill more.
+    An interval ends at the searched box. Between the simulated places, the window relies on the surrogate.
     """
 
     def __init__(self, actions: Space, centre: Point, tolerance: float) -> None:
-        """Plan.
+        """Plan the window.
 
         Args:
             actions: searched box.
             centre: the action, in its unit cube.
-            tolerance: largest loss, in the loss' own unit.
+            tolerance: largest loss, in the unit of the loss.
         """
         self._actions, self._centre, self._tolerance = actions, centre, tolerance
         self._sides: dict[tuple[str, Way], _Side] = {(name, way): _Side() for name in actions.names for way in _WAYS}
@@ -180,25 +187,25 @@ class SafeWindow:
 
     @property
     def places(self) -> tuple[Point, ...]:
-        """Where the surrogate is asked: the action, then outwards on all sides in turn."""
+        """Points at which the surrogate is evaluated: the action, then outwards on all sides in turn."""
         return (self._centre, *(self._at(*side, place) for side in self._sides for place in range(1, PLACES + 1)))
 
     def outline(self, predictions: Sequence[float], worst: Sequence[tuple[int, ...]] = ()) -> None:
-        """Read the surrogate's answer for `places`: what it expects there, and which disturbances are the worst."""
+        """Read the surrogate's answer for `places`: the expected losses, and the indices of the worst disturbances."""
         self._worst = dict(zip(self.places, worst, strict=True)) if worst else {}
         for number, (key, side) in enumerate(self._sides.items()):
             expected = predictions[1 + number * PLACES : 1 + (number + 1) * PLACES]
             self._expected[key] = (predictions[0], *expected)
-            if self._at(*key, PLACES) == self._centre:  # the action lies at the box' end
+            if self._at(*key, PLACES) == self._centre:  # the action lies at the end of the box
                 side.edge, side.passed = PLACES, {0, PLACES, PLACES // 2}
                 continue
             side.edge = next((i for i, value in enumerate(expected) if value > self._tolerance), PLACES)
 
     def allow_for(self, expected: Sequence[float], of_few: Sequence[float]) -> None:
-        """Checks are made with few disturbances: what the surrogate expects of all, and of these few, at `places`.
+        """Correct for checks that use few disturbances: expected losses over all, and over these few, at `places`.
 
-        What is judged is simulated + expected − expected of the few: the luck of the few is allowed for, as far as the
-        surrogate knows it, and what it does not know is simulated.
+        The evaluated value is simulated + expected − expected of the few. This removes the sampling error of the few
+        disturbances as far as the surrogate predicts it; the simulation covers the rest.
 
         Source: control variates: Glasserman, Monte Carlo methods in financial engineering, 2003, chapter 4.
         """
@@ -206,11 +213,11 @@ class SafeWindow:
         self._rest = dict(zip(self.places, rest, strict=True))
 
     def worst(self, check: WindowCheck) -> tuple[int, ...]:
-        """Indices of the disturbances that are the worst there; empty without a tail."""
+        """Indices of the worst disturbances at the place; empty without a tail."""
         return self._worst.get(check.point, ())
 
     def next_checks(self) -> list[WindowCheck]:
-        """What is to be simulated now; nothing if the window is closed, which this decides."""
+        """Return the actions to simulate next. If there are none, the window is closed."""
         assert not self.waiting, "every check has to be judged first"
         centre = WindowCheck(self._centre)
         if self._round < ROUNDS and not self._fails(centre):
@@ -224,7 +231,7 @@ class SafeWindow:
         return list(self.waiting)
 
     def judge(self, check: WindowCheck, loss: float | None) -> None:
-        """What came of a check: mean loss of its simulations; None, nothing that could be used, is not a pass."""
+        """Record the mean loss of a check's simulations; None (no usable simulation) does not pass."""
         self.waiting.remove(check)
         self._losses[check] = None if loss is None else max(loss + self._rest.get(check.point, 0.0), 0.0)
         if check.axis:
@@ -242,7 +249,7 @@ class SafeWindow:
         return (*self._centre[:index], u + (end - u) * place / PLACES, *self._centre[index + 1 :])
 
     def result(self, simulations: int) -> WindowFound:
-        """What was found with that many simulations."""
+        """The window, found with this number of simulations."""
         ends: dict[Way, dict[str, float]] = {"low": {}, "high": {}}
         cut_off: dict[str, list[Way]] = {}
         if not self._fails(WindowCheck(self._centre)):
@@ -270,7 +277,7 @@ class SafeWindow:
         )
 
     def _profile(self, name: str) -> WindowOutline:
-        """What the surrogate expects along one dimension, upwards: values [SI] and losses."""
+        """Expected loss along one dimension, ascending: values [SI] and losses."""
         down, up = (list(enumerate(self._expected[name, way])) for way in _WAYS)
         low: list[tuple[Way, int, float]] = [("low", *row) for row in reversed(down[1:])]
         high: list[tuple[Way, int, float]] = [("high", *row) for row in up]

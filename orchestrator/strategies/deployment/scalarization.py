@@ -1,6 +1,9 @@
-"""Several objectives behind one question: which scalar the next action minimises, and the front that was found.
+"""Scalarization of several objectives, and the Pareto front.
 
-The front of objectives that can't all be had: what finds it, and what of a set lies on it. Pure functions.
+- `scalarised` and `undominated` are pure functions on vectors of objectives.
+- `Scalarization` keeps the objectives of the simulations, provides the data of each query and determines the front.
+
+The objectives are defined in `objectives`.
 """
 
 from __future__ import annotations
@@ -22,11 +25,11 @@ from orchestrator.strategies.trials import Trial
 from sim_engine.search_space import Space
 
 AUGMENTATION = 0.05
-"""Share of the weighted sum in a scalarisation: without it, weakly dominated points would be as good as others."""
+"""Fraction of the weighted sum in a scalarization; without it, weakly dominated points would be rated as equal."""
 
 
 def random_weights(count: int, rng: np.random.Generator) -> Vector:
-    """Weights drawn evenly from the simplex: positive, adding up to 1."""
+    """Draw weights evenly from the simplex: positive, with sum 1."""
     drawn = rng.exponential(size=count)
     return tuple(float(w) for w in drawn / drawn.sum())
 
@@ -36,9 +39,9 @@ def scalarised(
 ) -> list[float]:
     """The augmented Chebyshev function of each vector: max_j λ_j z_j + ρ Σ_j λ_j z_j.
 
-    z_j is objective j over the range of what was observed of it (`among`; the vectors themselves unless given); pours
-    that delivered too little (beyond `worst`) don't stretch the range, and come to lie above 1. Every point of the
-    front minimises it for some weights, on concave parts too, which no weighted sum reaches.
+    z_j is objective j, normalised to the range of its observations (`among`; by default the vectors themselves). Pours
+    that delivered too little (beyond `worst`) do not extend the range, and have values above 1. Every point of the
+    front minimises the function for some weights, also on concave parts, which a weighted sum cannot reach.
 
     Source: Knowles, ParEGO: a hybrid algorithm with on-line landscape approximation for expensive multiobjective
     optimization problems, IEEE Transactions on Evolutionary Computation 10, 2006.
@@ -56,7 +59,7 @@ def scalarised(
 
 
 def undominated(vectors: Sequence[Vector]) -> list[int]:
-    """Indices of the vectors that no other one beats: as good in all objectives and better in one."""
+    """Indices of the vectors that no other vector dominates: as good in all objectives and better in one."""
     values = np.array(vectors, dtype=np.float64)
     kept = []
     for i, own in enumerate(values):
@@ -67,13 +70,13 @@ def undominated(vectors: Sequence[Vector]) -> list[int]:
 
 
 Observed = Sequence[tuple[Point, Vector]]
-"""Where objectives were observed, and what they were."""
+"""Points with their observed objectives."""
 
 
 class Scalarization:
-    """Remembers the objectives of simulations, and weighs them anew for every question.
+    """Keeps the objectives of simulations, and weighs them again for every query.
 
-    Unless a front is looked for, what is minimised is always the one number of `Costing.total`.
+    Unless a front is searched, the minimised quantity is always the number of `Costing.total`.
     """
 
     def __init__(self, costing: Costing, rng: np.random.Generator) -> None:
@@ -85,7 +88,7 @@ class Scalarization:
 
     @property
     def wanted(self) -> bool:
-        """A front is looked for."""
+        """Whether a front is searched."""
         return self._costing.objectives is not None and self._costing.objectives[0].pareto
 
     @property
@@ -95,15 +98,15 @@ class Scalarization:
 
     @property
     def exploring(self) -> bool:
-        """The question minimises a random compromise, and its numbers are not losses."""
+        """Whether the query minimises a random scalarization; its numbers are not losses then."""
         return self._weights is not None
 
     def weigh(self, *, exploring: bool) -> None:
-        """Weigh for the next question: at random to explore the front, else as the campaign says."""
+        """Set the weights of the next query: random to explore the front, otherwise those of the campaign."""
         self._weights = random_weights(len(self.names), self._rng) if self.wanted and exploring else None
 
     def note(self, request: Simulate, vector: Vector | None) -> float | None:
-        """Remember what a simulation came to; its cost."""
+        """Record the objectives of a simulation and return its cost."""
         if vector is None:
             return None
         self._vectors[request] = vector
@@ -119,11 +122,11 @@ class Scalarization:
         return found
 
     def data(self, observed: Observed, among: Observed) -> Data:
-        """Observations of what the next question minimises.
+        """Observations of the quantity that the next query minimises.
 
         Args:
-            observed: what is wanted.
-            among: all that is known: its range scales the objectives.
+            observed: observations to convert.
+            among: all known observations; their range scales the objectives.
         """
         points, vectors = tuple(point for point, _ in observed), [vector for _, vector in observed]
         if self._weights is None:
@@ -140,11 +143,11 @@ class Scalarization:
         questions: OptimizerQueries,
         then: Callable[[], None],
     ) -> None:
-        """Put a question for each objective, about the tried actions; their answers make the front.
+        """Put a query for each objective at the tried actions; the answers define the front.
 
         Args:
-            problem: how one objective is regressed, given what was simulated and what was poured of it.
-            then: called once the front is known.
+            problem: builds the query of one objective from its simulated and its poured data.
+            then: called when the front is known.
         """
         candidates = self._candidates([*simulated, *poured])
         answers: dict[int, Suggestion] = {}
@@ -160,14 +163,14 @@ class Scalarization:
             questions.put(question, "front", partial(answered, j))
 
     def _candidates(self, observed: Observed) -> list[Point]:
-        """Tried actions that may be on the front: those that delivered enough."""
+        """Tried actions that can belong to the front: those that delivered enough."""
         limits = np.array(self._costing.limits) + 1e-9
         return list(dict.fromkeys(point for point, vector in observed if np.all(np.array(vector) <= limits)))
 
     def _settle(self, candidates: Sequence[Point], answers: Sequence[Suggestion], actions: Space) -> None:
-        """The front among the candidates, by each objective's posterior mean."""
+        """Set the front of the candidates, by each objective's posterior mean."""
         if any(len(answer.predictions) != len(candidates) for answer in answers):
-            self.front = []  # too little was observed for a surrogate
+            self.front = []  # too few observations for a surrogate
             return
         means = [tuple(max(answer.predictions[i], 0.0) for answer in answers) for i in range(len(candidates))]
         kept = sorted(undominated(means), key=lambda i: means[i])
@@ -186,5 +189,5 @@ class Scalarization:
 
 
 def _one(observed: Observed, index: int) -> Data:
-    """One objective alone."""
+    """Data of a single objective."""
     return Data(tuple(point for point, _ in observed), tuple(vector[index] for _, vector in observed))

@@ -1,1 +1,1 @@
-"""What a study shows: figures, tables and a page."""
+"""Report of a study: figures, tables and an HTML page."""

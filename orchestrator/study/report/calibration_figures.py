@@ -16,7 +16,7 @@ from orchestrator.study.study_plan import StudyPlan
 
 
 def draw_calibrations(study: StudyPlan, found: Gathered) -> list[Drawn]:
-    """The figures that what is there allows."""
+    """Draw all figures for which there is data."""
     known = {name: one for name, one in found.calibrated.items() if any(one.test)}
     strategies = {name: one for name, one in known.items() if name not in (UNCALIBRATED, RANDOM)}
     drawn = [_boxes(known)] if known else []
@@ -27,7 +27,7 @@ def draw_calibrations(study: StudyPlan, found: Gathered) -> list[Drawn]:
 
 
 def error(one: Estimate) -> list[list[float]]:
-    """For `errorbar`: how far down and up; nothing where there is no interval."""
+    """Distances down and up for `errorbar`; zero without an interval."""
     return [[np.nan_to_num(one.mean - one.low)], [np.nan_to_num(one.high - one.mean)]]
 
 

@@ -1,4 +1,8 @@
-"""From the results of a study's cells to the numbers that figures and tables are made of. Works with what is there."""
+"""Conversion of the results of a study's cells to the numbers of its figures and tables.
+
+`gather` collects the finished cells in a `Gathered`; an unfinished study is allowed. Intervals and tests are calculated
+in `statistics`.
+"""
 
 from __future__ import annotations
 
@@ -16,22 +20,22 @@ from orchestrator.study.study_plan import FINAL, StudyPlan, cells_of
 from orchestrator.study.study_strategies import FinalPoured
 
 RANDOM = "random θ"
-"""Label of the θ that a study draws at random, all together."""
+"""Label of the random θ of a study, which count as one strategy."""
 
 LEVEL = 100_000
-"""Apart lie the numbers of repetitions on different benches, where calibrations are compared on all of them."""
+"""Offset between the repetition numbers of different benches, if calibrations are compared on all of them."""
 
 
 @dataclass
 class Found:
-    """What one strategy found in its repetitions at the compared level.
+    """Results of one strategy in its repetitions at the compared level.
 
     Attributes:
-        test, train: |r − c_s| of every pour, one list a repetition.
-        simulations: spent by each repetition; a grid that all of them score counts whole.
-        results: of the calibration stages; none of the uncalibrated simulator.
-        numbers: of the repetitions.
-        expected: C4: [simulations, expected mean |Δ|] of every θ that was chosen, one list a repetition.
+        test, train: |r − c_s| of every pour, one list per repetition.
+        simulations: simulations of each repetition; a grid that all repetitions score counts in full.
+        results: results of the calibration stages; empty for the uncalibrated simulator.
+        numbers: numbers of the repetitions.
+        expected: C4 only: [simulations, expected mean |Δ|] of every chosen θ, one list per repetition.
     """
 
     test: list[list[float]] = field(default_factory=list)
@@ -44,7 +48,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Key:
-    """Where pours were made: level, receiver's name, label of the deployment."""
+    """Place of pours: level, name of the receiver, label of the deployment."""
 
     level: str
     receiver: str
@@ -53,7 +57,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Final:
-    """A pour of a recommended action. What could not be made has the worst loss, and counts as all spilled."""
+    """A pour of a recommended action. A pour that was not made has the worst loss and counts as all spilled."""
 
     loss: float
     spillage: float
@@ -62,16 +66,16 @@ class Final:
 
 @dataclass
 class Gathered:
-    """Everything of a study that is finished.
+    """All finished results of a study.
 
     Attributes:
-        calibrated: by label, `UNCALIBRATED` first where it is there.
-        losses: loss of every pour in order, one list a repetition; NaN where a pour gave none.
-        numbers: of these repetitions.
+        calibrated: results by label, `UNCALIBRATED` first if present.
+        losses: losses of all pours in order, one list per repetition; NaN for a pour without a loss.
+        numbers: numbers of these repetitions.
         finals: pours of the recommended action, by repetition.
-        cells, finished: how many.
-        simulations, pours: that were made.
-        cpu_s, seconds: of all cells.
+        cells, finished: number of cells, and of finished ones.
+        simulations, pours: number of simulations and pours made.
+        cpu_s, seconds: CPU time and wall time of all cells [s].
     """
 
     calibrated: dict[str, Found] = field(default_factory=dict)
@@ -86,19 +90,19 @@ class Gathered:
     seconds: float = 0.0
 
     def best_so_far(self, key: Key) -> list[list[float]]:
-        """Least loss up to each pour, one list a repetition; all as long as the longest (D1 pours once)."""
+        """Smallest loss up to each pour, one list per repetition; the lists can differ in length (D1 pours once)."""
         return [running_least(losses) for losses in self.losses.get(key, [])]
 
     def by_repetition(self, key: Key, pour: int) -> dict[int, float]:
-        """Least loss up to a pour, by the repetition's number."""
+        """Smallest loss up to a pour, by number of the repetition."""
         return dict(zip(self.numbers.get(key, []), at_pour(self.best_so_far(key), pour), strict=True))
 
 
 def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
-    """Sort what the finished cells came to.
+    """Collect the results of the finished cells.
 
     Args:
-        results: by cell, as `read_result` has them.
+        results: results by cell, as returned by `read_result`.
     """
     cells = cells_of(study)
     found = Gathered(cells=len(cells))
@@ -115,7 +119,7 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
         found.cpu_s += data.cpu_s
         found.seconds += data.seconds
         if cell.kind in ("calibration", "uncalibrated") and study.compares(cell.level):
-            # a repetition's number counts once: on each of several benches it has a number of its own
+            # repetitions on different benches count separately: each has its own number
             number = cell.repetition + LEVEL * levels.index(cell.level)
             _note_random(found.calibrated.setdefault(RANDOM, Found()), number, data)
             _note_calibration(found.calibrated.setdefault(cell.arm or UNCALIBRATED, Found()), number, data)
@@ -137,7 +141,7 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
 
 
 def _note_random(noted: Found, number: int, data: CellResult) -> None:
-    """Random θ as if they were one arm: their differences together, where a cell scored them."""
+    """Record the random θ as one arm: all their differences together, if a cell scored them."""
     pairs = [
         (pair.split, abs(pair.measured - pair.simulated))
         for pair in result_of(data.results, EVALUATION, Scores).pairs
@@ -174,7 +178,7 @@ def _losses(data: CellResult) -> list[float]:
 
 
 def running_least(values: Sequence[float]) -> list[float]:
-    """Least value up to each place; NaN before the first that is a number."""
+    """Smallest value up to each place; NaN before the first number."""
     best, running = math.nan, []
     for value in values:
         if not math.isnan(value):
@@ -184,11 +188,11 @@ def running_least(values: Sequence[float]) -> list[float]:
 
 
 def mean(values: Sequence[float]) -> float:
-    """NaN of nothing."""
+    """Mean without NaN; NaN if there is no number."""
     known = [value for value in values if not math.isnan(value)]
     return sum(known) / len(known) if known else math.nan
 
 
 def at_pour(curves: Sequence[Sequence[float]], pour: int) -> list[float]:
-    """Each repetition's value at a pour, from 1; its last one where it has fewer (D1 goes on with its one action)."""
+    """Value of each repetition at a pour, from 1; its last value if it has fewer pours (D1 repeats its only action)."""
     return [curve[min(pour, len(curve)) - 1] for curve in curves if curve]

@@ -1,6 +1,8 @@
-"""Figures of the deployments: 5a, 5b and 6 loss against pours, 7 what pays off at which prices.
+"""Figures of the deployments, and the figure, table and effects of the recommended actions.
 
-What was learnt, poured again: figure, table and effects of the actions that deployments recommend.
+- `draw_deployments`: figures 5a, 5b and 6, loss against pours, and figure 7, loss against total time at assumed costs.
+- `draw_finals`, `final_rows` and `final_effects`: repeated pours of the actions that deployments recommend.
+- `means` and `level_title` are shared by these figures.
 """
 
 from __future__ import annotations
@@ -41,14 +43,14 @@ CHECKPOINTS = (3, 9, 15)
 
 
 def draw_deployments(study: StudyPlan, found: Gathered) -> list[Drawn]:
-    """The figures that what is there allows."""
+    """Draw all figures for which there is data."""
     if not found.losses:
         return []
     return [_after_pours(study, found), _mean_of_pours(study, found), _best_so_far(study, found), _prices(study, found)]
 
 
 def places(study: StudyPlan, found: Gathered) -> tuple[list[str], list[str], list[str]]:
-    """Levels, receivers and arms of which there is something, in the study's order."""
+    """Levels, receivers and arms with data, in the order of the study."""
     levels = [level.name for level in study.levels if any(key.level == level.name for key in found.losses)]
     names = [scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes]
     receivers = [name for name in dict.fromkeys(names) if any(key.receiver == name for key in found.losses)]
@@ -57,36 +59,36 @@ def places(study: StudyPlan, found: Gathered) -> tuple[list[str], list[str], lis
 
 
 def loss_range(study: StudyPlan) -> Range:
-    """What a loss can be: a share, or anything from 0."""
+    """Range of a loss: from 0 to its largest value."""
     return (0.0, largest_loss(study.deployments[0].plan))
 
 
 def mean_loss(study: StudyPlan, losses: Sequence[float]) -> Estimate:
-    """Estimate from one loss a repetition, in the unit that people read."""
+    """Estimate from one loss per repetition, in display units."""
     return estimate(losses, loss_range(study)).scaled(deployment_unit(study.deployments[0].plan).factor)
 
 
 def most_pours(study: StudyPlan) -> int:
-    """Pours of the longest deployment."""
+    """Number of pours of the longest deployment."""
     return max(arm.plan.pours for arm in study.deployments)
 
 
 def checkpoints(study: StudyPlan, wanted: tuple[int, ...] = CHECKPOINTS) -> list[int]:
-    """Those that are reached, and the end."""
+    """The checkpoints that are reached, and the last pour."""
     return sorted({min(pour, most_pours(study)) for pour in wanted})
 
 
 def means(
     axes: Axes, groups: Sequence[str], arms: Sequence[str], of: Callable[[int, str], Estimate], least: float
 ) -> Rows:
-    """A group of means for each name, in it one for each arm, with their intervals, on a logarithmic axis.
+    """Draw a group of means for each name, with one mean per arm and its interval, on a logarithmic axis.
 
     Args:
-        of: an estimate by the number of its group and its arm.
-        least: what less is drawn at.
+        of: returns the estimate for the index of a group and an arm.
+        least: smaller values are drawn at this value.
 
     Returns:
-        Group's number, arm, and numbers of each mean.
+        Index of the group, arm, and numbers of each mean.
     """
     width, rows = 0.8 / len(arms), []
     for i in range(len(groups)):
@@ -104,7 +106,7 @@ def means(
 
 
 def _mean(axes: Axes, x: float, one: Estimate, shown: SeriesStyle, least: float, label: str) -> None:
-    """A mean and its interval; one that reaches below what is shown ends in an arrow."""
+    """Draw a mean with its interval; an interval that extends below the axis ends in an arrow."""
     if math.isnan(one.mean):
         return
     middle, low, high = (max(value, least) for value in (one.mean, one.low, one.high))
@@ -119,21 +121,21 @@ def _mean(axes: Axes, x: float, one: Estimate, shown: SeriesStyle, least: float,
 
 
 def level_note(study: StudyPlan, level: str) -> str:
-    """In what a level's bench differs from the others: 'particles 600, friction 0.05, receiver -2 mm'."""
+    """Differences of a level's bench from the others: 'particles 600, friction 0.05, receiver -2 mm'."""
     benches = {one.name: one.bench for one in study.levels}
     liquids = {name: bench.liquid.model_dump() for name, bench in benches.items()}
-    told = [
+    parts = [
         f"{name} {value:g}".replace("_", HARD_SPACE).replace(" ", HARD_SPACE)
         for name, value in liquids[level].items()
         if len({liquid[name] for liquid in liquids.values()}) > 1
     ]
     if len({bench.pose_error.x for bench in benches.values()}) > 1:
-        told.append(f"receiver{HARD_SPACE}{round(1e3 * benches[level].pose_error.x):+d}{HARD_SPACE}mm")
-    return ", ".join(told)
+        parts.append(f"receiver{HARD_SPACE}{round(1e3 * benches[level].pose_error.x):+d}{HARD_SPACE}mm")
+    return ", ".join(parts)
 
 
 def level_title(study: StudyPlan, level: str) -> str:
-    """Title of a panel: the level's name, and below it what its bench is like."""
+    """Title of a panel: the name of the level, and its bench below."""
     return "\n".join([level_words(level), *textwrap.wrap(level_note(study, level), TITLE_WIDTH)])
 
 
@@ -141,13 +143,13 @@ LEVELS = (
     "A level's mismatch says how far its bench is from the simulator, not how hard it is to pour there: each has a "
     "liquid of its own, and most may be lost at the smallest mismatch."
 )
-"""For the captions of figures that have a panel for each level."""
+"""Note in the captions of figures with one panel per level."""
 
 HARD_SPACE = "\N{NO-BREAK SPACE}"
-"""Where a title's line is not to be broken."""
+"""Space without a line break, for titles."""
 
 TITLE_WIDTH = 42
-"""Characters of a line above a panel."""
+"""Number of characters per line above a panel."""
 
 
 def _listed(numbers: Sequence[int]) -> str:
@@ -156,7 +158,7 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def least_shown(unit: LossUnit) -> float:
-    """What less is drawn at where axes are logarithmic: the last place that means something."""
+    """Smallest value on logarithmic axes: the last significant decimal place."""
     return 10.0**-unit.decimals
 
 
@@ -234,7 +236,7 @@ def _best_so_far(study: StudyPlan, found: Gathered) -> Drawn:
                 middle = [max(one.mean, least) for one in points]
                 axes.plot(numbers, middle, shown.line, color=shown.colour, label=arm, linewidth=1.7)
                 for pour in checkpoints(study):
-                    # Bars beside each other, and no bands: those of several strategies would fill the panel.
+                    # Bars next to each other instead of bands: bands of several strategies would fill the panel.
                     aside = 0.6 * ((arms.index(arm) + 0.5) / len(arms) - 0.5)
                     _mean(axes, pour + aside, points[pour - 1], shown, least, "")
             x, y = "pours" if i == len(levels) - 1 else "", f"least {unit.label}" if is_first(axes) else ""
@@ -301,7 +303,7 @@ def _prices(study: StudyPlan, found: Gathered) -> Drawn:
 def _spent(
     study: StudyPlan, found: Gathered, level: str, receivers: list[str], arm: str, simulation: float, pour: float
 ) -> tuple[list[float], list[float]]:
-    """Total time after each pour, and the least loss so far, averaged over receivers."""
+    """Total time after each pour, and the smallest loss so far, averaged over receivers."""
     settings = study.deployment(arm).plan.settings
     curves = [curve for name in receivers for curve in found.best_so_far(Key(level, name, arm))]
     length = max((len(curve) for curve in curves), default=0)
@@ -319,7 +321,7 @@ CAPTION = (
 
 
 def draw_finals(study: StudyPlan, found: Gathered) -> list[Drawn]:
-    """The figure, where anything was poured again."""
+    """Draw the figure if there are repeated pours."""
     if not found.finals:
         return []
     levels, receivers, arms = final_places(study, found)
@@ -341,7 +343,7 @@ def draw_finals(study: StudyPlan, found: Gathered) -> list[Drawn]:
 
 
 def final_places(study: StudyPlan, found: Gathered) -> tuple[list[str], list[str], list[str]]:
-    """Levels, receivers and arms of which something was poured again."""
+    """Levels, receivers and arms with repeated pours."""
     levels, receivers, arms = places(study, found)
     return (
         [name for name in levels if any(key.level == name for key in found.finals)],
@@ -351,7 +353,7 @@ def final_places(study: StudyPlan, found: Gathered) -> tuple[list[str], list[str
 
 
 def final_losses(found: Gathered, level: str, receivers: Sequence[str], arm: str) -> dict[int, float]:
-    """Mean loss of the recommended actions by repetition: over receivers, of the repetitions that have all of them."""
+    """Mean loss of the recommended actions over receivers, for each repetition that has all receivers."""
     each = [found.finals.get(Key(level, receiver, arm), {}) for receiver in receivers]
     shared = set.intersection(*map(set, each)) if each else set()
     return {n: mean([mean([pour.loss for pour in pours[n]]) for pours in each]) for n in sorted(shared)}
@@ -378,8 +380,8 @@ def final_rows(study: StudyPlan, found: Gathered) -> tuple[list[str], list[list[
 
 
 def final_pairs(arms: Sequence[str]) -> list[tuple[str, str]]:
-    """Which strategies' recommended actions are compared: D3 with D2, the paper's form and the longest D1; the paper's
-    form with D2; those of packages with D2."""
+    """Pairs of strategies whose recommended actions are compared: D3 with D2, with the paper's form and with the
+    longest D1; the paper's form with D2; strategies of packages with D2."""
     longest = max((arm for arm in arms if arm.startswith("D1-")), key=lambda arm: int(arm[3:]), default="")
     pairs = [
         ("D3", "D2"),
@@ -392,7 +394,7 @@ def final_pairs(arms: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def final_effects(study: StudyPlan, found: Gathered) -> list[tuple[str, str, list[str], Effect]]:
-    """Differences of the mean losses: which two, level, receivers, effect."""
+    """Differences of the mean losses: names of the pair, level, receivers, effect."""
     effects = []
     levels, receivers, arms = final_places(study, found)
     for first, second in final_pairs(arms):

@@ -1,4 +1,8 @@
-"""What all figures of a study have in common: colours of the strategies, panels, files."""
+"""Common elements of a study's figures: colours and line styles of the strategies, panels, legends, files.
+
+`Drawn` is one figure with its caption and numbers; `SeriesStyle` is the style of one arm. The content of the figures is
+in `calibration_figures` and `deployment_figures`.
+"""
 
 from __future__ import annotations
 
@@ -29,37 +33,37 @@ COLOURS = {
     "D3-paper": style.GOOD,
 }
 OTHERS = (style.ESCAPED, style.FALLING, style.INK)
-"""Colours of strategies that packages add."""
+"""Colours of strategies from packages."""
 
 PAPER = "-paper"
-"""End of the label of a strategy as the paper has it: dashed, its marks open."""
+"""Suffix of the label of a strategy in the paper's form: dashed line, open markers."""
 
 LINES = (":", "--", "-", "-.")
 MARKERS = ("v", "^", "<", ">")
-"""Hatches of several D1, by iterations."""
+"""Line styles and markers of several D1, by number of iterations."""
 
 MARKER = {"D1": "v", "D2": "s", "D3": "o"}
 """Marker of each strategy; calibrations have a diamond."""
 
 MOST_ABREAST = 8
-"""Entries of a legend's row."""
+"""Maximum number of entries per row of a legend."""
 
 MOST_ABREAST_OF_PANELS = 4
-"""Panels beside each other, where there are more than so many levels."""
+"""Number of panels per row if there are more levels than this."""
 
 PALEST, DARKEST = 0.45, -0.35
-"""Shades of several D1, from the fewest iterations to the most: share of white, or below zero of ink, in the colour."""
+"""Shades of several D1, from the fewest iterations to the most: fraction of white, or of ink if negative."""
 
 
 @dataclass(frozen=True)
 class SeriesStyle:
-    """How one arm is drawn; no two of a figure share it, and none is known by its colour alone that has kin.
+    """Style of one arm. The styles of a figure are distinct; related arms differ in more than colour.
 
     Attributes:
-        colour: of lines and marks.
-        line: style of its lines.
-        marker: of its means.
-        filled: whether that is filled.
+        colour: colour of lines and markers.
+        line: line style.
+        marker: marker of means.
+        filled: whether the marker is filled.
     """
 
     colour: str
@@ -69,7 +73,7 @@ class SeriesStyle:
 
     @property
     def face(self) -> str:
-        """Colour that a mark is filled with."""
+        """Fill colour of the marker."""
         return self.colour if self.filled else "white"
 
 
@@ -78,10 +82,10 @@ class Drawn:
     """One figure.
 
     Attributes:
-        name: of its files.
-        number: of its counterpart in the paper; '' without one.
-        title, caption: for people.
-        header, rows: the numbers in it, as CSV.
+        name: stem of the file names.
+        number: number of its counterpart in the paper; '' without one.
+        title, caption: displayed texts.
+        header, rows: the plotted numbers, as CSV.
     """
 
     name: str
@@ -93,14 +97,14 @@ class Drawn:
     rows: Sequence[Sequence[object]]
 
     def save(self, folder: Path) -> None:
-        """PNG, SVG and CSV."""
+        """Write PNG, SVG and CSV files."""
         with style.also_as(".svg"):
             style.save(self.figure, folder / f"{self.name}.png")
         write_csv(folder / f"{self.name}.csv", self.header, self.rows)
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """Numbers for other programs."""
+    """Write a CSV file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
@@ -109,26 +113,26 @@ def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]
 
 
 def colour(arm: str) -> str:
-    """Colour of a strategy; all D1 have one, and those of packages have one by their name."""
+    """Colour of a strategy; all D1 share one, and strategies of packages have one by their name."""
     return COLOURS.get(arm) or COLOURS.get(strategy_of(arm)) or OTHERS[sum(arm.encode()) % len(OTHERS)]
 
 
 def is_ours(arm: str) -> bool:
-    """Whether an arm is one of Decant's own strategies, or its uncalibrated simulator."""
+    """Whether an arm is a built-in strategy or the uncalibrated simulator."""
     return arm in COLOURS or strategy_of(arm) in COLOURS
 
 
 def strategy_of(arm: str) -> str:
-    """The strategy of an arm's label: 'D1' of 'D1-15', 'D3' of 'D3-paper'."""
+    """Strategy of an arm's label: 'D1' of 'D1-15', 'D3' of 'D3-paper'."""
     return arm.split("-", maxsplit=1)[0]
 
 
 def look(arm: str, arms: Sequence[str]) -> SeriesStyle:
-    """How an arm is drawn beside others.
+    """Style of an arm in a figure with other arms.
 
     Args:
-        arm: its label.
-        arms: all of the figure, this one among them.
+        arm: label of the arm.
+        arms: labels of all arms of the figure, including this one.
     """
     marker = MARKER.get(strategy_of(arm), "D")
     if arm.endswith(PAPER):
@@ -147,7 +151,7 @@ def _iterations(arm: str) -> int | None:
 
 
 def _shade(colour: str, share: float) -> str:
-    """A colour with so much white in it, or ink where the share is negative."""
+    """Mix a colour with white, or with ink if the fraction is negative."""
     from matplotlib.colors import to_hex, to_rgb
 
     (r, g, b), other = to_rgb(colour), to_rgb("white" if share > 0 else style.INK)
@@ -156,7 +160,7 @@ def _shade(colour: str, share: float) -> str:
 
 
 def log_axis(axis: Axis, *, decades: bool = False) -> None:
-    """A logarithmic axis whose ticks are numbers that people read: 0.5, 1, 2, 5, 10; or `decades` alone."""
+    """Set a logarithmic axis with readable ticks: 0.5, 1, 2, 5, 10; or `decades` alone."""
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
     axes = axis.axes
@@ -167,18 +171,18 @@ def log_axis(axis: Axis, *, decades: bool = False) -> None:
 
 
 def level_words(*levels: str) -> str:
-    """'small, large mismatch' of levels 'small' and 'large'; numbered benches are called as they are: 'bench3'."""
+    """'small, large mismatch' for levels 'small' and 'large'; numbered benches keep their names: 'bench3'."""
     return ", ".join(levels) + ("" if levels[-1][-1:].isdigit() else " mismatch")
 
 
 def level_panels(
     levels: Sequence[str], across: int = 1, *, width: float = 3.6, height: float = 4.2
 ) -> tuple[Figure, list[list[Axes]]]:
-    """A figure with panels for each level, and these: `across` of them for each one, in as many rows as it takes.
+    """Make a figure and its panels: `across` panels for each level, in as many rows as needed.
 
     Args:
-        across: panels of a level.
-        width, height: of a panel, with its share of the margins [inch].
+        across: panels per level.
+        width, height: size of a panel including its share of the margins [inch].
     """
     few = len(levels) <= MOST_ABREAST_OF_PANELS
     abreast = (len(levels) if across == 1 else 1) if few else max(MOST_ABREAST_OF_PANELS // across, 1)
@@ -192,13 +196,13 @@ def level_panels(
 
 
 def is_first(axes: Axes) -> bool:
-    """Whether a panel stands at the left, where the vertical axis is named."""
+    """Whether a panel is in the left column, where the vertical axis has a label."""
     place = axes.get_subplotspec()
     return place is None or place.is_first_col()
 
 
 def legend(figure: Figure, arms: Sequence[str]) -> None:
-    """One legend for all panels below them, in the arms' order; an arm may be missing in some of the panels."""
+    """Add one legend for all panels below them, in the order of the arms; an arm may be missing in some panels."""
     handles = {name: h for axes in figure.axes for h, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     names = [*(arm for arm in arms if arm in handles), *(name for name in handles if name not in arms)]
     columns = -(-len(names) // -(-len(names) // MOST_ABREAST))

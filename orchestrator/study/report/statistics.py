@@ -1,13 +1,18 @@
-"""Means over repetitions with 95 % intervals. Pure functions of numbers; the same numbers give the same interval.
+"""Means over repetitions with 95 % intervals, and paired differences of strategies.
 
-Student's t for means and for mean differences: of normal numbers it covers 95 %, however few they are. The percentile
-bootstrap covers 83 % of five and 91 % of ten; it is kept for what is not a mean.
+All functions are pure: the same numbers yield the same interval.
 
-What one strategy gains over another: differences of a repetition, at the same level and into the same receiver.
+- `estimate` calculates a mean with Student's t interval. For normal data it covers 95 % at any sample size.
+- `statistic` uses the percentile bootstrap, for quantities other than means. Applied to means, it covers 83 % with five
+  repetitions and 91 % with ten.
+- `effect` compares two strategies by paired differences, at the same level and into the same receiver.
 
-Beside these, a pair shares little. C1 to C4 have the repetition's weighed pours, and are scored with the same seeds.
-Deployments have the bench's systematic errors in common, and all but D2 the repetition's θ*; the chance of each pour
-comes from the strategy's own seeds. Only pours of final actions share it, one by one (`FinalPour`).
+The pairs share the following random influences:
+
+- C1 to C4 share the weighed pours of the repetition and the seeds of the scores.
+- Deployments share the systematic errors of the bench, and all except D2 share the θ* of the repetition.
+- The random errors of each pour come from the strategy's own seeds, except for pours of final actions, which share them
+  one by one (`FinalPour`).
 """
 
 from __future__ import annotations
@@ -25,7 +30,7 @@ RESAMPLES = 4_000
 COVERED = 0.95
 
 Range = tuple[float, float]
-"""Least and largest value that a quantity can have."""
+"""Smallest and largest possible value of a quantity."""
 
 ANYTHING: Range = (-math.inf, math.inf)
 SHARE: Range = (0.0, 1.0)
@@ -36,8 +41,8 @@ class Estimate:
     """A mean over repetitions.
 
     Attributes:
-        low, high: of the interval; NaN where there are fewer than two repetitions.
-        count: repetitions.
+        low, high: ends of the interval; NaN for fewer than two repetitions.
+        count: number of repetitions.
     """
 
     mean: float
@@ -46,11 +51,11 @@ class Estimate:
     count: int
 
     def scaled(self, factor: float) -> Estimate:
-        """In another unit."""
+        """The estimate in another unit."""
         return Estimate(factor * self.mean, factor * self.low, factor * self.high, self.count)
 
     def text(self, decimals: int = 2) -> str:
-        """'1.23 [0.80, 1.71]'; '—' where nothing is known."""
+        """'1.23 [0.80, 1.71]'; '—' without data."""
         if math.isnan(self.mean):
             return "—"
         if math.isnan(self.low):
@@ -59,15 +64,15 @@ class Estimate:
 
 
 def estimate(values: Sequence[float], within: Range = ANYTHING) -> Estimate:
-    """Mean of one number a repetition, with Student's t interval; NaN are left out.
+    """Mean of one number per repetition, with Student's t interval; NaN are left out.
 
     Args:
-        within: what the quantity can be; the interval ends there, or at a mean that a balance's noise puts beyond.
+        within: possible range of the quantity. The interval is limited to it, or to a mean that a balance's noise moves
+            outside.
 
     Source: Student, The probable error of a mean, Biometrika 6, 1908.
-    Limitations: repetitions are taken for independent and their mean for normal. Where nearly all are alike and a few
-        far off, as with cups that touch now and then, five repetitions may show none of these, and the interval is too
-        narrow.
+    Limitations: repetitions are assumed to be independent and their mean to be normal. Rare large deviations, as from
+    cups that touch occasionally, may be absent in five repetitions; the interval is then too narrow.
     """
     from scipy.special import stdtrit
 
@@ -84,18 +89,20 @@ def estimate(values: Sequence[float], within: Range = ANYTHING) -> Estimate:
 
 
 def difference_of(within: Range) -> Range:
-    """What a difference of two such quantities can be."""
+    """Possible range of a difference of two quantities with this range."""
     return within[0] - within[1], within[1] - within[0]
 
 
 def statistic(
     repetitions: Sequence[Sequence[float]], of: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> Estimate:
-    """What is not a mean, with the percentile bootstrap's interval: whole repetitions are drawn, with replacement.
+    """Estimate of a quantity other than a mean, with the percentile bootstrap's interval over whole repetitions.
+
+    Repetitions are drawn with replacement.
 
     Args:
         repetitions: (n, m) numbers.
-        of: from (…, n, m) numbers to (…).
+        of: maps (…, n, m) numbers to (…).
     """
     data = np.array(repetitions, dtype=np.float64)
     count = len(data)
@@ -110,24 +117,24 @@ def statistic(
 
 
 ALL = "all"
-"""In place of a receiver: the mean over all of them, repetition by repetition."""
+"""Label used instead of a receiver for the mean over all receivers, calculated per repetition."""
 
 FEWEST = 5
-"""Repetitions below which nothing is tested: with four the smallest two-sided probability is 1/8."""
+"""Minimum number of repetitions for a test: with four, the smallest two-sided probability is 1/8."""
 
 MOST_CHANGES = 1 << 14
-"""Sign changes that are tried: all of them up to 14 repetitions, so many random ones beyond."""
+"""Maximum number of sign changes: all of them up to 14 repetitions, random ones beyond."""
 
 
 @dataclass(frozen=True)
 class Effect:
-    """A difference of two strategies; below 0 the first is better.
+    """A difference of two strategies; below 0 the first one is better.
 
     Attributes:
-        difference: mean over the repetitions that both have, with the t interval of paired differences.
-        better: repetitions in which the first is better.
-        probability: two-sided, of a mean at least as far from 0 if signs were chance (all 2ⁿ sign changes are tried);
-            None with fewer than `FEWEST` repetitions.
+        difference: mean over the common repetitions, with the t interval of paired differences.
+        better: number of repetitions in which the first strategy is better.
+        probability: two-sided probability of a mean at least as far from 0 under random signs (all 2ⁿ sign changes are
+            tried); None with fewer than `FEWEST` repetitions.
     """
 
     difference: Estimate
@@ -136,10 +143,10 @@ class Effect:
 
 
 def effect(first: Mapping[int, float], second: Mapping[int, float], within: Range = ANYTHING) -> Effect:
-    """The difference of values by repetition; repetitions that only one has, or that are NaN, are left out.
+    """Difference of values by repetition. Repetitions that only one side has, or with NaN, are left out.
 
     Args:
-        within: what a value can be.
+        within: possible range of a value.
 
     Source: Fisher's randomisation test of paired differences (The Design of Experiments, 1935, section 21).
     """
@@ -159,7 +166,7 @@ def _chance(differences: Sequence[float]) -> float | None:
 
 
 def at_pour_of(found: Gathered, level: str, receivers: Sequence[str], arm: str, pour: int) -> dict[int, float]:
-    """Least loss up to a pour by repetition: the mean over receivers, of the repetitions that have all of them."""
+    """Mean over receivers of the smallest loss up to a pour, for each repetition that has all receivers."""
     each = [found.by_repetition(Key(level, receiver, arm), pour) for receiver in receivers]
     shared = set.intersection(*map(set, each)) if each else set()
     return {number: mean([values[number] for values in each]) for number in sorted(shared)}

@@ -1,6 +1,10 @@
-"""The report of a study: figures and tables as files, and one page that needs nothing beside it.
+"""The report of a study: figure and table files, and one self-contained HTML page.
 
-What a study's differences say, in plain sentences: which strategy was better, by how much, where nobody knows.
+- `write_report` writes all files from the finished cells; an unfinished study is allowed.
+- `plain_words` describes the differences between strategies in sentences: which one is better, by how much, and where
+  the data does not decide.
+
+Figures and tables are defined in the other modules of this package.
 """
 
 from __future__ import annotations
@@ -23,7 +27,8 @@ from orchestrator.study.study_plan import Level, StudyPlan, cells_of
 
 
 def plain_words(shown: Sequence[StudyTable]) -> list[str]:
-    """A sentence for each pair of strategies at each level: over all receivers, after the last pour that is shown."""
+    """Write a sentence for each pair of strategies at each level: over all receivers, after the last pour in the
+    table."""
     rows = [row for table in shown if table.name == "table-effects" for row in table.rows]
     last: dict[tuple[str, str, str, str], tuple[str, Estimate, str]] = {}
     for compared, of, level, receiver, _, difference, better, _ in rows:
@@ -69,13 +74,13 @@ _AS_IN_THE_PAPER = {
 
 
 def write_report(study: StudyPlan, folder: Path) -> Path:
-    """Write figures, tables and the page of what is finished.
+    """Write figures, tables and the page of all finished cells.
 
     Args:
-        folder: of the study.
+        folder: folder of the study.
 
     Returns:
-        The page.
+        Path of the page.
 
     Raises:
         StudyError: a result can't be read.
@@ -131,20 +136,20 @@ def _caption(one: Drawn) -> str:
 
 
 def _unknown(study: StudyPlan, found: Gathered) -> list[str]:
-    """What a reader must not take from it."""
+    """Limitations that a reader must consider."""
     counts = [arm.repetitions for arm in study.calibrations] + [arm.repetitions for arm in study.deployments]
-    said = ["All benches are VIRTUAL: what a real robot, cup and liquid would do is not in these numbers."]
+    notes = ["All benches are VIRTUAL: what a real robot, cup and liquid would do is not in these numbers."]
     if counts and min(counts) < FEWEST:
-        said.append(
+        notes.append(
             f"Some strategies have {min(counts)} repetitions: below {FEWEST} no difference is tested, and intervals "
             "are wide or missing. Such numbers show that everything works, and nothing more."
         )
     if found.finished < found.cells:
-        said.append("Cells are missing: what is compared may change when they are there.")
+        notes.append("Cells are missing: what is compared may change when they are there.")
     receivers = sorted({scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes})
     if receivers:
-        said.append(f"It holds for these receivers ({', '.join(receivers)}), this liquid and these ranges of actions.")
-    return said
+        notes.append(f"It holds for these receivers ({', '.join(receivers)}), this liquid and these ranges of actions.")
+    return notes
 
 
 def _summary(study: StudyPlan, found: Gathered) -> str:

@@ -1,4 +1,4 @@
-"""Tables of a study: discrepancies of the calibrations, losses of the deployments, pours to the same loss."""
+"""Tables of a study: discrepancies of the calibrations, losses of the deployments, effects, pours to the same loss."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _NEEDED = (
 
 @dataclass(frozen=True)
 class StudyTable:
-    """Cells are texts, numbers, or estimates (three columns in CSV)."""
+    """A table. Its cells are texts, numbers, or estimates (three columns in CSV)."""
 
     name: str
     title: str
@@ -80,7 +80,7 @@ class StudyTable:
 
 
 def tables(study: StudyPlan, found: Gathered) -> list[StudyTable]:
-    """Those of which there is something."""
+    """All tables for which there is data."""
     made = []
     if found.calibrated:
         made.append(_calibrations(study, found))
@@ -159,10 +159,10 @@ PAIRS = (
     ("C4-paper", "C3"),
     ("C3", "C2"),
 )
-"""Calibrations whose test discrepancies are compared; those of packages are with C4."""
+"""Pairs of calibrations whose test discrepancies are compared; calibrations of packages are compared with C4."""
 
 ARMS = (("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"), ("D3-paper", "D2-paper"), ("D2", "D2-paper"))
-"""Deployments whose losses are compared; those of packages are with D2."""
+"""Pairs of deployments whose losses are compared; deployments of packages are compared with D2."""
 
 
 def _calibration_effects(study: StudyPlan, found: Gathered) -> list[list[str | int | float | Estimate]]:
@@ -263,7 +263,8 @@ def _needed(study: StudyPlan, found: Gathered) -> list[list[str | int | float | 
 
 
 def pours_needed(curves: Sequence[Sequence[float]], loss: float) -> Estimate:
-    """Pours until the mean of the curves is at most `loss`; one more than there are where it never is."""
+    """Number of pours until the mean of the curves is at most `loss`; one more than available if it is never
+    reached."""
 
     def first(data: NDArray[np.float64]) -> NDArray[np.float64]:
         reached = data.mean(axis=-2) <= loss + 1e-12
