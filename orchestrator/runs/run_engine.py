@@ -1,4 +1,9 @@
-"""Runs the stages of a campaign on a laboratory, and resumes them."""
+"""Runs the stages of a campaign on a laboratory and resumes interrupted runs.
+
+`run_campaign` is the entry point. It opens the journal and the laboratory, settles pours with unknown outcome, runs
+each stage with a `StageScheduler`, and records the campaign's state. Parsing of files and displays are outside this
+module.
+"""
 
 from __future__ import annotations
 
@@ -57,23 +62,24 @@ async def run_campaign(
     stages: Sequence[StageDefinition] | None = None,
     deadlines: Deadlines | None = None,
 ) -> CampaignResult:
-    """Run a campaign to its end, or go on with one.
+    """Run a campaign to its end, or resume one.
 
-    Cancelling the awaiting task pauses the run: simulations are dropped, a pour that has begun is finished and
-    weighed, then `asyncio.CancelledError` is raised. Cancelling it again gives the pour up, too; it is UNKNOWN then.
+    Cancelling the awaiting task pauses the run: simulations are dropped, a pour that has begun is finished and weighed,
+    then `asyncio.CancelledError` is raised. A second cancellation also abandons the pour, whose outcome is then
+    UNKNOWN.
 
     Args:
-        laboratory: not opened yet; it is opened here, after everything that can be checked without it was, and closed.
-        run_directory: where the journal is, or will be.
-        resume: go on with the journal in `run_directory`; without, there must be none.
-        ask_operator: asked about pours whose outcome is unknown; None if nobody is there.
-        stages: in place of those that the plan asks for.
-        deadlines: other than the usual ones.
+        laboratory: not opened yet. It is opened here, after all checks that do not need it, and closed here.
+        run_directory: the directory of the journal.
+        resume: continue with the journal in `run_directory`; otherwise there must be none.
+        ask_operator: called for pours whose outcome is unknown; None if no operator is present.
+        stages: replaces the stages of the plan.
+        deadlines: replaces the default deadlines.
 
     Raises:
-        RunError: the run can't begin or go on: another process runs it (JournalLockedError), its journal doesn't fit
-            (JournalError, ReplayError), a person is needed (OperatorNeededError), the disk is too full for a pour's
-            records (NoSpaceError), the laboratory or a strategy fails.
+        RunError: the run can't begin or continue. Another process runs it (JournalLockedError), its journal doesn't fit
+            (JournalError, ReplayError), the operator is needed (OperatorNeededError), the disk has too little space for
+            a pour's records (NoSpaceError), or the laboratory or a strategy fails.
         LaboratoryError: the laboratory can't be opened.
     """
     run = _Run(
@@ -89,7 +95,7 @@ async def run_campaign(
 
 
 def _patience(plan: CampaignPlan) -> Deadlines:
-    """A person who has to weigh what was poured takes the time that questions may take."""
+    """Deadlines of a plan: with an operator who weighs, a pause waits for a pour as long as a question may take."""
     usual, laboratory = Deadlines(), plan.laboratory
     if laboratory.arm is None or laboratory.operator.answers == "virtual":
         return usual
@@ -98,7 +104,7 @@ def _patience(plan: CampaignPlan) -> Deadlines:
 
 @dataclass
 class _Run:
-    """One process' part of a campaign's run."""
+    """One process's part of a campaign's run."""
 
     _plan: CampaignPlan
     _laboratory: Laboratory
@@ -138,7 +144,7 @@ class _Run:
                 self._come_to_rest(State.PAUSED, str(error))
                 raise
             except Exception as error:
-                if self._is_finished():  # the results are safe; only the tidying up went wrong
+                if self._is_finished():  # the results are complete; only the cleanup failed
                     self._watchers.log("warning", f"while closing the laboratory: {error}")
                 else:
                     self._come_to_rest(State.FAILED, f"{type(error).__name__}: {error}")
@@ -239,7 +245,8 @@ class _Run:
     def _foreseeing(
         self, stage: StageDefinition, index: int, results: Results, lanes: RequestExecutor
     ) -> Iterator[None]:
-        """While the arm pours, simulate what later stages will ask for, where that disturbs nobody."""
+        """While the arm pours, run simulations that later stages will request, if the pool does not share the arm's
+        CPUs."""
         later = self._stages[index - 1 :]
         if not stage.pours or len(later) < 2 or not lanes.simulators.separate:
             yield
@@ -251,7 +258,7 @@ class _Run:
         finally:
             task.cancel()
             lanes.ahead.pause()
-            # Awaited nowhere: whatever goes wrong in a rehearsal shows when its stage's turn comes.
+            # Not awaited: an error in speculative execution appears again when its stage runs.
             task.add_done_callback(lambda task: task.cancelled() or task.exception())
 
     async def _settle(self, stage: StageDefinition, history: StageHistory) -> StageHistory:
@@ -300,10 +307,10 @@ class _Run:
             )
 
     def _hear(self, notice: Notice) -> None:
-        """Something happened to the laboratory: written down, and shown."""
+        """Write a notice of the laboratory to the journal and emit it."""
         try:
             self._journal.append(Kind.NOTE, {"text": notice.text})
-        except JournalError:  # it ends the run with the next write that matters; until then the screen holds everything
+        except JournalError:  # the next important write ends the run; until then the display shows everything
             self._watchers.log("error", f"can't be written down: {notice.text}")
             return
         if notice.level != "note":
@@ -326,7 +333,7 @@ class _Run:
             state, reason = State.UNKNOWN, f"{reason}, while a pour was under way: nobody knows what came of it"
         try:
             self._enter(state, reason)
-        except JournalError as problem:  # the next process sees it from what is missing
+        except JournalError as problem:  # the next process finds the run interrupted
             self._watchers.log("error", f"can't write that the run is {state}: {problem}")
         results = decode_results(self._journal.stage_results())
         self._watchers.emit(CampaignClosed(state=str(self._state), results=results))

@@ -1,16 +1,17 @@
-"""Runs one stage: asks a strategy, runs what it asks for, writes everything down, tells it what came of it.
+"""Runs one stage: takes requests from a strategy, executes them, writes the journal, and returns the outcomes.
 
-The strategy is asked once at the start and once after every tell. Two orders of delivery:
+`StageScheduler` calls `ask` once at the start and once after every `tell`. A `PendingRequest` is a request whose
+outcome was not delivered yet. There are two orders of delivery:
 
-* *logical*: suggestions first, then simulations, then the pour, each in the order in which they were asked for. The
-  sequence of asks and tells then depends on plan and outcomes only, not on how fast anything was, and neither the
-  optimiser nor the pool stands still while the arm pours. A strategy that wants k simulations beside each pour asks
-  for k and no more until it is told.
-* *completion*: told as they come. The clock takes part in the decisions; only the journal can replay them.
+- *logical*: suggestions first, then simulations, then the pour; within a kind, in the order of the requests. The
+  sequence of asks and tells then depends on plan and outcomes only, not on speed. Neither the optimiser nor the pool is
+  idle while the arm pours. A strategy that wants k simulations next to each pour requests k, and no more until the next
+  `tell`.
+- *completion*: in the order in which requests finish. Time then affects the decisions, and only the journal can replay
+  them.
 
-In both, the slots that a strategy is shown are capacity minus what was asked for and not yet told.
-
-What is under way in a stage: requests that were asked for and whose outcome was not told yet.
+In both orders, the slots that a strategy receives are the capacity minus the pending requests. The scheduler does not
+know how a request is executed (`orchestrator.runs.request_executor`).
 """
 
 from __future__ import annotations
@@ -44,20 +45,19 @@ from orchestrator.strategies.strategy import Strategy
 from sim_engine.outcome import RecordedFrames
 
 _LOGICAL_ORDER: dict[type[Request], int] = {Suggest: 0, Ask: 0, Simulate: 1, Pour: 2}
-"""What is told first when several are under way: quick things before slow ones, so that a free slot is never kept
-waiting for the strategy's next idea."""
+"""Order of delivery of pending requests: fast kinds first, so that a free slot does not wait for `ask`."""
 
 
 @dataclass
 class PendingRequest:
-    """One request that is under way.
+    """A request whose outcome was not delivered yet.
 
     Attributes:
         record: whether a simulation keeps its frames.
-        attempt: how often a pour has been begun, this time included.
-        started: something may have happened because of it.
+        attempt: how often a pour was begun, including this attempt.
+        started: whether execution has begun, so that it may have had an effect.
         finished: place in the order of finishing, from 1; 0 while there is no outcome.
-        task: that runs it; None if its outcome was read from the journal.
+        task: the task that runs it; None if its outcome was read from the journal.
     """
 
     id: int
@@ -71,25 +71,28 @@ class PendingRequest:
 
     @property
     def running(self) -> bool:
-        """A task is busy with it."""
+        """Whether a task is executing it."""
         return self.task is not None and not self.task.done()
 
 
 def is_recorded(number: int, recordings: int) -> bool:
-    """Whether the `number`-th simulation of a stage (from 1) keeps its frames: the 1st, 2nd, 4th, 8th, … until
-    `recordings` have been kept, so that early and late ones are seen whatever the budget."""
+    """Whether the `number`-th simulation of a stage (from 1) keeps its frames.
+
+    The 1st, 2nd, 4th, 8th, … keep theirs until `recordings` are kept. Early and late simulations are thus recorded for
+    any budget.
+    """
     return number.bit_count() == 1 and number.bit_length() <= recordings
 
 
 def free_slots(flights: Sequence[PendingRequest], capacity: int) -> Slots:
-    """Capacity minus what was asked for and not yet told: the same wherever and however fast it runs."""
+    """Capacity minus the pending requests: the same on every machine and at any speed."""
     simulations = sum(isinstance(f.request, Simulate) for f in flights)
     pours = sum(isinstance(f.request, Pour) for f in flights)
     return Slots(max(capacity - simulations, 0), max(1 - pours, 0))
 
 
 def next_to_tell(flights: Sequence[PendingRequest], order: Order) -> PendingRequest | None:
-    """The flight whose outcome the strategy is told next, if there is one already; None: wait."""
+    """The pending request whose outcome is delivered next; None if it has no outcome yet."""
     if order == "completion":
         return min((f for f in flights if f.outcome is not None), key=lambda f: f.finished, default=None)
     first = min(flights, key=lambda f: (_LOGICAL_ORDER[type(f.request)], f.id), default=None)
@@ -97,11 +100,11 @@ def next_to_tell(flights: Sequence[PendingRequest], order: Order) -> PendingRequ
 
 
 _REPORT_INTERVAL = 0.3
-"""Least time between two reports of a strategy's progress to watchers, unless one matters [s]."""
+"""Minimum time between two progress events of a strategy, unless the event is urgent [s]."""
 
 
 class StrategyError(RunError):
-    """A strategy breaks the rules of ask and tell: a defect in the program, not in the laboratory."""
+    """A strategy violates the ask–tell protocol: a defect in the program, not in the laboratory."""
 
 
 class StageScheduler:
@@ -125,9 +128,9 @@ class StageScheduler:
 
         Args:
             capacity: logical slots for simulations, ≥ 1.
-            recordings: how many simulations keep their frames.
+            recordings: number of simulations that keep their frames.
             on_pausing: called when the stage begins to wind down.
-            on_stopping: called when it is told to do so at once.
+            on_stopping: called when winding down is cancelled to stop at once.
         """
         self._stage = stage
         self._strategy = strategy
@@ -149,14 +152,14 @@ class StageScheduler:
 
     @property
     def unknown_pours(self) -> list[int]:
-        """Pours that have begun and whose outcome nobody knows."""
+        """Pours that have begun and whose outcome is unknown."""
         return [f.id for f in self._flights.values() if isinstance(f.request, Pour) and f.started and f.outcome is None]
 
     def restore(self, history: StageHistory) -> None:
-        """Bring the strategy to where the journal ends. Runs nothing.
+        """Bring the strategy to the state at the end of the journal. Executes nothing.
 
         Raises:
-            ReplayError: it doesn't ask for what the journal says.
+            ReplayError: the strategy's requests differ from those in the journal.
         """
         untold = replay(self._strategy, history, self._stage)
         simulations = [key for key, written in history.requests.items() if written["type"] == Simulate.__name__]
@@ -180,15 +183,15 @@ class StageScheduler:
             self._report_progress()
 
     async def run(self) -> StageResult:
-        """Ask, run and tell until the strategy is finished.
+        """Ask, execute and tell until the strategy is finished.
 
         Returns:
-            What it has learnt, as it is in the journal.
+            The strategy's result, as in the journal.
 
         Raises:
-            StrategyError: it asks for more than it may, or for nothing while there is nothing to wait for.
-            LaneError: the laboratory can't go on.
-            asyncio.CancelledError: told to pause; what had begun is finished or given up, and written down.
+            StrategyError: it requests more than its slots allow, or nothing while no request is pending.
+            RequestExecutorError: the laboratory can't continue.
+            asyncio.CancelledError: the run is paused; requests that had begun were finished or abandoned, and recorded.
         """
         try:
             for flight in self._flights.values():
@@ -247,7 +250,7 @@ class StageScheduler:
             flight.task = asyncio.create_task(self._perform(flight), name=f"{self._stage} request {flight.id}")
 
     async def _perform(self, flight: PendingRequest) -> None:
-        """Run one request and write down its outcome."""
+        """Execute one request and write its outcome to the journal."""
         begin, frames, request = time.monotonic(), None, flight.request
 
         def started() -> None:
@@ -284,7 +287,7 @@ class StageScheduler:
 
                 outcome = await self._lanes.suggest(request, started=started, retrying=retrying)
             case Ask():
-                # A question is answered on resume: nobody types into a display that is redrawn, and no arm waits.
+                # A question is answered on resume: a display that is redrawn takes no input, and the arm does not wait.
                 raise needs_answer(request)
         self._finish(flight, outcome, time.monotonic() - begin, frames)
 
@@ -297,7 +300,7 @@ class StageScheduler:
             if isinstance(flight.request, Pour) and isinstance(outcome, Poured):
                 raise JournalError(f"{error}. {weighed_by_hand(flight.request, outcome.measurement)}") from error
             raise
-        # The strategy is told what the journal holds, so that a replay can't tell it anything else.
+        # The strategy receives the outcome as decoded from the journal, so that a replay delivers the same.
         flight.outcome = decode_outcome(written)
         self._finished += 1
         flight.finished = self._finished
@@ -312,7 +315,7 @@ class StageScheduler:
         self._watchers.emit(event)
 
     async def _next(self) -> PendingRequest:
-        """The flight whose outcome is to be told next, once it has one."""
+        """Wait until the next request to deliver has an outcome, and return it."""
         while True:
             self._raise_failures()
             flight = next_to_tell(list(self._flights.values()), self._order)
@@ -339,7 +342,8 @@ class StageScheduler:
         self._report_progress(urgent=isinstance(flight.request, Pour) or self._strategy.finished)
 
     def _write_with_decisions(self, drafts: list[Draft]) -> None:
-        """Write entries and the decisions that came with them together, so that a replay knows which are written."""
+        """Write entries together with the decisions that belong to them, so that a replay has the same number of
+        decisions."""
         decisions: Sequence[Decision] = getattr(self._strategy, "decisions", ())[self._decisions :]
         for decision in decisions:
             drafts.append(Draft(Kind.DECISION, cast("dict[str, Any]", to_json(decision, Decision)), self._stage))
@@ -349,7 +353,7 @@ class StageScheduler:
             self._watchers.emit(DecisionMade(stage=self._stage, decision=decision))
 
     def _report_progress(self, *, urgent: bool = True) -> None:
-        """Tell watchers where the strategy stands; often only now and then, as results grow long."""
+        """Emit the strategy's progress; limited in frequency unless urgent, because results grow large."""
         if not urgent and time.monotonic() - self._reported < _REPORT_INTERVAL:
             return
         self._reported = time.monotonic()
@@ -360,13 +364,13 @@ class StageScheduler:
         self._journal.append(kind, body, stage=self._stage)
 
     async def _wind_down(self, error: BaseException) -> None:
-        """Drop what can be repeated, finish what can't: simulations are cancelled, a pour that has begun is awaited.
+        """Cancel simulations and suggestions, which can be repeated, and wait for a pour that has begun.
 
-        Cancelled again, it gives the pour up as well.
+        A second cancellation abandons the pour as well.
         """
         if isinstance(error, asyncio.CancelledError):
             reason = "asked to pause"
-        else:  # the text of an error of ours says all; another one's is a defect, whose kind matters
+        else:  # the text of a RunError is complete; for a defect the type matters
             reason = str(error) if isinstance(error, RunError) else f"{type(error).__name__}: {error}"
         pours: list[asyncio.Task[None]] = []
         others: list[asyncio.Task[None]] = []
@@ -378,7 +382,7 @@ class StageScheduler:
             task.cancel()
         try:
             self._on_pausing(reason)
-        except Exception as problem:  # a full disk, say: no reason to leave a pour alone
+        except Exception as problem:  # for example a full disk: the pour must be awaited nevertheless
             self._watchers.log("error", f"can't write that the run is pausing: {problem}", self._stage)
         try:
             if pours:
