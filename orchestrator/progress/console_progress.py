@@ -1,7 +1,8 @@
-"""The live display in the terminal: bars for the stages, the running pour, the pool, the best so far.
+"""Live display in the terminal: bars for the stages, the running pour, the pool, and the best pour so far.
 
-Goes to stderr, so that stdout stays for results. Where stderr is not a terminal (CI, a log file) it writes plain lines,
-at most one every two seconds.
+`ProgressDisplay` is a subscriber of a run's events. It writes to stderr, so that stdout stays free for results. If
+stderr is not a terminal (CI, a log file), it writes plain lines, at most one every two seconds. `ProgressState` keeps
+the numbers.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ if TYPE_CHECKING:
     from rich.live import Live
 
 INTERVAL = 2.0
-"""Least seconds between two plain lines of progress."""
+"""Minimum time between two plain lines of progress [s]."""
 
 _LEVEL_STYLE = {"info": "", "warning": "yellow", "error": "bold red"}
 
 
 class ProgressDisplay:
-    """A watcher that shows a campaign in the terminal. Use as a context manager.
+    """A subscriber that displays a campaign in the terminal. Use it as a context manager.
 
     Args:
-        plan: of the campaign.
-        console: where to write; by default stderr.
+        plan: plan of the campaign.
+        console: output console; stderr by default.
         clock: seconds, monotonic, for the plain lines.
-        quiet: only warnings and errors are wanted.
+        quiet: show only warnings and errors.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class ProgressDisplay:
         if self._console.is_terminal and not self._quiet:
             from rich.live import Live
 
-            # Rich draws in a thread of its own, four times a second, whatever the rate of events.
+            # Rich draws in its own thread, four times a second, at any rate of events.
             self._live = Live(console=self._console, get_renderable=self._render, refresh_per_second=4, transient=False)
             self._live.start()
         return self
@@ -88,10 +89,10 @@ class ProgressDisplay:
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
-        """While somebody is asked something: the bars are gone, and lines wait, but for warnings and errors."""
+        """During a question to the operator: hide the bars and delay lines, except warnings and errors."""
         live, self._live = self._live, None
         if live is not None:
-            live.transient = True  # the bars make room for the question
+            live.transient = True  # remove the bars from the screen before the question
             live.stop()
         self._held = []
         try:
@@ -106,13 +107,13 @@ class ProgressDisplay:
                 self._live = live
 
     def __call__(self, event: Event) -> None:
-        """Take note of an event. Returns at once."""
+        """Process an event. Returns at once."""
         with self._lock:
             self._tally(event)
         self._say(event)
 
     def _say(self, event: Event) -> None:
-        """Lines that stay on the screen, and in plain mode the progress in between."""
+        """Print permanent lines and, in plain mode, the progress in between."""
         match event:
             case CampaignOpened():
                 goes = "goes on" if event.resumed else "begins"
@@ -125,7 +126,7 @@ class ProgressDisplay:
                 if not event.asked:
                     self._print(event.text, _LEVEL_STYLE[event.level])
             case _ if event.replayed:
-                return  # an earlier run has told it
+                return  # an earlier process has displayed it
             case DecisionMade() if event.decision.urgent:
                 self._print(event.decision.text, _LEVEL_STYLE["warning"])
             case StageOpened() if self._live is None:
@@ -151,7 +152,7 @@ class ProgressDisplay:
         self._last_line = now
         left = self._tally.forecast.left(event.time)
         eta = f"  about {_duration(left)} left in all" if left is not None else ""
-        # Lines come at moments when something has just ended; who is busy at that moment says nothing about the pool.
+        # Lines are printed when a request has just ended, so the mean load is shown instead of the load at that moment.
         load = self._tally.load()
         pool = f"pool {100 * load:.0f} % busy · " if load is not None else ""
         self._print(f"{stage.name}: {stage.progress}  {pool}{self._tally.counts_line()}{eta}")
