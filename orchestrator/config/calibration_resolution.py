@@ -1,6 +1,7 @@
-"""From a calibration as written to its plan: pours, and what each strategy may spend.
+"""Converts a calibration section to its plan, including weighed pours from before the campaign.
 
-Pours of before the campaign, from a CSV file or a former run: the same scene, and actions that are searched.
+`resolve_calibration` determines pours, budgets and priors. `resolve_data` and `records_of_run` read existing pours from
+a CSV file or a previous run; they must match the scene and the searched actions.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def resolve_data(
     laboratory: LaboratorySpec | None,
     report: Report,
 ) -> ExistingPours | None:
-    """Deployment's existing pours by scene; what is wrong goes to the report, and then they are None."""
+    """Existing pours of the deployment by scene; None after a problem, which is added to the report."""
     given = [key for key in ("from", "run") if section.value(key) is not None]
     if len(given) == 2:
         report.add(place.at("run"), "stands beside 'from'; keep one of them", key=True)
@@ -126,7 +127,7 @@ def _of_run(
 
 
 def former_run(run: str, place: Place, report: Report) -> PreviousRun | None:
-    """A former run by its folder; None where there is none that can be read."""
+    """A previous run by its folder; None if it can't be read."""
     directory = resolved(place.directory / run)
     if (outside := out_of_bounds(directory)) is not None:
         report.add(place, f"{directory} {outside}")
@@ -152,7 +153,7 @@ def records_of_run(
     laboratory: LaboratorySpec | None,
     report: Report,
 ) -> RecordSet | None:
-    """Calibration's pours from a former run, in any of its scenes; None where something is wrong."""
+    """Calibration pours from a previous run, in any of its scenes; None after a problem."""
     former = former_run(run, place, report)
     if former is None:
         return None
@@ -182,7 +183,7 @@ def records_of_run(
 
 
 DESIGN_SIMULATIONS = 64
-"""Simulations of an active design unless a campaign says how many."""
+"""Default number of simulations of an active design."""
 
 
 def resolve_calibration(
@@ -194,13 +195,13 @@ def resolve_calibration(
     laboratory: LaboratorySpec | None,
     known: tuple[NormalPrior, ...] = (),
 ) -> CalibrationPlan | None:
-    """The plan of a calibration; what is wrong goes to the report, and then the plan may be None.
+    """The plan of a calibration. Problems are added to the report; the plan may then be None.
 
     Args:
-        fixed: θ that are not searched.
-        searched: axes of those that are, by name.
-        place: of the section.
-        known: what is known of searched ones beforehand.
+        fixed: parameters that are not searched, by name.
+        searched: axes of the searched parameters, by name.
+        place: place of the section.
+        known: priors of searched parameters.
     """
     report = builder.report
     pours, at = section.pours, place.at("pours")
@@ -247,7 +248,7 @@ def resolve_calibration(
     if pours is not None and (from_file or from_run is not None):
         source = "a file" if from_file else "a run"
         for key in ("count", "holdout", "holdout_receivers", "design", "simulations"):
-            if pours.value(key) not in (None, "stratified"):  # what is meant anyway stands in a run's record
+            if pours.value(key) not in (None, "stratified"):  # the default appears in the record of a run
                 report.add(
                     at.at(key), f"belongs to pours that are still to be made; these are read 'from' {source}", key=True
                 )
