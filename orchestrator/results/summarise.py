@@ -1,4 +1,4 @@
-"""A run's summary, made of its plan and of what its stages learnt."""
+"""Creates the summary of a run from its plan and the results of its stages."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def summarise(
     """The summary of a run.
 
     Args:
-        plan: of the campaign.
-        results: what the stages learnt.
+        plan: plan of the campaign.
+        results: results of the stages.
         figures: name → file.
-        recording: the `.rrd`.
-        dropped_events: that are missing in it.
-        not_covered: what is not simulated in the action spaces, by scene.
-        best_not_covered: and of the recommended actions.
-        totals: how much the run took.
+        recording: path of the `.rrd`.
+        dropped_events: number of events missing in the recording.
+        not_covered: effects that are not simulated in the action spaces, by scene.
+        best_not_covered: the same for the recommended actions.
+        totals: costs of the run.
     """
     found = theta_of(results)
     names, predictions, confirmations = receiver_names(plan), predictions_of(results), confirmations_of(results)
