@@ -264,12 +264,12 @@ class Catalogue:
     def _enter(self, path: str, stamp: str, read: RunRead) -> None:
         for table in ("run", "pour", "source"):
             self._connection.execute(f"delete from {table} where path = ?", [path])
-        self._drop_former_place(read.run)
+        self._drop_previous_folder(read.run)
         self._insert("run", [read.run])
         self._insert("pour", read.pours)
         self._connection.execute("insert into source values (?, ?, 0, ?)", [path, stamp, read.problem])
 
-    def _drop_former_place(self, run: Row) -> None:
+    def _drop_previous_folder(self, run: Row) -> None:
         """Remove the former folder of a run that was moved; a run is identified by its name and its start."""
         query = """select path from run join source using (path) where run = ? and begun = ? and missing"""
         for (path,) in self._connection.execute(query, [run.get("run"), run.get("begun")]).fetchall():

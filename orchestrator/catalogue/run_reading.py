@@ -132,7 +132,7 @@ class _Reading:
             "open_pours": sum(row["outcome"] == "open" for row in rows),
             "spilled_g": sum(row.get("spilled_g") or 0.0 for row in rows),
         }
-        self._run |= _learnt(results, {name: scene["receiver"]["name"] for name, scene in self._scenes.items()})
+        self._run |= _result_columns(results, {name: scene["receiver"]["name"] for name, scene in self._scenes.items()})
         return RunRead(self._run, rows)
 
     def _pour(self, entry: Entry, stage: str, pour: Pour) -> Row:
@@ -176,7 +176,7 @@ def _names(found: Iterator[str]) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def _learnt(results: Mapping[str, Mapping[str, Any]], receivers: Mapping[str, str]) -> Row:
+def _result_columns(results: Mapping[str, Mapping[str, Any]], receivers: Mapping[str, str]) -> Row:
     """θ*, its discrepancy, and recommendations, from encoded results; their kinds need not be installed."""
     row: Row = {"theta": None, "test_discrepancy": None, "recommended": {}}
     for written in results.values():

@@ -63,7 +63,7 @@ def use_state_directory(path: Path) -> None:
 LIST_NAME = "runs.txt"
 
 _log = logging.getLogger(__name__)
-_said = False
+_reported = False
 
 
 def register(directory: Path) -> None:
@@ -71,17 +71,17 @@ def register(directory: Path) -> None:
 
     A state directory that can't be written is reported once, and never stops a run.
     """
-    global _said
+    global _reported
     try:
         enter([directory])
     except (OSError, UnicodeError) as error:
-        if not _said:
+        if not _reported:
             _log.warning(
                 "note: this run is not in the catalogue of runs (%s); `decant runs add %s` enters it later",
                 error,
                 directory,
             )
-        _said = True
+        _reported = True
 
 
 def enter(directories: Iterable[Path], state: Path | None = None) -> None:

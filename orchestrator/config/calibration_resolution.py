@@ -112,18 +112,18 @@ def _of_file(
 def _of_run(
     run: str, place: Place, scenes: tuple[Scene, ...], laboratory: LaboratorySpec | None, report: Report
 ) -> tuple[Path, dict[str, tuple[RecordedPour, ...]] | None]:
-    former = former_run(run, place, report)
-    if former is None:
+    previous = former_run(run, place, report)
+    if previous is None:
         return Path(run), None
-    if laboratory is not None and former.mode != laboratory.mode:
-        report.add(place, f"was poured in a {former.mode} laboratory, and '{laboratory.name}' is {laboratory.mode}")
-        return former.path, None
-    found = {scene.name: pours_in(former, scene) for scene in scenes}
+    if laboratory is not None and previous.mode != laboratory.mode:
+        report.add(place, f"was poured in a {previous.mode} laboratory, and '{laboratory.name}' is {laboratory.mode}")
+        return previous.path, None
+    found = {scene.name: pours_in(previous, scene) for scene in scenes}
     if not any(pours for pours, _ in found.values()):
         reasons = dict.fromkeys(reason for _, reason in found.values())
         report.add(place, f"has nothing to learn from: it {'; it '.join(reasons)}")
-        return former.path, None
-    return former.path, {name: tuple(pours) for name, (pours, _) in found.items() if pours}
+        return previous.path, None
+    return previous.path, {name: tuple(pours) for name, (pours, _) in found.items() if pours}
 
 
 def former_run(run: str, place: Place, report: Report) -> PreviousRun | None:
@@ -154,17 +154,17 @@ def records_of_run(
     report: Report,
 ) -> RecordSet | None:
     """Calibration pours from a previous run, in any of its scenes; None after a problem."""
-    former = former_run(run, place, report)
-    if former is None:
+    previous = former_run(run, place, report)
+    if previous is None:
         return None
-    if laboratory is not None and laboratory.mode == "hardware" and former.mode != "hardware":
+    if laboratory is not None and laboratory.mode == "hardware" and previous.mode != "hardware":
         report.add(place, f"was poured in a virtual laboratory, and '{laboratory.name}' has a real one's liquid")
         return None
     found: list[RecordedPour] = []
     left_out: list[str] = []
     reasons: list[str] = []
     for scene in scenes:
-        pours, why = pours_in(former, scene)
+        pours, why = pours_in(previous, scene)
         fit = fitting(pours, scene, actions)
         found += [replace(pour, scene=scene.name) for pour in fit.pours] if len(scenes) > 1 else fit.pours
         left_out += fit.left_out
@@ -179,7 +179,7 @@ def records_of_run(
     if all(pour.split != "train" for pour in found):
         report.add(place, "has no pour with split 'train' to calibrate on")
         return None
-    return RecordSet(scenes[0], tuple(found), former.path)
+    return RecordSet(scenes[0], tuple(found), previous.path)
 
 
 DESIGN_SIMULATIONS = 64
@@ -285,8 +285,8 @@ def resolve_calibration(
     settings = None
     if not report.is_broken(place.at("strategy")):
         train = count - holdout if records is None else records.training_pours
-        complaints = PlacedProblems(place, report, frozenset(CalibrationSection.model_fields))
-        settings = section.settings.settled(tuple(searched), train, complaints)
+        problems = PlacedProblems(place, report, frozenset(CalibrationSection.model_fields))
+        settings = section.settings.settled(tuple(searched), train, problems)
     active = pours is not None and pours.design == "active" and count > 0
     others = tuple(other for other in further if other is not None)
     if scene is None or len(others) < len(receivers) - 1 or actions is None or settings is None or not searched:

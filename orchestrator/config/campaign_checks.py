@@ -71,13 +71,13 @@ def senseless(
         arm: arm of the laboratory, if it has one.
         known: landings computed before, which do not depend on the receiver. Filled here.
     """
-    told = [_misses(plan.actions, scene, pourer, receiver, known)]
+    findings = [_misses(plan.actions, scene, pourer, receiver, known)]
     if arm is not None and arm.tilt_speed_limit is not None:
-        told += [
+        findings += [
             _too_fast(plan.actions, scene, name, arm.tilt_speed_limit)
             for name in ("angular_velocity", "return_velocity")
         ]
-    return [one for one in told if one is not None]
+    return [one for one in findings if one is not None]
 
 
 def _misses(
@@ -219,7 +219,7 @@ def _place(action: Action) -> CheckedPlace:
     return action.x_offset, action.y_offset, action.height
 
 
-def _nothing(told: object) -> None:
+def _ignore(findings: object) -> None:
     """Default callback: does nothing."""
 
 
@@ -228,8 +228,8 @@ class _Checker:
     source: Path
     arm: ArmSpec | None = None
     document: Document | None = None
-    warn: Callable[[Problem], None] = _nothing
-    doing: Callable[[str], None] = _nothing
+    warn: Callable[[Problem], None] = _ignore
+    doing: Callable[[str], None] = _ignore
     problems: list[Problem] = field(default_factory=list)
     vessels: dict[VesselSpec, Vessel | None] = field(default_factory=dict)
     landings: dict[tuple[object, ...], float | None] = field(default_factory=dict)
@@ -403,8 +403,8 @@ def check_campaign(
     plan: CampaignPlan,
     *,
     as_written: bool = True,
-    warn: Callable[[Problem], None] = _nothing,
-    doing: Callable[[str], None] = _nothing,
+    warn: Callable[[Problem], None] = _ignore,
+    doing: Callable[[str], None] = _ignore,
 ) -> list[Problem]:
     """Build the vessels of a campaign and try its actions.
 

@@ -75,8 +75,8 @@ def resolve_deployment(
         section.actions, place, "is what calibration averages over; deployment looks for the best action"
     )
     if known:
-        complaints = PlacedProblems(place, report, frozenset(DeploymentSection.model_fields))
-        settings.check(Premises(actions, section.objectives is not None), complaints)
+        problems = PlacedProblems(place, report, frozenset(DeploymentSection.model_fields))
+        settings.check(Premises(actions, section.objectives is not None), problems)
     if settings.pours and laboratory is not None and not laboratory.pours:
         at = place.at("pours") if "pours" in settings.model_fields_set else place
         hint = "name one with a bench" if settings.learns_on_pours else "'pours: 0' only plans"

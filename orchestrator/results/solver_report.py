@@ -121,15 +121,15 @@ def draw(figure: Figure, path: Path) -> Path:
     rows = -(-panels // columns)
     wide, high = (6.2, 3.9) if panels == 1 else (3.4, 2.7)
     canvas, axes = style.new_figure(rows, columns, size=(wide * columns, 0.5 + high * rows), squeeze=False)
-    looks = _looks(figure)
+    styles = _curve_styles(figure)
     for number, place in enumerate(axes.flat):
         if number < panels:
-            _panel(place, figure, number, looks)
+            _panel(place, figure, number, styles)
         else:
             place.set_visible(False)
     # Below the panels, because inside it would cover curves.
     handles = {n: h for place in axes.flat for h, n in zip(*place.get_legend_handles_labels(), strict=True)}
-    names = [name for name in looks if name in handles]
+    names = [name for name in styles if name in handles]
     room = wide * columns / (0.55 + CHARACTER * max(map(len, names), default=1))
     canvas.legend(
         [handles[name] for name in names], names, loc="outside lower center", ncols=max(1, min(int(room), len(names))),
@@ -151,24 +151,24 @@ class CaseFigureStyle:
     marker: str = ""
 
 
-def _looks(figure: Figure) -> dict[str, CaseFigureStyle]:
+def _curve_styles(figure: Figure) -> dict[str, CaseFigureStyle]:
     """Styles by name. Measured curves differ in colour; references have their subject's colour and another style."""
     measured = list(dict.fromkeys(s.name for s in figure.series if s.kind == "measured"))
-    looks = {name: CaseFigureStyle(colour) for name, colour in zip(measured, COLOURS * 4, strict=False)}
-    of_subject = {_subject(name): looks[name].colour for name in reversed(measured)}
-    styles = iter(REFERENCES * 4)
+    styles = {name: CaseFigureStyle(colour) for name, colour in zip(measured, COLOURS * 4, strict=False)}
+    of_subject = {_subject(name): styles[name].colour for name in reversed(measured)}
+    references = iter(REFERENCES * 4)
     for series in figure.series:
-        if series.name not in looks:
-            line, marker = next(styles)
+        if series.name not in styles:
+            line, marker = next(references)
             few = 2 < len(series.x) < FEW
             colour = of_subject.get(_subject(series.name), style.INK)
-            looks[series.name] = CaseFigureStyle(colour, "", marker) if few else CaseFigureStyle(colour, line)
-    return looks
+            styles[series.name] = CaseFigureStyle(colour, "", marker) if few else CaseFigureStyle(colour, line)
+    return styles
 
 
-def _panel(axes: Axes, figure: Figure, number: int, looks: Mapping[str, CaseFigureStyle]) -> None:
+def _panel(axes: Axes, figure: Figure, number: int, styles: Mapping[str, CaseFigureStyle]) -> None:
     for series in (s for s in figure.series if s.panel == number):
-        look = looks[series.name]
+        look = styles[series.name]
         above = 3 if series.kind == "reference" else 2
         axes.plot(
             series.x, series.y, color=look.colour, ls=look.line or "none", marker=look.marker or None, ms=5,

@@ -205,7 +205,7 @@ def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[Po
         predictions = [
             None
             if pour.predicted is None
-            else _told(
+            else _prediction_interval(
                 Prediction(
                     pour.predicted, pour.predicted_deviation or 0.0, pour.predicted_scatter, pour.predicted_band
                 ),
@@ -217,7 +217,7 @@ def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[Po
     return series
 
 
-def _told(predicted: Prediction, unit: LossUnit) -> tuple[float, float, float]:
+def _prediction_interval(predicted: Prediction, unit: LossUnit) -> tuple[float, float, float]:
     low, high = predicted.of_a_pour()
     return unit.factor * at_least_nothing(predicted.mean), unit.factor * low, unit.factor * high
 

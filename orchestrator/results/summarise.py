@@ -116,14 +116,14 @@ _NOTHING: dict[str, None] = dict.fromkeys(Recommended.model_fields)
 def _receiver(
     name: str,
     result: Deployed,
-    foreseen: Foreseen | None,
+    predicted: Foreseen | None,
     not_covered: Sequence[NotCovered],
     liquid: Liquid | None,
     confirmed: Confirmed | None,
     axes: tuple[Axis, ...],
 ) -> ReceiverSummary:
     pours, best = result.weighed, result.best
-    prediction = None if foreseen is None else foreseen.over_seeds
+    prediction = None if predicted is None else predicted.over_seeds
     received = None if prediction is None else prediction.get("received")
     delivered = None if received is None or liquid is None else received.mean * liquid.mass
     recommended: Mapping[str, Any] = _NOTHING if result.recommended is None else dict(result.recommended)
@@ -158,7 +158,7 @@ def _receiver(
         risk=result.risk,
         window=result.window,
         prediction=prediction,
-        prediction_band=None if foreseen is None else foreseen.band,
+        prediction_band=None if predicted is None else predicted.band,
         at_bounds=tuple(style.at_ends(dict(recommended["action_si"] or {}), axes)),
         predicted_delivered_g=None if delivered is None else 1e3 * delivered,
         predicted_delivered_ml=None if delivered is None or liquid is None else liquid.millilitres(delivered),

@@ -131,12 +131,12 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
         said.append(f"{best}; the least of several is a lucky one, so that it is not what to expect of the next.")
     if row.risk is not None:
         said.append(_sentence(risk_line(row.risk, unit)))
-    if _borne_out(row) and (trust := trust_line(row.trust)) is not None:
+    if _is_confirmed(row) and (trust := trust_line(row.trust)) is not None:
         said.append(_sentence(trust))
     return said
 
 
-def _borne_out(row: ReceiverSummary) -> bool:
+def _is_confirmed(row: ReceiverSummary) -> bool:
     """Whether the pours confirm the judgement about the simulator without doubt."""
     trust = row.trust
     return isinstance(trust, Believed) and bool(trust.after) and trust.after[-1].ignorance < DOUBT
@@ -144,7 +144,7 @@ def _borne_out(row: ReceiverSummary) -> bool:
 
 def _open(row: ReceiverSummary, unit: LossUnit) -> list[str]:
     said = []
-    if not _borne_out(row) and (alarm := trust_line(row.trust)) is not None:
+    if not _is_confirmed(row) and (alarm := trust_line(row.trust)) is not None:
         said.append(_sentence(alarm))
     if isinstance(row.trust, Compared) and row.trust.better:
         said.append(

@@ -180,13 +180,13 @@ class Watchers:
 
     def emit(self, event: Event) -> None:
         """Send an event to every remaining subscriber. Never raises."""
-        broken: list[tuple[Watcher, Exception]] = []
+        failed: list[tuple[Watcher, Exception]] = []
         for watcher in self._watchers:
             try:
                 watcher(event)
             except Exception as error:
-                broken.append((watcher, error))
-        for watcher, problem in broken:
+                failed.append((watcher, error))
+        for watcher, problem in failed:
             self._watchers.remove(watcher)
             name = getattr(watcher, "__qualname__", type(watcher).__qualname__)
             text = f"{name} can't watch any longer: {type(problem).__name__}: {problem}"

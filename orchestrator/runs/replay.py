@@ -144,21 +144,21 @@ def replay(strategy: Strategy, history: StageHistory, stage: str) -> dict[int, R
     Raises:
         ReplayError: the strategy's requests differ from those in the journal.
     """
-    untold: dict[int, Request] = {}
+    undelivered: dict[int, Request] = {}
     for step in history.steps:
         if isinstance(step, ToldStep):
-            strategy.tell(untold.pop(step.id), history.outcomes[step.id])
+            strategy.tell(undelivered.pop(step.id), history.outcomes[step.id])
             continue
         requests = strategy.ask(step.slots)
         for key, request in zip(step.ids, requests, strict=False):
             _check_same(history.requests[key], encode_request(request), key, stage)
-            untold[key] = request
+            undelivered[key] = request
         if len(requests) != len(step.ids):
             raise ReplayError(
                 f"stage {stage}: the journal has {len(step.ids)} request(s) from {step.ids[:1] or 'none'} on, "
                 f"the replayed strategy asks for {len(requests)}. {_ADVICE}"
             )
-    return untold
+    return undelivered
 
 
 _ADVICE = (

@@ -92,9 +92,9 @@ class RequestExecutor:
         self._record_rate = record_rate
         self._real = asyncio.Lock()
         self._optimiser = asyncio.Lock()
-        self.ahead = SpeculativeExecution(self._foreseen, laboratory.simulators.size)
+        self.ahead = SpeculativeExecution(self._speculate, laboratory.simulators.size)
 
-    async def _foreseen(self, request: Simulate) -> Outcome:
+    async def _speculate(self, request: Simulate) -> Outcome:
         return (await self._simulated(request))[0]
 
     async def simulate(
@@ -108,8 +108,8 @@ class RequestExecutor:
         """
         if not record and self.ahead.knows(request):
             started()
-            if (foreseen := await self.ahead.take(request)) is not None:
-                return foreseen, None
+            if (speculated := await self.ahead.take(request)) is not None:
+                return speculated, None
         else:
             started()
         with self.ahead.asked_for():

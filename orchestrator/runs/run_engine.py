@@ -89,12 +89,12 @@ async def run_campaign(
         Watchers(watchers),
         ask_operator,
         tuple(stages_of(plan) if stages is None else stages),
-        deadlines or _patience(plan),
+        deadlines or _default_deadlines(plan),
     )
     return await run.run(resume)
 
 
-def _patience(plan: CampaignPlan) -> Deadlines:
+def _default_deadlines(plan: CampaignPlan) -> Deadlines:
     """Deadlines of a plan: with an operator who weighs, a pause waits for a pour as long as a question may take."""
     usual, laboratory = Deadlines(), plan.laboratory
     if laboratory.arm is None or laboratory.operator.answers == "virtual":
@@ -166,10 +166,10 @@ class _Run:
                 histories[stage.name] = await self._settle(stage, history)
         async with self._laboratory as laboratory:
             if isinstance(laboratory, Telling):
-                laboratory.listen(self._hear)
+                laboratory.listen(self._on_notice)
             self._check_bench(laboratory, histories)
-            lanes = RequestExecutor(laboratory, self._scenes, self._deadlines, self._plan.outputs.record_rate)
-            lanes.ahead.changed = lambda running, waiting: self._watchers.emit(
+            executor = RequestExecutor(laboratory, self._scenes, self._deadlines, self._plan.outputs.record_rate)
+            executor.ahead.changed = lambda running, waiting: self._watchers.emit(
                 MadeAhead(running=running, waiting=waiting)
             )
             opened = CampaignOpened(
@@ -181,14 +181,14 @@ class _Run:
                 resumed=resume,
             )
             self._watchers.emit(opened)
-            self._tell_of_idle(laboratory.simulators.size)
+            self._log_idle_simulators(laboratory.simulators.size)
             self._enter(State.RUNNING)
             results: dict[str, StageResult] = {}
             try:
                 for index, stage in enumerate(self._stages, start=1):
-                    results[stage.name] = await self._run_stage(stage, index, histories[stage.name], results, lanes)
+                    results[stage.name] = await self._run_stage(stage, index, histories[stage.name], results, executor)
             finally:
-                await lanes.ahead.close()
+                await executor.ahead.close()
             self._enter(State.FINISHED)
 
     async def _run_stage(
@@ -197,7 +197,7 @@ class _Run:
         index: int,
         history: StageHistory,
         results: Results,
-        lanes: RequestExecutor,
+        executor: RequestExecutor,
     ) -> StageResult:
         done = history.result is not None
         opened = StageOpened(
@@ -220,7 +220,7 @@ class _Run:
             stage.name,
             stage.build(results, seed),
             journal=self._journal,
-            lanes=lanes,
+            lanes=executor,
             watchers=self._watchers,
             capacity=self._plan.parallel_simulations,
             order=stage.order,
@@ -229,35 +229,37 @@ class _Run:
             on_stopping=lambda reason: self._enter(State.STOPPING, reason),
         )
         scheduler.restore(history)
-        used = lanes.ahead.used
+        used = executor.ahead.used
         try:
-            with self._foreseeing(stage, index, results, lanes):
+            with self._speculating(stage, index, results, executor):
                 result = await scheduler.run()
         finally:
             self._unknown_pours = bool(scheduler.unknown_pours)
-        if lanes.ahead.used > used:
-            text = f"{lanes.ahead.used - used} simulation(s) of {stage.name} were made while the arm was pouring before"
+        if executor.ahead.used > used:
+            text = (
+                f"{executor.ahead.used - used} simulation(s) of {stage.name} were made while the arm was pouring before"
+            )
             self._journal.append(Kind.NOTE, {"text": text}, stage=stage.name)
         self._watchers.emit(StageClosed(stage=stage.name, result=result))
         return result
 
     @contextmanager
-    def _foreseeing(
-        self, stage: StageDefinition, index: int, results: Results, lanes: RequestExecutor
+    def _speculating(
+        self, stage: StageDefinition, index: int, results: Results, executor: RequestExecutor
     ) -> Iterator[None]:
         """While the arm pours, run simulations that later stages will request, if the pool does not share the arm's
         CPUs."""
         later = self._stages[index - 1 :]
-        if not stage.pours or len(later) < 2 or not lanes.simulators.separate:
+        if not stage.pours or len(later) < 2 or not executor.simulators.separate:
             yield
             return
-        rehearsal = RequestForecast(later, results, self._plan.seed, self._plan.parallel_simulations, lanes)
-        task = asyncio.create_task(rehearsal.run(), name=f"rehearsal beside {stage.name}")
+        forecast = RequestForecast(later, results, self._plan.seed, self._plan.parallel_simulations, executor)
+        task = asyncio.create_task(forecast.run(), name=f"rehearsal beside {stage.name}")
         try:
             yield
         finally:
             task.cancel()
-            lanes.ahead.pause()
+            executor.ahead.pause()
             # Not awaited: an error in speculative execution appears again when its stage runs.
             task.add_done_callback(lambda task: task.cancelled() or task.exception())
 
@@ -297,7 +299,7 @@ class _Run:
                 f"the plan is for a {self._plan.laboratory.mode} bench, but the laboratory's is {laboratory.bench.mode}"
             )
 
-    def _tell_of_idle(self, simulators: int) -> None:
+    def _log_idle_simulators(self, simulators: int) -> None:
         slots = self._plan.parallel_simulations
         if simulators > slots:
             self._watchers.log(
@@ -306,7 +308,7 @@ class _Run:
                 f"{simulators - slots} will have nothing to do; 'parallel_simulations' in the campaign changes that",
             )
 
-    def _hear(self, notice: Notice) -> None:
+    def _on_notice(self, notice: Notice) -> None:
         """Write a notice of the laboratory to the journal and emit it."""
         try:
             self._journal.append(Kind.NOTE, {"text": notice.text})

@@ -42,7 +42,7 @@ class SpeculativeExecution:
         self._known: dict[Simulate, Outcome] = {}
         self._promised: dict[Simulate, asyncio.Future[Outcome | None]] = {}
         self._asked_for = 0
-        self._told = (0, 0)
+        self._reported = (0, 0)
         self.changed: Callable[[int, int], None] = lambda running, waiting: None
         self.made = 0
         self.used = 0
@@ -128,8 +128,8 @@ class SpeculativeExecution:
             task = asyncio.ensure_future(self._simulate(request))
             self._running[request] = task
             task.add_done_callback(partial(self._done, request))
-        if (now := (len(self._running), len(self._known))) != self._told:
-            self._told = now
+        if (now := (len(self._running), len(self._known))) != self._reported:
+            self._reported = now
             self.changed(*now)
 
     def _done(self, request: Simulate, task: asyncio.Future[Outcome]) -> None:

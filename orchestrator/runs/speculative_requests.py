@@ -49,11 +49,11 @@ class RequestForecast:
         """Queue all predicted simulations; returns when nothing more can be predicted."""
         now, *later = self.stages
         results: dict[str, StageResult] = dict(self.results)
-        made_up = self._acted_out(now)
-        guessed = made_up is not None
+        placeholder = self._placeholder_result(now)
+        guessed = placeholder is not None
         unknown: list[SimulationParameters] = []
-        if made_up is not None:
-            results[now.name] = made_up
+        if placeholder is not None:
+            results[now.name] = placeholder
         for stage in later:
             strategy = self._built(stage, results)
             if strategy is None:
@@ -72,7 +72,7 @@ class RequestForecast:
         except Exception:  # its input is unknown yet; a real problem is reported when the stage runs
             return None
 
-    def _acted_out(self, stage: StageDefinition) -> StageResult | None:
+    def _placeholder_result(self, stage: StageDefinition) -> StageResult | None:
         """Result of a stage that only pours, with placeholder outcomes; None for any other stage."""
         strategy = self._built(stage, self.results)
         if strategy is None:
@@ -84,7 +84,7 @@ class RequestForecast:
             if not requests or not all(isinstance(request, Pour) for request in requests):
                 return None
             for request in requests:
-                strategy.tell(request, _made_up_pour(number))
+                strategy.tell(request, _placeholder_pour(number))
         return None
 
     async def _first(self, strategy: Strategy, unknown: Sequence[SimulationParameters]) -> None:
@@ -130,6 +130,6 @@ class RequestForecast:
         return await self.lanes.suggest(question, started=lambda: None, retrying=lambda text: None)
 
 
-def _made_up_pour(number: int) -> Outcome:
+def _placeholder_pour(number: int) -> Outcome:
     """An arbitrary outcome that varies with the number, because a regression needs different values."""
     return Poured(PourMeasurement(loaded=0.2, spilled=0.2 * (0.05 + 0.1 * (number % 7)), retained=0.002))

@@ -84,18 +84,18 @@ def is_recorded(number: int, recordings: int) -> bool:
     return number.bit_count() == 1 and number.bit_length() <= recordings
 
 
-def free_slots(flights: Sequence[PendingRequest], capacity: int) -> Slots:
+def free_slots(pending_requests: Sequence[PendingRequest], capacity: int) -> Slots:
     """Capacity minus the pending requests: the same on every machine and at any speed."""
-    simulations = sum(isinstance(f.request, Simulate) for f in flights)
-    pours = sum(isinstance(f.request, Pour) for f in flights)
+    simulations = sum(isinstance(f.request, Simulate) for f in pending_requests)
+    pours = sum(isinstance(f.request, Pour) for f in pending_requests)
     return Slots(max(capacity - simulations, 0), max(1 - pours, 0))
 
 
-def next_to_tell(flights: Sequence[PendingRequest], order: Order) -> PendingRequest | None:
+def next_to_tell(pending_requests: Sequence[PendingRequest], order: Order) -> PendingRequest | None:
     """The pending request whose outcome is delivered next; None if it has no outcome yet."""
     if order == "completion":
-        return min((f for f in flights if f.outcome is not None), key=lambda f: f.finished, default=None)
-    first = min(flights, key=lambda f: (_LOGICAL_ORDER[type(f.request)], f.id), default=None)
+        return min((f for f in pending_requests if f.outcome is not None), key=lambda f: f.finished, default=None)
+    first = min(pending_requests, key=lambda f: (_LOGICAL_ORDER[type(f.request)], f.id), default=None)
     return first if first is not None and first.outcome is not None else None
 
 
@@ -135,14 +135,14 @@ class StageScheduler:
         self._stage = stage
         self._strategy = strategy
         self._journal = journal
-        self._lanes = lanes
+        self._executor = lanes
         self._watchers = watchers
         self._capacity = capacity
         self._order = order
         self._recordings = recordings
         self._on_pausing = on_pausing
         self._on_stopping = on_stopping
-        self._flights: dict[int, PendingRequest] = {}
+        self._pending: dict[int, PendingRequest] = {}
         self._next_id = journal.last_id() + 1
         self._simulations = 0
         self._finished = 0
@@ -153,7 +153,7 @@ class StageScheduler:
     @property
     def unknown_pours(self) -> list[int]:
         """Pours that have begun and whose outcome is unknown."""
-        return [f.id for f in self._flights.values() if isinstance(f.request, Pour) and f.started and f.outcome is None]
+        return [f.id for f in self._pending.values() if isinstance(f.request, Pour) and f.started and f.outcome is None]
 
     def restore(self, history: StageHistory) -> None:
         """Bring the strategy to the state at the end of the journal. Executes nothing.
@@ -161,13 +161,13 @@ class StageScheduler:
         Raises:
             ReplayError: the strategy's requests differ from those in the journal.
         """
-        untold = replay(self._strategy, history, self._stage)
+        undelivered = replay(self._strategy, history, self._stage)
         simulations = [key for key, written in history.requests.items() if written["type"] == Simulate.__name__]
         numbers = {key: number for number, key in enumerate(simulations, start=1)}
         order = {key: place for place, key in enumerate(history.outcomes, start=1)}
         self._simulations, self._finished = len(numbers), len(order)
-        for key, request in untold.items():
-            self._flights[key] = PendingRequest(
+        for key, request in undelivered.items():
+            self._pending[key] = PendingRequest(
                 key,
                 request,
                 record=is_recorded(numbers.get(key, 0), self._recordings),
@@ -194,12 +194,12 @@ class StageScheduler:
             asyncio.CancelledError: the run is paused; requests that had begun were finished or abandoned, and recorded.
         """
         try:
-            for flight in self._flights.values():
-                self._launch(flight)
+            for pending in self._pending.values():
+                self._launch(pending)
             while True:
                 if self._ask_is_due and not self._strategy.finished:
                     self._ask()
-                if not self._flights:
+                if not self._pending:
                     if self._strategy.finished:
                         break
                     raise StrategyError(
@@ -215,26 +215,26 @@ class StageScheduler:
         return result
 
     def _ask(self) -> None:
-        slots = free_slots(list(self._flights.values()), self._capacity)
+        slots = free_slots(list(self._pending.values()), self._capacity)
         requests = self._strategy.ask(slots)
         self._check(requests, slots)
-        flights = []
+        pending_requests = []
         for request in requests:
             record = False
             if isinstance(request, Simulate):
                 self._simulations += 1
                 record = is_recorded(self._simulations, self._recordings)
-            flights.append(PendingRequest(self._next_id, request, record=record))
+            pending_requests.append(PendingRequest(self._next_id, request, record=record))
             self._next_id += 1
-        asked = {"simulations": slots.simulations, "pours": slots.pours, "ids": [f.id for f in flights]}
+        asked = {"simulations": slots.simulations, "pours": slots.pours, "ids": [f.id for f in pending_requests]}
         drafts = [Draft(Kind.ASKED, asked, self._stage)]
-        for f in flights:
+        for f in pending_requests:
             drafts.append(Draft(Kind.REQUESTED, {"id": f.id, "request": encode_request(f.request)}, self._stage))
         self._write_with_decisions(drafts)
         self._ask_is_due = False
-        for flight in flights:
-            self._flights[flight.id] = flight
-            self._launch(flight)
+        for pending in pending_requests:
+            self._pending[pending.id] = pending
+            self._launch(pending)
 
     def _check(self, requests: Sequence[Request], slots: Slots) -> None:
         simulations = sum(isinstance(r, Simulate) for r in requests)
@@ -245,70 +245,70 @@ class StageScheduler:
                 f"{slots.simulations} and {slots.pours} slot(s) are free"
             )
 
-    def _launch(self, flight: PendingRequest) -> None:
-        if flight.outcome is None:
-            flight.task = asyncio.create_task(self._perform(flight), name=f"{self._stage} request {flight.id}")
+    def _launch(self, pending: PendingRequest) -> None:
+        if pending.outcome is None:
+            pending.task = asyncio.create_task(self._perform(pending), name=f"{self._stage} request {pending.id}")
 
-    async def _perform(self, flight: PendingRequest) -> None:
+    async def _perform(self, pending: PendingRequest) -> None:
         """Execute one request and write its outcome to the journal."""
-        begin, frames, request = time.monotonic(), None, flight.request
+        begin, frames, request = time.monotonic(), None, pending.request
 
         def started() -> None:
             nonlocal begin
             begin = time.monotonic()
             if isinstance(request, Pour):
-                body = {"id": flight.id, "attempt": flight.attempt, "number": request.number}
+                body = {"id": pending.id, "attempt": pending.attempt, "number": request.number}
                 self._append(Kind.POUR_STARTED, body)
             else:
-                self._append(Kind.STARTED, {"id": flight.id})
-            flight.started = True
-            self._watchers.emit(RequestStarted(stage=self._stage, id=flight.id, request=request))
+                self._append(Kind.STARTED, {"id": pending.id})
+            pending.started = True
+            self._watchers.emit(RequestStarted(stage=self._stage, id=pending.id, request=request))
 
         match request:
             case Simulate():
-                outcome, frames = await self._lanes.simulate(request, record=flight.record, started=started)
+                outcome, frames = await self._executor.simulate(request, record=pending.record, started=started)
             case Pour():
 
                 def progress(p: PourProgress) -> None:
-                    event = PourProgressed(stage=self._stage, id=flight.id, number=request.number, progress=p)
+                    event = PourProgressed(stage=self._stage, id=pending.id, number=request.number, progress=p)
                     self._watchers.emit(event)
 
                 def withdrawn(reason: str) -> None:
-                    self._append(Kind.POUR_WITHDRAWN, {"id": flight.id, "reason": reason})
-                    flight.started = False
+                    self._append(Kind.POUR_WITHDRAWN, {"id": pending.id, "reason": reason})
+                    pending.started = False
 
                 self._journal.check_space_for_pour()
-                outcome = await self._lanes.pour(request, started=started, withdrawn=withdrawn, progress=progress)
+                outcome = await self._executor.pour(request, started=started, withdrawn=withdrawn, progress=progress)
             case Suggest():
 
                 def retrying(text: str) -> None:
                     self._append(Kind.NOTE, {"text": text})
                     self._watchers.log("warning", text, self._stage)
 
-                outcome = await self._lanes.suggest(request, started=started, retrying=retrying)
+                outcome = await self._executor.suggest(request, started=started, retrying=retrying)
             case Ask():
                 # A question is answered on resume: a display that is redrawn takes no input, and the arm does not wait.
                 raise needs_answer(request)
-        self._finish(flight, outcome, time.monotonic() - begin, frames)
+        self._finish(pending, outcome, time.monotonic() - begin, frames)
 
-    def _finish(self, flight: PendingRequest, outcome: Outcome, seconds: float, frames: RecordedFrames | None) -> None:
+    def _finish(self, pending: PendingRequest, outcome: Outcome, seconds: float, frames: RecordedFrames | None) -> None:
         written = encode_outcome(outcome)
-        kind = Kind.POUR_FINISHED if isinstance(flight.request, Pour) else Kind.FINISHED
+        kind = Kind.POUR_FINISHED if isinstance(pending.request, Pour) else Kind.FINISHED
         try:
-            self._append(kind, {"id": flight.id, "outcome": written, "seconds": seconds})
+            self._append(kind, {"id": pending.id, "outcome": written, "seconds": seconds})
         except JournalError as error:
-            if isinstance(flight.request, Pour) and isinstance(outcome, Poured):
-                raise JournalError(f"{error}. {weighed_by_hand(flight.request, outcome.measurement)}") from error
+            if isinstance(pending.request, Pour) and isinstance(outcome, Poured):
+                raise JournalError(f"{error}. {weighed_by_hand(pending.request, outcome.measurement)}") from error
             raise
         # The strategy receives the outcome as decoded from the journal, so that a replay delivers the same.
-        flight.outcome = decode_outcome(written)
+        pending.outcome = decode_outcome(written)
         self._finished += 1
-        flight.finished = self._finished
+        pending.finished = self._finished
         event = RequestFinished(
             stage=self._stage,
-            id=flight.id,
-            request=flight.request,
-            outcome=flight.outcome,
+            id=pending.id,
+            request=pending.request,
+            outcome=pending.outcome,
             seconds=seconds,
             frames=frames,
         )
@@ -318,28 +318,28 @@ class StageScheduler:
         """Wait until the next request to deliver has an outcome, and return it."""
         while True:
             self._raise_failures()
-            flight = next_to_tell(list(self._flights.values()), self._order)
-            if flight is not None:
-                return flight
-            running = [f.task for f in self._flights.values() if f.task is not None and f.running]
+            pending = next_to_tell(list(self._pending.values()), self._order)
+            if pending is not None:
+                return pending
+            running = [f.task for f in self._pending.values() if f.task is not None and f.running]
             await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
 
     def _raise_failures(self) -> None:
-        for flight in self._flights.values():
-            task = flight.task
+        for pending in self._pending.values():
+            task = pending.task
             if task is not None and task.done():
                 if task.cancelled():
-                    raise StrategyError(f"request {flight.id} of stage {self._stage} was cancelled from outside")
+                    raise StrategyError(f"request {pending.id} of stage {self._stage} was cancelled from outside")
                 if (error := task.exception()) is not None:
                     raise error
 
-    def _tell(self, flight: PendingRequest) -> None:
-        assert flight.outcome is not None
-        del self._flights[flight.id]
-        self._strategy.tell(flight.request, flight.outcome)
-        self._write_with_decisions([Draft(Kind.TOLD, {"id": flight.id}, self._stage)])
+    def _tell(self, pending: PendingRequest) -> None:
+        assert pending.outcome is not None
+        del self._pending[pending.id]
+        self._strategy.tell(pending.request, pending.outcome)
+        self._write_with_decisions([Draft(Kind.TOLD, {"id": pending.id}, self._stage)])
         self._ask_is_due = True
-        self._report_progress(urgent=isinstance(flight.request, Pour) or self._strategy.finished)
+        self._report_progress(urgent=isinstance(pending.request, Pour) or self._strategy.finished)
 
     def _write_with_decisions(self, drafts: list[Draft]) -> None:
         """Write entries together with the decisions that belong to them, so that a replay has the same number of
@@ -374,10 +374,10 @@ class StageScheduler:
             reason = str(error) if isinstance(error, RunError) else f"{type(error).__name__}: {error}"
         pours: list[asyncio.Task[None]] = []
         others: list[asyncio.Task[None]] = []
-        for flight in self._flights.values():
-            if flight.task is not None and flight.running:
-                begun = isinstance(flight.request, Pour) and flight.started
-                (pours if begun else others).append(flight.task)
+        for pending in self._pending.values():
+            if pending.task is not None and pending.running:
+                begun = isinstance(pending.request, Pour) and pending.started
+                (pours if begun else others).append(pending.task)
         for task in others:
             task.cancel()
         try:
@@ -386,20 +386,20 @@ class StageScheduler:
             self._watchers.log("error", f"can't write that the run is pausing: {problem}", self._stage)
         try:
             if pours:
-                grace = self._lanes.deadlines.pour_grace
+                grace = self._executor.deadlines.pour_grace
                 self._watchers.log(
                     "info", f"a pour is under way; it is finished first (up to {grace:g} s)", self._stage
                 )
                 await asyncio.wait(pours, timeout=grace)
             if others:
-                await asyncio.wait(others, timeout=self._lanes.deadlines.cleanup)
+                await asyncio.wait(others, timeout=self._executor.deadlines.cleanup)
         except asyncio.CancelledError:
             self._on_stopping("asked again")
         unfinished = [task for task in (*pours, *others) if not task.done()]
         for task in unfinished:
             task.cancel()
         if unfinished:
-            await asyncio.wait(unfinished, timeout=self._lanes.deadlines.cleanup)
+            await asyncio.wait(unfinished, timeout=self._executor.deadlines.cleanup)
         for task in (*pours, *others):
             if task.done() and not task.cancelled() and (late := task.exception()) is not None and late is not error:
                 self._watchers.log("warning", f"while winding down: {type(late).__name__}: {late}", self._stage)
