@@ -279,7 +279,7 @@ class PoseErrorSection(Section):
     """Sideways offset of the receiver."""
 
     z: Offset = 0.0
-    """Height offset of the receiver."""
+    """Upward offset of the receiver."""
 
     tilt: Tilt = 0.0
     """Additional tilt of the pourer over the commanded one."""

@@ -44,7 +44,7 @@ class PointSection(Section):
     """The y in the base frame."""
 
     z: Length | None = None
-    """Height above the robot's mounting surface."""
+    """Height above the robot's mounting point."""
 
 
 class CellSection(Section):
@@ -62,7 +62,7 @@ class CellSection(Section):
     """Pouring direction seen from above: 0 along the x axis of the base frame, 90 deg along its y axis."""
 
     table: Length = 0.0
-    """Height of the lowest surface that the arm may reach, in the gravity-aligned base frame."""
+    """Height of the surface below which nothing may move, in the gravity-aligned base frame."""
 
 
 class ArmSettings(Section):
