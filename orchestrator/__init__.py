@@ -1,1 +1,1 @@
-"""What should happen next, and what has happened: strategies, scheduler, journal, command line."""
+"""Orchestration of campaigns: strategies, scheduler, journal, results, daemon and command line."""

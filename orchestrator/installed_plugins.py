@@ -1,4 +1,4 @@
-"""All doors for packages from outside, and what stands in them."""
+"""All plug-in registries and the plug-ins that installed packages add to them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from sim_engine.settings.plugin_registry import PluginRegistry, UnloadablePlugin
 
 @dataclass(frozen=True)
 class Plugin:
-    """One thing that an installed package adds.
+    """One plug-in of an installed package.
 
     Attributes:
         group: entry-point group that it is registered in.
-        name: that files use.
-        package: that registers it, with its version.
+        name: its name in files.
+        package: package that registers it, with its version.
     """
 
     group: str
@@ -25,7 +25,7 @@ class Plugin:
 
 
 def doors() -> tuple[PluginRegistry[Any], ...]:
-    """Every door; nothing behind them has been loaded before somebody looks."""
+    """All plug-in registries. Plug-ins are loaded on first use."""
     from actors.balance.dialect_registry import BALANCES
     from orchestrator.config.arm_file import ARMS
     from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES
@@ -35,12 +35,12 @@ def doors() -> tuple[PluginRegistry[Any], ...]:
 
 
 def installed() -> list[Plugin]:
-    """What is usable, ours as everybody's, by door and name."""
+    """All usable plug-ins, Decant's own included, by registry and name."""
     return [Plugin(door.group, name, door.package(name)) for door in doors() for name in door.names]
 
 
 def packages() -> dict[str, tuple[str, list[str]]]:
-    """Packages from outside that register something: version, and what ('decant.balances: spring'). Loads nothing."""
+    """Other packages that register plug-ins: version, and the plug-ins ('decant.balances: spring'). Loads nothing."""
     found: dict[str, tuple[str, list[str]]] = {}
     for door in doors():
         for entry in entry_points(group=door.group):
@@ -51,5 +51,5 @@ def packages() -> dict[str, tuple[str, list[str]]]:
 
 
 def broken() -> list[UnloadablePlugin]:
-    """What is registered and can't be used, with the reason."""
+    """Registered plug-ins that can't be loaded, with the reason."""
     return [one for door in doors() for one in door.broken]

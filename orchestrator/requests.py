@@ -1,4 +1,8 @@
-"""What strategies ask for and what they are told: values only, no handles, no clock."""
+"""Requests of strategies and their outcomes: immutable values without handles and without a clock.
+
+A strategy returns `Simulate`, `Pour`, `Suggest` or `Ask` and receives `Simulated`, `Poured`, `Suggested`, `Answered` or
+`Failed`.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +23,14 @@ _NORMAL = NormalDist()
 
 @dataclass(frozen=True)
 class Prediction:
-    """A predicted loss, in the loss' own unit.
+    """A predicted loss, in the loss's own unit.
 
     Attributes:
         mean: expected loss.
-        deviation: standard deviation of that expectation: how well it is known.
+        deviation: standard deviation of the expected loss.
         scatter: standard deviation of a single pour around it (in simulation: of a single seed); None if unknown.
-        band: the shortest interval that a single pour lies in with a probability of
-        `sim_engine.prediction_band.LEVEL`; None if
-            unknown.
+        band: the shortest interval that contains a single pour with a probability of
+            `sim_engine.prediction_band.LEVEL`; None if unknown.
     """
 
     mean: float
@@ -36,8 +39,11 @@ class Prediction:
     band: tuple[float, float] | None = None
 
     def of_a_pour(self) -> tuple[float, float]:
-        """Its band; where none was told, that of a normal distribution with these moments. No loss is below 0: where
-        one may well be 0 the band begins there, and holds no more for that."""
+        """The prediction interval of a single pour.
+
+        Without `band`, it is that of a normal distribution with these moments. Losses are not negative: if 0 is a
+        likely value, the interval begins at 0 and is one-sided.
+        """
         if self.band is not None:
             return self.band
         spread = math.hypot(self.deviation, self.scatter or 0.0)
@@ -50,13 +56,13 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Simulate:
-    """Run one simulated pour (idempotent, retried at will).
+    """Run one simulated pour (idempotent, can be repeated).
 
     Attributes:
-        purpose: one word for journal and monitor: 'calibrate', 'prior', 'refine', 'evaluate' …
-        pose_error: with which it is executed; None: as intended.
-        drawn_shapes: whether vessels have shapes that they may as well have, drawn by `seed`; else those that were
-            measured.
+        purpose: one word for journal and live view: 'calibrate', 'prior', 'refine', 'evaluate' …
+        pose_error: execution error; None: executed as intended.
+        drawn_shapes: whether vessel shapes are drawn from their uncertainty by `seed`; otherwise the measured shapes
+            are used.
     """
 
     scene: str
@@ -70,12 +76,12 @@ class Simulate:
 
 @dataclass(frozen=True)
 class Pour:
-    """Pour once on the real (or virtual) bench. Never retried by software.
+    """Pour once on the real (or virtual) bench. Never repeated by software.
 
     Attributes:
         number: 1, 2, … within the stage.
-        seed: of the virtual bench's hidden noise for this pour; a real bench ignores it.
-        predicted: what the strategy expects, for people and for the trust check.
+        seed: seed of the virtual bench's hidden noise for this pour; a real bench ignores it.
+        predicted: the strategy's prediction, for display and for the model check.
     """
 
     scene: str
@@ -88,7 +94,7 @@ class Pour:
 
 @dataclass(frozen=True)
 class Suggest:
-    """Ask the optimiser actor for points. Its answer is journalled and replayed, never recomputed."""
+    """Query the optimiser actor for points. Its answer is recorded and replayed, never recomputed."""
 
     problem: SuggestProblem
     purpose: str = "suggest"
@@ -96,10 +102,10 @@ class Suggest:
 
 @dataclass(frozen=True)
 class Ask:
-    """Ask a person to decide. The run pauses; the answer is given on resume, journalled and replayed.
+    """Ask the operator for a decision. The run pauses; the answer is given on resume, recorded and replayed.
 
     Attributes:
-        question: with the facts that the answer depends on.
+        question: includes the facts that the answer depends on.
         options: allowed answers.
     """
 
@@ -133,19 +139,21 @@ class Suggested:
 
 @dataclass(frozen=True)
 class Answered:
-    """Outcome of an `AskOperator`: one of its options."""
+    """Outcome of an `Ask`: one of its options."""
 
     answer: str
 
 
 @dataclass(frozen=True)
 class Failed:
-    """The request came to nothing: a simulation that leaked or diverged, a touching pair of vessels, a pour that was
-    declared lost by the operator.
+    """A failed request.
+
+    Examples are a simulation that leaked or diverged, a pair of touching vessels, or a pour that the operator declared
+    lost.
 
     Attributes:
         kind: 'invalid_action', 'simulation', 'pour_unknown' or 'pour_failed'.
-        reason: for people.
+        reason: text for the operator.
     """
 
     kind: str
@@ -157,7 +165,7 @@ Outcome = Simulated | Poured | Suggested | Answered | Failed
 
 @dataclass(frozen=True)
 class Slots:
-    """How many requests of each kind the scheduler could start now."""
+    """Number of requests of each kind that the scheduler could start now."""
 
     simulations: int
     pours: int = 1
@@ -165,10 +173,10 @@ class Slots:
 
 @dataclass(frozen=True)
 class Decision:
-    """Why a strategy asked for what it asked for; shown, streamed and journalled.
+    """The reason for a strategy's requests; displayed, streamed and recorded.
 
     Attributes:
-        urgent: people should read it now, in the terminal too.
+        urgent: whether it is also displayed in the terminal immediately.
     """
 
     text: str
@@ -177,4 +185,4 @@ class Decision:
 
 
 Order = Literal["logical", "completion"]
-"""The order in which outcomes are told; see `orchestrator.runs.stage_scheduler`."""
+"""The order in which outcomes are delivered; see `orchestrator.runs.stage_scheduler`."""

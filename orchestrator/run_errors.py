@@ -1,4 +1,4 @@
-"""The base of what may end a run, and the exit codes that people and scripts see."""
+"""Base classes of errors that end a run, with the exit codes of the command line."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from sim_engine.errors import DecantError
 
 
 class RunError(DecantError):
-    """A run can't begin or go on. The text is for the person who can mend it.
+    """A run can't begin or continue. The text is for the user who can fix the cause.
 
     Attributes:
-        exit_code: of the command line: 1 failed, 3 an answer of a person is needed.
+        exit_code: of the command line: 1 failed, 3 an answer of the operator is needed.
     """
 
     exit_code = 1
 
 
 class LearningError(RunError):
-    """What was weighed and simulated is not enough to learn from; the text says what is missing."""
+    """There are too few measurements or simulations to learn from; the text names the missing data."""

@@ -1,4 +1,4 @@
-"""The files that Decant comes with: campaigns, laboratories, studies, vessels, weighed pours."""
+"""The files that are shipped with Decant: campaigns, laboratories, studies, vessels, weighed pours."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import shutil
 from pathlib import Path
 
 STARTING_SET = ("README.md", "campaigns", "data", "laboratories", "schema", "studies", "vessels")
-"""What is copied of the shipped files."""
+"""The shipped files that `starting_set` copies."""
 
 
 def shipped(name: str = "") -> Path:
-    """One of the files that Decant comes with: 'campaigns/quickstart.yaml'; the folder of all without a name.
+    """Path of a shipped file such as 'campaigns/quickstart.yaml'; without a name, the folder of all of them.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -27,13 +27,13 @@ def starting_set(directory: Path | str) -> list[Path]:
     """Copy the shipped campaigns, laboratories, studies, vessels and data into a folder: `decant init DIR`.
 
     Args:
-        directory: is made if needed; must be empty.
+        directory: created if needed; must be empty.
 
     Returns:
         The campaigns.
 
     Raises:
-        FileExistsError: there is something in it already.
+        FileExistsError: the directory is not empty.
         OSError: it can't be written.
     """
     directory = Path(directory)
@@ -50,6 +50,6 @@ def starting_set(directory: Path | str) -> list[Path]:
 
 
 def _root() -> Path:
-    """In an installed package they stand beside its modules, in a checkout at its top."""
+    """In an installed package the folder is next to the modules, in a checkout at the top."""
     here = Path(__file__).parent
     return here / "configs" if (here / "configs").is_dir() else here.parent / "configs"

@@ -1,4 +1,4 @@
-"""The states of a campaign and the only ways from one to another."""
+"""The states of a campaign and the allowed transitions."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ from enum import StrEnum
 
 
 class State(StrEnum):
-    """What a campaign is doing."""
+    """State of a campaign."""
 
     QUEUED = "queued"
-    """Written down; nothing started."""
+    """Created; nothing started."""
     PREPARING = "preparing"
     """The laboratory is being opened; a resumed strategy is being replayed."""
     RUNNING = "running"
-    """Strategies ask and are told."""
+    """Stages are running."""
     PAUSING = "pausing"
-    """Asked to pause: simulations are dropped, a pour that has begun is finished and weighed."""
+    """A pause was requested: simulations are dropped, a pour that has begun is finished and weighed."""
     PAUSED = "paused"
-    """At rest with nothing lost; may be resumed."""
+    """Paused without loss; can be resumed."""
     WAITING_FOR_OPERATOR = "waiting for operator"
-    """A question to a person is open."""
+    """A question to the operator is open."""
     STOPPING = "stopping"
-    """Asked twice: everything is dropped at once, the running pour too."""
+    """A second stop was requested: everything is dropped at once, including the running pour."""
     FINISHED = "finished"
     """All stages are closed."""
     FAILED = "failed"
-    """Something that software can't mend; may be resumed once it is mended."""
+    """An error that software can't fix; can be resumed after the cause is fixed."""
     UNKNOWN = "unknown"
-    """A pour had started and nobody knows what came of it; resuming asks."""
+    """A pour had started and its outcome is unknown; the operator reports it on resume."""
 
 
 TRANSITIONS: dict[State, frozenset[State]] = {
@@ -42,11 +42,13 @@ TRANSITIONS: dict[State, frozenset[State]] = {
     State.FAILED: frozenset({State.PREPARING}),
     State.FINISHED: frozenset(),
 }
-"""From each state, where it may go. RUNNING → PAUSED or UNKNOWN directly is what the next process writes when it finds
-a run whose own process died without a word."""
+"""Allowed transitions from each state.
+
+RUNNING → PAUSED or UNKNOWN is written by the next process if it finds a run whose process died.
+"""
 
 RESTING = frozenset({State.QUEUED, State.PAUSED, State.UNKNOWN, State.FAILED, State.FINISHED})
-"""States in which a run may be left: any other, found in a journal that nobody writes, means that its process died."""
+"""States in which a run may be left. Any other state in a journal without a writer means that its process died."""
 
 
 class TransitionError(RuntimeError):

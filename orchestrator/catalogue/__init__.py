@@ -1,1 +1,1 @@
-"""What has been run on this machine, and what was poured: an index over the runs' own journals."""
+"""Catalogue of the runs on this machine: an index of runs and pours, built from the runs' own journals."""

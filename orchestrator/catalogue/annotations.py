@@ -1,4 +1,4 @@
-"""Tags and notes of people: a file in the run's own folder, so that they go wherever the run goes."""
+"""Tags and notes of a run, stored in a file in the run's folder, so that they move with the run."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ REMARKS_NAME = "remarks.json"
 
 
 class Note(BaseModel):
-    """What somebody wrote about a run.
+    """A note about a run.
 
     Attributes:
         time: seconds since 1970.
-        by: who wrote it.
+        by: its author.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -30,7 +30,7 @@ class Note(BaseModel):
 
 
 class Annotations(BaseModel):
-    """All that people said about a run; notes in the order in which they were written."""
+    """All tags and notes of a run; notes in the order in which they were written."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -39,14 +39,14 @@ class Annotations(BaseModel):
 
 
 class AnnotationsError(Exception):
-    """The remarks of a run can't be read or written; the text says why and what to do."""
+    """The annotations of a run can't be read or written; the text gives the reason and the remedy."""
 
 
 def read_remarks(run: Path) -> Annotations:
-    """The remarks of a run; none where nobody has said anything.
+    """The annotations of a run; empty if there are none.
 
     Raises:
-        RemarksError: the file is not one of ours.
+        AnnotationsError: the file is not a file of annotations.
     """
     path = run / REMARKS_NAME
     try:
@@ -58,10 +58,10 @@ def read_remarks(run: Path) -> Annotations:
 
 
 def tag(run: Path, add: tuple[str, ...] = (), remove: tuple[str, ...] = ()) -> Annotations:
-    """Put tags on a run, and take others off.
+    """Add tags to a run, and remove others.
 
     Raises:
-        RemarksError: as `read_remarks`, and where they can't be kept.
+        AnnotationsError: as `read_remarks`, or the file can't be written.
     """
 
     def changed(before: Annotations) -> Annotations:
@@ -75,14 +75,14 @@ def note(run: Path, text: str, by: str | None = None) -> Annotations:
     """Add a note to a run.
 
     Raises:
-        RemarksError: as `tag`.
+        AnnotationsError: as `tag`.
     """
     written = Note(time=time.time(), by=_me() if by is None else by, text=text)
     return _change(run, lambda before: before.model_copy(update={"notes": (*before.notes, written)}))
 
 
 def _change(run: Path, change: Callable[[Annotations], Annotations]) -> Annotations:
-    """Read, change, and replace the file in one step; two who do it at once wait for each other."""
+    """Read the file, change it, and replace it atomically; concurrent changes wait for each other."""
     path = run / REMARKS_NAME
     try:
         with path.with_suffix(".lock").open("w") as lock:

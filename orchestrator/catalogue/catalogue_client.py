@@ -1,4 +1,7 @@
-"""What people ask of the catalogue and how it answers, JSON-ready: the same on this machine and through the daemon."""
+"""Operations on the catalogue with JSON-ready results, the same on this machine and through the daemon.
+
+`CatalogueClient` is the protocol; `LocalCatalogueClient` implements it with the catalogue of this machine.
+"""
 
 from __future__ import annotations
 
@@ -22,39 +25,42 @@ from orchestrator.journal.run_record import Row
 
 
 class CatalogueClient(Protocol):
-    """Who answers. Conditions are those of `search.searching`; a run is named as `search.one_run` knows it.
+    """A catalogue. Conditions are those of `queries.searching`; runs are named as in `queries.one_run`.
 
-    Every call may raise RunError or RemarksError, whose text says why.
+    Every call may raise RunError or AnnotationsError, whose text gives the reason.
     """
 
     def runs(self, conditions: Mapping[str, Any]) -> list[Row]:
-        """Runs, the newest first. Raises ValueError where a condition is none."""
+        """Runs, the newest first. Raises ValueError for an invalid condition."""
 
     def pours(self, conditions: Mapping[str, Any]) -> list[Row]:
-        """Pours, the oldest first. Raises ValueError where a condition is none."""
+        """Pours, the oldest first. Raises ValueError for an invalid condition."""
 
     def run(self, name: str) -> Row:
-        """One run, with its notes (time, by, text) and under 'list_of_pours' its pours."""
+        """One run, with its notes (time, by, text) and its pours under 'list_of_pours'."""
 
     def compare(self, names: Sequence[str]) -> Row:
-        """'runs' (their folders), 'settings' in which they differ, and 'outcomes' of each."""
+        """'runs' (their folders), the differing 'settings', and the 'outcomes' of each run."""
 
     def tag(self, name: str, add: Sequence[str], remove: Sequence[str]) -> Row:
-        """Change a run's tags; 'run' and 'tags'."""
+        """Change a run's tags; returns 'run' and 'tags'."""
 
     def note(self, name: str, text: str) -> Row:
-        """Write a note about a run; 'run' and 'notes'."""
+        """Add a note to a run; returns 'run' and 'notes'."""
 
     def export(self, folder: Path, conditions: Mapping[str, Any], formats: Sequence[str]) -> Row:
-        """Write runs and pours into files; 'files', and how many 'runs', 'pours'. Raises MissingExtraError, OSError."""
+        """Write runs and pours into files.
+
+        Returns 'files' and the numbers of 'runs' and 'pours'. Raises MissingExtraError, OSError.
+        """
 
 
 class LocalCatalogueClient:
     """The catalogue of this machine.
 
     Args:
-        catalogue: open, and brought up to date.
-        by: who writes notes; the user of this process unless given.
+        catalogue: open and up to date.
+        by: author of notes; the user of this process unless given.
     """
 
     def __init__(self, catalogue: Catalogue, by: str | None = None) -> None:

@@ -1,9 +1,9 @@
-"""The index of the catalogue: one SQLite file that may be deleted at any time, for it is made anew from the runs.
+"""The index of the catalogue: one SQLite file with a table of runs and a table of pours.
 
-Before it is asked, it looks at the journals of all known runs: those that were written since it read them are read
-again. So it never lags behind, whoever died when, and nobody but the one who asks has to write it.
-
-The columns of the catalogue's two tables, each declared once: for index, exports and their data dictionary.
+- `Catalogue.refresh` reads all journals that changed since they were last read, so queries are never outdated. Only the
+  process that queries the catalogue writes the index.
+- The index may be deleted at any time; it is rebuilt from the runs.
+- The columns of both tables are declared once here, for the index, exports and their data dictionary.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from orchestrator.strategies.stage_result import displayed_action
 from sim_engine.action import ACTION_DIMENSIONS
 
 ColumnType = Literal["text", "texts", "integer", "number", "time", "values"]
-"""'texts' are several, 'values' a mapping; both stand as JSON in the index and in CSV."""
+"""'texts' are several texts, 'values' a mapping; both are stored as JSON in the index and in CSV."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Column:
     """One column.
 
     Attributes:
-        unit: of its numbers; empty without one.
-        meaning: one line for people.
+        unit: unit of its numbers; empty without one.
+        meaning: description in one line.
     """
 
     name: str
@@ -82,7 +82,7 @@ RUNS = (
     Column("tags", "texts", "given by people: `decant runs tag`"),
     Column("notes", "texts", "written by people: `decant runs note`"),
 )
-"""One row for each run."""
+"""Columns of the table of runs."""
 
 POURS = (
     *_WHICH_RUN,
@@ -114,10 +114,10 @@ POURS = (
     Column("reason", "text", "why it failed"),
     Column("seconds", "number", "from its request to its outcome", "s"),
 )
-"""One row for each pour that had begun."""
+"""Columns of the table of pours; one row for each pour that had begun."""
 
 ACTION_COLUMNS = tuple(displayed_action(dict.fromkeys(ACTION_DIMENSIONS)))
-"""Those of POURS that say what was chosen."""
+"""Columns of POURS with the action."""
 
 TABLES: dict[str, tuple[Column, ...]] = {"run": RUNS, "pour": POURS}
 """The index's tables."""
@@ -126,7 +126,7 @@ TABLES: dict[str, tuple[Column, ...]] = {"run": RUNS, "pour": POURS}
 INDEX_NAME = "catalogue.sqlite"
 
 FORMAT = 2
-"""Version of what is in the index; one of another version is made anew."""
+"""Version of the index's content; an index of another version is rebuilt."""
 
 _SQL = {"text": "text", "texts": "text", "integer": "integer", "number": "real", "time": "real", "values": "text"}
 
@@ -134,17 +134,17 @@ Progress = Callable[[int, int], None]
 
 
 class CatalogueError(RunError):
-    """The catalogue can't do what was asked; the text says why and what would be right."""
+    """The catalogue can't fulfil a request; the text gives the reason and a correct form."""
 
 
 @dataclass
 class Refreshed:
-    """What looking at the runs came to.
+    """Result of a refresh.
 
     Attributes:
-        read: how many were read anew.
+        read: number of runs that were read.
         missing: known folders without a run.
-        problems: why runs, or parts of them, can't be read.
+        problems: reasons why runs, or parts of them, can't be read.
     """
 
     read: int = 0
@@ -153,17 +153,17 @@ class Refreshed:
 
 
 class Catalogue:
-    """The runs of this machine. Open it, `refresh` it, ask it."""
+    """The runs of this machine. Open it, call `refresh`, then query it."""
 
     def __init__(self, state: Path | None = None) -> None:
-        """Open the catalogue, or begin one.
+        """Open the catalogue, or create one.
 
         Args:
-            state: the state directory, if not the usual one.
+            state: the state directory, if not the default.
         """
         self.state = state_directory() if state is None else state
         self.warning = ""
-        """Why the index is kept in memory alone, where it can't be written; empty otherwise."""
+        """Why the index is kept in memory only, if it can't be written; empty otherwise."""
         path = self.state / INDEX_NAME
         try:
             make_state_directory(self.state)
@@ -171,8 +171,8 @@ class Catalogue:
                 self._connection = _opened(str(path))
             except sqlite3.DatabaseError as error:
                 if isinstance(error, sqlite3.OperationalError):
-                    raise  # a folder that can't be written, a full disk: not the index's fault
-                _remove(path)  # damaged: everything in it stands in the runs
+                    raise  # a folder that can't be written, a full disk: not an error of the index
+                _remove(path)  # damaged: all of its content is in the runs
                 self._connection = _opened(str(path))
         except (OSError, sqlite3.OperationalError) as error:
             self.warning = f"{path}: can't be written ({error}); the runs are read anew each time"
@@ -185,15 +185,15 @@ class Catalogue:
         self.close()
 
     def close(self) -> None:
-        """Give the file back. May be called twice."""
+        """Close the file. May be called twice."""
         self._connection.close()
 
     def refresh(self, progress: Progress | None = None, *, anew: bool = False) -> Refreshed:
-        """Read the runs that were written since they were read.
+        """Read the runs that were written since they were last read.
 
         Args:
-            progress: called with how many are read, of how many.
-            anew: read all of them; those that are gone are forgotten.
+            progress: called with the number of runs read so far, and their total.
+            anew: read all runs, and remove missing ones from the index.
 
         Raises:
             CatalogueError: the list of runs or the index can't be read or written.
@@ -225,7 +225,7 @@ class Catalogue:
         return found
 
     def rows(self, table: str, where: str = "1", values: Sequence[Any] = (), order: str = "") -> list[Row]:
-        """Rows of a table ('run' or 'pour') that a condition holds for, as declared in `columns`."""
+        """Rows of a table ('run' or 'pour') that satisfy a condition, with the columns of `TABLES`."""
         columns = TABLES[table]
         names = ", ".join(f"{table}.{column.name}" for column in columns)
         query = f"select {names} from {table} where {where} {f'order by {order}' if order else ''}"
@@ -235,8 +235,6 @@ class Catalogue:
             for row in found:
                 row["state"] = _state_now(row)
         return found
-
-    # -- inside ------------------------------------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
@@ -255,8 +253,8 @@ class Catalogue:
             self._enter(path, stamp, read)
         except (sqlite3.Error, OverflowError, TypeError, ValueError) as error:
             if isinstance(error, sqlite3.OperationalError):
-                raise  # a full disk, a locked index: not the run's fault
-            # Its content doesn't fit the columns: damaged, or beyond what SQLite can hold.
+                raise  # a full disk, a locked index: not an error of the run
+            # Its content doesn't fit the columns: it is damaged, or exceeds the limits of SQLite.
             self._connection.execute("rollback to one_run")
             problem = f"{path}: its journal has values that can't be entered ({error}); see `decant runs check`"
             self._enter(path, stamp, unreadable(Path(path), problem))
@@ -266,13 +264,13 @@ class Catalogue:
     def _enter(self, path: str, stamp: str, read: RunRead) -> None:
         for table in ("run", "pour", "source"):
             self._connection.execute(f"delete from {table} where path = ?", [path])
-        self._drop_former_place(read.run)
+        self._drop_previous_folder(read.run)
         self._insert("run", [read.run])
         self._insert("pour", read.pours)
         self._connection.execute("insert into source values (?, ?, 0, ?)", [path, stamp, read.problem])
 
-    def _drop_former_place(self, run: Row) -> None:
-        """A run that was moved is known by its name and its beginning; where it was, it is no longer."""
+    def _drop_previous_folder(self, run: Row) -> None:
+        """Remove the former folder of a run that was moved; a run is identified by its name and its start."""
         query = """select path from run join source using (path) where run = ? and begun = ? and missing"""
         for (path,) in self._connection.execute(query, [run.get("run"), run.get("begun")]).fetchall():
             for table in ("run", "pour", "source"):
@@ -319,7 +317,7 @@ def _remove(path: Path) -> None:
 
 
 def _stamp(run: Path) -> str:
-    """Changes with everything that is written into a run; empty where there is none."""
+    """A text that changes with every write to a run; empty if there is no run."""
     marks = []
     for name in (JOURNAL_NAME, f"{JOURNAL_NAME}-wal", REMARKS_NAME):
         try:
@@ -345,17 +343,17 @@ def _read_value(column: Column, value: Any) -> Any:
 
 
 def _state_now(run: Row) -> str:
-    """The state in the journal; a run that should be busy and whose journal nobody holds was interrupted."""
+    """The state in the journal; 'interrupted' for an active state if no process holds the journal."""
     state = str(run["state"] or "")
     busy = state not in ("", UNREADABLE, *RESTING)
     return "interrupted" if busy and not _held(Path(run["path"]) / JOURNAL_NAME) else state
 
 
 def _held(journal: Path) -> bool:
-    """Whether a process holds a journal's lock, by the system's own list of locks: trying it would be in the way."""
+    """Whether a process holds a journal's lock, from the system's list of locks; trying the lock would block others."""
     try:
         lock = journal.with_suffix(".lock").stat().st_ino
         lines = Path("/proc/locks").read_text(encoding="ascii").splitlines()
     except OSError:
-        return True  # nobody can tell: the journal's word stands
+        return True  # unknown: the state in the journal is used
     return any(len(part := line.split()) > 5 and part[-3].rpartition(":")[2] == str(lock) for line in lines)

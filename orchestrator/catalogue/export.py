@@ -1,4 +1,4 @@
-"""Runs and pours as files for other programs: CSV and Parquet, with a data dictionary beside them."""
+"""Export of runs and pours for other programs: CSV and Parquet, with a data dictionary."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ DICTIONARY = "dictionary.csv"
 
 
 def export(tables: Mapping[str, Sequence[Row]], folder: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
-    """Write tables as 'runs.csv', 'pours.parquet' …, and what their columns mean as 'dictionary.csv'.
+    """Write tables as 'runs.csv', 'pours.parquet' …, and the meanings of their columns as 'dictionary.csv'.
 
-    Times are UTC; in CSV as ISO 8601, lists and mappings as JSON, and what is not known is empty. In Parquet columns
-    carry meaning and unit in their metadata.
+    Times are UTC. In CSV, times are ISO 8601, lists and mappings are JSON, and unknown values are empty. In Parquet,
+    the metadata of the columns contain meaning and unit.
 
     Args:
         tables: 'run' and 'pour' to their rows.
-        folder: made if it isn't there.
+        folder: created if needed.
         formats: of `FORMATS`.
 
     Raises:
@@ -75,7 +75,7 @@ def _text(column: Column, value: Any) -> Any:
 
 
 def utc(seconds: float) -> datetime:
-    """Seconds since 1970 as a date with its zone."""
+    """Seconds since 1970 as a date with its time zone."""
     return datetime.fromtimestamp(seconds, UTC)
 
 

@@ -1,8 +1,8 @@
-"""What may be asked of the catalogue: runs, and single pours, by dates, vessels, liquid, strategy, words.
+"""Queries of the catalogue: runs and pours by date, vessels, liquid, strategy and words, and comparisons of runs.
 
-Runs side by side: what was asked differently, and what came of it.
-
-What people may ask the catalogue for: declared once, for the command line, the API and notebooks.
+- `CONDITIONS` declares all conditions once, for the command line, the API and notebooks.
+- `searching` creates a `CatalogueQuery` from text; `find_runs`, `find_pours` and `one_run` execute queries.
+- `differing_settings` and `outcomes` compare runs.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from sim_engine.errors import InvalidArgumentError
 
 _AGO = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 _DATES = (("%Y-%m-%dT%H:%M:%S", 0), ("%Y-%m-%dT%H:%M", 60), ("%Y-%m-%d", 86_400), ("%Y-%m", -1), ("%Y", -12))
-"""Forms of a date, and how long it lasts [s]; -1 and -12: so many months."""
+"""Formats of a date, and the length of the period [s]; -1 and -12: one month and twelve months."""
 
 MODES = {"virtual": "virtual", "real": "hardware", "hardware": "hardware"}
 
 
 @dataclass(frozen=True)
 class CatalogueQuery:
-    """Conditions; all that are given must hold. Texts may hold * and ?, and capitals don't matter.
+    """Conditions; all given ones must hold. Texts may contain * and ?; case is ignored.
 
     Attributes:
-        words: each must stand somewhere in a run: its names, vessels, liquid, strategy, state, tags or notes.
-        since, until: seconds since 1970; of a run its beginning, of a pour when it was weighed.
+        words: each must occur in a run: in its names, vessels, liquid, strategy, state, tags or notes.
+        since, until: seconds since 1970; compared with the start of a run, or the weighing of a pour.
         run: name of the folder, or its path.
         mode: 'virtual' or 'hardware'.
-        limit: the newest so many.
+        limit: maximum number of rows, the newest ones.
     """
 
     words: tuple[str, ...] = ()
@@ -59,17 +59,17 @@ class NoSuchRunError(CatalogueError):
 
 
 def find_runs(catalogue: Catalogue, search: CatalogueQuery) -> list[Row]:
-    """Runs, the newest first; see `columns.RUNS`."""
+    """Runs, the newest first; see `catalogue_index.RUNS`."""
     where, values = _conditions(search, "run")
     found = catalogue.rows("run", where, values, "begun desc, path")
-    if search.state is not None:  # 'interrupted' stands in no journal
+    if search.state is not None:  # no journal contains 'interrupted'
         pattern = _like(search.state)
         found = [row for row in found if re.fullmatch(pattern, str(row["state"]), re.IGNORECASE)]
     return found[: search.limit]
 
 
 def find_pours(catalogue: Catalogue, search: CatalogueQuery) -> list[Row]:
-    """Pours, the oldest first; of too many the newest. See `columns.POURS`."""
+    """Pours, the oldest first; beyond the limit only the newest. See `catalogue_index.POURS`."""
     where, values = _conditions(search, "pour")
     if search.state is not None:
         paths = [row["path"] for row in find_runs(catalogue, CatalogueQuery(state=search.state))]
@@ -79,7 +79,7 @@ def find_pours(catalogue: Catalogue, search: CatalogueQuery) -> list[Row]:
 
 
 def one_run(catalogue: Catalogue, name: str) -> Row:
-    """The run of that name, or in that folder; the beginning of a name is enough where only one run has it.
+    """The run with that name, or in that folder; an unambiguous beginning of a name is enough.
 
     Raises:
         NoSuchRunError: there is none.
@@ -147,12 +147,12 @@ def _like(text: str) -> str:
 
 
 def moment(text: str, *, end: bool = False, now: datetime | None = None) -> float:
-    """A moment as people type it, in this machine's time: '2030-03-01', '2030-03', '2030-03-01 14:30', '7d' (ago).
+    """Parse a moment in local time: '2030-03-01', '2030-03', '2030-03-01 14:30', '7d' (ago).
 
     Args:
         text: as typed.
-        end: the end of what is named: of the day, of the month.
-        now: what 'ago' counts from.
+        end: return the end of the named period: of the day, of the month.
+        now: reference of 'ago'.
 
     Returns:
         Seconds since 1970.
@@ -160,7 +160,7 @@ def moment(text: str, *, end: bool = False, now: datetime | None = None) -> floa
     Raises:
         ValueError: it is none of these.
     """
-    with contextlib.suppress(OverflowError):  # farther away than dates go
+    with contextlib.suppress(OverflowError):  # beyond the range of dates
         if ago := re.fullmatch(r"(\d{1,9})\s*([mhdw])", text.strip(), re.ASCII):
             return ((now or datetime.now()) - timedelta(**{_AGO[ago[2]]: int(ago[1])})).timestamp()
         for form, lasts in _DATES:
@@ -187,10 +187,10 @@ def searching(
     words: Sequence[str] = (),
     **others: Any,
 ) -> CatalogueQuery:
-    """A search from what people type; see `Search`, `moment`, and `MODES` for `mode`.
+    """A query from typed text; see `CatalogueQuery`, `moment`, and `MODES` for `mode`.
 
     Raises:
-        ValueError: a date or a mode is none.
+        ValueError: a date or a mode is invalid.
     """
     if mode is not None and mode.lower() not in MODES:
         raise InvalidArgumentError(f"mode '{mode}' is not one of {', '.join(MODES)}")
@@ -207,9 +207,9 @@ _MISSING = object()
 
 
 def differing_settings(runs: Sequence[Path]) -> dict[str, list[Any]]:
-    """Settings in which runs differ: place in the plan → its value in each run, None where a run hasn't got it.
+    """Settings in which runs differ: place in the plan → its value in each run, None if a run does not have it.
 
-    Where a whole section is missing in one run, the section stands there, not all that is in it.
+    If a whole section is missing in one run, the section is listed, not all of its values.
 
     Raises:
         RunError: a journal can't be read.
@@ -239,7 +239,7 @@ def _compare(place: str, values: Sequence[Any], found: dict[str, list[Any]]) -> 
 
 
 def outcomes(run: Row) -> dict[str, Any]:
-    """What a run came to, one value for each line of a comparison: by θ, and by receiver."""
+    """The result of a run, one value for each line of a comparison: by θ, and by receiver."""
     theta = {f"θ* {name}": value for name, value in (run["theta"] or {}).items()}
     shown: dict[str, Any] = {
         name: run[name] for name in ("state", "simulations", "pours", "spilled_g", "test_discrepancy")
@@ -262,7 +262,7 @@ CONDITIONS = {
     "state": "finished, paused, failed, unknown, interrupted …",
     "tag": "A tag of the run.",
 }
-"""What people may ask for, beside words: for the command line, the API and notebooks. Names may hold * and ?."""
+"""Conditions in addition to words, for the command line, the API and notebooks. Names may contain * and ?."""
 
 
 class Conditions(TypedDict, total=False):
@@ -281,6 +281,6 @@ class Conditions(TypedDict, total=False):
 
 
 class PourConditions(Conditions, total=False):
-    """Those of pours."""
+    """Conditions for pours."""
 
     run: str | Path | None

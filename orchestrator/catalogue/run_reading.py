@@ -1,6 +1,6 @@
-"""A run's folder as rows of the catalogue, read from its journal: the header says what was planned, entries what came.
+"""Reads a run's folder as rows of the catalogue: the plan from the journal's header, the outcomes from its entries.
 
-What is not needed is not asked for: vessels are not built, meshes and plug-ins may be gone.
+Vessels are not built, and meshes and plug-ins may be missing.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _KINDS = (
 
 @dataclass(frozen=True)
 class RunRead:
-    """What the catalogue knows of a run.
+    """The catalogue's content of a run.
 
     Attributes:
-        run, pours: rows, by the names of `columns`.
-        problem: why something of it could not be read; empty otherwise.
+        run, pours: rows, by the names of the columns.
+        problem: why a part of it could not be read; empty otherwise.
     """
 
     run: Row
@@ -46,11 +46,11 @@ class RunRead:
 
 
 UNREADABLE = "unreadable"
-"""The state of a run of which nothing but its folder is known."""
+"""The state of a run of which only the folder is known."""
 
 
 def read_run(directory: Path) -> RunRead:
-    """Read a run, also one that is being written. What can't be read is written into `problem`; it is never raised."""
+    """Read a run, also while it is being written. Errors are stored in `problem` and never raised."""
     row: Row = {}
     try:
         remarks = read_remarks(directory)
@@ -59,12 +59,12 @@ def read_run(directory: Path) -> RunRead:
             return _Reading(journal, {"run": directory.name, "path": str(directory), **row}).read()
     except (RunError, CodecError, AnnotationsError, OSError) as error:
         return unreadable(directory, str(error), row)
-    except Exception as error:  # damaged content can be anything, and must not hide other runs
+    except Exception as error:  # damaged content can cause any error, and must not hide other runs
         return unreadable(directory, f"{directory}: its journal is damaged ({type(error).__name__}: {error})", row)
 
 
 def unreadable(directory: Path, problem: str, remarks: Row | None = None) -> RunRead:
-    """A run that is listed with its folder, the time of its last change, and the reason why it can't be read.
+    """An unreadable run: its folder, the time of its last change, and the reason.
 
     Args:
         remarks: its tags and notes.
@@ -132,7 +132,7 @@ class _Reading:
             "open_pours": sum(row["outcome"] == "open" for row in rows),
             "spilled_g": sum(row.get("spilled_g") or 0.0 for row in rows),
         }
-        self._run |= _learnt(results, {name: scene["receiver"]["name"] for name, scene in self._scenes.items()})
+        self._run |= _result_columns(results, {name: scene["receiver"]["name"] for name, scene in self._scenes.items()})
         return RunRead(self._run, rows)
 
     def _pour(self, entry: Entry, stage: str, pour: Pour) -> Row:
@@ -164,7 +164,7 @@ class _Reading:
 
     def _measured_loss(self, outcome: Outcome | None, calibrating: bool) -> float | None:
         if calibrating or self._loss is None or not isinstance(outcome, Poured):
-            return None  # weighted objectives need the plan: `decant.open_run(run).pours` has them
+            return None  # weighted objectives need the plan: use `decant.open_run(run).pours`
         weighed, particles = outcome.measurement, (self._plan.get("parameters") or {}).get("particles", 0)
         return self._loss(weighed.fractions, loaded_mass=weighed.loaded, particles=int(particles))
 
@@ -176,8 +176,8 @@ def _names(found: Iterator[str]) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def _learnt(results: Mapping[str, Mapping[str, Any]], receivers: Mapping[str, str]) -> Row:
-    """θ*, its discrepancy, and what is recommended, from results as they are written: their kinds need not be known."""
+def _result_columns(results: Mapping[str, Mapping[str, Any]], receivers: Mapping[str, str]) -> Row:
+    """θ*, its discrepancy, and recommendations, from encoded results; their kinds need not be installed."""
     row: Row = {"theta": None, "test_discrepancy": None, "recommended": {}}
     for written in results.values():
         result = from_json(written)

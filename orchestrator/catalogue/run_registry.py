@@ -1,8 +1,9 @@
-"""Which folders hold runs: a plain list to which every new run is appended. What is in them is read from the runs.
+"""The state directory of a machine, and the list of folders that contain runs.
 
-One line is written without a lock and without a database, so that a run is never kept waiting by whoever searches.
+The list is a text file to which every new run is appended; all other data are read from the runs. One line is written
+without a lock and without a database, so that a search never blocks a run.
 
-Where Decant keeps what belongs to a machine rather than to one run: the catalogue of runs, the daemon's queue.
+The state directory contains data of the machine rather than of one run: the catalogue of runs, the daemon's queue.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ VARIABLE = "DECANT_STATE"
 
 
 def state_directory() -> Path:
-    """`$DECANT_STATE`, else what systemd gives a unit, else `decant` in `$XDG_STATE_HOME` or `~/.local/state`.
+    """`$DECANT_STATE`, else systemd's `$STATE_DIRECTORY`, else `decant` in `$XDG_STATE_HOME` or `~/.local/state`.
 
     It need not exist yet.
 
     Raises:
-        OSError: nothing says where: none of these is set, and this user has no home.
+        OSError: there is no default: none of these is set, and this user has no home.
     """
     if named := os.environ.get(VARIABLE):
         return Path(named).expanduser().absolute()
@@ -39,13 +40,13 @@ def state_directory() -> Path:
 
 
 def make_state_directory(path: Path) -> None:
-    """Make the state directory, or take one that exists, and let only its owner read it (0700).
+    """Create the state directory if needed, and restrict it to its owner (0700).
 
-    It holds tokens, campaigns and results. Call this before anything is written there. A directory of another user is
-    left as it is: its mode is that user's decision.
+    It contains tokens, campaigns and results. Call this before anything is written there. A directory of another user
+    is left unchanged: its mode is that user's decision.
 
     Raises:
-        OSError: it can't be made.
+        OSError: it can't be created.
     """
     path.mkdir(parents=True, exist_ok=True, mode=0o700)
     found = path.stat()
@@ -55,29 +56,32 @@ def make_state_directory(path: Path) -> None:
 
 
 def use_state_directory(path: Path) -> None:
-    """Have this process and those that it starts keep their state there: what `--state` does."""
+    """Set the state directory of this process and its child processes, as `--state` does."""
     os.environ[VARIABLE] = str(path.expanduser().absolute())
 
 
 LIST_NAME = "runs.txt"
 
 _log = logging.getLogger(__name__)
-_said = False
+_reported = False
 
 
 def register(directory: Path) -> None:
-    """Enter a run's folder. A state directory that can't be written is reported once, and never stops a run."""
-    global _said
+    """Add a run's folder to the list.
+
+    A state directory that can't be written is reported once, and never stops a run.
+    """
+    global _reported
     try:
         enter([directory])
     except (OSError, UnicodeError) as error:
-        if not _said:
+        if not _reported:
             _log.warning(
                 "note: this run is not in the catalogue of runs (%s); `decant runs add %s` enters it later",
                 error,
                 directory,
             )
-        _said = True
+        _reported = True
 
 
 def enter(directories: Iterable[Path], state: Path | None = None) -> None:
@@ -98,10 +102,10 @@ def enter(directories: Iterable[Path], state: Path | None = None) -> None:
 
 
 def known(state: Path) -> list[Path]:
-    """The folders of the list, each once, in the order in which they were entered.
+    """The folders of the list, each once, in the order in which they were added.
 
     Raises:
-        OSError: it is there and can't be read.
+        OSError: the list exists and can't be read.
     """
     path = state / LIST_NAME
     if not path.is_file():
@@ -111,9 +115,9 @@ def known(state: Path) -> list[Path]:
 
 
 def runs_below(directory: Path) -> Iterator[Path]:
-    """Folders of runs in a folder, at any depth, itself included; links are not followed."""
+    """Run folders in a folder, at any depth, including itself; links are not followed."""
     for folder, folders, files in os.walk(directory):
         folders.sort()
         if JOURNAL_NAME in files:
-            folders.clear()  # a run holds no other
+            folders.clear()  # a run contains no other run
             yield Path(folder)

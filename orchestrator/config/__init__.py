@@ -1,1 +1,1 @@
-"""Laboratories as written in files: simulators, arm, balance, operator, cluster."""
+"""Files of campaigns, laboratories and vessels: their sections, their validation, and the plans made from them."""

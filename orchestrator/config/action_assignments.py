@@ -1,6 +1,7 @@
-"""Actions from the command line: `angular_velocity=40`, `x_offset='90 mm'`.
+"""Actions and constraints written as text.
 
-Constraints between the searched dimensions of an action, as written in files: 'x_offset >= 60 mm + 0.5 * height'.
+- `set_action` and `assigned_action` parse assignments from the command line: `angular_velocity=40`, `x_offset='90 mm'`.
+- `parse_constraint` parses a constraint between searched dimensions from a file: 'x_offset >= 60 mm + 0.5 * height'.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from sim_engine.settings.quantity import KINDS, QuantityError, parse_quantity
 
 
 class AssignmentError(DecantError, ValueError):
-    """Values of an action can't be used; one line per value that is wrong."""
+    """Values of an action are invalid; one line per invalid value."""
 
 
 def set_action(
@@ -25,16 +26,16 @@ def set_action(
 ) -> dict[str, float | None]:
     """Action values of assignments such as 'angular_velocity=40' or 'x_offset=90 mm', SI.
 
-    A bare number is in the unit that the dimension is shown in (deg, deg/s, deg/s^2, mm, s).
+    A number without unit is in the display unit of the dimension (deg, deg/s, deg/s^2, mm, s).
 
     Args:
         assignments: `name=value` texts.
         fixed: values that need no assignment (a scene's).
-        space: searched dimensions: those that are neither fixed nor assigned are missing, and the message says how
+        space: searched dimensions. Those that are neither fixed nor assigned are missing, and the message explains how
             to give them.
 
     Returns:
-        `fixed` with the assignments over it.
+        `fixed`, updated with the assignments.
 
     Raises:
         AssignmentError: unknown dimension, no value, wrong unit, out of bounds, given twice, or missing.
@@ -72,7 +73,7 @@ def set_action(
 def assigned_action(
     assignments: Iterable[str], *, fixed: Mapping[str, float | None] | None = None, space: Space | None = None
 ) -> Action:
-    """The complete action of `set_action`'s values.
+    """The complete action with the values of `set_action`.
 
     Raises:
         AssignmentError: as `set_action`.
@@ -115,12 +116,12 @@ def parse_constraint(text: str, space: Space) -> Linear:
     """A constraint on the values of a space's axes.
 
     Args:
-        text: two sums of terms with '<=' or '>=' between them; a term is a quantity, or a dimension that is searched,
-            with a factor or without one. All terms are of one kind: lengths, angles, …
-        space: whose axes they may name.
+        text: two sums of terms with '<=' or '>=' between them. A term is a quantity, or a searched dimension with or
+            without a factor. All terms are of one kind: lengths, angles, …
+        space: the space whose axes may occur.
 
     Raises:
-        QuantityError: it is none; the message says what would be right.
+        QuantityError: the text is not a constraint; the message gives a correct form.
     """
     sides = _RELATION.split(text)
     if len(sides) != 2:
@@ -164,7 +165,7 @@ def _kind(
 ) -> tuple[str, str]:
     """Unit of all terms, and a right quantity for messages."""
     for _, number, word in constants:
-        if not number:  # a word that stands alone should have been a dimension
+        if not number:  # Unit of all terms, and a valid quantity for messages.
             guess = did_you_mean(word, list(ACTION_DIMENSIONS))
             meant = f"did you mean '{guess}'?" if guess else f"dimensions are {', '.join(ACTION_DIMENSIONS)}"
             raise QuantityError(f"unknown dimension {word!r} in {text!r}; {meant}")

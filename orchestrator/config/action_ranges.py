@@ -1,8 +1,8 @@
-"""Motions and action spaces as written in files, derived from the declarations in `sim_engine.action`.
+"""File sections for motions, action spaces and execution errors, derived from the declarations in `sim_engine.action`.
 
-Ranges as written in files, and a right value of everything that may be given one.
-
-Errors of execution as written in files: what a bench hides, and what a plan under risk has to bear.
+- `RangeSection` and `ActionRangeSection`: bounds of a searched quantity, with scale and prior.
+- `MotionBase`: values of the motion that are not searched; `ActionsBase`: searched dimensions and their constraints.
+- `PoseErrorSection`, `PoseNoiseSection`: errors of a virtual bench, or errors that a plan under risk must tolerate.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ EXAMPLES = {
     "y_offset": "0 mm",
     "height": "60 mm",
 } | {
-    # A parameter's default is a good example of it.
+    # The default of a parameter is a good example of it.
     name: f"{default / info.factor:g}" + ("" if info.shown == "1" else f" {info.shown}")
     for (name, info), default in zip(
         SimulationParameters.info().items(), SimulationParameters().model_dump().values(), strict=True
     )
 }
-"""A right value of every action dimension and simulation parameter, for messages and schemas."""
+"""A valid value of every action dimension and simulation parameter, for messages and schemas."""
 
 
 class RangeSection(Section):
@@ -49,7 +49,7 @@ class RangeSection(Section):
     """[lowest, highest]"""
 
     scale: Scale = "linear"
-    """How the search spreads over the range."""
+    """Scale on which the search spreads over the range."""
 
     @model_validator(mode="before")
     @classmethod
@@ -79,7 +79,7 @@ class RangeSection(Section):
         return {"anyOf": [long_form["properties"]["range"], dict(long_form)]}
 
     def axis(self, name: str, *, integer: bool = False) -> Axis:
-        """The axis of a space."""
+        """The axis of a search space."""
         assert self.range is not None
         return Axis(name, float(self.range[0]), float(self.range[1]), self.scale, integer)
 
@@ -87,7 +87,7 @@ class RangeSection(Section):
 def range_model(
     name: str, quantity: Quantity, base: type[RangeSection] = RangeSection, **further: Any
 ) -> type[RangeSection]:
-    """A range of one quantity; `further` fields beside its bounds."""
+    """A range of one quantity; `further` are additional fields."""
     end = Annotated[float, quantity]
     fields: Any = {"range": (tuple[end, end] | None, Field(default=None, description="[lowest, highest]")), **further}
     model: type[RangeSection] = create_model(
@@ -102,16 +102,16 @@ def title(name: str) -> str:
 
 
 def described(section: type[Section], field: str) -> str | None:
-    """What a field of a section means."""
+    """Description of a section's field."""
     return section.model_fields[field].description
 
 
 DEVIATIONS = {"rad/s": "20 deg/s", "rad": "10 deg", "rad/s^2": "200 deg/s^2", "s": "0.5 s", "m": "15 mm"}
-"""A right standard deviation of a dimension in each unit."""
+"""A valid standard deviation of a dimension in each unit."""
 
 
 def dimension_quantity(dimension: Dimension, *, words: bool = False) -> Quantity:
-    """Annotation of an action dimension; with `words`, those that switch it off are allowed."""
+    """Annotation of an action dimension; with `words`, the words that switch it off are allowed."""
     return Quantity(
         dimension.unit,
         EXAMPLES[dimension.name],
@@ -122,23 +122,23 @@ def dimension_quantity(dimension: Dimension, *, words: bool = False) -> Quantity
 
 
 class PriorSection(Section):
-    """How likely values of a searched dimension are beforehand: a normal distribution, cut off at the range's ends."""
+    """Prior of a searched dimension: a normal distribution, truncated at the ends of the range."""
 
     mean: Any = None
-    """Its mean, within the range."""
+    """Mean, within the range."""
 
     deviation: Any = None
-    """Its standard deviation."""
+    """Standard deviation."""
 
 
 class ActionRangeSection(RangeSection):
     """Bounds of a searched dimension: `[lowest, highest]`, or `{range: [...], scale: log, prior: {...}}`."""
 
     prior: Any = None
-    """C4: how likely its values are beforehand, in place of all alike."""
+    """C4: prior of its values; uniform unless given."""
 
     def normal(self, name: str) -> NormalPrior | None:
-        """The prior of the dimension; None where its values are all alike, or where something is wrong here."""
+        """The prior of the dimension; None if it is uniform or the section has a problem."""
         prior: PriorSection | None = self.prior
         if self.range is None or prior is None or prior.mean is None or prior.deviation is None:
             return None
@@ -162,15 +162,15 @@ def _action_range_model(dimension: Dimension) -> type[RangeSection]:
 
 
 class PivotPoint(Section):
-    """A horizontal line, given in the frame of the upright pourer."""
+    """A horizontal line in the frame of the upright pourer."""
 
     required: ClassVar[dict[str, str]] = {"x": "0 mm", "z": "50 mm"}
 
     x: Annotated[float, Quantity("m", "0 mm", -1.0, 1.0)] | None = None
-    """From the pourer's axis towards the receiver."""
+    """Distance from the pourer's axis towards the receiver."""
 
     z: Annotated[float, Quantity("m", "50 mm", -1.0, 1.0)] | None = None
-    """Above the pourer's underside."""
+    """Height above the pourer's underside."""
 
 
 def _pivot_form(value: Any) -> str:
@@ -189,7 +189,7 @@ class MotionBase(Section):
     """Line about which the pourer turns: 'lip', or {x: ..., z: ...} in the frame of the upright pourer."""
 
     hold_cap: Annotated[float, Quantity("s", "5 s", 0.0, 60.0)] | None = None
-    """Longest hold 'until_flow_ends'."""
+    """Maximum duration of a hold 'until_flow_ends'."""
 
     def fixed(self) -> dict[str, float | None]:
         """Dimensions given here, SI; None for those that are switched off."""
@@ -227,7 +227,7 @@ class ActionsBase(Section):
     """Searched dimensions of the motion, each with its range; any subset."""
 
     constraints: list[Text] | None = None
-    """What must hold between them besides, 'x_offset >= 60 mm + 0.5 * height' for example: sums of one kind."""
+    """Constraints between the dimensions, for example 'x_offset >= 60 mm + 0.5 * height': sums of one kind."""
 
     def space(self) -> Space | None:
         """The action space, axes in the order of the declarations; None if nothing is searched."""
@@ -239,7 +239,7 @@ class ActionsBase(Section):
         return Space(axes) if axes else None
 
     def prior(self) -> tuple[NormalPrior, ...]:
-        """Dimensions whose values are not all alike beforehand."""
+        """Dimensions with a prior that is not uniform."""
         ranges = ((name, self.value(name)) for name in ACTION_DIMENSIONS)
         normals = (section.normal(name) for name, section in ranges if section is not None)
         return tuple(normal for normal in normals if normal is not None)
@@ -270,26 +270,26 @@ Spread = Annotated[float, Quantity("1", "0.01", 0.0, 0.5)]
 
 
 class PoseErrorSection(Section):
-    """How the real placement differs from the intended one."""
+    """Difference between the real and the intended placement."""
 
     x: Offset = 0.0
-    """The receiver stands that much further from the pourer."""
+    """Offset of the receiver away from the pourer."""
 
     y: Offset = 0.0
-    """… and that much sideways."""
+    """Sideways offset of the receiver."""
 
     z: Offset = 0.0
-    """… and that much higher."""
+    """Upward offset of the receiver."""
 
     tilt: Tilt = 0.0
-    """The pourer is held that much more tilted than commanded."""
+    """Additional tilt of the pourer over the commanded one."""
 
     speed_factor: Factor = 1.0
     """Executed over commanded angular velocity."""
 
 
 class PoseNoiseSection(Section):
-    """Standard deviations of the same from pour to pour."""
+    """Standard deviations of the execution errors from pour to pour."""
 
     x: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
     """Standard deviation of the distance."""

@@ -1,14 +1,11 @@
-"""A laboratory's arm and its cell: from what is written in its file to what planner and driver need, and back.
+"""File sections `arm` and `cell` of a laboratory, and their conversion to the settings of planner and driver.
 
-What stands where around an arm of any kind.
-
-What an arm of any kind is in a laboratory's file: one section, derived from `ArmSettings`, found at the door.
-
-What may be written under `arm` and `cell` in a laboratory's file.
+- `CellSection`: receiver, pouring direction and table around an arm of any kind.
+- `ArmSettings`: base class of all kinds of arms; `ARMS` is the registry of installed kinds.
+- `UrArmSection`: a UR robot; `resolve_arm` checks it and converts it.
+- `NumbersArmSection`: a simulated arm without protocol, for example to test a real balance without a robot.
 
 Units are those of the teach pendant: mm, deg, kg; rotation vectors in rad.
-
-An arm of numbers in a laboratory's file: with a balance on a wire, for trying that out without a robot.
 """
 
 from __future__ import annotations
@@ -36,22 +33,22 @@ Angle = Annotated[float, Quantity("rad", "90 deg", -math.radians(363.0), math.ra
 
 
 class PointSection(Section):
-    """A point in the room's frame: the base's, as the teach pendant shows it, for an arm that stands on a table."""
+    """A point in the gravity-aligned base frame. For an arm on a table, this is the base frame of the teach pendant."""
 
     required: ClassVar[dict[str, str]] = {"x": "650 mm", "y": "0 mm", "z": "80 mm"}
 
     x: Length | None = None
-    """The x of the room's frame."""
+    """The x in the base frame."""
 
     y: Length | None = None
-    """The y of the room's frame."""
+    """The y in the base frame."""
 
     z: Length | None = None
-    """Upwards from where the robot is screwed down."""
+    """Height above the robot's mounting point."""
 
 
 class CellSection(Section):
-    """What stands where around the arm."""
+    """Objects around the arm."""
 
     required: ClassVar[dict[str, str]] = {
         "receiver": "{x: 650 mm, y: 0 mm, z: 80 mm}",
@@ -59,34 +56,34 @@ class CellSection(Section):
     }
 
     receiver: PointSection | None = None
-    """Where the middle of the receiver's underside stands, in the room's frame."""
+    """Position of the middle of the receiver's underside, in the gravity-aligned base frame."""
 
     direction: Angle | None = None
-    """The direction that the liquid is poured in, seen from above: 0 along the room's x, 90 deg along its y."""
+    """Pouring direction seen from above: 0 along the x axis of the base frame, 90 deg along its y axis."""
 
     table: Length = 0.0
-    """Height of the surface that nothing may go below, in the room's frame."""
+    """Height of the surface below which nothing may move, in the gravity-aligned base frame."""
 
 
 class ArmSettings(Section):
-    """What may be written under `arm` for one kind; its field `kind` has the name that it is registered under."""
+    """Base class of the section `arm`. The field `kind` of a subclass has the name under which it is registered."""
 
     tag: ClassVar[str] = "kind"
 
     @classmethod
     def unknown_tag(cls, word: str) -> str:
-        """Which plug-in would have it, if it could be loaded."""
+        """The plug-in that provides this kind, if it could not be loaded."""
         return next((str(broken) for broken in ARMS.broken if broken.name == word), "")
 
     @abstractmethod
     def resolve(self, cell: CellSection | None, place: Place, report: Report, *, mode: str) -> ArmSpec | None:
-        """The arm's settings; what is wrong goes to the report, and then there are none.
+        """The arm's settings; None after a problem, which is added to the report.
 
         Args:
-            cell: as written under `cell`; None where there is no such key.
-            place: of the mapping in which `arm` and `cell` stand.
-            report: takes problems.
-            mode: of the laboratory, 'virtual' or 'hardware'.
+            cell: the section `cell`; None if it is missing.
+            place: place of the mapping that contains `arm` and `cell`.
+            report: receives problems.
+            mode: mode of the laboratory, 'virtual' or 'hardware'.
         """
 
 
@@ -100,14 +97,14 @@ def _arm(loaded: object, name: str) -> type[ArmSettings]:
 
 
 ARMS: PluginRegistry[type[ArmSettings]] = PluginRegistry("decant.arms", "arm", _arm)
-"""Sections of all kinds of arms that are installed."""
+"""Section classes of all installed kinds of arms."""
 
 
 _LIMITS = ArmLimits((0.0,) * 3, (0.0,) * 3)
 _ARM = UrArmSpec("ur10e", _LIMITS, RobotCell((0.0,) * 3), (0.0,) * 6)
 
 JOINTS = ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3")
-"""As the teach pendant names them."""
+"""Names of the joints on the teach pendant."""
 
 Turn = Annotated[float, Quantity("rad", "1.571 rad", -2.0 * math.pi, 2.0 * math.pi)]
 Speed = Annotated[float, Quantity("rad/s", "40 deg/s", 0.0, math.radians(360.0), positive=True)]
@@ -124,11 +121,11 @@ class CentreSection(Section):
     """The y in the flange's frame."""
 
     z: Length = 0.0
-    """Out of the flange."""
+    """Distance outwards from the flange."""
 
 
 class PoseSection(Section):
-    """Where a frame stands in another, as the teach pendant shows it: place and rotation vector."""
+    """Pose of a frame in another, as on the teach pendant: position and rotation vector."""
 
     x: Length = 0.0
     """The x of its origin."""
@@ -150,17 +147,17 @@ class PoseSection(Section):
 
 
 class MountSection(Section):
-    """How the robot is screwed down: turned about its own z axis, then leant about the room's x axis."""
+    """Mounting of the robot: rotation about its own z axis, then tilt about the x axis of the base frame."""
 
     tilt: Annotated[float, Quantity("rad", "90 deg", -math.pi, math.pi)] = 0.0
     """0 on a table, 90 deg on a wall, 180 deg on a ceiling."""
 
     turn: Annotated[float, Quantity("rad", "90 deg", -math.pi, math.pi)] = 0.0
-    """About its own z axis."""
+    """Rotation about its own z axis."""
 
 
 class JointsSection(Section):
-    """The six joints, as the teach pendant names and shows them."""
+    """The six joints, as named and displayed on the teach pendant."""
 
     required: ClassVar[dict[str, str]] = dict.fromkeys(JOINTS, "90 deg")
 
@@ -184,7 +181,7 @@ class JointsSection(Section):
 
 
 class BoxSection(Section):
-    """A box along the room's axes."""
+    """A box along the axes of the gravity-aligned base frame."""
 
     required: ClassVar[dict[str, str]] = {
         "low": "{x: 300 mm, y: -500 mm, z: 0 mm}",
@@ -195,7 +192,7 @@ class BoxSection(Section):
     """Corner with the smallest x, y and z."""
 
     high: PointSection | None = None
-    """Corner with the largest."""
+    """Corner with the largest x, y and z."""
 
 
 class PlaneSection(Section):
@@ -204,40 +201,40 @@ class PlaneSection(Section):
     required: ClassVar[dict[str, str]] = {"normal": "[0, 1, 0]", "offset": "-400 mm"}
 
     normal: tuple[Number, Number, Number] | None = None
-    """Direction towards the allowed side, in the room's frame; its length does not matter."""
+    """Direction towards the allowed side, in the gravity-aligned base frame; its length does not matter."""
 
     offset: Length | None = None
     """Distance of the plane from the base, along the normal."""
 
 
 class LimitsSection(Section):
-    """What the arm may do here. Checked before a pour is planned, and again before anything moves."""
+    """Limits of the arm in this cell. Checked before a pour is planned, and again before any motion."""
 
     required: ClassVar[dict[str, str]] = {"box": "{low: {x: …, y: …, z: …}, high: {x: …, y: …, z: …}}"}
 
     box: BoxSection | None = None
-    """The box that tool and pourer stay in."""
+    """Box that must contain tool and pourer."""
 
     planes: tuple[PlaneSection, ...] = ()
-    """Planes that tool and pourer stay on one side of."""
+    """Planes that tool and pourer must not cross."""
 
     joint_speed: Speed = _LIMITS.joint_speed
-    """Largest speed of any joint; the robot's own limits hold besides."""
+    """Maximum speed of any joint; the robot's own limits apply as well."""
 
     tool_speed: Annotated[float, Quantity("m/s", "1000 mm/s", 0.0, 3.0, positive=True)] = _LIMITS.tool_speed
-    """Largest speed of the tool centre point and of any point of the pourer."""
+    """Maximum speed of the tool centre point and of any point of the pourer."""
 
     tilt: Annotated[float, Quantity("rad", "140 deg", 0.0, math.pi, positive=True)] = _LIMITS.tilt
-    """Largest tilt of the pourer."""
+    """Maximum tilt of the pourer."""
 
     tilt_speed: Speed = _LIMITS.tilt_speed
-    """Largest angular velocity of the pourer."""
+    """Maximum angular velocity of the pourer."""
 
     singularity: Annotated[float, Quantity("1", "0.1", 0.02, 0.9)] = _LIMITS.singularity
-    """How far to stay from poses in which the arm loses a direction: sine of wrist and elbow, shoulder over reach."""
+    """Minimum distance from singular poses: sine of wrist and elbow, shoulder over reach."""
 
     clearance: Annotated[float, Quantity("m", "5 mm", 0.0, 0.012)] = _LIMITS.clearance
-    """Between the pourer and the receiver."""
+    """Minimum distance between the pourer and the receiver."""
 
 
 class UrArmSection(ArmSettings):
@@ -253,16 +250,16 @@ class UrArmSection(ArmSettings):
     }
 
     kind: Literal["ur"] = "ur"
-    """A UR robot; meant where there is no such key."""
+    """A UR robot; the default kind."""
 
     model: Literal["ur10", "ur10e"] | None = None
-    """Which robot."""
+    """Model of the robot."""
 
     address: Text | None = None
-    """Address of its controller in the network; a virtual laboratory starts its own."""
+    """Network address of its controller; a virtual laboratory starts its own controller."""
 
     mount: MountSection = MountSection()
-    """How the robot is screwed down; unless given, it stands on a table."""
+    """Mounting of the robot; on a table unless given."""
 
     tool: PoseSection | None = None
     """Tool centre point in the flange's frame, as set on the teach pendant."""
@@ -271,31 +268,31 @@ class UrArmSection(ArmSettings):
     """Mass of gripper and filled pourer, as set on the teach pendant."""
 
     payload_centre: CentreSection = CentreSection()
-    """Their centre of gravity in the flange's frame."""
+    """Centre of gravity of gripper and pourer in the flange's frame."""
 
     grip: PoseSection | None = None
-    """The pourer in the frame of the tool centre point: its underside's middle, z out of its opening, liquid leaves towards x."""  # noqa: E501
+    """Pose of the pourer in the frame of the tool centre point: origin in the middle of its underside, z out of its opening, x towards the side where liquid leaves."""  # noqa: E501
 
     home: JointsSection | None = None
-    """Where the arm waits, the pourer upright."""
+    """Waiting pose of the arm, with the pourer upright."""
 
     limits: LimitsSection | None = None
-    """What the arm may do here."""
+    """Limits of the arm in this cell."""
 
     approach_speed: Speed = _ARM.approach_speed
     """Speed of the fastest joint between home and pour."""
 
     approach_acceleration: Acceleration = _ARM.approach_acceleration
-    """Acceleration of the fastest joint there."""
+    """Acceleration of the fastest joint between home and pour."""
 
     untilt_speed: Speed = _ARM.untilt_speed
-    """The speed at which a stopped, tilted pourer is brought upright."""
+    """Speed at which a stopped, tilted pourer is brought upright."""
 
     announcement: Annotated[float, Quantity("s", "3 s", 0.0, 60.0)] = _ARM.announcement
-    """From the operator's consent to the first movement."""
+    """Time from the operator's consent to the first movement."""
 
     rate: Annotated[float, Quantity("1/s", "125 Hz", 100.0, 500.0)] = _ARM.rate
-    """The rate at which the joints are read back."""
+    """Rate at which the joints are read back."""
 
     def resolve(self, cell: CellSection | None, place: Place, report: Report, *, mode: str) -> UrArmSpec | None:
         """See `ArmSettings.resolve`."""
@@ -310,14 +307,14 @@ _HOST = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(\.{_LABEL})*\.?")
 def resolve_arm(
     arm: UrArmSection, cell: CellSection | None, place: Place, report: Report, *, mode: str
 ) -> UrArmSpec | None:
-    """The arm of a laboratory's file; what is wrong goes to the report, and then there is none.
+    """The arm of a laboratory's file; None after a problem, which is added to the report.
 
     Args:
-        arm: as written under `arm`.
-        cell: as written under `cell`; None where there is no such key, which is a problem.
-        place: of the mapping in which both keys stand.
-        report: takes problems.
-        mode: of the laboratory, 'virtual' or 'hardware'.
+        arm: the section `arm`.
+        cell: the section `cell`; None if it is missing, which is a problem.
+        place: place of the mapping that contains both keys.
+        report: receives problems.
+        mode: mode of the laboratory, 'virtual' or 'hardware'.
     """
     before = len(report.problems)
     at = place.at("arm")
@@ -332,7 +329,7 @@ def resolve_arm(
     receiver = None if cell is None else _point(cell.receiver)
     needed = (arm.model, arm.tool, arm.payload, arm.grip, limits, receiver)
     if None in needed or home is None or None in home or cell is None or cell.direction is None:
-        return None  # reported already, as missing or as wrong
+        return None  # reported already, as missing or invalid
     assert arm.model is not None
     assert arm.tool is not None
     assert arm.payload is not None
@@ -358,7 +355,7 @@ def resolve_arm(
     )
     if len(report.problems) > before:
         return None
-    from actors.arm.planning.path_checks import check_limits  # brings scipy along
+    from actors.arm.planning.path_checks import check_limits  # imports scipy
 
     for problem in check_limits(spec):
         key, _, text = problem.partition(": ")
@@ -382,7 +379,7 @@ def _check_address(arm: UrArmSection, at: Place, report: Report, mode: str) -> N
 
 
 def _is_address(text: str) -> bool:
-    if re.fullmatch(r"[\d.]+", text):  # all digits and dots can only be meant as an address
+    if re.fullmatch(r"[\d.]+", text):  # a text of digits and dots can only be meant as an address
         try:
             ipaddress.IPv4Address(text)
         except ValueError:
@@ -417,7 +414,7 @@ def _plane(section: PlaneSection, place: Place, report: Report) -> Plane | None:
     if length < 1e-6:
         report.add(place.at("normal"), "has no direction; write for example [0, 1, 0]")
         return None
-    # a normal that was normalised once stays as it is to the last bit, so that a written-out file means the same
+    # A normalised normal keeps its last bit, so that a written file gives the same arm.
     length = 1.0 if abs(length - 1.0) < 1e-12 else length
     x, y, z = section.normal
     return Plane((x / length, y / length, z / length), section.offset)
@@ -430,12 +427,12 @@ def _point(section: PointSection | None) -> Vector | None:
 
 
 class NumbersArmSection(ArmSettings):
-    """An arm of numbers: it makes every motion, and stands nowhere."""
+    """A simulated arm without protocol: it makes every motion and has no geometry."""
 
     required: ClassVar[dict[str, str]] = {"kind": "numbers"}
 
     kind: Literal["numbers"] = "numbers"
-    """An arm of numbers."""
+    """A simulated arm without protocol."""
 
     def resolve(self, cell: CellSection | None, place: Place, report: Report, *, mode: str) -> NumbersSpec | None:
         """See `ArmSettings.resolve`."""

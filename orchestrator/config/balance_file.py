@@ -1,4 +1,10 @@
-"""A laboratory's balance as written in files: where it stands, its serial line, and when its weights count."""
+"""File section `balance` of a laboratory: placement, serial line, and the criteria for a settled weight.
+
+- `BalanceDeviceSection`: base class of all kinds of balances; packages can register more kinds.
+- `SerialSection`: a balance on a serial line, real or virtual.
+- `NumbersSection`: a simulated balance without protocol.
+- `resolve_balance` converts a section to the driver's settings.
+"""
 
 from __future__ import annotations
 
@@ -29,92 +35,92 @@ _SERIAL = SerialBalanceSpec(port="")
 _BALANCE = BalanceSpec(Placement.TRAY, None)
 
 Error = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.01)]
-"""Error of a weighing: a balance that is 10 g out tells nothing about a spill."""
+"""Error of a weighing. A balance with an error of 10 g cannot measure a spill."""
 PositiveMass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.1, positive=True)]
 Duration = Annotated[float, Quantity("s", "1.5 s", 0.0, 600.0)]
 PositiveDuration = Annotated[float, Quantity("s", "20 s", 0.0, 600.0, positive=True)]
 
 USUAL_BAUDS = (300, 600, 1200, 2400, 4800, 9600, 14_400, 19_200, 28_800, 38_400, 57_600, 115_200)
-"""Speeds that balances can be set to [bits per second]."""
+"""Usual speeds of balances [bits per second]."""
 
 
 def dialect_names() -> list[str]:
-    """What `dialect` may be: what is installed, ours as everybody's."""
+    """Allowed values of `dialect`: all installed dialects, and automatic detection."""
     return [AUTO, *dialects()]
 
 
 class SettlingSection(Section):
-    """When a weight counts."""
+    """Criteria for a settled weight."""
 
     readings: Annotated[int, Field(strict=True, ge=2, le=100)] = _RULE.readings
-    """Stable readings in a row that are needed."""
+    """Number of consecutive stable readings."""
 
     span: Duration = _RULE.span
-    """From the first to the last of them."""
+    """Time from the first to the last of these readings."""
 
     steps: Annotated[float, Quantity("1", "1", 0.0, 100.0)] = _RULE.steps
-    """How far they may lie apart, in steps of the display."""
+    """Largest difference between these readings, in steps of the display."""
 
     deadline: PositiveDuration = _RULE.deadline
-    """When a weight that has not settled is given up."""
+    """Maximum time for a weight to settle; then the weighing fails."""
 
 
 class VirtualScaleSection(Section):
-    """What the data sheet of a virtual balance says."""
+    """Data sheet of a virtual balance."""
 
     resolution: PositiveMass = _SHEET.resolution
     """Step of the display."""
 
     capacity: Annotated[float, Quantity("kg", "6.2 kg", 0.0, 1000.0, positive=True)] = _SHEET.capacity
-    """Heaviest load."""
+    """Maximum load."""
 
     noise: Error = _SHEET.noise
-    """Standard deviation of weighing the same thing again."""
+    """Standard deviation of repeated weighings of the same load."""
 
     drift: Annotated[float, Quantity("kg/s", "0.01 g/s", -0.01, 0.01)] = _SHEET.drift
-    """Creep of the zero."""
+    """Drift of the zero."""
 
     settling_time: Duration = _SHEET.settling_time
-    """Until a change is shown to within a hundredth of it."""
+    """Time until the display is within 1 % of a change."""
 
 
 class BalanceDeviceSection(Section):
-    """The balance: where it stands, and how it is reached.
+    """The balance: its placement and its connection.
 
-    A further kind is a class derived from this in a package, registered at the door `decant.balances` under its `kind`.
+    A package adds a kind with a subclass, registered in the entry-point group `decant.balances` under its `kind`.
     """
 
     tag: ClassVar[str] = "kind"
 
     kind: str = ""
-    """What is there; a literal in each class, and its name at the door."""
+    """Kind of the balance; a literal in each subclass, equal to its registered name."""
 
     placement: Literal["tray", "receiver", "everything", "manual"] = "tray"
-    """What it stands under: 'tray' reads the spill, 'receiver' what was received, 'everything' what was poured; with 'manual' the operator types all weights."""  # noqa: E501
+    """Load of the balance: 'tray' reads the spill, 'receiver' the received liquid, 'everything' the poured liquid; with 'manual' the operator types all weights."""  # noqa: E501
 
     pourer: Literal["here", "elsewhere"] = "here"
-    """Where the pourer is weighed: on this balance, or on another one and typed."""
+    """Where the pourer is weighed: on this balance, or on another one whose weight is typed."""
 
     load_tolerance: PositiveMass = _BALANCE.load_tolerance
-    """How far a load may lie from the one that the campaign asks for."""
+    """Largest difference between a load and the load of the campaign."""
 
     @classmethod
     def unknown_tag(cls, word: str) -> str:
-        """Which plug-in would have it, if it could be loaded."""
+        """The plug-in that provides this kind, if it could not be loaded."""
         return next((str(broken) for broken in BALANCES.broken if broken.name == word), "")
 
     def check(self, place: Place, report: Report, *, mode: str) -> None:
-        """Complain of what makes no sense together.
+        """Check for combinations of keys that are invalid.
 
         Args:
-            place: where the section stands.
-            report: takes problems.
-            mode: of the laboratory, 'virtual' or 'hardware'.
+            place: place of the section.
+            report: receives problems.
+            mode: mode of the laboratory, 'virtual' or 'hardware'.
         """
 
     @abstractmethod
     def device(self) -> BalanceDevice:
-        """The settings as values, which know their driver."""
+        """The settings of the device, which select its driver."""
 
 
 class SerialSection(BalanceDeviceSection):
@@ -124,40 +130,40 @@ class SerialSection(BalanceDeviceSection):
     """A balance on a serial line."""
 
     port: Text | None = None
-    """Its serial port; names under /dev/serial/by-id/ stay when it is plugged in again."""
+    """Serial port; names under /dev/serial/by-id/ do not change when the balance is reconnected."""
 
     virtual: VirtualScaleSection | None = None
-    """A balance that is not there, in place of a port."""
+    """A virtual balance instead of a port."""
 
     dialect: Annotated[str, Choice(dialect_names)] = AUTO
-    """How it talks; 'auto' finds out."""
+    """Protocol of the balance; 'auto' detects it."""
 
     baud: PositiveCount | None = None
-    """Bits per second; found out unless given."""
+    """Bits per second; detected unless given."""
 
     format: Text | None = None
-    """Bits, parity and stop bits, e.g. 8N1 ('7E1' in quotes, or YAML takes it for a number); found out unless given."""
+    """Bits, parity and stop bits, e.g. 8N1 (write '7E1' in quotes; it is a number in YAML); detected unless given."""
 
     handshake: Literal["none", "software", "hardware"] = _SERIAL.handshake
-    """Whether the balance may stop the line: by characters (Xon/Xoff), by wires (CTS), or not."""
+    """Flow control by the balance: characters (Xon/Xoff), wires (CTS), or none."""
 
     step: PositiveMass | None = None
-    """Step of its display, where that is not one of the last digit."""
+    """Step of the display, if it is not one unit of the last digit."""
 
     repeatability: Error = _SERIAL.repeatability
-    """Standard deviation of weighing the same thing again, from its data sheet."""
+    """Standard deviation of repeated weighings of the same load, from the data sheet."""
 
     settling: SettlingSection = SettlingSection()
-    """When a weight counts."""
+    """Criteria for a settled weight."""
 
     interval: Annotated[float, Quantity("s", "0.15 s", 0.02, 5.0)] = _SERIAL.interval
-    """From one question to the next."""
+    """Time between two requests for a reading."""
 
     answer_time: PositiveDuration = _SERIAL.answer_time
-    """Longest wait for an answer."""
+    """Maximum time to wait for a reply."""
 
     reconnect_time: Duration = _SERIAL.reconnect_time
-    """How long a port that vanished is waited for."""
+    """Maximum time to wait for a port that has disappeared."""
 
     def check(self, place: Place, report: Report, *, mode: str) -> None:
         """See `BalanceDeviceSection.check`."""
@@ -185,19 +191,19 @@ class SerialSection(BalanceDeviceSection):
 
 
 class NumbersSection(BalanceDeviceSection):
-    """A balance of numbers: nothing is at its far end, and its driver is given what stands on it."""
+    """A simulated balance without protocol: its driver receives the load directly."""
 
     kind: Literal["numbers"] = "numbers"
-    """A balance of numbers, on a virtual bench."""
+    """A simulated balance without protocol, on a virtual bench."""
 
     resolution: PositiveMass = 1e-4
-    """Step of its display."""
+    """Step of the display."""
 
     noise: Error = 1e-4
     """Standard deviation of a reading."""
 
     settling_time: Duration = 1.5
-    """Until a change is shown to within a hundredth of it."""
+    """Time until the display is within 1 % of a change."""
 
     def check(self, place: Place, report: Report, *, mode: str) -> None:
         """See `BalanceDeviceSection.check`."""
@@ -211,22 +217,22 @@ class NumbersSection(BalanceDeviceSection):
 
 
 _TYPED = ("kind", "placement", "load_tolerance", "step", "repeatability")
-"""Keys that have a meaning where the operator types all weights."""
+"""Keys that apply if the operator types all weights."""
 
 
 def any_balance() -> Any:
-    """The section of whatever balance is installed."""
+    """The section type of any installed balance."""
     return tagged(kinds(), default="serial")
 
 
 def resolve_balance(section: BalanceDeviceSection, place: Place, report: Report, *, mode: str) -> BalanceSpec | None:
-    """The balance of a file; what is wrong goes to the report, and then there is none.
+    """The balance of a file; None after a problem, which is added to the report.
 
     Args:
-        section: as written.
-        place: where it stands.
-        report: takes problems.
-        mode: of the laboratory, 'virtual' or 'hardware'.
+        section: the section as written.
+        place: place of the section.
+        report: receives problems.
+        mode: mode of the laboratory, 'virtual' or 'hardware'.
     """
     before = len(report.problems)
     if section.placement == "manual":

@@ -1,6 +1,7 @@
-"""From a calibration as written to its plan: pours, and what each strategy may spend.
+"""Converts a calibration section to its plan, including weighed pours from before the campaign.
 
-Pours of before the campaign, from a CSV file or a former run: the same scene, and actions that are searched.
+`resolve_calibration` determines pours, budgets and priors. `resolve_data` and `records_of_run` read existing pours from
+a CSV file or a previous run; they must match the scene and the searched actions.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def resolve_data(
     laboratory: LaboratorySpec | None,
     report: Report,
 ) -> ExistingPours | None:
-    """Deployment's existing pours by scene; what is wrong goes to the report, and then they are None."""
+    """Existing pours of the deployment by scene; None after a problem, which is added to the report."""
     given = [key for key in ("from", "run") if section.value(key) is not None]
     if len(given) == 2:
         report.add(place.at("run"), "stands beside 'from'; keep one of them", key=True)
@@ -111,22 +112,22 @@ def _of_file(
 def _of_run(
     run: str, place: Place, scenes: tuple[Scene, ...], laboratory: LaboratorySpec | None, report: Report
 ) -> tuple[Path, dict[str, tuple[RecordedPour, ...]] | None]:
-    former = former_run(run, place, report)
-    if former is None:
+    previous = former_run(run, place, report)
+    if previous is None:
         return Path(run), None
-    if laboratory is not None and former.mode != laboratory.mode:
-        report.add(place, f"was poured in a {former.mode} laboratory, and '{laboratory.name}' is {laboratory.mode}")
-        return former.path, None
-    found = {scene.name: pours_in(former, scene) for scene in scenes}
+    if laboratory is not None and previous.mode != laboratory.mode:
+        report.add(place, f"was poured in a {previous.mode} laboratory, and '{laboratory.name}' is {laboratory.mode}")
+        return previous.path, None
+    found = {scene.name: pours_in(previous, scene) for scene in scenes}
     if not any(pours for pours, _ in found.values()):
         reasons = dict.fromkeys(reason for _, reason in found.values())
         report.add(place, f"has nothing to learn from: it {'; it '.join(reasons)}")
-        return former.path, None
-    return former.path, {name: tuple(pours) for name, (pours, _) in found.items() if pours}
+        return previous.path, None
+    return previous.path, {name: tuple(pours) for name, (pours, _) in found.items() if pours}
 
 
 def former_run(run: str, place: Place, report: Report) -> PreviousRun | None:
-    """A former run by its folder; None where there is none that can be read."""
+    """A previous run by its folder; None if it can't be read."""
     directory = resolved(place.directory / run)
     if (outside := out_of_bounds(directory)) is not None:
         report.add(place, f"{directory} {outside}")
@@ -152,18 +153,18 @@ def records_of_run(
     laboratory: LaboratorySpec | None,
     report: Report,
 ) -> RecordSet | None:
-    """Calibration's pours from a former run, in any of its scenes; None where something is wrong."""
-    former = former_run(run, place, report)
-    if former is None:
+    """Calibration pours from a previous run, in any of its scenes; None after a problem."""
+    previous = former_run(run, place, report)
+    if previous is None:
         return None
-    if laboratory is not None and laboratory.mode == "hardware" and former.mode != "hardware":
+    if laboratory is not None and laboratory.mode == "hardware" and previous.mode != "hardware":
         report.add(place, f"was poured in a virtual laboratory, and '{laboratory.name}' has a real one's liquid")
         return None
     found: list[RecordedPour] = []
     left_out: list[str] = []
     reasons: list[str] = []
     for scene in scenes:
-        pours, why = pours_in(former, scene)
+        pours, why = pours_in(previous, scene)
         fit = fitting(pours, scene, actions)
         found += [replace(pour, scene=scene.name) for pour in fit.pours] if len(scenes) > 1 else fit.pours
         left_out += fit.left_out
@@ -178,11 +179,11 @@ def records_of_run(
     if all(pour.split != "train" for pour in found):
         report.add(place, "has no pour with split 'train' to calibrate on")
         return None
-    return RecordSet(scenes[0], tuple(found), former.path)
+    return RecordSet(scenes[0], tuple(found), previous.path)
 
 
 DESIGN_SIMULATIONS = 64
-"""Simulations of an active design unless a campaign says how many."""
+"""Default number of simulations of an active design."""
 
 
 def resolve_calibration(
@@ -194,13 +195,13 @@ def resolve_calibration(
     laboratory: LaboratorySpec | None,
     known: tuple[NormalPrior, ...] = (),
 ) -> CalibrationPlan | None:
-    """The plan of a calibration; what is wrong goes to the report, and then the plan may be None.
+    """The plan of a calibration. Problems are added to the report; the plan may then be None.
 
     Args:
-        fixed: θ that are not searched.
-        searched: axes of those that are, by name.
-        place: of the section.
-        known: what is known of searched ones beforehand.
+        fixed: parameters that are not searched, by name.
+        searched: axes of the searched parameters, by name.
+        place: place of the section.
+        known: priors of searched parameters.
     """
     report = builder.report
     pours, at = section.pours, place.at("pours")
@@ -247,7 +248,7 @@ def resolve_calibration(
     if pours is not None and (from_file or from_run is not None):
         source = "a file" if from_file else "a run"
         for key in ("count", "holdout", "holdout_receivers", "design", "simulations"):
-            if pours.value(key) not in (None, "stratified"):  # what is meant anyway stands in a run's record
+            if pours.value(key) not in (None, "stratified"):  # the default appears in the record of a run
                 report.add(
                     at.at(key), f"belongs to pours that are still to be made; these are read 'from' {source}", key=True
                 )
@@ -284,8 +285,8 @@ def resolve_calibration(
     settings = None
     if not report.is_broken(place.at("strategy")):
         train = count - holdout if records is None else records.training_pours
-        complaints = PlacedProblems(place, report, frozenset(CalibrationSection.model_fields))
-        settings = section.settings.settled(tuple(searched), train, complaints)
+        problems = PlacedProblems(place, report, frozenset(CalibrationSection.model_fields))
+        settings = section.settings.settled(tuple(searched), train, problems)
     active = pours is not None and pours.design == "active" and count > 0
     others = tuple(other for other in further if other is not None)
     if scene is None or len(others) < len(receivers) - 1 or actions is None or settings is None or not searched:

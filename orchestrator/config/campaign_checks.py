@@ -1,11 +1,12 @@
-"""What a campaign file can't show by itself: whether its vessels exist as solids, hold the liquid, and stay clear.
+"""Checks of a campaign beyond its file: vessels, reachable actions, and settings that make little sense.
 
-What can be run and makes little sense: warned of, with the part of the box of actions that would.
+- `check_campaign` and `check_vessels` build the vessels and try actions. Vessels must be valid solids, hold the liquid
+  and not touch; the arm must be able to make some action.
+- `senseless` finds settings that can run but waste pours: streams that miss the receiver (range of a free jet), and
+  tilt speeds that the arm refuses.
+- `check_ranges` checks the searched parameters and their measured values for consistency.
 
-Finding it costs no pour: a stream that can't hit its receiver (a free jet's range), and tilts that are faster
-than the laboratory's arm may turn.
-
-Which parameters a campaign searches, and what is known of them beforehand: what only makes sense together.
+No pour and no simulation is made.
 """
 
 from __future__ import annotations
@@ -41,16 +42,16 @@ from sim_engine.vessel.shapes import MeshShape, VesselError, VesselSpec
 from sim_engine.vessel.vessel import Vessel, check_holds
 
 BESIDE = 0.015
-"""How far beside the opening the middle of a stream may pass and still bring something into it [m]."""
+"""Largest distance outside the opening at which part of a stream still enters it [m]."""
 
 LEAST = 1.0 / 3.0
-"""Part of a range of offsets from which a stream has to hit: below it most pours of a campaign are wasted."""
+"""Minimum share of a range of offsets from which a stream must hit; below it, most pours of a campaign are wasted."""
 
 MOST_TRIED = 9
-"""Pours of a box, other than in x_offset, whose streams are worked out."""
+"""Maximum number of pours whose streams are computed, in all dimensions other than x_offset."""
 
 Senseless = tuple[tuple[Loc, ...], str]
-"""Keys where it may stand, the most particular first, and what to say."""
+"""Keys that the finding may concern, the most specific first, and the message."""
 
 
 def senseless(
@@ -61,28 +62,28 @@ def senseless(
     arm: ArmSpec | None,
     known: dict[tuple[object, ...], float | None],
 ) -> list[Senseless]:
-    """What makes little sense about the actions of a stage in one of its scenes.
+    """Settings of a stage's actions that make little sense in one of its scenes.
 
     Args:
-        plan: of the stage.
+        plan: plan of the stage.
         scene: one of its scenes.
         pourer, receiver: geometry of the scene's vessels, which hold its load.
-        arm: of the laboratory, if it has one.
-        known: landings that were worked out before; they don't depend on the receiver. Filled here.
+        arm: arm of the laboratory, if it has one.
+        known: landings computed before, which do not depend on the receiver. Filled here.
     """
-    told = [_misses(plan.actions, scene, pourer, receiver, known)]
+    findings = [_misses(plan.actions, scene, pourer, receiver, known)]
     if arm is not None and arm.tilt_speed_limit is not None:
-        told += [
+        findings += [
             _too_fast(plan.actions, scene, name, arm.tilt_speed_limit)
             for name in ("angular_velocity", "return_velocity")
         ]
-    return [one for one in told if one is not None]
+    return [one for one in findings if one is not None]
 
 
 def _misses(
     actions: Space, scene: Scene, pourer: Vessel, receiver: Vessel, known: dict[tuple[object, ...], float | None]
 ) -> Senseless | None:
-    """An x_offset from which the stream passes beside the receiver."""
+    """An x_offset from which the stream misses the receiver."""
     half, hits, beside, below = receiver.opening_radius + BESIDE, [], 0.0, False
     for values in _spread(tuple(axis for axis in actions.axes if axis.name != "x_offset")):
         try:
@@ -107,7 +108,7 @@ def _misses(
         return _where(actions, "height"), text
     if not hits:
         if not beside:
-            return None  # nothing leaves, which is reported elsewhere
+            return None  # no liquid leaves, which is reported elsewhere
         return (
             _where(actions, "y_offset"),
             f"the stream passes {1e3 * beside:.0f} mm beside the axis of '{scene.receiver.name}', whose opening has a "
@@ -137,14 +138,14 @@ def _misses(
 
 
 def _landing(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> float | None:
-    """Where the stream comes down if the pourer stands over the receiver's axis [m]; None if nothing leaves.
+    """Where the stream lands if the pourer is above the receiver's axis [m]; None if no liquid leaves.
 
-    Not a number if most of it leaves below the receiver's rim.
+    NaN if most of the liquid leaves below the receiver's rim.
     """
     try:
         course = flow_course(plan_motion(scene, action, pourer, receiver), scene.liquid, pourer, receiver)
     except ValueError:
-        return None  # a motion that can't be made, which is reported elsewhere
+        return None  # an impossible motion, which is reported elsewhere
     if course is None:
         return None
     return course.landing() if course.quantile(course.fall, 0.5) > 0.0 else math.nan
@@ -161,7 +162,7 @@ def _too_fast(actions: Space, scene: Scene, name: str, most: float) -> Senseless
     except ValueError:
         return None
     peak = axis.upper
-    if action.angular_acceleration is not None:  # a short turn doesn't get that fast
+    if action.angular_acceleration is not None:  # a short rotation does not reach this speed
         peak = min(peak, math.sqrt(action.max_angle * action.angular_acceleration))
     if peak <= most * (1.0 + 1e-4):
         return None
@@ -175,29 +176,30 @@ def _too_fast(actions: Space, scene: Scene, name: str, most: float) -> Senseless
 
 
 def _where(actions: Space, name: str) -> tuple[Loc, ...]:
-    """Keys that an action dimension may have its values from."""
+    """Keys that may define an action dimension."""
     return (("actions", name), ("actions",)) if name in actions.names else (("motion", name),)
 
 
 def _spread(axes: tuple[Axis, ...]) -> list[dict[str, float]]:
-    """The middle, and as many corners as may be."""
+    """The middle, and corners up to the maximum number."""
     corners = itertools.islice(itertools.product((0.0, 1.0), repeat=len(axes)), MOST_TRIED - 1)
     points = [(0.5,) * len(axes), *corners] if axes else [()]
     return [{axis.name: axis.decode(u) for axis, u in zip(axes, point, strict=True)} for point in points]
 
 
 CORNERS, DRAWN = 64, 16
-"""Actions of a space that are tried beside its middle before saying that all of it touches."""
+"""Number of corners and of random actions that are tried, besides the middle, before the whole space counts as
+touching."""
 
 
 @dataclass(frozen=True)
 class _Role:
-    """A scene's part in a campaign.
+    """Role of a scene in a campaign.
 
     Attributes:
         text: for messages.
-        section: of the file, which overrides what stands at its top.
-        receiver: where the receiver may be named, the most particular place first.
+        section: section of the file that overrides the top level.
+        receiver: places that may name the receiver, the most specific first.
     """
 
     text: str
@@ -205,7 +207,7 @@ class _Role:
     receiver: tuple[Loc, ...] = ()
 
     def places(self, *keys: Loc) -> tuple[Loc, ...]:
-        """Where keys may stand, the most particular place first; the section itself where they don't."""
+        """Places that may contain keys, the most specific first; the section itself comes last."""
         return (*(self.section + key for key in keys), *keys, self.section)
 
 
@@ -213,12 +215,12 @@ CheckedPlace = tuple[float, float, float]
 
 
 def _place(action: Action) -> CheckedPlace:
-    """Where a pour begins: what the way there depends on."""
+    """Start of a pour, which determines the transfer motion."""
     return action.x_offset, action.y_offset, action.height
 
 
-def _nothing(told: object) -> None:
-    """Where nobody listens."""
+def _ignore(findings: object) -> None:
+    """Default callback: does nothing."""
 
 
 @dataclass
@@ -226,18 +228,18 @@ class _Checker:
     source: Path
     arm: ArmSpec | None = None
     document: Document | None = None
-    warn: Callable[[Problem], None] = _nothing
-    doing: Callable[[str], None] = _nothing
+    warn: Callable[[Problem], None] = _ignore
+    doing: Callable[[str], None] = _ignore
     problems: list[Problem] = field(default_factory=list)
     vessels: dict[VesselSpec, Vessel | None] = field(default_factory=dict)
     landings: dict[tuple[object, ...], float | None] = field(default_factory=dict)
 
     def add(self, places: tuple[Loc, ...], text: str) -> None:
-        """Note a problem at the first of some places that the campaign's file has."""
+        """Add a problem at the first of these places that exists in the campaign's file."""
         self.problems.append(self.problem(places, text))
 
     def problem(self, places: tuple[Loc, ...], text: str) -> Problem:
-        """A problem at the first of some places that the campaign's file has."""
+        """A problem at the first of these places that exists in the campaign's file."""
         document = self.document
         found = None if document is None else next((loc for loc in places if loc in document.marks), None)
         if document is None or found is None:
@@ -255,7 +257,7 @@ class _Checker:
         return self.vessels[spec]
 
     def scene(self, scene: Scene, role: _Role, wanted: float | None = None) -> tuple[Vessel, Vessel] | None:
-        """The scene's vessels, if both exist and hold the liquid.
+        """The scene's vessels, if both are valid and hold the liquid.
 
         Args:
             wanted: volume that the receiver has to hold [m³]; the whole load unless given.
@@ -286,7 +288,7 @@ class _Checker:
         return (pourer, receiver) if ok else None
 
     def reachable(self, plan: CalibrationPlan | DeploymentPlan, scene: Scene, role: _Role) -> None:
-        """Some action of the space must pour, not touch, and be one that the arm can make."""
+        """At least one action of the space must pour without contact, and the arm must be able to make it."""
         wanted = plan.wanted(scene) if isinstance(plan, DeploymentPlan) else None
         vessels = self.scene(scene, role, wanted)
         self._payload(scene)
@@ -304,7 +306,7 @@ class _Checker:
                 if _place(action) in barred:
                     continue
                 contact = touch(scene, action, *vessels)
-            except ValueError as error:  # an action out of bounds, or a motion that can't be made
+            except ValueError as error:  # an action out of bounds, or an impossible motion
                 contact = str(error)
             if contact is None:
                 problem = self._for_the_arm(scene, action, actions, barred)
@@ -326,7 +328,7 @@ class _Checker:
         self.add(role.places(("actions",)), text)
 
     def _payload(self, scene: Scene) -> None:
-        """What the arm believes to carry can't weigh less than the liquid alone."""
+        """The configured payload of the arm can't be less than the mass of the liquid."""
         carries = None if self.arm is None else self.arm.payload_limit
         if carries is None or carries >= scene.liquid.mass:
             return
@@ -338,13 +340,13 @@ class _Checker:
         self.add((("liquid", "mass"), ("liquid",)), text)
 
     def _never_pours(self, scene: Scene, trials: Sequence[dict[str, float]], pourer: Vessel, role: _Role) -> bool:
-        """Whether the liquid stays below the lip at the largest tilt of the space; warned of if not."""
+        """Whether the liquid stays below the lip at the largest tilt of the space; if so, a problem is added."""
         tilts = []
         for chosen in trials:
             try:
                 tilts.append(scene.action(chosen).max_angle)
             except ValueError:
-                continue  # no such action, which `touch` will tell
+                continue  # no such action, which `touch` reports
         volume = scene.liquid.volume
         if not tilts or level(pourer, volume, max(tilts)) > 0.0:
             return False
@@ -359,10 +361,10 @@ class _Checker:
         return True
 
     def _for_the_arm(self, scene: Scene, action: Action, actions: Space, barred: set[CheckedPlace]) -> str:
-        """Why the laboratory's arm, if it has one, can't make it; '' if it can.
+        """Reason why the laboratory's arm can't make the action; '' if it can or there is no arm.
 
         Args:
-            barred: places that the arm can't get to from home, whatever it does there. Filled here.
+            barred: places that the arm can't reach from home with any motion. Filled here.
         """
         if self.arm is None:
             return ""
@@ -375,11 +377,11 @@ class _Checker:
         return ""
 
     def recorded(self, scene: Scene, recorded: list[Action], role: _Role, place: Loc) -> None:
-        """Weighed pours have been poured: if their vessels touch, the scene is described wrongly."""
+        """Recorded pours were possible: if their vessels touch, the description of the scene is wrong."""
         vessels = self.scene(scene, role)
         if vessels is None:
             return
-        # The slowest to vary is the place: pours of one place and one largest tilt go through the same poses.
+        # Sorted by place: pours with the same place and maximum tilt have the same poses.
         seen = set()
         for action in recorded:
             at = (action.x_offset, action.y_offset, action.height)
@@ -401,28 +403,32 @@ def check_campaign(
     plan: CampaignPlan,
     *,
     as_written: bool = True,
-    warn: Callable[[Problem], None] = _nothing,
-    doing: Callable[[str], None] = _nothing,
+    warn: Callable[[Problem], None] = _ignore,
+    doing: Callable[[str], None] = _ignore,
 ) -> list[Problem]:
     """Build the vessels of a campaign and try its actions.
 
-    Runs must find a folder. Checked for every scene: both vessels can be built and hold the liquid; some action of the
-    space tilts far enough for the liquid to leave, and one lets the vessels stay clear of each other and can be made by
-    the laboratory's arm (middle, corners and a few drawn at random are tried); recorded pours stay clear.
+    Also checks that the output folder can be created. For every scene:
+
+    - Both vessels can be built and hold the liquid.
+    - Some action of the space tilts far enough for the liquid to leave.
+    - Some action avoids contact between the vessels, and the laboratory's arm can make it. The middle, corners and a
+      few random actions are tried.
+    - Recorded pours avoid contact.
 
     Args:
-        plan: of the campaign.
-        as_written: whether its vessels are those of its file; places in it would else mislead.
-        warn: called with what can be run and makes little sense.
-        doing: called with what is being tried, where that takes long.
+        plan: plan of the campaign.
+        as_written: whether its vessels are those of its file; otherwise places in the file would be misleading.
+        warn: called with settings that can run but make little sense.
+        doing: called with a description of each slow step.
 
     Returns:
-        What is wrong, with its place as far as the campaign's file has one; empty when the campaign can start.
+        Problems, with their places if the campaign's file has them; empty if the campaign can start.
     """
     try:
         document = Document.read(plan.source) if as_written else None
     except ConfigError:
-        document = None  # a plan that was never a file
+        document = None  # a plan without a file
     checker = _Checker(plan.source, plan.laboratory.arm, document, warn, doing)
     at: Loc
     if (problem := why_not_writable(plan.outputs.directory)) is not None:
@@ -451,12 +457,12 @@ def check_vessels(scene: Scene, source: Path, wanted: float | None = None) -> li
     """Build the vessels of one scene.
 
     Args:
-        scene: any.
+        scene: the scene.
         source: the campaign's file.
         wanted: volume that the receiver has to hold [m³]; the whole load unless given.
 
     Returns:
-        What is wrong: a vessel that is none, or can't hold the load.
+        Problems: a vessel that is invalid, or can't hold the load.
     """
     checker = _Checker(source)
     checker.scene(scene, _Role(f"{scene.pourer.name} into {scene.receiver.name}"), wanted)
@@ -464,7 +470,7 @@ def check_vessels(scene: Scene, source: Path, wanted: float | None = None) -> li
 
 
 def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str | None:
-    """Where the vessels touch during an action, in words; None when they stay clear.
+    """Place where the vessels touch during an action, as text; None if they do not touch.
 
     Raises:
         ValueError: the motion can't be made.
@@ -480,7 +486,7 @@ def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str
 
 
 def check_ranges(file: CampaignFile, root: Place, report: Report) -> None:
-    """Complain of ranges that nothing searches, calibrations without any, and measured values that are incomplete."""
+    """Report ranges that are not searched, calibrations without ranges, and incomplete measured values."""
     parameters: ParametersBase | None = file.simulator.parameters
     place = root.at("simulator", "parameters")
     sections = {} if parameters is None else parameters.ranges()
@@ -511,7 +517,7 @@ def check_ranges(file: CampaignFile, root: Place, report: Report) -> None:
 
 
 def _check(section: ParameterRangeSection, at: Place, report: Report) -> None:
-    """A measured value has a tolerance, and lies in the range beside it."""
+    """A measured value must have a tolerance and lie in its range."""
     if any(loc[: len(at.loc)] == at.loc for _, loc in report.broken):
         return
     info, value, tolerance = section.info, section.measured, section.tolerance

@@ -1,4 +1,9 @@
-"""Campaigns as written in files: the sections, their keys and what they mean. `resolve` makes plans of them."""
+"""File sections of a campaign: keys, types, defaults and their descriptions.
+
+`CampaignFile` is the whole file. Sections of calibration and deployment combine the common keys with the settings of
+each installed strategy. The classes only describe the file; `orchestrator.config.campaign_resolution` converts them to
+a plan.
+"""
 
 from __future__ import annotations
 
@@ -33,14 +38,14 @@ from sim_engine.settings.model import (
 )
 from sim_engine.settings.quantity import Quantity
 
-# Built at import from the declarations in sim_engine; a type checker sees them as Any.
+# Created at import from the declarations in sim_engine; a type checker sees them as Any.
 Actions: Any = ActionsModel
 Motion: Any = MotionModel
 Parameters: Any = ParametersModel
 
 
 class TransferSection(Section):
-    """Weighed pours in another scene, for scoring what was calibrated; never fitted."""
+    """Weighed pours in another scene, used only to evaluate the calibration."""
 
     required: ClassVar[dict[str, str]] = {"from": "transfer.csv", "receiver": "cone.yaml"}
 
@@ -48,10 +53,10 @@ class TransferSection(Section):
     """CSV file."""
 
     receiver: PathOr[VesselFile] | None = None
-    """Its receiver."""
+    """Receiver of these pours."""
 
     motion: Motion | None = None
-    """What its motion has otherwise than calibration's."""
+    """Values of the motion that differ from calibration's."""
 
 
 class PoursSection(Section):
@@ -61,49 +66,49 @@ class PoursSection(Section):
     """Pours to make on the bench."""
 
     holdout: PourCount | None = None
-    """How many of them are kept for testing; an eighth unless given."""
+    """Number of these pours that are kept for testing; an eighth unless given."""
 
     design: Design = "stratified"
-    """stratified: spread evenly over the actions; active: each by what it will tell about what is to be deployed."""
+    """stratified: spread evenly over the actions; active: each chosen by its information about the deployment."""
 
     simulations: PositiveSimulationCount | None = None
-    """active: simulations to learn from what pours would tell; 64 unless given."""
+    """active: simulations to estimate that information; 64 unless given."""
 
     holdout_receivers: list[PathOr[VesselFile]] | None = None
-    """Receivers that those kept for testing go into, by turns: how well calibration carries over to other vessels."""
+    """Receivers for the test pours, used in turn: they measure how well calibration transfers to other vessels."""
 
     source: FilePath | None = Field(default=None, alias="from")
-    """CSV file of weighed pours; its column `split` says which are kept for testing."""
+    """CSV file of weighed pours; its column `split` marks the test pours."""
 
     from_run: FilePath | None = None
-    """Folder of a former run: its weighed pours in the same scene, with the splits that they had there."""
+    """Folder of a previous run: its weighed pours in the same scene, with their splits."""
 
     lip_radius: Annotated[float, Quantity("m", "40 mm", 0.0, 0.5)] | None = None
-    """The pourer's inner radius at the lip, where the CSV has lip_to_receiver_axis_mm in place of x_offset_mm."""
+    """The pourer's inner radius at the lip, if the CSV has lip_to_receiver_axis_mm instead of x_offset_mm."""
 
     columns: dict[Text, Text] = Field(default_factory=dict)
-    """Columns that have another name in the CSV: {name that Decant knows: name in the file}."""
+    """Columns that have another name in the CSV: {Decant's name: name in the file}."""
 
     transfer: TransferSection | None = None
-    """Weighed pours in another scene, scored only."""
+    """Weighed pours in another scene, used only for evaluation."""
 
 
 class CalibrationSection(Section):
-    """Which parameters of the simulator reproduce the weighed spills: what every calibration has."""
+    """Common keys of every calibration, which finds the simulation parameters that reproduce the weighed spillage."""
 
     required: ClassVar[dict[str, str]] = {"pours": "{count: 32, holdout: 4}"}
 
     pourer: PathOr[VesselFile] | None = None
-    """The campaign's unless given."""
+    """Pourer; the campaign's unless given."""
 
     receiver: PathOr[VesselFile] | None = None
-    """The campaign's unless given."""
+    """Receiver; the campaign's unless given."""
 
     receivers: list[PathOr[VesselFile]] | None = None
-    """Several receivers, into which calibration pours are made by turns."""
+    """Several receivers, used in turn for calibration pours."""
 
     motion: Motion | None = None
-    """What has other values than in the campaign's `motion`."""
+    """Values that differ from the campaign's `motion`."""
 
     actions: Actions | None = None
     """Searched dimensions; the campaign's `actions` unless given."""
@@ -112,107 +117,108 @@ class CalibrationSection(Section):
     """Pours to calibrate on."""
 
     random_baseline: SimulationCount = 0
-    """Random parameters that are scored for comparison."""
+    """Number of random parameter sets that are evaluated for comparison."""
 
     @property
     def settings(self) -> CalibrationSettings:
-        """What belongs to the strategy."""
+        """The strategy's own settings."""
         return settings_in(self, CalibrationSettings)  # type: ignore[type-abstract]
 
 
 class DataSection(Section):
-    """Pours of before the campaign that deployment learns from: in a CSV file, or made by a former run."""
+    """Pours from before the campaign that deployment uses as data: from a CSV file, or from a previous run."""
 
     source: FilePath | None = Field(default=None, alias="from")
     """CSV file of weighed pours, with the columns of calibration's `pours`; `split` may be left out."""
 
     run: FilePath | None = None
-    """Folder of a former run: its weighed pours in the same scenes, whatever they were made for."""
+    """Folder of a previous run: its weighed pours in the same scenes, from any stage."""
 
     receiver: Text | None = None
-    """Name of the receiver that the CSV file is about, where there are several."""
+    """Name of the receiver of the CSV file's pours, if there are several receivers."""
 
     counts: Switch = False
     """Whether these pours count against the budget."""
 
     lip_radius: Annotated[float, Quantity("m", "40 mm", 0.0, 0.5)] | None = None
-    """The pourer's inner radius at the lip, where the CSV has lip_to_receiver_axis_mm in place of x_offset_mm."""
+    """The pourer's inner radius at the lip, if the CSV has lip_to_receiver_axis_mm instead of x_offset_mm."""
 
     columns: dict[Text, Text] = Field(default_factory=dict)
-    """Columns that have another name in the CSV: {name that Decant knows: name in the file}."""
+    """Columns that have another name in the CSV: {Decant's name: name in the file}."""
 
 
 class LossSection(Section):
-    """What deployment minimises."""
+    """Loss that deployment minimises."""
 
     name: LossName = "spilled_and_retained"
     """(spilled + w·retained) / loaded; or the paper's: normalised, grams, particles."""
 
     retained_weight: Annotated[float, Quantity("1", "1.0", 0.0, 100.0)] | None = None
-    """w; 1 unless given."""
+    """Weight w of the retained liquid; 1 unless given."""
 
 
 AnyObjective: Any = tagged(OBJECTIVES.all)
 
 
 class DeploymentSection(Section):
-    """How to pour into vessels that calibration never saw: what every deployment has."""
+    """Common keys of every deployment, which finds actions for vessels that calibration did not use."""
 
     pourer: PathOr[VesselFile] | None = None
-    """The campaign's unless given."""
+    """Pourer; the campaign's unless given."""
 
     receiver: PathOr[VesselFile] | None = None
-    """The campaign's unless given."""
+    """Receiver; the campaign's unless given."""
 
     receivers: list[PathOr[VesselFile]] | None = None
     """Several receivers, one after the other."""
 
     motion: Motion | None = None
-    """What has other values than in the campaign's `motion`."""
+    """Values that differ from the campaign's `motion`."""
 
     actions: Actions | None = None
     """Searched dimensions; the campaign's `actions` unless given."""
 
     loss: LossSection | None = None
-    """What is minimised."""
+    """Loss that is minimised."""
 
     objectives: list[AnyObjective] | None = None
-    """Several things wanted at once, in place of a loss."""
+    """Several objectives instead of a loss."""
 
     pareto: Switch | None = None
-    """Look for all compromises between the objectives that nothing beats; the weights then choose one of them."""
+    """Search for all Pareto-optimal actions; the weights then choose one of them."""
 
     floor: Annotated[float, Quantity("1", "0.5", 0.01, 1.0)] | None = None
-    """Share of the load (of the target volume) that a pour must deliver to be better than none; 0.5 unless given."""
+    """Minimum share of the load (of the target volume) that a pour must deliver to be better than none; 0.5 unless
+    given."""
 
     confirm: PourCount = 0
-    """Pours of the recommended action at the end, which take no part in choosing it: what to expect of it."""
+    """Pours of the recommended action at the end, which measure its outcome and do not influence the choice."""
 
     @property
     def settings(self) -> DeploymentSettings:
-        """What belongs to the strategy."""
+        """The strategy's own settings."""
         return settings_in(self, DeploymentSettings)  # type: ignore[type-abstract]
 
 
 class LearningSection(DeploymentSection):
-    """A deployment that learns on real pours."""
+    """A deployment that learns from real pours."""
 
     data: DataSection | None = None
-    """Pours of before the campaign."""
+    """Pours from before the campaign."""
 
 
 T = TypeVar("T", bound=StrategySettings)
 
 
 def settings_in(section: Section, kind: type[T]) -> T:
-    """The settings of the strategy that a section is about, without the keys that all strategies have."""
+    """The settings of a section's strategy, without the keys that all strategies have."""
     model = next(base for base in type(section).__mro__ if issubclass(base, kind) and base in STRATEGIES.all.values())
     values = {name: getattr(section, name) for name in model.model_fields}
     return model.model_construct(section.model_fields_set & model.model_fields.keys(), **values)
 
 
 def _variants(settings: Mapping[str, type[StrategySettings]], base: type[Section]) -> dict[str, type[Section]]:
-    """The sections of all strategies: their settings, and the keys that all of a kind have."""
+    """The sections of all strategies: their settings, with the common keys of their kind."""
     found: dict[str, type[Section]] = {}
     for name, own in settings.items():
         learns = issubclass(own, DeploymentSettings) and own.learns_on_pours
@@ -224,7 +230,7 @@ def _variants(settings: Mapping[str, type[StrategySettings]], base: type[Section
 
 CALIBRATIONS = _variants(calibrations(), CalibrationSection)
 DEPLOYMENTS = _variants(deployments(), DeploymentSection)
-"""Sections of all strategies that are installed, by name."""
+"""Sections of all installed strategies, by name."""
 
 AnyCalibration: Any = tagged(CALIBRATIONS, default="C4")
 AnyDeployment: Any = tagged(DEPLOYMENTS)
@@ -234,14 +240,14 @@ class SimulatorSection(Section):
     """The simulator."""
 
     parameters: Parameters | None = None
-    """Parameters θ: a value fixes one, a range has it searched by calibration; the others have their defaults."""
+    """Parameters θ: a value fixes one, a range makes calibration search it; the others have their defaults."""
 
 
 class OutputsSection(Section):
-    """What is written beside the journal."""
+    """Outputs in addition to the journal."""
 
     directory: FilePath | None = None
-    """Where runs go; 'runs' in the working directory unless given."""
+    """Folder of the runs; 'runs' in the working directory unless given."""
 
     rrd: Switch = True
     """Write a recording for the viewer."""
@@ -253,11 +259,11 @@ class OutputsSection(Section):
     """Frames of particles per simulated second."""
 
     recorded_simulations: SimulationCount = 6
-    """How many simulations are recorded with their particles."""
+    """Number of simulations that are recorded with their particles."""
 
 
 class CampaignFile(Section):
-    """A campaign: calibrate the simulator, deploy what was learnt, or both."""
+    """A campaign: calibrate the simulator, deploy with the calibrated parameters, or both."""
 
     required: ClassVar[dict[str, str]] = {
         "name": "narrow-cup",
@@ -272,13 +278,13 @@ class CampaignFile(Section):
     """Seed of every random choice: same campaign, seed and outcomes → same requests."""
 
     laboratory: PathOr[LaboratoryFile] | None = None
-    """Where it runs."""
+    """Laboratory in which it runs."""
 
     liquid: PathOr[LiquidFile] | None = None
-    """What is poured."""
+    """Liquid that is poured."""
 
     pourer: PathOr[VesselFile] | None = None
-    """The vessel in the robot's hand."""
+    """The vessel that the robot holds."""
 
     receiver: PathOr[VesselFile] | None = None
     """The vessel on the table."""
@@ -290,22 +296,23 @@ class CampaignFile(Section):
     """Values of the motion that are not searched, for all sections."""
 
     actions: Actions | None = None
-    """Searched dimensions, for sections that name none of their own."""
+    """Searched dimensions, for sections without their own."""
 
     simulator: SimulatorSection = SimulatorSection()
     """The simulator."""
 
     calibration: AnyCalibration | None = None
-    """Which parameters of the simulator reproduce the weighed spills."""
+    """Calibration: find the simulation parameters that reproduce the weighed spillage."""
 
     deployment: AnyDeployment | None = None
-    """How to pour into vessels that calibration never saw."""
+    """Deployment: find actions for vessels that calibration did not use."""
 
     on_unknown: Literal["ask", "repeat"] = "ask"
-    """What happens on resume to a pour that had started and has no outcome; 'repeat' on a virtual bench only."""
+    """Treatment on resume of a pour that had started and has no outcome; 'repeat' on a virtual bench only."""
 
     parallel_simulations: Annotated[PositiveCount, Field(le=256)] = 2
-    """Logical slots of the simulation lane, whatever the machine: the same seed asks for the same things anywhere."""
+    """Logical slots for parallel simulations, independent of the machine: the same seed gives the same requests on any
+    machine."""
 
     outputs: OutputsSection = OutputsSection()
-    """What is written beside the journal."""
+    """Outputs in addition to the journal."""

@@ -1,8 +1,10 @@
-"""From a campaign as written to a plan: what only makes sense together is checked here.
+"""Converts a campaign's file to a plan and checks the combinations of its keys.
 
-Several objectives in place of a loss: each with its own keys, none that another one contradicts.
+- `resolve_campaign` is the entry point.
+- `resolve_deployment` determines scenes, budgets, loss and existing data of the deployment.
+- `resolve_objectives` checks and converts several objectives instead of a loss.
 
-From a deployment as written to its plan: scenes, budgets, what is minimised, what is known beforehand.
+Sections are validated before (`orchestrator.config.yaml.section_validation`); vessels are not built here.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from sim_engine.search_space import Space
 def resolve_objectives(
     section: DeploymentSection, place: Place, scene: Scene, actions: Space, report: Report
 ) -> Objectives | None:
-    """What is minimised in place of a loss; None where nothing is given, or something is wrong."""
+    """The objectives that replace a loss; None if none are given, or after a problem."""
     before, parts = len(report.problems), section.objectives
     if parts is None:
         for key in ("pareto", "floor"):
@@ -62,7 +64,7 @@ def resolve_objectives(
 def resolve_deployment(
     section: DeploymentSection, builder: SceneBuilder, place: Place, laboratory: LaboratorySpec | None
 ) -> DeploymentPlan | None:
-    """The plan of a deployment; what is wrong goes to the report, and then the plan may be None."""
+    """The plan of a deployment. Problems are added to the report; the plan may then be None."""
     report, settings = builder.report, section.settings
     known = not report.is_broken(place.at("strategy"))
     pourer = builder.pourer(section.pourer, place)
@@ -73,8 +75,8 @@ def resolve_deployment(
         section.actions, place, "is what calibration averages over; deployment looks for the best action"
     )
     if known:
-        complaints = PlacedProblems(place, report, frozenset(DeploymentSection.model_fields))
-        settings.check(Premises(actions, section.objectives is not None), complaints)
+        problems = PlacedProblems(place, report, frozenset(DeploymentSection.model_fields))
+        settings.check(Premises(actions, section.objectives is not None), problems)
     if settings.pours and laboratory is not None and not laboratory.pours:
         at = place.at("pours") if "pours" in settings.model_fields_set else place
         hint = "name one with a bench" if settings.learns_on_pours else "'pours: 0' only plans"
@@ -124,7 +126,7 @@ def resolve_deployment(
 
 
 def _check_that_pouring_pays(loss: LossSection, actions: Space, place: Place, builder: SceneBuilder) -> None:
-    """Where a pour may stop before anything has left, doing so must not be the best that there is."""
+    """If a pour can stop before any liquid leaves, stopping early must not be the optimum."""
     stops = [name for name in STOPS if name in actions.names]
     if not stops or (loss.name == "spilled_and_retained" and loss.retained_weight != 0.0):
         return
@@ -142,12 +144,12 @@ def _check_that_pouring_pays(loss: LossSection, actions: Space, place: Place, bu
 
 
 def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> CampaignPlan | None:
-    """The plan of a campaign; what is wrong goes to the report, and then the plan may be None."""
+    """The plan of a campaign. Problems are added to the report; the plan may then be None."""
     references = References(report)
     laboratory: LaboratorySpec | None = references.laboratory(file.laboratory, root.at("laboratory"))
     liquid = references.liquid(file.liquid, root.at("liquid"))
     builder = SceneBuilder(file, root, references, liquid)
-    for role in ("pourer", "receiver"):  # checked even where the sections override it
+    for role in ("pourer", "receiver"):  # checked even if the sections override it
         if file.value(role) is not None:
             references.vessel(file.value(role), root.at(role))
     parameters: ParametersBase | None = file.simulator.parameters

@@ -1,4 +1,4 @@
-"""Campaigns, vessels, laboratories and parameters from files. Everything that is wrong comes as one `ConfigError`."""
+"""Loads campaigns, vessels, laboratories and parameters from files. All problems of a file are in one `ConfigError`."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ def load_campaign(path: Path | str, laboratory: Path | str | None = None, seed: 
     """The plan of a campaign file, with everything that it refers to.
 
     Args:
-        path: of the file.
-        laboratory: of a file in place of the campaign's own.
-        seed: in place of the campaign's own.
+        path: the file.
+        laboratory: a laboratory's file that replaces the campaign's laboratory.
+        seed: replaces the campaign's seed.
 
     Raises:
-        ConfigError: anything is wrong with it or with a file it refers to; all problems at once.
+        ConfigError: the file or a file that it refers to is invalid; contains all problems.
     """
     other = None if laboratory is None else Path(laboratory)
     return campaign_from(Document.read(resolved(Path(path))), other, seed)
 
 
 def campaign_from(document: Document, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
-    """The plan of a campaign that was read already; relative paths in it start from the folder of its path.
+    """The plan of a campaign document; relative paths in it start from the folder of its path.
 
     Raises:
         ConfigError: as `load_campaign`.
     """
     if laboratory is not None:
-        load_laboratory(laboratory)  # what is wrong with it is not the campaign's fault
+        load_laboratory(laboratory)  # its problems are reported separately from the campaign's
     report = Report()
     place = Place(document)
     if (other := wrong_kind(place.document, "campaign")) is not None:
@@ -70,7 +70,7 @@ def load_vessel(path: Path | str) -> VesselSpec:
     """The vessel of a file (its shape is built and checked by `sim_engine.vessel`).
 
     Raises:
-        ConfigError: anything is wrong with it.
+        ConfigError: the file is invalid.
     """
     report, path = Report(), Path(path)
     if path.suffix.lower() in MESH_SUFFIXES:
@@ -87,7 +87,7 @@ def load_laboratory(path: Path) -> LaboratorySpec:
     """The laboratory of a file.
 
     Raises:
-        ConfigError: anything is wrong with it.
+        ConfigError: the file is invalid.
     """
     report = Report()
     found = References(report).file(resolved(path), LaboratoryFile)
@@ -98,7 +98,7 @@ def load_laboratory(path: Path) -> LaboratorySpec:
 
 
 class _LooseQuantity(Quantity):
-    """A quantity in which a bare number is in SI units: as programs write them."""
+    """A quantity that also accepts a number without unit, in SI units, as programs write them."""
 
     def parse(self, value: Any) -> float | str:
         if isinstance(value, (int, float)) and not isinstance(value, bool) and self.unit != "1":
@@ -128,21 +128,21 @@ DISCREPANCY_KEY, SHIFT_KEY = "remaining_discrepancy", "shift"
 
 
 def predicts_with_posterior(path: Path) -> bool:
-    """Whether predictions with a file of θ draw from its posterior: it has one, and θ is the calibrated one.
+    """Whether predictions with a file of θ use its posterior: it has one, and θ is the calibrated one.
 
     Raises:
-        ConfigError: it is not YAML or JSON.
+        ConfigError: the file is not YAML or JSON.
     """
     data = Document.read(resolved(path)).data
     return isinstance(data, dict) and POSTERIOR_KEY in data and data.get(RECOMMENDED_KEY) != "uncalibrated"
 
 
 def load_discrepancy(path: Path) -> float | None:
-    """The shift that a calibration left over (`sim_engine.prediction_band`), from a run's `theta.json`; None if it
-    has none.
+    """The residual shift of a calibration (`sim_engine.prediction_band`), from a run's `theta.json`; None if it has
+    none.
 
     Raises:
-        ConfigError: what stands there is not a number from 0 on.
+        ConfigError: the value is not a number ≥ 0.
     """
     document = Document.read(resolved(path))
     found = document.data.get(DISCREPANCY_KEY) if isinstance(document.data, dict) else None
@@ -162,9 +162,9 @@ def load_discrepancy(path: Path) -> float | None:
 def load_posterior(
     path: Path, count: int, base: SimulationParameters | None = None
 ) -> tuple[SimulationParameters, ...]:
-    """`count` of the weighted θ that a run's `theta.json` has under `posterior`, each as likely as its weight says.
+    """`count` posterior draws of θ from a run's `theta.json`, each with a probability given by its weight.
 
-    Drawn evenly along the cumulated weights: the same file gives the same θ.
+    They are drawn evenly along the cumulated weights: the same file gives the same θ.
 
     Args:
         path: the file.
@@ -172,7 +172,7 @@ def load_posterior(
         base: values of the parameters that the file does not name.
 
     Raises:
-        ConfigError: it has no posterior, or anything is wrong with it.
+        ConfigError: the file has no posterior, or is invalid.
     """
     report = Report()
     document = Document.read(resolved(path))
@@ -200,18 +200,17 @@ def load_posterior(
 
 
 def load_parameters(path: Path, base: SimulationParameters | None = None) -> SimulationParameters:
-    """θ from a file: what `decant calibrate --json` prints, or written by hand.
+    """θ from a file: the output of `decant calibrate --json`, or a file written by hand.
 
-    The file is JSON or YAML: a mapping of parameter names, or one that has such a mapping under `theta` (or
-    `parameters`) beside whatever else. Values are numbers in SI units (cohesion in N/m, viscosity in 1/s) or quantities
-    with units.
+    The file is JSON or YAML: a mapping of parameter names, or a mapping that contains one under `theta` (or
+    `parameters`). Values are numbers in SI units (cohesion in N/m, viscosity in 1/s) or quantities with units.
 
     Args:
         path: the file.
         base: values of the parameters that the file does not name; the simulator's defaults unless given.
 
     Raises:
-        ConfigError: anything is wrong with it.
+        ConfigError: the file is invalid.
     """
     report = Report()
     document = Document.read(resolved(path))

@@ -1,4 +1,4 @@
-"""JSON schemas of the files people write, for editors that complete and check, and of `summary.json` for programs."""
+"""JSON schemas of the input files, for completion and checks in editors, and of `summary.json`, for programs."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "study": study_schema,
     "result": result_schema,
 }
-"""By the names of their files."""
+"""Functions that create the schemas, by the names of the schema files."""
 
 
 def write_schemas(directory: Path) -> list[Path]:
-    """Write all schemas into a directory, each as NAME.json; the paths written."""
+    """Write all schemas into a directory, each as NAME.json; returns the paths."""
     directory.mkdir(parents=True, exist_ok=True)
     paths = []
     for name, schema in SCHEMAS.items():
@@ -65,7 +65,7 @@ def write_schemas(directory: Path) -> list[Path]:
 
 
 def schema_text(schema: dict[str, Any]) -> str:
-    """The schema as it stands in its file."""
+    """The schema as text of its file."""
     return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
 
 

@@ -1,8 +1,7 @@
-"""Laboratories as written in files. The hidden θ of a virtual bench lives here, and calibration never reads it.
+"""File sections of a laboratory: simulators, arm, balance, operator, virtual bench, Ray cluster.
 
-The person at the bench as written in a laboratory's file: who answers, and how long that may take.
-
-A laboratory's Ray cluster as written in files.
+`LaboratoryFile` is the whole file, `resolve_laboratory` converts it. The hidden θ of a virtual bench is part of it;
+calibration never reads it. The sections of arm and balance are in `arm_file` and `balance_file`.
 """
 
 from __future__ import annotations
@@ -33,29 +32,29 @@ Patience = Annotated[float, Quantity("s", "30 min", 0.0, 7 * 86400.0, positive=T
 
 
 class OperatorSection(Section):
-    """Who refills, wipes, places, and says when it is done."""
+    """The operator, who refills, wipes and places the vessels, and confirms each step."""
 
     answers: Literal["person", "virtual"] | None = None
-    """A 'person' at the terminal, or a 'virtual' one; unless given, whoever fits the laboratory's mode."""
+    """A 'person' at the terminal, or a 'virtual' operator; unless given, it follows from the laboratory's mode."""
 
     time: Annotated[float, Quantity("s", "85 s", 0.0, 3600.0)] = _OPERATOR.time
-    """What a virtual one takes for all its work around one pour, in bench time."""
+    """Total time of a virtual operator for one pour, in bench time."""
 
     reminder: Patience = _OPERATOR.reminder
-    """After which an open question is asked again."""
+    """Time after which an open question is repeated."""
 
     deadline: Patience = _OPERATOR.deadline
-    """After which it is given up: nothing moves then, and the campaign pauses."""
+    """Time after which an open question is abandoned: nothing moves then, and the campaign pauses."""
 
 
 def resolve_operator(section: OperatorSection, place: Place, report: Report, *, mode: str) -> OperatorSpec | None:
-    """The operator of a file; what is wrong goes to the report, and then there is none.
+    """The operator of a file; None after a problem, which is added to the report.
 
     Args:
-        section: as written.
-        place: where it stands.
-        report: takes problems.
-        mode: of the laboratory, 'virtual' or 'hardware'.
+        section: the section as written.
+        place: place of the section.
+        report: receives problems.
+        mode: mode of the laboratory, 'virtual' or 'hardware'.
     """
     before = len(report.problems)
     if mode == "hardware" and section.answers == "virtual":
@@ -92,19 +91,19 @@ Address = Annotated[str, Strict(), AfterValidator(_address)]
 
 
 class RaySection(Section):
-    """A Ray cluster that runs already; Decant joins it and leaves it running."""
+    """An existing Ray cluster; Decant connects to it and does not stop it."""
 
     required: ClassVar[dict[str, str]] = {"address": "10.0.0.1:6379"}
 
     address: Address | None = None
-    """Address of its head, host:port."""
+    """Address of its head node, host:port."""
 
     bench_resource: Name = RaySpec.bench_resource
-    """Custom resource of the node that arm, balance and bench run on; 'ray start --resources' gives it one."""
+    """Custom resource of the node that runs arm, balance and bench; set it with 'ray start --resources'."""
 
 
 def resolve_ray(section: RaySection | None) -> RaySpec | None:
-    """The cluster of a file; None if it names none, or its address is wrong (which is reported already)."""
+    """The cluster of a file; None without a cluster, or if its address is invalid (which is reported already)."""
     if section is None or section.address is None:
         return None
     return RaySpec(section.address, section.bench_resource)
@@ -126,24 +125,24 @@ class BalanceSection(Section):
     """Standard deviation of a reading."""
 
     drift: Annotated[float, Quantity("kg/s", "0.01 g/s", -0.01, 0.01)] = _DEFAULT.balance_drift
-    """Creep of the zero."""
+    """Drift of the zero."""
 
     settling_time: Duration = _DEFAULT.settling_time
     """Time constant until a reading is stable."""
 
 
 class HiddenLiquidBase(Section):
-    """θ of the 'real' liquid between the virtual arm and the virtual balance. Hidden: calibration never reads it."""
+    """θ of the 'real' liquid of the virtual bench. Hidden: calibration never reads it."""
 
     def parameters(self) -> SimulationParameters:
-        """The hidden θ; what is not given has its default."""
+        """The hidden θ; missing values have their defaults."""
         return SimulationParameters.from_values(
             {name: v for name in self.written_keys() if (v := self.value(name)) is not None}
         )
 
 
 def hidden_liquid_model() -> type[HiddenLiquidBase]:
-    """The section with one key per parameter of the solver; a bench's nuisances are its `pose_error`."""
+    """The section with one key per parameter of the solver; the nuisance parameters of a bench are its `pose_error`."""
     fields: Any = {
         name: (Annotated[float, parameter_quantity(name)] | None, Field(default=None, description=info.meaning or None))
         for name, info in SimulationParameters.info().items()
@@ -159,7 +158,8 @@ HiddenLiquid: Any = hidden_liquid_model()
 
 
 class BenchSection(Section):
-    """What is hidden on a virtual bench: a liquid that is not the simulator's, errors, and how fast time runs."""
+    """Ground truth of a virtual bench: a liquid that differs from the simulator's, execution errors, and the speed of
+    time."""
 
     required: ClassVar[dict[str, str]] = {"liquid": "{particles: 4000, cohesion: 0.05 N/m}"}
 
@@ -170,26 +170,26 @@ class BenchSection(Section):
     """Systematic error of grip and placement."""
 
     pose_noise: PoseNoiseSection = PoseNoiseSection()
-    """Its scatter, drawn anew for each pour."""
+    """Random error of grip and placement, drawn for each pour."""
 
     balance: BalanceSection = BalanceSection()
-    """The balance of a bench of numbers; a laboratory with an arm has its own section for it."""
+    """The balance of a simulated bench; a laboratory with an arm has a separate section for it."""
 
     time_scale: Annotated[float, Quantity("1", "30", 0.0, 1e6)] = _DEFAULT.time_scale
-    """Bench seconds per wall second; 0 waits for nothing (not with an arm)."""
+    """Bench seconds per wall second; 0 means no waiting (not with an arm)."""
 
     operator_time: Duration = _DEFAULT.operator_time
-    """Refilling, placing, wiping between two pours, in bench time; with an arm see 'operator'."""
+    """Time to refill, place and wipe between two pours, in bench time; with an arm see 'operator'."""
 
 
 AnyArm: Any = tagged(ARMS.all, default="ur")
-"""Arms of all kinds that are installed."""
+"""Section type of all installed kinds of arms."""
 
 AnyBalance: Any = any_balance()
 
 
 class LaboratoryFile(Section):
-    """Where a campaign runs."""
+    """The laboratory in which a campaign runs."""
 
     recorded_as_given: ClassVar[bool] = True
 
@@ -199,13 +199,13 @@ class LaboratoryFile(Section):
     """Its name in journals and banners."""
 
     mode: Literal["virtual", "hardware"] = "virtual"
-    """What it is made of: 'virtual' moves nothing, 'hardware' moves an arm."""
+    """'virtual' moves nothing, 'hardware' moves an arm."""
 
     simulators: Annotated[Count, Field(le=10_000)] = 0
-    """Simulators in the pool; 0: one per core, of this machine or of the cluster."""
+    """Number of simulators in the pool; 0: one per core of this machine or of the cluster."""
 
     in_process: Switch = False
-    """Run everything in one process (slow, for finding errors)."""
+    """Run everything in one process (slow, for debugging)."""
 
     object_store: Annotated[float, Quantity("MB", "160 MB", 80.0, 100_000.0)] = 160.0
     """Shared memory for simulators' results, without a cluster."""
@@ -214,28 +214,28 @@ class LaboratoryFile(Section):
     """The Ray cluster to run on; unless given, a private Ray on this machine."""
 
     arm: AnyArm | None = None
-    """The arm that holds the pourer, virtual or not; its `kind` is one of those that are installed."""
+    """The arm that holds the pourer, virtual or real; `kind` is one of the installed kinds."""
 
     cell: CellSection | None = None
-    """What stands where around the arm."""
+    """Objects around the arm."""
 
     balance: AnyBalance | None = None
-    """The balance beside the arm."""
+    """The balance next to the arm."""
 
     operator: OperatorSection = OperatorSection()
-    """The person beside the arm."""
+    """The operator next to the arm."""
 
     bench: BenchSection | None = None
-    """What is hidden on a virtual bench; without it and without an arm, the laboratory simulates and plans."""
+    """Ground truth of a virtual bench. Without bench and arm, the laboratory only simulates and plans."""
 
 
 def resolve_laboratory(section: LaboratoryFile, place: Place, report: Report) -> LaboratorySpec | None:
-    """The laboratory of a file; what is wrong goes to the report, and then there is none.
+    """The laboratory of a file; None after a problem, which is added to the report.
 
     Args:
-        section: as written.
-        place: where it stands.
-        report: takes problems.
+        section: the section as written.
+        place: place of the section.
+        report: receives problems.
     """
     before = len(report.problems)
     if section.mode == "hardware":
@@ -280,7 +280,7 @@ def _check_hardware(section: LaboratoryFile, place: Place, report: Report) -> No
 
 
 def _check_wires(section: LaboratoryFile, place: Place, report: Report) -> None:
-    """What belongs to an arm, and what with one belongs elsewhere."""
+    """Keys that need an arm, and keys that belong to other sections if there is an arm."""
     if section.arm is None:
         if report.is_broken(place.at("arm")):
             return
@@ -329,7 +329,7 @@ def _bench(b: BenchSection) -> VirtualBenchSpec:
 
 
 def _paced(balance: BalanceSpec | None, time_scale: float) -> BalanceSpec | None:
-    """A virtual balance in the bench's time."""
+    """A virtual balance that runs in bench time."""
     if balance is None or balance.device is None:
         return balance
     return replace(balance, device=balance.device.paced(time_scale))

@@ -1,4 +1,4 @@
-"""Simulation parameters as written in files, fixed or searched: derived from how `sim_engine.liquids` declares them."""
+"""File sections for simulation parameters, fixed or searched, derived from the declarations in `sim_engine.liquids`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sim_engine.settings.model import MADE, Section
 from sim_engine.settings.quantity import Quantity
 
 SEARCHED_TOLERANCES = 3.0
-"""A measured value is searched so many of its standard deviations to both sides."""
+"""The default range of a measured value, in standard deviations to both sides."""
 
 
 def parameter_quantity(name: str) -> Quantity:
@@ -25,22 +25,21 @@ def parameter_quantity(name: str) -> Quantity:
 
 
 class ParameterRangeSection(RangeSection):
-    """What calibration searches: `[lowest, highest]`, all values alike beforehand; or what was measured,
-    `{measured: …, tolerance: …}`, a normal prior that a range beside it cuts off.
-    """
+    """A searched parameter: `[lowest, highest]` for a uniform prior, or `{measured: …, tolerance: …}` for a normal
+    prior, which an additional range truncates."""
 
     required: ClassVar[dict[str, str]] = {}
 
     measured: Any = None
-    """C4: what was measured or is known of it."""
+    """C4: measured or known value."""
 
     tolerance: Any = None
-    """C4: standard deviation of that; without a range three of them to both sides are searched."""
+    """C4: standard deviation of the measured value; without a range, three of them to both sides are searched."""
 
     info: ClassVar[ParameterInfo]
 
     def searched(self) -> Axis | None:
-        """The axis that is searched; None where something is wrong here."""
+        """The searched axis; None after a problem."""
         info = self.info
         if self.range is not None:
             return self.axis(info.name, integer=info.integer)
@@ -50,7 +49,7 @@ class ParameterRangeSection(RangeSection):
         return Axis(info.name, max(low, info.lower), min(high, info.upper), self.scale, info.integer)
 
     def normal(self) -> NormalPrior | None:
-        """The prior; None where all values are alike, or where something is wrong here."""
+        """The prior; None if it is uniform, or after a problem."""
         if self.measured is None or self.tolerance is None:
             return None
         return NormalPrior(self.info.name, float(self.measured), float(self.tolerance))
@@ -75,34 +74,34 @@ def _parameter_form(value: Any) -> str:
 
 
 class ParametersBase(Section):
-    """Parameters: a value fixes one; a range, or what was measured with a tolerance, has it searched by calibration."""
+    """Parameters: a value fixes one; a range, or a measured value with a tolerance, makes calibration search it."""
 
     def fixed(self) -> dict[str, float]:
         """Parameters with a value, SI."""
         return {name: float(v) for name in self.written_keys() if isinstance(v := self.value(name), (int, float))}
 
     def ranges(self) -> dict[str, ParameterRangeSection]:
-        """Parameters that are to be searched."""
+        """Searched parameters."""
         given = {name: self.value(name) for name in self.written_keys()}
         return {name: section for name, section in given.items() if isinstance(section, ParameterRangeSection)}
 
     def searched(self) -> dict[str, Axis]:
-        """Axes of parameters that are to be searched."""
+        """Axes of the searched parameters."""
         axes = {name: section.searched() for name, section in self.ranges().items()}
         return {name: axis for name, axis in axes.items() if axis is not None}
 
     def priors(self) -> tuple[NormalPrior, ...]:
-        """Searched parameters whose values are not all alike beforehand."""
+        """Searched parameters with a prior that is not uniform."""
         found = (section.normal() for section in self.ranges().values())
         return tuple(prior for prior in found if prior is not None)
 
     def completed(self) -> Self:
-        """With the defaults of parameters that are not named."""
+        """A copy with the defaults of parameters that are not given."""
         given = {name: value for name in self.written_keys() if (value := self.value(name)) is not None}
         return self.model_copy(update=SimulationParameters().model_dump() | given)
 
     def in_force(self) -> dict[str, float]:
-        """What is named, SI: a value, and of a range what was measured (or the default), or what is nearest."""
+        """Values in SI: fixed values; for a range, the measured value or the default, clipped to the range."""
         default = SimulationParameters().model_dump() | {prior.name: prior.mean for prior in self.priors()}
         return self.fixed() | {n: min(max(default[n], axis.lower), axis.upper) for n, axis in self.searched().items()}
 

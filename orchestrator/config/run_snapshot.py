@@ -1,6 +1,7 @@
-"""What a run keeps of a campaign that was made from another: that one's record, with what is otherwise.
+"""The self-contained record of a campaign that a run stores as `resolved.json`: the file with all values filled in.
 
-What a run keeps of its campaign: the file with everything filled in, standing alone (`resolved.json`).
+`campaign_record` writes a campaign's file. `record_of` writes a plan derived from another campaign, for example the
+cell of a study, as the base record with its changes. Loading a record gives the plan again.
 """
 
 from __future__ import annotations
@@ -23,14 +24,15 @@ from sim_engine.vessel.shapes import MeshShape, ProfileShape, VesselSpec
 
 
 def record_of(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
-    """A plan in the language of campaign files, JSON-ready. Loading it gives the plan again.
+    """A plan in the format of campaign files, JSON-ready. Loading it gives the plan again.
 
-    Pours that the cell of a study takes over from another cell are its shares of the load; loading reads the masses of
-    that cell's journal instead, which differ from them by rounding. θ drawn from a posterior are not part of it.
+    There are two exceptions. Pours that the cell of a study takes over from another cell are stored as shares of the
+    load; loading reads the masses of that cell's journal instead, which differ by rounding. θ drawn from a posterior
+    are not included.
 
     Args:
-        base: the record of the campaign that the plan was made from.
-        plan: of a study's cell, or for planning alone.
+        base: the record of the campaign from which the plan was made.
+        plan: plan of a study's cell, or for planning alone.
     """
     record = {key: value for key, value in base.items() if key not in ("calibration", "deployment")}
     outputs = {**asdict(plan.outputs), "record_rate": f"{plan.outputs.record_rate!r} 1/s"}
@@ -94,7 +96,7 @@ def _deployment(base: Mapping[str, Any], plan: DeploymentPlan) -> dict[str, Any]
 
 
 def vessel_record(vessel: VesselSpec) -> dict[str, Any]:
-    """A vessel as a file has it."""
+    """A vessel in the format of its file."""
     shape = vessel.shape
     match shape:
         case ProfileShape():
@@ -114,23 +116,23 @@ def vessel_record(vessel: VesselSpec) -> dict[str, Any]:
 
 
 def _common(base: Mapping[str, Any], section: type[Section]) -> dict[str, Any]:
-    """What of a section is not its strategy's."""
+    """The keys of a section that are common to all strategies."""
     return {key: value for key, value in base.items() if key in section.written_keys()}
 
 
 def written(section: Section) -> dict[str, Any]:
-    """A section that stands in no file, as a file would have it."""
+    """A section without a file, in the format of a file."""
     return as_file(section, Place(Document(Path.cwd() / "written")), References(Report()))
 
 
 def campaign_record(file: CampaignFile, root: Place, references: References, directory: Path) -> dict[str, Any]:
-    """The campaign in the language of campaign files, JSON-ready: loading it gives the same plan.
+    """The campaign in the format of campaign files, JSON-ready: loading it gives the same plan.
 
     Args:
-        file: without problems.
-        root: its place.
-        references: that its other files were read by.
-        directory: in which its runs get folders.
+        file: the file's content, without problems.
+        root: place of the file's root.
+        references: the references that read its other files.
+        directory: parent folder of its runs.
     """
     record = as_file(file, root, references)
     record["outputs"]["directory"] = str(directory)

@@ -1,4 +1,8 @@
-"""Scenes and action spaces of a campaign's sections: defaults, overrides, and what must end up with a value."""
+"""Builds scenes and action spaces from a campaign's sections.
+
+`SceneBuilder` combines the campaign's defaults with the overrides of a section, and checks that every dimension has a
+value.
+"""
 
 from __future__ import annotations
 
@@ -23,22 +27,22 @@ from sim_engine.settings.quantity import QuantityError
 from sim_engine.vessel.shapes import VesselSpec
 
 NEEDED = ("angular_velocity", "max_angle", "x_offset", "height")
-"""Dimensions that have no default: each campaign fixes or searches them."""
+"""Dimensions without a default: each campaign fixes or searches them."""
 
 LEAST_LEFT = 64
-"""So many at least of some 30,000 actions all over the ranges must meet the constraints."""
+"""Minimum number of actions, out of about 30,000 spread over the ranges, that must satisfy the constraints."""
 
 DEFAULTS = Action(angular_velocity=1.0, x_offset=0.0, height=0.0).values()
 
 
 @dataclass
 class SceneBuilder:
-    """Puts the campaign's defaults and a section's overrides together.
+    """Combines the campaign's defaults with a section's overrides.
 
     Attributes:
-        file: the campaign as written (what is right of it).
-        root: its place.
-        liquid: None where something is wrong with it.
+        file: the campaign as written (its valid part).
+        root: place of the file's root.
+        liquid: None after a problem.
     """
 
     file: CampaignFile
@@ -48,11 +52,11 @@ class SceneBuilder:
 
     @property
     def report(self) -> Report:
-        """Where problems go."""
+        """The report that receives problems."""
         return self.references.report
 
     def space(self, actions: ActionsBase | None, motion: MotionBase | None, place: Place) -> Space | None:
-        """The action space of a section; what it searches must not be fixed beside it."""
+        """The action space of a section; a searched dimension must not be fixed as well."""
         own = actions is not None
         used = actions if own else self.file.actions
         if used is None:
@@ -75,7 +79,7 @@ class SceneBuilder:
         return space
 
     def constraints(self, actions: ActionsBase | None, place: Place, space: Space | None) -> tuple[Linear, ...]:
-        """The constraints of the action space of a section, which leave something of it."""
+        """The constraints of a section's action space; they must leave a part of it."""
         used, at = (self.file.actions, self.root) if actions is None else (actions, place)
         if space is None or used is None or not used.constraints:
             return ()
@@ -96,7 +100,7 @@ class SceneBuilder:
     def prior(
         self, actions: ActionsBase | None, place: Place, space: Space | None, constraints: Sequence[Linear]
     ) -> tuple[NormalPrior, ...]:
-        """The prior over the action space of C4, which leaves something of it."""
+        """C4's prior over the action space; it must have mass inside the constraints."""
         used, at = (self.file.actions, self.root) if actions is None else (actions, place)
         prior: tuple[NormalPrior, ...] = () if space is None or used is None else used.prior()
         if space is None or not prior:
@@ -117,7 +121,7 @@ class SceneBuilder:
         return prior
 
     def refuse_prior(self, actions: ActionsBase | None, place: Place, why: str) -> None:
-        """Say of every prior of a section's own dimensions that it decides nothing."""
+        """Report every prior of a section's own dimensions as unused."""
         for one in () if actions is None else actions.prior():
             self.report.add(place.at("actions").at(one.name, "prior"), f"{why}; remove it", key=True)
 
@@ -138,14 +142,15 @@ class SceneBuilder:
 
         Args:
             name: key for journal and strategies.
-            pourer: None where something is wrong with it.
-            receiver: None where something is wrong with it.
-            motions: sections that override the campaign's motion, the last wins.
+            pourer: None after a problem.
+            receiver: None after a problem.
+            motions: sections that override the campaign's motion; the last has priority.
             searched: dimensions that the action space (or a varying column of a record) gives.
-            place: section that the scene belongs to.
-            recorded: replays weighed pours, so that a step and no return are allowed.
-            constants: values that the whole record has; a different value in `motion` is an error …
-            constants_win: … unless the record is of a scene that only inherits the motion.
+            place: section of the scene.
+            recorded: the scene replays weighed pours, so that a step and no return are allowed.
+            constants: values that the whole record has; a different value in `motion` is an error, unless
+                `constants_win`.
+            constants_win: the record's scene only inherits the motion, so that its constants have priority.
         """
         fixed: dict[str, float | None] = {k: v for k, v in DEFAULTS.items() if k not in NEEDED}
         pivot, hold_cap = Pivot(), 5.0
@@ -195,7 +200,7 @@ class SceneBuilder:
         return self._vessel("receiver", value, place)
 
     def receivers(self, section: Any, place: Place, *, inherit: bool = True) -> list[VesselSpec | None]:
-        """A section's receivers: its own, or the campaign's; `inherit`: those under the campaign's 'receivers', too."""
+        """A section's receivers: its own, or the campaign's; `inherit` includes the campaign's 'receivers'."""
         owners = ((section, place), (self.file, self.root))
         for owner, at in owners if inherit else owners[:1]:
             if owner.receiver is not None and owner.receivers is not None:
@@ -235,7 +240,7 @@ class SceneBuilder:
         )
 
     def _hidden_by_problems(self, place: Place, word: str) -> bool:
-        """Whether a problem was noted that may be why a word has no value: one cause, one message."""
+        """Whether a reported problem may explain that a word has no value: one cause, one message."""
         return any(
             path == place.document.path and (word in loc or (loc and loc[-1] in ("motion", "actions")))
             for path, loc in self.report.broken

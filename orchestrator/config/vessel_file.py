@@ -1,4 +1,4 @@
-"""Vessels and liquids as written in files."""
+"""File sections of vessels and liquids, and their conversion."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ class ProfileSection(Section):
     """Thickness of the floor, downwards."""
 
     radius_deviations: tuple[tuple[Number, ...], ...] | None = None
-    """How well it is known: a row for each independent way in which the shape may be off, with how far outwards each
-    point of `inner` then is, one standard deviation. Predicted spillages are of shapes drawn by it."""
+    """Uncertainty of the shape: a row for each independent deviation, with the outward displacement of each point of
+    `inner` at one standard deviation. Predictions of spillage use shapes drawn from it."""
 
     height_deviation: Annotated[float, Quantity("m", "0.3 mm", lower=0.0, upper=0.02)] | None = None
-    """Likewise the height of the rim, one standard deviation; all points move in proportion."""
+    """Uncertainty of the rim's height, one standard deviation; all points move in proportion."""
 
 
 class VesselBase(Section):
-    """A vessel: a profile of [r, z] points, a mesh of its solid, or what an installed package knows."""
+    """A vessel: a profile of [r, z] points, a mesh of its solid, or a source that an installed package adds."""
 
     required: ClassVar[dict[str, str]] = {"name": "beaker"}
 
@@ -75,7 +75,7 @@ class VesselBase(Section):
 
 
 def further_sources() -> dict[str, type[Section]]:
-    """Sources of vessels that packages add, by the key that they have in a vessel's file."""
+    """Sources of vessels that packages add, by their keys in a vessel's file."""
     own = VesselBase.model_fields.keys()
     return {kind: shape for kind, shape in VESSELS.all.items() if kind not in own and issubclass(shape, Section)}
 
@@ -96,11 +96,11 @@ VesselFile: Any = _vessel_file()
 
 
 class LiquidFile(Section):
-    """What is poured: by its name, if it is in the [table](liquids.md#the-table), or by its properties."""
+    """The liquid, given by its name if it is in the [table](liquids.md#the-table), or by its properties."""
 
     name: Text = "water"
     """A name in the table: 'ethanol', 'glycerol 80 %', 'sugar syrup 60 %', 'rapeseed oil' … Any other name needs
-    `density` and `viscosity` next to it."""
+    `density` and `viscosity` as well."""
 
     temperature: Annotated[float, Quantity("degC", "20 degC", lower=0.0, upper=100.0)] | None = None
     """Temperature at which the table is read; 20 °C unless given."""
@@ -109,28 +109,27 @@ class LiquidFile(Section):
     """Mass that is loaded into the pourer; or give `volume`."""
 
     volume: Annotated[float, Quantity("m^3", "200 mL", lower=1e-7, upper=0.02)] | None = None
-    """Volume that is loaded, from which the mass follows; or give `mass`, which a balance tells better."""
+    """Volume that is loaded, from which the mass follows; or give `mass`, which is more accurate with a balance."""
 
     density: Annotated[float, Quantity("kg/m^3", "998 kg/m^3", lower=101.0, upper=19_999.0)] | None = None
     """Density; the table's unless given. Required for a liquid that is not in the table."""
 
     surface_tension: Annotated[float, Quantity("N/m", "72.8 mN/m", lower=1e-3, upper=1.0)] | None = None
     """Surface tension against air; the table's unless given, water's 72.8 mN/m for a liquid that is not in the table.
-    Liquids above 5 mm²/s are simulated with it; for thinner ones the simulator's own knob is the parameter
-    `cohesion`."""
+    Liquids above 5 mm²/s are simulated with it; for thinner ones set the simulation parameter `cohesion`."""
 
     viscosity: Annotated[float, Quantity("Pa*s", "1 mPa*s", lower=1e-5, upper=1e3)] | None = None
     """Dynamic viscosity; the table's unless given. Required for a liquid that is not in the table. Above 5 mm²/s
-    (viscosity over density) it is simulated, and the liquid sticks to walls; for thinner ones the simulator's knob is
-    the parameter `viscosity`."""
+    (viscosity over density) it is simulated, and the liquid sticks to walls; for thinner ones set the simulation
+    parameter `viscosity`."""
 
     contact_angle: Annotated[float, Quantity("rad", "40 deg", lower=0.0, upper=math.pi)] = NEUTRAL
-    """Contact angle on the vessels' walls. Held against theory where particles are finer than the capillary length
-    (1.9 mm for oil, 2.7 mm for water); at the spacing of a usual simulation it is felt, and not validated."""
+    """Contact angle on the vessels' walls. It agrees with theory if particles are finer than the capillary length (1.9
+    mm for oil, 2.7 mm for water). At the usual particle spacing it has an effect, which is not validated."""
 
 
 def resolve_vessel(section: VesselBase, place: Place, report: Report) -> VesselSpec | None:
-    """The vessel of a file; problems go to the report, and then the answer is None."""
+    """The vessel of a file; None after a problem, which is added to the report."""
     before = len(report.problems)
     shape: Shape | None = None
     kinds = ("profile", "mesh", *further_sources())
@@ -219,7 +218,7 @@ def _mesh(section: VesselBase, place: Place, report: Report) -> MeshShape | None
 
 
 def resolve_liquid(section: LiquidFile, place: Place, report: Report) -> Liquid | None:
-    """The liquid of a file; problems go to the report, and then the answer is None."""
+    """The liquid of a file; None after a problem, which is added to the report."""
     if section.mass is not None and section.volume is not None:
         report.add(place.at("volume"), "the load has a mass already; keep one of 'mass' and 'volume'", key=True)
         return None
@@ -251,7 +250,7 @@ def _first(given: float | None, known: float) -> float:
 
 
 PLAIN_WATER = Properties(density=998.0, dynamic_viscosity=1.0e-3, surface_tension=0.0728)
-"""Properties of water without a temperature; the tension of a liquid that gives its other properties itself."""
+"""Properties of water without a temperature; its surface tension is also the default of liquids outside the table."""
 
 
 def _known(section: LiquidFile, place: Place, report: Report) -> Properties | None:

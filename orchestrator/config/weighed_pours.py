@@ -1,6 +1,7 @@
-"""Weighed pours from CSV files; every error names the file, the line and the column.
+"""Reads weighed pours from CSV files and checks them against the campaign.
 
-Records of a campaign: weighed pours with the scene they were poured in, checked against what is searched.
+`read_records` returns a `RecordTable`; each problem names the file, the line and the column. `resolve_records` adds the
+scene of the pours and compares them with the searched actions.
 """
 
 from __future__ import annotations
@@ -36,13 +37,14 @@ SPLITS = ("train", "test", "transfer")
 LIP_COLUMN = "lip_to_receiver_axis_mm"
 
 MASS_TOLERANCE = 0.01
-"""Largest relative difference between poured + retained and the load; spills and drips make a weighing no better."""
+"""Largest relative difference between poured + retained and the load; spills and drips limit the accuracy of a
+weighing."""
 
 NOISE, NOISE_OF_LOAD = 0.3, 1e-3
-"""How far below zero a weighed mass may come to lie: in grams, or as a part of the load where that is more."""
+"""Largest negative value of a weighed mass: in grams, or as a share of the load if that is larger."""
 
 MOST_ALIKE = 5
-"""Lines that are the same in all their numbers: pours that were made differ in the last digit."""
+"""Largest number of lines with identical numbers: real pours differ in the last digit."""
 
 _NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 
@@ -60,9 +62,9 @@ class RecordTable:
     """A CSV file of weighed pours.
 
     Attributes:
-        rows: action dimensions [SI], masses [kg] and split of every good line.
+        rows: action dimensions [SI], masses [kg] and split of every valid line.
         dimensions: action dimensions that have a column.
-        problems: everything found wrong.
+        problems: all problems found.
     """
 
     rows: list[PourRecordRow] = field(default_factory=list)
@@ -90,10 +92,10 @@ class PourRecordRow:
     split: str
 
     def pour(self, fixed: Mapping[str, float | None]) -> RecordedPour:
-        """The record, with the dimensions that have no column.
+        """The record, completed with the dimensions that have no column.
 
         Raises:
-            ValueError: the action is not complete or out of bounds.
+            ValueError: the action is incomplete or out of bounds.
         """
         action = Action.compose(fixed, self.action)
         return RecordedPour(action, self.poured, self.spilled, self.retained, self.split)
@@ -110,7 +112,7 @@ def read_records(
     """Read weighed pours.
 
     Columns: `poured_g`, `spilled_g`, `retained_g`, `split` (train, test or transfer), and one per action dimension that
-    varies, named after it and its unit (`angular_velocity_deg_s`, `max_angle_deg`, `x_offset_mm` …). In place of
+    varies, named after it and its unit (`angular_velocity_deg_s`, `max_angle_deg`, `x_offset_mm` …). Instead of
     `x_offset_mm` there may be `lip_to_receiver_axis_mm`, the distance from the pourer's inner lip to the receiver's
     axis: `lip_radius` is added to it.
 
@@ -118,11 +120,11 @@ def read_records(
         path: the CSV file, UTF-8, comma-separated, with a header.
         loaded: mass in the pourer before each pour [kg].
         lip_radius: the pourer's inner radius at the lip [m].
-        columns: names that the file has in place of the above, {above: in the file}.
-        split: of all pours where the file has no such column; it must have one unless given.
+        columns: different names in the file, {name above: name in the file}.
+        split: split of all pours if the file has no such column; without it the column is required.
 
     Returns:
-        The table; its `problems` say what is wrong with the file.
+        The table; its `problems` describe what is wrong with the file.
     """
     table = RecordTable()
     try:
@@ -237,7 +239,7 @@ def _read_row(
     before = len(table.problems)
 
     def add(name: str, message: str) -> None:
-        # The caret stands under the cell: cells are unquoted numbers in all but the oddest files.
+        # The caret is below the cell; cells are unquoted numbers in nearly all files.
         index = header.index(name) if name in header else 0
         column = sum(len(cell) + 1 for cell in cells[:index]) + 1
         table.problems.append(Problem(path, number, column, name, message, line))
@@ -300,7 +302,7 @@ def _check_masses(masses: list[float], loaded: float, add: Callable[[str, str], 
 Motions = tuple[tuple[MotionBase | None, Place], ...]
 
 LIP_RADIUS_TOLERANCE = 1e-3
-"""Largest difference [m] between a stated lip radius and the rim of a pourer's profile: more is a slip of the pen."""
+"""Largest difference [m] between a stated lip radius and the rim of a pourer's profile; more is a typing error."""
 
 
 def resolve_records(
@@ -313,7 +315,7 @@ def resolve_records(
     pourer: VesselSpec | None,
     motions: Motions,
 ) -> tuple[RecordSet | None, RecordSet | None]:
-    """Calibration's records and those of the transfer scene; None where something is wrong or not asked for."""
+    """Calibration's records and those of the transfer scene; None if not given, or after a problem."""
     report = builder.report
     _check_lip_radius(pours, place, builder, pourer)
     records = transfer = None
@@ -361,7 +363,7 @@ def resolve_records(
 
 
 def read_table(pours: PoursSection, source: str | None, place: Place, builder: SceneBuilder) -> RecordTable | None:
-    """A CSV file of weighed pours; None where there is none or something is wrong with it."""
+    """A CSV file of weighed pours; None if not given, or after a problem."""
     if source is None or builder.liquid is None:
         return None
     path = _path(source, place)

@@ -1,1 +1,1 @@
-"""The write-ahead record of a run, and its reader."""
+"""The write-ahead record of a run, its checks and its readers."""

@@ -1,7 +1,8 @@
-"""Values to JSON and back, exactly: what the journal keeps of requests, outcomes and plans.
+"""Exact conversion of values to JSON and back, for requests, outcomes and plans in the journal.
 
-The type annotations of the values decide, so that a new field needs no code here. Floats survive bit for bit
-(shortest round-trip notation); what is not finite is written as {"$float": "nan"}, because JSON has no word for it.
+`to_json` and `from_json` follow the type annotations of the values, so a new field needs no code here. Floats are
+preserved bit for bit (shortest round-trip notation). Numbers that are not finite are written as {"$float": "nan"},
+because JSON cannot represent them.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _TYPE = "type"
 
 
 class CodecError(RunError, ValueError):
-    """A value that can't be written, or a text that can't be read back."""
+    """A value that can't be encoded, or data that can't be decoded."""
 
 
 def encode_request(request: Request) -> dict[str, Any]:
@@ -53,7 +54,7 @@ def decode_outcome(data: Mapping[str, Any]) -> Outcome:
 
 
 def canonical(data: Any) -> str:
-    """The one text of a JSON-ready value: sorted keys, no blanks. Equal values have equal texts."""
+    """The canonical text of a JSON-ready value: sorted keys, no blanks. Equal values have equal texts."""
     return json.dumps(data, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
@@ -63,7 +64,7 @@ def digest(data: Any) -> str:
 
 
 def first_difference(expected: Any, actual: Any, path: str = "") -> str | None:
-    """Where two JSON-ready values differ first, for people; None if they are equal."""
+    """The first place where two JSON-ready values differ, as text for a message; None if they are equal."""
     if isinstance(expected, dict) and isinstance(actual, dict):
         for key in sorted(set(expected) | set(actual)):
             place = f"{path}.{key}" if path else str(key)
@@ -88,7 +89,7 @@ def to_json(value: Any, hint: Any = Any) -> Any:
     """A JSON-ready copy of a value of the annotated type.
 
     Raises:
-        CodecError: the value is not of that type, or holds something that JSON can't.
+        CodecError: the value does not have that type, or contains something that JSON can't represent.
     """
     if hint is Any or hint is object:
         return _plain(value)
@@ -118,7 +119,7 @@ def to_json(value: Any, hint: Any = Any) -> Any:
         return typing.cast(BaseModel, value).model_dump(mode="json")
     if dataclasses.is_dataclass(hint):
         return {name: to_json(getattr(value, name), h) for name, h in _fields(hint).items()}
-    if dataclasses.is_dataclass(value):  # of which only a base class is annotated
+    if dataclasses.is_dataclass(value):  # only a base class is annotated
         return {_TYPE: type(value).__name__, **to_json(value, type(value))}
     raise CodecError(f"no rule to write a {hint.__name__}")
 
@@ -127,7 +128,7 @@ def from_json(data: Any, hint: Any = Any) -> Any:
     """Inverse of `to_json` for the same annotation.
 
     Raises:
-        CodecError: the data don't fit the type; the text says where.
+        CodecError: the data don't fit the type; the text names the place.
     """
     if hint is Any or hint is object:
         return _unplain(data)
@@ -172,7 +173,7 @@ def _dataclass_from_json(data: Any, hint: type[Any]) -> Any:
             f"{hint.__name__} has no field {', '.join(sorted(unknown))}; was it written by a newer version?"
         )
     defaults = {field.name for field in dataclasses.fields(hint) if field.default is not dataclasses.MISSING}
-    if missing := hints.keys() - data.keys() - defaults:  # what a later version added means what it meant before
+    if missing := hints.keys() - data.keys() - defaults:  # a field of a later version has its default
         raise CodecError(f"{hint.__name__} lacks {', '.join(sorted(missing))}; was it written by an older version?")
     values = {}
     for name in (name for name in hints if name in data):
@@ -232,7 +233,7 @@ def _element_hints(hint: Any, count: int) -> tuple[Any, ...]:
 
 
 def _plain(value: Any) -> Any:
-    """Anything JSON-ready, tuples and numpy scalars and arrays included."""
+    """A JSON-ready copy of any value, including tuples, numpy scalars and numpy arrays."""
     if value is None or isinstance(value, bool | str):
         return value
     if isinstance(value, int):

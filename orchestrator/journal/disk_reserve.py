@@ -1,9 +1,9 @@
-"""Room on the disk that a run keeps free for itself, so that no pour is made that could not be written down.
+"""Disk space that a run reserves, so that every pour can be recorded.
 
-A file beside the journal holds the room from the run's beginning on. Where the disk gets full while a pour is under way
-the file is let go of, and the pour's records go where it was. Before the next pour it has to be there again.
+A file next to the journal occupies the space from the start of the run. If the disk fills up while a pour is running,
+the file is deleted and the pour's records use its space. The file must exist again before the next pour.
 
-Limitations: on file systems that copy on write or compress (btrfs, zfs) a file's length promises less than its room.
+Limitations: on file systems that copy on write or compress (btrfs, zfs), a file's length does not guarantee its space.
 """
 
 from __future__ import annotations
@@ -18,39 +18,42 @@ from orchestrator.run_errors import RunError
 MB = 1_000_000
 
 RESERVE = 12 * MB
-"""A pour's records are some 200 kB with all pages of the journal that they touch; SQLite's log of changes grows to 4 MB
-before it is copied into the journal, and so does the journal then [bytes]."""
+"""Size of the reserve [bytes].
+
+A pour's records need about 200 kB, including all pages of the journal that they change. SQLite's write-ahead log grows
+to 4 MB before it is copied into the journal, and the journal then grows by the same amount.
+"""
 
 FOR_A_POUR = 8 * MB
-"""What has to be free beside the reserve when a pour begins: recording and figures grow beside the journal [bytes]."""
+"""Free space needed in addition to the reserve when a pour begins, because recording and figures also grow [bytes]."""
 
 TO_BEGIN = RESERVE + FOR_A_POUR + 20 * MB
-"""What has to be free where a run begins: its journal, a recording and the figures of a small campaign [bytes]."""
+"""Free space needed when a run begins: journal, recording and figures of a small campaign [bytes]."""
 
 
 class NoSpaceError(RunError):
-    """The disk has not enough room for what comes next; nothing was begun, and nothing is lost."""
+    """The disk has too little free space for the next step; nothing was begun, and nothing is lost."""
 
     exit_code = 3
 
 
 def free_space(path: Path) -> int:
-    """Bytes that this user may still write on the disk of a file or folder, or of where it would be made."""
+    """Bytes that this user may still write on the disk of a path; the path need not exist."""
     there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     found = os.statvfs(there)
     return found.f_bavail * found.f_frsize
 
 
 def require_space(path: Path, needed: int, purpose: str) -> None:
-    """See that there is room.
+    """Check that there is enough free space.
 
     Args:
         path: file or folder on the disk.
         needed: [bytes].
-        purpose: ends 'N MB are needed …', for people.
+        purpose: completes the message 'N MB are needed …'.
 
     Raises:
-        NoSpaceError: with path, room needed and room free.
+        NoSpaceError: with path, needed space and free space.
     """
     free = free_space(path)
     if free < needed:
@@ -60,10 +63,10 @@ def require_space(path: Path, needed: int, purpose: str) -> None:
 
 
 class Reserve:
-    """The room of one run.
+    """The reserved space of one run.
 
     Args:
-        path: of the file that holds it.
+        path: path of the file that occupies it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -71,10 +74,10 @@ class Reserve:
         self._held = False
 
     def take(self) -> None:
-        """Hold the room, unless it is held.
+        """Reserve the space, unless it is reserved already.
 
         Raises:
-            NoSpaceError: there isn't so much.
+            NoSpaceError: there is not enough.
         """
         if self._held:
             return
@@ -86,23 +89,23 @@ class Reserve:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
             require_space(self._path.parent, RESERVE + FOR_A_POUR, _PURPOSE)
-            raise NoSpaceError(  # a quota, which the disk knows nothing of
+            raise NoSpaceError(  # a quota, which the free space of the disk does not show
                 f"{self._path.parent}: {RESERVE / MB:.0f} MB are needed {_PURPOSE}, and can't be had "
                 f"({error.strerror}; {free_space(self._path) / MB:.0f} MB are free on the disk)"
             ) from None
         self._held = True
 
     def check_pour(self) -> None:
-        """See that whatever comes of the next pour can be written down; hold the room anew if it had been used.
+        """Check that the next pour can be recorded; reserve the space again if it was used.
 
         Raises:
-            NoSpaceError: it can't.
+            NoSpaceError: it can't be recorded.
         """
         require_space(self._path.parent, FOR_A_POUR + (0 if self._held else RESERVE), _PURPOSE)
         self.take()
 
     def release(self) -> bool:
-        """Let go of the room, for something that has to be written now. Returns whether it was held."""
+        """Free the reserved space for a write that needs it. Returns whether it was reserved."""
         held, self._held = self._held, False
         if held:
             self._remove()

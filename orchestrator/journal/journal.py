@@ -1,13 +1,15 @@
-"""The write-ahead record of a run: one SQLite file, append-only, one writer, any number of readers.
+"""The write-ahead record of a run: one SQLite file, append-only, with one writer and any number of readers.
 
-Every entry is one row: sequence number, stage, time, kind, JSON body. Nothing is ever changed or deleted (triggers
-refuse it). Entries written together (`append_all`) are there together or not at all, whenever the process dies. Pours
-are flushed to the disk before the arm moves and before their outcome is used (synchronous=FULL), everything else
-survives the death of the process, and a power cut but for its last moments. At a pour the write-ahead log is copied
-into the file, and the entry is repeated in a ledger (`orchestrator.journal.pour_ledger`), so that a lost or changed
-journal is
-detected: see `orchestrator.journal.journal_check`. A full disk takes no pour's records away: see
-`orchestrator.journal.disk_reserve`.
+Each `Entry` is one row: sequence number, stage, time, kind, JSON body. `Journal` writes, `JournalReader` reads.
+
+- Entries are never changed or deleted; triggers refuse it.
+- Entries written together (`append_all`) are all present or all absent, whenever the process dies.
+- Pours are flushed to the disk before the arm moves and before their outcome is used (synchronous=FULL). All other
+  entries survive the death of the process; a power cut can lose the most recent ones.
+- At a pour, the write-ahead log is copied into the file, and the entry is repeated in a ledger
+  (`orchestrator.journal.pour_ledger`). A lost or changed journal is thus detected
+  (`orchestrator.journal.journal_check`).
+- A full disk does not prevent the records of a pour (`orchestrator.journal.disk_reserve`).
 """
 
 from __future__ import annotations
@@ -51,17 +53,17 @@ JOURNAL_NAME = "journal.sqlite"
 
 
 class Kind(StrEnum):
-    """What an entry says. The bodies' keys stand behind each."""
+    """Kind of an entry. The comments list the keys of each body."""
 
     CAMPAIGN_STATE = "campaign.state"  # before, after, reason, pid
     STAGE_OPENED = "stage.opened"  # seed
     STAGE_CLOSED = "stage.closed"  # result
-    ASKED = "asked"  # simulations, pours (the free slots), ids (of the requests it brought)
+    ASKED = "asked"  # simulations, pours (the free slots), ids (of the new requests)
     REQUESTED = "requested"  # id, request
     STARTED = "started"  # id
     FINISHED = "finished"  # id, outcome, seconds
     POUR_STARTED = "pour.started"  # id, attempt, number
-    POUR_WITHDRAWN = "pour.withdrawn"  # id, reason: nothing was poured, it may be poured later
+    POUR_WITHDRAWN = "pour.withdrawn"  # id, reason: nothing was poured, the pour may be made later
     POUR_FINISHED = "pour.finished"  # id, outcome, seconds
     TOLD = "told"  # id
     DECISION = "decision"  # text, values
@@ -87,7 +89,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Draft:
-    """An entry that is still to be written."""
+    """An entry that is not written yet."""
 
     kind: Kind
     body: dict[str, Any]
@@ -101,7 +103,7 @@ class JournalReader:
         """Open for reading.
 
         Raises:
-            JournalError: there is no journal at that path, or it is not one of ours.
+            JournalError: there is no journal at that path, or it is not one of Decant's.
         """
         self.path = path
         if not path.is_file():
@@ -120,7 +122,7 @@ class JournalReader:
         self.close()
 
     def close(self) -> None:
-        """Give the file back. May be called twice."""
+        """Close the file. May be called twice."""
         self._connection.close()
 
     def entries(
@@ -129,9 +131,9 @@ class JournalReader:
         """Entries in the order in which they were written.
 
         Args:
-            after: only those with a larger sequence number.
-            stage: only those of one stage.
-            kinds: only those of some kinds.
+            after: only entries with a larger sequence number.
+            stage: only entries of this stage.
+            kinds: only entries of these kinds.
 
         Raises:
             JournalError: the file is damaged.
@@ -152,7 +154,7 @@ class JournalReader:
             raise JournalError(f"{self.path}: is damaged ({error}); see `decant runs check`") from error
 
     def state(self) -> State:
-        """The campaign's last written state."""
+        """The campaign's last recorded state."""
         last = State.QUEUED
         for entry in self.entries(kinds=[Kind.CAMPAIGN_STATE]):
             try:
@@ -164,8 +166,10 @@ class JournalReader:
         return last
 
     def stage_results(self) -> dict[str, dict[str, Any]]:
-        """Results of the closed stages by name, in the order in which they were closed; see
-        `orchestrator.journal.stage_results`."""
+        """Results of the closed stages by name, in the order in which the stages were closed.
+
+        See `orchestrator.journal.stage_results`.
+        """
         return {entry.stage: entry.body["result"] for entry in self.entries(kinds=[Kind.STAGE_CLOSED])}
 
     def last_id(self) -> int:
@@ -204,7 +208,7 @@ def _body(seq: int, text: str) -> dict[str, Any]:
 
 
 class Journal(JournalReader):
-    """The one writer of a journal. Made by `Journal.create` and `Journal.resume`."""
+    """The only writer of a journal. Created by `Journal.create` and `Journal.resume`."""
 
     def __init__(self, path: Path, lock: IO[str], connection: sqlite3.Connection) -> None:
         self.path = path
@@ -223,10 +227,10 @@ class Journal(JournalReader):
 
         Raises:
             JournalLockedError: another process is writing it.
-            JournalError: it holds a run already, or traces of one, or can't be written.
+            JournalError: a run or traces of one exist already, or the file can't be written.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
-        # A recording may be there: the program that is about to run the campaign has opened it.
+        # A recording may exist already: the program that will run the campaign has opened it.
         traces = [name for name in traces_of_a_run(path) if not name.endswith(".rrd")]
         with contextlib.ExitStack() as opened:
             lock = opened.enter_context(take_lock(path))
@@ -246,7 +250,7 @@ class Journal(JournalReader):
 
     @classmethod
     def resume(cls, path: Path, header: Header) -> Journal:
-        """Go on with a journal. One whose process died before it had written anything is begun again.
+        """Continue a journal. If its process died before it wrote anything, the journal is begun again.
 
         Raises:
             JournalLockedError: another process is writing it.
@@ -268,15 +272,15 @@ class Journal(JournalReader):
             return journal
 
     def reserve_space(self) -> None:
-        """Hold room on the disk for a pour's records, until the journal is closed.
+        """Reserve disk space for a pour's records, until the journal is closed.
 
         Raises:
-            NoSpaceError: there isn't enough.
+            NoSpaceError: there is not enough.
         """
         self._reserve.take()
 
     def check_space_for_pour(self) -> None:
-        """See that whatever comes of a pour can be written down.
+        """Check that a pour can be recorded, whatever its outcome.
 
         Raises:
             NoSpaceError: it can't; the pour must not begin.
@@ -288,7 +292,7 @@ class Journal(JournalReader):
         self.append_all([Draft(kind, body, stage)])
 
     def append_all(self, drafts: Sequence[Draft]) -> None:
-        """Write several entries in one transaction: all or none. On a full disk the reserve makes room.
+        """Write several entries in one transaction: all or none. On a full disk the reserved space is used.
 
         Raises:
             JournalError: the file can't be written.
@@ -324,7 +328,7 @@ class Journal(JournalReader):
             checkpoint(self._connection)
 
     def _with_reserve(self, write: Callable[[], None]) -> None:
-        """Write; if that fails, once more in the room of the reserve."""
+        """Write; if that fails, free the reserve and write once more."""
         try:
             write()
         except (sqlite3.OperationalError, OSError):
@@ -339,12 +343,12 @@ class Journal(JournalReader):
             self._connection.executemany("insert into chain values (?, ?)", links)
             self._connection.execute("commit")
         except BaseException:
-            if self._connection.in_transaction:  # SQLite itself rolls back where the disk is full
+            if self._connection.in_transaction:  # SQLite itself rolls back if the disk is full
                 self._connection.execute("rollback")
             raise
 
     def _open_ledger(self) -> PourLedger:
-        """The ledger, with everything that the journal has about pours. A journal of an older version gets its chain.
+        """The ledger, with all entries of the journal about pours. A journal of an older version gets its hash chain.
 
         Raises:
             JournalError: it can't be written.
@@ -383,7 +387,7 @@ class Journal(JournalReader):
         return found
 
     def close(self) -> None:
-        """Give file, lock and reserve back. May be called twice."""
+        """Release file, lock and reserve. May be called twice."""
         self._reserve.release()
         self._connection.close()
         self._ledger.close()

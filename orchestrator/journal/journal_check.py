@@ -1,6 +1,7 @@
 """Checks a run's records: the journal's file, its hash chain, and its agreement with the ledger of pours.
 
-Resuming a run, `decant runs check` and the report use it. It reads only, and works while a run is being written.
+`check_journal` returns a `JournalCheck`. Resuming, `decant runs check` and the report use it. It only reads, and works
+while a run is being written.
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ class JournalDamagedError(JournalError):
 
 @dataclass(frozen=True)
 class JournalCheck:
-    """What a check has found.
+    """Result of a check.
 
     Attributes:
-        path: of the journal.
-        problems: one text each; none: the records are complete and unchanged.
-        pours: that have begun, from the ledger.
-        entries: how many the journal has.
-        unchecked: how many of them were written before the journal had a chain, so that a change that was made before
-            then can't be found. All of them, in a journal of an older version.
+        path: path of the journal.
+        problems: one text each; empty: the records are complete and unchanged.
+        pours: pours that have begun, from the ledger.
+        entries: number of entries in the journal.
+        unchecked: number of entries written before the journal had a chain; earlier changes to them can't be found. In
+            a journal of an older version, all entries.
         begun: whether there is a run; False in a folder where a run died before its first entry.
     """
 
@@ -52,7 +53,7 @@ class JournalCheck:
 
     @property
     def verdict(self) -> str:
-        """The result in one sentence without its end."""
+        """The result as one sentence without a full stop."""
         if self.problems:
             return f"damaged or incomplete: {'; '.join(self.problems)}"
         if self.unchecked == 0:
@@ -62,10 +63,10 @@ class JournalCheck:
         return f"not verifiable: the journal ({self.entries} entries) is of a version without a hash chain"
 
     def require(self) -> None:
-        """Refuse to go on with a journal that fails the check.
+        """Raise an error if the journal fails the check.
 
         Raises:
-            JournalDamagedError: with every problem, the pours that may have been made, and what to do.
+            JournalDamagedError: with every problem, the pours that may have been made, and advice.
         """
         if not self.problems:
             return
@@ -111,7 +112,7 @@ def check_journal(path: Path) -> JournalCheck:
         OSError: a file can't be read.
     """
     traces = [name for name in traces_of_a_run(path) if not name.endswith(".lock")]
-    # The ledger first: a run that is being written is ahead of it then, never behind.
+    # The ledger is read first: the journal of a running campaign can then only be ahead of it, never behind.
     ledger, problems = _ledger(path.with_name(LEDGER_NAME))
     pours = tuple(pours_in_ledger(ledger if ledger is not None else readable_lines(path.with_name(LEDGER_NAME))))
     if not path.is_file() or path.stat().st_size == 0:

@@ -1,4 +1,4 @@
-"""The file that a journal is: its tables, its header, its hash chain, its lock.
+"""The file format of a journal: tables, header, hash chain and lock.
 
 Every entry has a digest of itself and of the digest before it. The first digest is that of the header. A changed,
 removed or inserted entry therefore changes all digests from there on. Only `journal.py` and `journal_check.py` read
@@ -23,7 +23,7 @@ from orchestrator.journal.disk_reserve import MB, free_space
 from orchestrator.run_errors import RunError
 
 FORMAT = 3
-"""Version of the tables and of the entries' bodies. A journal of another version is refused, never guessed at."""
+"""Version of the tables and of the entries' bodies. A journal of another version is refused."""
 
 WITHOUT_CHAIN = 2
 """The version before the hash chain. Such a journal can be read; resuming it adds the chain."""
@@ -54,7 +54,7 @@ create trigger event_is_never_deleted before delete on event
 
 
 class JournalError(RunError):
-    """The journal can't be used; the text says why and what to do."""
+    """The journal can't be used; the text gives the reason and the remedy."""
 
 
 class JournalLockedError(JournalError):
@@ -63,11 +63,11 @@ class JournalLockedError(JournalError):
 
 @dataclass(frozen=True)
 class Header:
-    """Which campaign the journal belongs to.
+    """The campaign that a journal belongs to.
 
     Attributes:
-        name: of the campaign.
-        fingerprint: JSON-ready; everything in the plan that decides what is asked for.
+        name: name of the campaign.
+        fingerprint: JSON-ready; all values of the plan that decide which requests are made.
         created: seconds since 1970.
     """
 
@@ -77,10 +77,10 @@ class Header:
 
 
 def check_format(found: int, path: Path) -> None:
-    """See that this version of Decant can read a journal.
+    """Check that this version of Decant can read a journal.
 
     Raises:
-        JournalError: it was written by another version.
+        JournalError: another version wrote it.
     """
     if found not in (FORMAT, WITHOUT_CHAIN):
         raise JournalError(
@@ -105,7 +105,7 @@ def chained(previous: bytes, row: EventRow) -> bytes:
 
 
 def chain_of(connection: sqlite3.Connection) -> Iterator[tuple[EventRow, bytes]]:
-    """Every entry of a journal with its digest, computed from what is stored; the first one is row 0, the header's.
+    """Every entry of a journal with its digest, computed from the stored columns; the first one is row 0, the header's.
 
     Raises:
         sqlite3.DatabaseError: the file is damaged.
@@ -119,7 +119,7 @@ def chain_of(connection: sqlite3.Connection) -> Iterator[tuple[EventRow, bytes]]
 
 
 def add_chain(connection: sqlite3.Connection) -> None:
-    """Give a journal of the version before the chain its chain, in one transaction."""
+    """Add the hash chain to a journal of the version before it, in one transaction."""
     digests = [(row[0], digest) for row, digest in chain_of(connection)][1:]
     connection.executescript(f"begin immediate; {_CHAIN}")
     connection.executemany("insert into chain values (?, ?)", digests)
@@ -130,7 +130,7 @@ def add_chain(connection: sqlite3.Connection) -> None:
 def checkpoint(connection: sqlite3.Connection) -> None:
     """Copy the write-ahead log into the journal's own file, and flush it. A reader may delay it, never block it.
 
-    Without room on the disk the entries stay in the log, where they are safe; the next call tries again.
+    If the disk is full, the entries stay in the log, where they are safe; the next call tries again.
     """
     try:
         connection.execute("pragma busy_timeout = 0")
@@ -146,16 +146,15 @@ _TIMEOUT = 10.0
 
 
 def connect(uri: str) -> sqlite3.Connection:
-    """Open a journal; every transaction is one that its user begins."""
-    # Autocommit, so that every transaction in this file is one that it begins itself.
+    """Open a journal in autocommit mode: callers begin every transaction themselves."""
     return sqlite3.connect(uri, uri=True, isolation_level=None, timeout=_TIMEOUT)
 
 
 def connect_writer(path: Path) -> sqlite3.Connection:
-    """Open a journal for its one writer.
+    """Open a journal for its only writer.
 
     Raises:
-        JournalError: it is something else.
+        JournalError: the file is not a journal.
     """
     connection = connect(path.absolute().as_uri())
     try:
@@ -168,10 +167,10 @@ def connect_writer(path: Path) -> sqlite3.Connection:
 
 
 def has_tables(connection: sqlite3.Connection, path: Path) -> bool:
-    """Whether anything was laid out in it.
+    """Whether the file contains tables.
 
     Raises:
-        JournalError: it is something else.
+        JournalError: the file is not a journal.
     """
     try:
         with closing(connection.execute("select count(*) from sqlite_master")) as cursor:
@@ -204,7 +203,7 @@ def locked_alone(file: IO[str]) -> bool:
         False if another process holds the lock.
 
     Raises:
-        OSError: the file system can't lock files; the text says what to do.
+        OSError: the file system can't lock files; the text gives the remedy.
     """
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -217,10 +216,10 @@ def locked_alone(file: IO[str]) -> bool:
 
 
 def take_lock(path: Path) -> IO[str]:
-    """Hold the run for this process.
+    """Lock the run for this process.
 
     Raises:
-        JournalLockedError: another process holds it.
+        JournalLockedError: another process holds the lock.
         JournalError: the file system can't lock files.
     """
     file = path.with_suffix(".lock").open("a+", encoding="utf-8")
@@ -244,7 +243,7 @@ def take_lock(path: Path) -> IO[str]:
 
 
 def whole_copy(path: Path) -> bytes:
-    """A journal in one file, as bytes; also while it is being written."""
+    """The journal as the bytes of a single file; also while it is being written."""
     uri = f"{path.absolute().as_uri()}?mode=ro"
     with closing(sqlite3.connect(uri, uri=True)) as source, closing(sqlite3.connect(":memory:")) as copy:
         source.backup(copy)

@@ -35,13 +35,13 @@ class LedgerError(JournalError):
 
 @dataclass(frozen=True)
 class LedgerLine:
-    """One line.
+    """One line of a ledger.
 
     Attributes:
-        seq: of the journal's entry that it repeats; of the last entry, for the first line.
+        seq: sequence number of the journal's entry that it repeats; of the last entry, for the first line.
         digest: the journal's digest at that entry, in hexadecimal.
         t: seconds since 1970.
-        kind, stage, body: of the journal's entry.
+        kind, stage, body: as in the journal's entry.
     """
 
     seq: int
@@ -53,7 +53,7 @@ class LedgerLine:
 
 
 class PourLedger:
-    """The ledger's one writer, which holds the journal's lock."""
+    """The only writer of a ledger. Its caller holds the journal's lock."""
 
     def __init__(self, path: Path, descriptor: int, size: int, last: str) -> None:
         self._path, self._descriptor, self._size, self._last = path, descriptor, size, last
@@ -77,7 +77,7 @@ class PourLedger:
 
     @classmethod
     def resume(cls, path: Path) -> Self:
-        """Go on with a ledger; a last line that was never completed is removed.
+        """Continue a ledger; an incomplete last line is removed.
 
         Raises:
             LedgerError: it is damaged.
@@ -91,7 +91,7 @@ class PourLedger:
         return cls(path, os.open(path, os.O_WRONLY | os.O_CLOEXEC), size, last)
 
     def append(self, lines: Sequence[LedgerLine]) -> None:
-        """Write lines; they are on the disk when this returns. What fails leaves no part of a line behind.
+        """Write lines; they are on the disk when this returns. A failed write leaves no partial line.
 
         Raises:
             OSError: they can't be written.
@@ -109,18 +109,18 @@ class PourLedger:
         self._size, self._last = self._size + len(text), last
 
     def close(self) -> None:
-        """Give the file back. May be called twice."""
+        """Close the file. May be called twice."""
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
 
 
 def read_ledger(path: Path) -> list[LedgerLine]:
-    """The lines of a ledger, also while a run is writing it; a last line without its end is left out.
+    """The lines of a ledger, also while a run is writing it; an incomplete last line is left out.
 
     Raises:
         LedgerError: a line was changed, removed or inserted; the text gives its number.
-        OSError: it can't be read.
+        OSError: the file can't be read.
     """
     lines: list[LedgerLine] = []
     last = ""
@@ -178,7 +178,7 @@ def _when(t: float) -> str:
 
 
 def _text(lines: Sequence[LedgerLine], last: str) -> tuple[bytes, str]:
-    """Lines as they are written after a line with the digest `last`, and the digest of the last one."""
+    """Encode lines that follow a line with the digest `last`; also returns the digest of the last line."""
     parts = []
     for line in lines:
         content = dict(line.__dict__)
@@ -210,7 +210,7 @@ def _parsed(path: Path, text: bytes, last: str, number: int | None = None) -> tu
 
 
 def _flush_folder(folder: Path) -> None:
-    with contextlib.suppress(OSError):  # some network file systems refuse it
+    with contextlib.suppress(OSError):  # some network file systems do not support it
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(descriptor)

@@ -1,8 +1,10 @@
-"""What a run's journal says was done, whether the run has ended or not: stages, pours, questions, time.
+"""A readable record of a run, finished or not, from its journal.
 
-Requests of a journal with what came of them, and pours as rows of a table in the units that people read.
+- `read_record` returns a `Record`: stages, pours, questions, notes, decisions and times.
+- `answers` yields finished requests with their outcomes; `pour_row` is a pour as a table row in display units.
+- `read_result` returns the `CampaignResult`: state, counts, costs, and the results of the stages.
 
-What a run came to, read from its journal: state, counts, costs, what each stage learnt.
+The module only reads; it does not check the journal (`orchestrator.journal.journal_check`).
 """
 
 from __future__ import annotations
@@ -25,14 +27,14 @@ Came = Literal["weighed", "failed", "unknown", "not begun"]
 
 @dataclass
 class PourMade:
-    """A pour that was asked for, and what came of it.
+    """A requested pour and its outcome.
 
     Attributes:
-        came: 'unknown': it had begun and nobody has said what came of it.
-        measured: where it was weighed.
+        came: status; 'unknown': it had begun and its outcome was not reported.
+        measured: the measurement, if it was weighed.
         reason: why it failed.
-        said: what a person answered about it; '' where nobody was asked.
-        seconds: that it took, operator and balance included; None where nobody knows.
+        said: the operator's answer about it; '' without one.
+        seconds: duration, operator and balance included; None if unknown.
     """
 
     stage: str
@@ -47,7 +49,7 @@ class PourMade:
 
 @dataclass
 class StageDone:
-    """How far a stage has come."""
+    """Progress of a stage."""
 
     name: str
     closed: bool = False
@@ -58,7 +60,7 @@ class StageDone:
 
 @dataclass
 class RecordedQuestion:
-    """Something that a person was asked. `answer` is None while nobody has answered."""
+    """A question to the operator. `answer` is None while there is none."""
 
     time: float
     stage: str
@@ -68,16 +70,16 @@ class RecordedQuestion:
 
 @dataclass
 class Record:
-    """A run's journal, read for people.
+    """The content of a run's journal in readable form.
 
     Attributes:
         created: when the run was begun, seconds since 1970.
         ended: when the last entry was written.
-        state: that was written last.
-        reason: why it was entered.
-        at_work_s: seconds during which a process had the run; pauses are left out.
-        notes: what was written down for people: time and text.
-        decisions: why strategies asked for what they asked for: stage and text.
+        state: the last recorded state.
+        reason: why that state was entered.
+        at_work_s: seconds during which a process had the run; without pauses.
+        notes: messages for the operator: time and text.
+        decisions: reasons for the strategies' requests: stage and text.
     """
 
     created: float
@@ -103,10 +105,10 @@ class Record:
 
 
 def read_record(journal: JournalReader) -> Record:
-    """What a journal says, finished or not.
+    """Read a journal, finished or not.
 
     Raises:
-        RunError: an entry can't be read.
+        RunError: an entry can't be decoded.
     """
     reading = _Reading(journal.header.created)
     for entry in journal.entries():
@@ -158,7 +160,7 @@ class _Reading:
         self.record.ended = entry.t
 
     def end(self) -> Record:
-        """The whole record; a process that has the run still, or died with it, was at work until the last entry."""
+        """The whole record. A process that still has the run, or died with it, is counted until its last entry."""
         if self._process is not None:
             self.record.at_work_s += self.record.ended - self._process[1]
         return self.record
@@ -167,7 +169,7 @@ class _Reading:
         record, body = self.record, entry.body
         if self._process is not None:
             pid, since = self._process
-            # Of a process that died without a word, the last entry before another one's is the last sign of life.
+            # For a process that died, the last entry before the next process's first entry counts as its end.
             until = entry.t if body.get("pid") == pid else max(record.ended, since)
             record.at_work_s += until - since
         record.state, record.reason = State(body["after"]), body.get("reason", "")
@@ -185,7 +187,8 @@ class _Reading:
             self._asks((entry.stage, body["id"]), entry, request["question"])
 
     def _asks(self, key: tuple[str, int], entry: Entry, text: str) -> None:
-        if key not in self._asked:  # a strategy's question is written when it is asked for, and when it is answered
+        # a strategy's question is written when it is requested and again when it is answered
+        if key not in self._asked:
             self._asked[key] = RecordedQuestion(entry.t, entry.stage, text)
             self.record.questions.append(self._asked[key])
 
@@ -204,12 +207,12 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class RequestOutcome:
-    """A request and what came of it.
+    """A request and its outcome.
 
     Attributes:
         id: unique within the campaign.
-        time: when it was answered (seconds since 1970).
-        seconds: from start to end.
+        time: when it finished (seconds since 1970).
+        seconds: duration from start to end.
     """
 
     stage: str
@@ -221,7 +224,7 @@ class RequestOutcome:
 
 
 def answers(journal: JournalReader, kind: type[Request]) -> Iterator[RequestOutcome]:
-    """Requests of one kind that were answered, in that order."""
+    """Finished requests of one kind, in the order in which they finished."""
     requests: dict[int, Request] = {}
     for entry in journal.entries(kinds=(Kind.REQUESTED, Kind.FINISHED, Kind.POUR_FINISHED)):
         key, body = entry.body["id"], entry.body
@@ -249,14 +252,14 @@ def pour_row(pour: Pour, outcome: Outcome | None) -> Row:
 
 @dataclass(frozen=True)
 class CampaignResult:
-    """What a campaign came to.
+    """Result of a campaign.
 
     Attributes:
-        results: of the closed stages by name, in order.
-        simulations: finished ones, failed ones included.
-        pours: finished ones, failed ones included.
+        results: results of the closed stages by name, in order.
+        simulations: number of finished simulations, including failed ones.
+        pours: number of finished pours, including failed ones.
         cpu_s: CPU seconds of all simulations and suggestions.
-        seconds: wall time of this process' part of the run.
+        seconds: wall time of this process's part of the run.
     """
 
     name: str
@@ -270,7 +273,7 @@ class CampaignResult:
 
 
 def read_result(journal: JournalReader, directory: Path, *, seconds: float = 0.0) -> CampaignResult:
-    """What the journal of a run, finished or not, says it came to."""
+    """Result of a run, finished or not, from its journal."""
     simulations = pours = 0
     cpu_s = 0.0
     for entry in journal.entries(kinds=[Kind.FINISHED, Kind.POUR_FINISHED]):

@@ -1,6 +1,6 @@
-"""The results of a campaign's stages: all kinds of them, their JSON form and its schema.
+"""The results of a campaign's stages: all kinds, their JSON form and their lookup by stage.
 
-A result is a value with a `kind`, declared beside the strategy that learns it; here they come together.
+A result is a value with a `kind`, declared next to the strategy that produces it. This module collects the kinds.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from orchestrator.strategies.stage_result import StageResult
 L = TypeVar("L", bound=StageResult)
 
 Results = Mapping[str, StageResult]
-"""What the stages learnt, by their names, in order."""
+"""Results of the stages by name, in order."""
 
 DECLARED_IN = (
     "orchestrator.strategies.calibration.pour_design",
@@ -31,11 +31,11 @@ DECLARED_IN = (
     "orchestrator.strategies.single_pour",
     "orchestrator.study.study_strategies",
 )
-"""Modules that declare the kinds of results that Decant comes with, named by text: results know no strategy."""
+"""Modules that declare Decant's own kinds of results; named as text, so that results do not import strategies."""
 
 
 def kinds() -> tuple[type[StageResult], ...]:
-    """All kinds: ours, and those of the packages whose strategies are installed."""
+    """All kinds: Decant's own, and those of installed packages with strategies."""
     strategies = resolve_name("orchestrator.strategies.strategy_registry:STRATEGIES").all.values()  # this loads them
     packages = {settings.__module__.partition(".")[0] for settings in strategies}
     for module in DECLARED_IN:
@@ -46,7 +46,7 @@ def kinds() -> tuple[type[StageResult], ...]:
 
 
 def encode_result(result: StageResult) -> dict[str, Any]:
-    """JSON-ready mapping of a result; numbers that are not finite as the journal writes them."""
+    """JSON-ready mapping of a result; numbers that are not finite are encoded as in the journal."""
     return cast("dict[str, Any]", to_json(result.model_dump()))
 
 
@@ -54,11 +54,11 @@ def decode_result(data: Mapping[str, Any]) -> StageResult:
     """Inverse of `encode_result`.
 
     Raises:
-        RunError: the kind is not known, or the data don't fit it.
+        RunError: the kind is unknown, or the data don't fit it.
     """
     kind = data.get("kind")
     if kind not in StageResult.KINDS:
-        kinds()  # perhaps of a package that nobody has asked for yet
+        kinds()  # the kind may belong to a package that is not loaded yet
     known = StageResult.KINDS.get(str(kind))
     if known is None:
         raise RunError(
@@ -74,15 +74,15 @@ def decode_result(data: Mapping[str, Any]) -> StageResult:
 
 
 def decode_results(data: Mapping[str, Mapping[str, Any]]) -> dict[str, StageResult]:
-    """Results by their stages' names. Raises RunError as `decode_result` does."""
+    """Results by the names of their stages. Raises RunError as `decode_result` does."""
     return {name: decode_result(result) for name, result in data.items()}
 
 
 def result_of(results: Results, stage: str, kind: type[L]) -> L:
-    """What a stage learnt.
+    """The result of a stage.
 
     Raises:
-        RunError: there is no such stage, or it learnt something of another kind.
+        RunError: there is no such stage, or its result is of another kind.
     """
     found = results.get(stage)
     if not isinstance(found, kind):

@@ -1,1 +1,1 @@
-"""A running campaign in numbers: progress state, time estimate, console display."""
+"""Progress of a running campaign: progress state, time estimate, console display."""

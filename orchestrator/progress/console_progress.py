@@ -1,7 +1,8 @@
-"""The live display in the terminal: bars for the stages, the running pour, the pool, the best so far.
+"""Live display in the terminal: bars for the stages, the running pour, the pool, and the best pour so far.
 
-Goes to stderr, so that stdout stays for results. Where stderr is not a terminal (CI, a log file) it writes plain lines,
-at most one every two seconds.
+`ProgressDisplay` is a subscriber of a run's events. It writes to stderr, so that stdout stays free for results. If
+stderr is not a terminal (CI, a log file), it writes plain lines, at most one every two seconds. `ProgressState` keeps
+the numbers.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ if TYPE_CHECKING:
     from rich.live import Live
 
 INTERVAL = 2.0
-"""Least seconds between two plain lines of progress."""
+"""Minimum time between two plain lines of progress [s]."""
 
 _LEVEL_STYLE = {"info": "", "warning": "yellow", "error": "bold red"}
 
 
 class ProgressDisplay:
-    """A watcher that shows a campaign in the terminal. Use as a context manager.
+    """A subscriber that displays a campaign in the terminal. Use it as a context manager.
 
     Args:
-        plan: of the campaign.
-        console: where to write; by default stderr.
+        plan: plan of the campaign.
+        console: output console; stderr by default.
         clock: seconds, monotonic, for the plain lines.
-        quiet: only warnings and errors are wanted.
+        quiet: show only warnings and errors.
     """
 
     def __init__(
@@ -64,17 +65,17 @@ class ProgressDisplay:
         self._console = console
         self._clock = clock
         self._quiet = quiet
-        self._tally = ProgressState(plan)
+        self._progress_state = ProgressState(plan)
         self._live: Live | None = None
         self._lock = threading.Lock()
         self._last_line = -float("inf")
-        self._held: list[str] | None = None
+        self._delayed: list[str] | None = None
 
     def __enter__(self) -> ProgressDisplay:
         if self._console.is_terminal and not self._quiet:
             from rich.live import Live
 
-            # Rich draws in a thread of its own, four times a second, whatever the rate of events.
+            # Rich draws in its own thread, four times a second, at any rate of events.
             self._live = Live(console=self._console, get_renderable=self._render, refresh_per_second=4, transient=False)
             self._live.start()
         return self
@@ -88,16 +89,16 @@ class ProgressDisplay:
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
-        """While somebody is asked something: the bars are gone, and lines wait, but for warnings and errors."""
+        """During a question to the operator: hide the bars and delay lines, except warnings and errors."""
         live, self._live = self._live, None
         if live is not None:
-            live.transient = True  # the bars make room for the question
+            live.transient = True  # remove the bars from the screen before the question
             live.stop()
-        self._held = []
+        self._delayed = []
         try:
             yield
         finally:
-            held, self._held = self._held, None
+            held, self._delayed = self._delayed, None
             for text in held:
                 self._print(text)
             if live is not None:
@@ -106,13 +107,13 @@ class ProgressDisplay:
                 self._live = live
 
     def __call__(self, event: Event) -> None:
-        """Take note of an event. Returns at once."""
+        """Process an event. Returns at once."""
         with self._lock:
-            self._tally(event)
-        self._say(event)
+            self._progress_state(event)
+        self._print_event(event)
 
-    def _say(self, event: Event) -> None:
-        """Lines that stay on the screen, and in plain mode the progress in between."""
+    def _print_event(self, event: Event) -> None:
+        """Print permanent lines and, in plain mode, the progress in between."""
         match event:
             case CampaignOpened():
                 goes = "goes on" if event.resumed else "begins"
@@ -120,12 +121,12 @@ class ProgressDisplay:
             case CampaignStateChanged() if event.reason:
                 self._print(f"{event.before} → {event.after}: {event.reason}")
             case CampaignClosed():
-                self._print(f"campaign {event.state}; {self._tally.counts_line()}")
+                self._print(f"campaign {event.state}; {self._progress_state.counts_line()}")
             case LogLine():
                 if not event.asked:
                     self._print(event.text, _LEVEL_STYLE[event.level])
             case _ if event.replayed:
-                return  # an earlier run has told it
+                return  # an earlier process has displayed it
             case DecisionMade() if event.decision.urgent:
                 self._print(event.decision.text, _LEVEL_STYLE["warning"])
             case StageOpened() if self._live is None:
@@ -133,36 +134,36 @@ class ProgressDisplay:
             case StageClosed() if self._live is None:
                 self._print(f"{event.stage}: done")
             case RequestFinished(request=Pour()):
-                line = self._tally.pour_line()
+                line = self._progress_state.pour_line()
                 if line is not None:
                     self._print(line)
             case _ if self._live is None:
                 self._plain(event)
 
     def _plain(self, event: Event) -> None:
-        if self._held is not None:
+        if self._delayed is not None:
             return
         now = self._clock()
         if now - self._last_line < INTERVAL:
             return
-        stage = self._tally.stages.get(event.stage)
+        stage = self._progress_state.stages.get(event.stage)
         if stage is None or stage.progress.total == 0:
             return
         self._last_line = now
-        left = self._tally.forecast.left(event.time)
+        left = self._progress_state.forecast.left(event.time)
         eta = f"  about {_duration(left)} left in all" if left is not None else ""
-        # Lines come at moments when something has just ended; who is busy at that moment says nothing about the pool.
-        load = self._tally.load()
+        # Lines are printed when a request has just ended, so the mean load is shown instead of the load at that moment.
+        load = self._progress_state.load()
         pool = f"pool {100 * load:.0f} % busy · " if load is not None else ""
-        self._print(f"{stage.name}: {stage.progress}  {pool}{self._tally.counts_line()}{eta}")
+        self._print(f"{stage.name}: {stage.progress}  {pool}{self._progress_state.counts_line()}{eta}")
 
     def _print(self, text: str, look: str = "") -> None:
         from rich.text import Text
 
         if self._quiet and not look:
             return
-        if self._held is not None and not look:
-            self._held.append(text)
+        if self._delayed is not None and not look:
+            self._delayed.append(text)
             return
         self._console.print(Text(text, style=look), soft_wrap=True)
 
@@ -171,15 +172,15 @@ class ProgressDisplay:
         from rich.text import Text
 
         with self._lock:
-            tally = self._tally
+            state = self._progress_state
             rows: list[RenderableType] = [self._stages()]
-            pour = tally.pour
+            pour = state.pour
             if pour is not None and not pour.result:
-                rows.append(Text(tally.pour_line() or "", style="bold"))
+                rows.append(Text(state.pour_line() or "", style="bold"))
                 rows.append(self._pour_bar())
-            left = tally.forecast.left(time.time())
+            left = state.forecast.left(time.time())
             eta = f" · about {_duration(left)} left in all" if left is not None else ""
-            rows.append(Text(f"  {tally.pool_line()}{eta}", style="dim"))
+            rows.append(Text(f"  {state.pool_line()}{eta}", style="dim"))
             return Group(*rows)
 
     def _stages(self) -> RenderableType:
@@ -188,7 +189,7 @@ class ProgressDisplay:
         from rich.text import Text
 
         table = Table.grid(padding=(0, 2))
-        for stage in self._tally.stages.values():
+        for stage in self._progress_state.stages.values():
             progress = stage.progress
             waiting = stage.opened_at is None and progress.total == 0
             total = max(progress.total, 1)
@@ -205,7 +206,7 @@ class ProgressDisplay:
         if stage.closed_at is not None:
             return "done"
         now = time.time()
-        left = self._tally.forecast.stage_left(stage.name, now)
+        left = self._progress_state.forecast.stage_left(stage.name, now)
         about = "" if left is None else f"about {_duration(left)}"
         if stage.opened_at is None:
             return about or "waiting"
@@ -217,7 +218,7 @@ class ProgressDisplay:
         from rich.table import Table
         from rich.text import Text
 
-        pour = self._tally.pour
+        pour = self._progress_state.pour
         assert pour is not None
         progress = pour.progress
         fraction = 0.0 if progress is None else progress.fraction

@@ -1,4 +1,8 @@
-"""What a person wants to know of a running campaign, counted from its events: no terminal, no clock of its own."""
+"""Progress of a running campaign, counted from its events.
+
+`ProgressState` keeps the counts, the running pour, the best losses and the time estimate for displays. It does not
+print, and its only clock is the time of the events.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +49,7 @@ class StageProgressState:
     """Progress of one stage.
 
     Attributes:
-        progress: as the strategy told it last.
+        progress: progress last reported by the strategy.
         opened_at, closed_at: times of these events; a replayed opening has none.
     """
 
@@ -57,7 +61,7 @@ class StageProgressState:
 
 @dataclass
 class PourProgressState:
-    """The pour that runs, or the last one."""
+    """The running pour, or the last one."""
 
     number: int
     stage: str
@@ -73,7 +77,7 @@ class PourProgressState:
 
 @dataclass
 class Best:
-    """The smallest measured loss of a receiver, in the loss' own unit."""
+    """The smallest measured loss of a receiver, in the loss's own unit."""
 
     loss: float
     pour: int
@@ -86,14 +90,14 @@ class ProgressState:
 
     Attributes:
         plan: the campaign.
-        simulators: members of the pool.
-        running: ids of simulations that run.
-        ahead: of those that nobody has asked for yet.
-        simulations, failed_simulations: finished ones.
-        simulation_seconds: wall seconds that finished simulations took, all together (replayed ones not counted).
-        timed_simulations: how many these were.
-        best: by scene.
-        forecast: of the time that is left.
+        simulators: number of simulators in the pool.
+        running: ids of running simulations.
+        ahead: number of running and unused speculative simulations.
+        simulations, failed_simulations: number of finished and of failed simulations.
+        simulation_seconds: total wall seconds of finished simulations, without replayed ones.
+        timed_simulations: number of simulations in `simulation_seconds`.
+        best: best measured loss by scene.
+        forecast: estimate of the remaining time.
     """
 
     plan: CampaignPlan
@@ -135,7 +139,7 @@ class ProgressState:
                 self.state = event.state
             case StageOpened():
                 stage = self._stage(event.stage)
-                # A stage that is being replayed has no pace; the first live event starts its clock.
+                # A replayed stage has no known duration; the first live event starts its clock.
                 stage.opened_at = None if event.replayed else event.time
             case StageClosed():
                 self._stage(event.stage).closed_at = event.time
@@ -211,7 +215,7 @@ class ProgressState:
 
     @property
     def busy(self) -> int:
-        """Simulators that work."""
+        """Number of busy simulators."""
         return min(len(self.running) + self.ahead.running, self.simulators)
 
     @property
@@ -219,7 +223,7 @@ class ProgressState:
         return self.pour is not None and self.pour.calibrating and not self.pour.result
 
     def load(self) -> float | None:
-        """Mean share of the pool (0 … 1) that was busy since this was asked last; None if no time has passed."""
+        """Mean share of the pool (0 … 1) that was busy since the last call; None if no time has passed."""
         elapsed = 0.0 if self._load_from is None else self._load_to - self._load_from
         if elapsed <= 0.0 or not self.simulators:
             return None
@@ -236,7 +240,7 @@ class ProgressState:
         """'214 simulations, 0.9 s each · best so far 1.10 % (pour 4)'."""
         each = f", {self.simulation_seconds / self.timed_simulations:.1f} s each" if self.timed_simulations else ""
         parts = [f"{self.simulations} simulation{'s' * (self.simulations != 1)}{each}"]
-        if self.ahead.waiting and (self.ahead.running or self._calibration_pour):  # later on some are never asked for
+        if self.ahead.waiting and (self.ahead.running or self._calibration_pour):  # some of them are never requested
             parts.append(f"{self.ahead.waiting} more made ahead")
         if self.failed_simulations:
             parts.append(f"{self.failed_simulations} failed")

@@ -1,13 +1,18 @@
-"""How long a campaign still takes: from the plan's own times, and what pours and simulations have taken so far.
+"""Estimate of a campaign's remaining time.
 
-A pour and a simulation are priced apart. What has not been seen yet in this run is priced by the plan: a pour by the
-times of operator and motion, a simulation by its particles. What a stage has done itself counts more than what others
-have. Simulations beside a pour cost nothing while they take no longer than it does; so do those that are made for later
-stages while a stage of nothing but pours keeps the arm busy.
+`work_of` derives the expected work of each stage (`WorkEstimate`) from the plan. `Forecast` follows the events and
+combines this work with measured durations.
 
-Limitations: a person's pace is not known before the first pour; other programs' load is taken to stay as it is.
+- Pours and simulations are estimated separately. Before the first measurement, a pour takes the planned times of
+  operator and motion, and a simulation a time proportional to its particles.
+- A stage's own durations have more weight than those of other stages.
+- Simulations during a pour take no extra time unless they take longer than the pour. The same holds for speculative
+  simulations while a stage of pours keeps the arm busy.
 
-What the stages of a campaign are expected to do, from its plan: for forecasts only, nothing is decided by it.
+The estimate is for display only; no decision depends on it.
+
+Limitations: the operator's speed is unknown before the first pour; the load by other programs is assumed to be
+constant.
 """
 
 from __future__ import annotations
@@ -36,29 +41,31 @@ from sim_engine.scene import Scene
 from sim_engine.search_space import Space
 
 PRICE = 1e-3
-"""Price of a simulated pour on one core, per particle, before one has been seen [s]."""
+"""Assumed time of a simulated pour on one core, per particle, before the first measurement [s]."""
 
 THOUGHT = 0.2
-"""Time between two pours beside them: a question to the optimiser, the journal [s]."""
+"""Time between two pours in addition to the pours: a query to the optimiser, the journal [s]."""
 
 ENOUGH = 4
-"""Simulations, or pours, of a stage after which its pace counts; what is expected of it still counts as so many
-simulations, and as one pour."""
+"""Number of simulations, or pours, after which a stage's own durations are used.
+
+The expected duration keeps the weight of this number of simulations, or of one pour.
+"""
 
 RECENT = 5
-"""Pours that count for the next ones: a person finds a pace, and other programs come and go."""
+"""Number of recent pours that predict the next ones: operators get faster, and other programs start and stop."""
 
 
 @dataclass(frozen=True)
 class WorkEstimate:
-    """What a stage is expected to do, before it says so itself.
+    """Expected work of a stage, before the strategy reports its own progress.
 
     Attributes:
-        simulations, pours: in all.
-        beside: of the simulations, that run beside each pour.
-        particles: of a simulation in the mean; 0: those of θ*.
-        pour_time: of one pour, as planned [s of the clock].
-        ahead: of the simulations, those that are made while an earlier stage pours, if the simulators are free then.
+        simulations, pours: total numbers.
+        beside: number of the simulations that run during each pour.
+        particles: mean number of particles of a simulation; 0: those of θ*.
+        pour_time: planned duration of one pour [s of wall time].
+        ahead: number of the simulations that run during pours of an earlier stage, if the simulators are free then.
     """
 
     simulations: int = 0
@@ -71,15 +78,15 @@ class WorkEstimate:
 
 @dataclass
 class _Stage:
-    """What was seen of a stage. Times in seconds of the clock.
+    """Measurements of a stage. Times in seconds of wall time.
 
     Attributes:
-        waits: from each simulation's answer to the next one's, where no pour has been made yet; the first from the
-            stage's opening.
-        particles: of these simulations.
-        made_before: simulations whose answers were there when they were asked for.
-        answered: when the last one was answered.
-        cycles: from each pour's begin (the first) or the one before's end to its end.
+        waits: times between consecutive finished simulations while no pour has been made; the first counts from the
+            opening of the stage.
+        particles: particles of these simulations.
+        made_before: number of simulations whose outcomes existed when they were requested.
+        answered: when the last simulation finished.
+        cycles: times from the end of the previous pour to the end of each pour; the first counts from its beginning.
     """
 
     work: WorkEstimate
@@ -94,21 +101,21 @@ class _Stage:
 
     @property
     def simulations_alone(self) -> int:
-        """Simulations that still have to be waited for before the next pour, or in a stage without pours."""
+        """Simulations to wait for before the next pour, or in a stage without pours."""
         if self.cycle_from is not None:
             return 0
         ahead = self.work.ahead - self.made_before
         if len(self.waits) > self.progress.of_simulations - self.work.ahead:
-            ahead = 0  # more were waited for than would have been, had any been made ahead
+            ahead = 0  # more simulations were waited for than possible if any had run speculatively
         return max(self.progress.simulations_left - self.work.beside * self.progress.pours_left - max(ahead, 0), 0)
 
 
 class Forecast:
-    """Counts a campaign's events, and says what is left.
+    """Counts a campaign's events and estimates the remaining time.
 
     Args:
-        slots: simulations that can run at a time.
-        particles: of θ before anything is calibrated.
+        slots: maximum number of simulations at a time.
+        particles: particles of θ before anything is calibrated.
     """
 
     def __init__(self, slots: int, particles: float) -> None:
@@ -119,7 +126,7 @@ class Forecast:
         self._pours: list[float] = []
 
     def begin(self, simulators: int, works: Mapping[str, WorkEstimate]) -> None:
-        """A run begins with so many simulators, and with stages that are expected to do this."""
+        """Begin a run with this number of simulators and the expected work of each stage."""
         self._slots = max(min(self._slots, simulators), 1)
         self._stages = {name: _Stage(work, _all_of(work)) for name, work in works.items()}
 
@@ -170,7 +177,7 @@ class Forecast:
             self._particles = theta.particles
 
     def stage_left(self, name: str, now: float) -> float | None:
-        """Seconds to a stage's end; None for one that is not known."""
+        """Seconds to the end of a stage; None for an unknown stage."""
         stage = self._stages.get(name)
         if stage is None:
             return None
@@ -185,13 +192,13 @@ class Forecast:
         return max(left, 0.0)
 
     def left(self, now: float) -> float | None:
-        """Seconds to the campaign's end; None before it has begun."""
+        """Seconds to the end of the campaign; None before it has begun."""
         if not self._stages:
             return None
         return sum(self.stage_left(name, now) or 0.0 for name in self._stages)
 
     def _price(self, stage: _Stage) -> float:
-        """Seconds from one simulation's answer to the next one's, where no pour is made."""
+        """Seconds between two consecutive finished simulations, without pours."""
         expected = self._expected(stage)
         if len(stage.waits) < ENOUGH:
             return expected
@@ -199,7 +206,7 @@ class Forecast:
         return (sum(waits) + ENOUGH * expected) / (len(waits) + ENOUGH)
 
     def _expected(self, stage: _Stage) -> float:
-        """The same, from what was seen of other stages."""
+        """The same, from measurements of other stages."""
         particles = stage.work.particles or self._particles
         others = [other for other in self._stages.values() if other is not stage and len(other.waits) >= ENOUGH]
         if not others:
@@ -212,12 +219,13 @@ class Forecast:
         pour = median_low([stage.work.pour_time, *seen])
         expected = max(pour, stage.work.beside * self._price(stage)) + THOUGHT
         cycles = [*stage.cycles[-RECENT:], *[expected] * max(ENOUGH - len(stage.cycles), 1)]
-        unusual = 2 if len(stage.cycles) <= RECENT else 1  # the first two start a bench, and what is made beside them
+        # the first two include the start of the bench and speculative work
+        unusual = 2 if len(stage.cycles) <= RECENT else 1
         return _mean(sorted(cycles)[:-unusual])
 
 
 def _made_before(event: RequestFinished) -> bool:
-    """Whether a simulation was made while the arm poured, and says nothing about the next one's price."""
+    """Whether a simulation ran while the arm poured; its duration then does not predict the next one."""
     return isinstance(event.outcome, Simulated) and event.seconds < 0.1 * event.outcome.outcome.cpu_s
 
 
@@ -230,7 +238,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _usual(values: Sequence[float]) -> float:
-    """Mean without the largest one, which may have started a process and compiled what it runs."""
+    """Mean without the largest value, which may include the start of a process and compilation."""
     return _mean(sorted(values)[:-1])
 
 
@@ -238,11 +246,11 @@ WEIGHINGS = 15.0
 """Weighing and settling in one pour [s of bench time]; see `actors.bench`."""
 
 WAYS = 8.0
-"""Way to the pour and back home [s of bench time]."""
+"""Motion to the pour and back home [s of bench time]."""
 
 
 def work_of(plan: CampaignPlan, stages: Sequence[str]) -> dict[str, WorkEstimate]:
-    """What each stage is expected to do, by name; nothing is known of stages that are not the plan's own."""
+    """Expected work of each stage, by name; empty for stages that are not the plan's own."""
     return {name: _work(plan, name) for name in stages}
 
 
@@ -267,26 +275,27 @@ def _work(plan: CampaignPlan, name: str) -> WorkEstimate:
 
 
 def _weighed(plan: CalibrationPlan) -> int:
-    """Pours that θ* is scored on: made by then, or recorded."""
+    """Number of pours that θ* is evaluated on: made by then, or recorded."""
     records = 0 if plan.records is None else len(plan.records.pours)
     return plan.pour_count + records + (0 if plan.transfer is None else len(plan.transfer.pours))
 
 
 def _unseen(plan: CalibrationPlan) -> int:
-    """Those of them that calibration has not seen."""
+    """Number of these pours that calibration does not use."""
     records = [] if plan.records is None else list(plan.records.pours)
     transfer = 0 if plan.transfer is None else len(plan.transfer.pours)
     return plan.holdout + sum(pour.split != "train" for pour in records) + transfer
 
 
 def _scored(plan: CalibrationPlan) -> int:
-    """θ* and the uncalibrated θ on all pours; draws of θ and random rivals on those that calibration has not seen."""
+    """Simulations of the evaluation: θ* and the uncalibrated θ on all pours; posterior draws and random rivals on
+    unused pours."""
     drawn = DRAWS if plan.random_baseline and plan.settings.makes_posterior else 0
     return 2 * _weighed(plan) + (plan.random_baseline + drawn) * _unseen(plan)
 
 
 def particles_of(plan: CampaignPlan) -> float:
-    """Particles of a simulation: their mean over what is searched, where they are; else what they are."""
+    """Particles of a simulation: the mean over the search space if particles are searched, else the fixed number."""
     calibration = plan.calibration
     if calibration is None:
         return float(plan.parameters.particles)
@@ -303,12 +312,12 @@ def _deployed(plan: DeploymentPlan, pour: float) -> WorkEstimate:
 
 
 def pour_time(laboratory: LaboratorySpec, scene: Scene, actions: Space) -> float:
-    """Time of one whole pour with the operator's part, as planned [s of the clock].
+    """Duration of one whole pour with the operator's part, as planned [s of wall time].
 
     Args:
-        laboratory: whose operator and bench make it.
-        scene: with what is not chosen of the motion.
-        actions: with what is; its middle counts.
+        laboratory: laboratory with the operator and the bench.
+        scene: scene with the fixed parameters of the motion.
+        actions: searched parameters of the motion; the middle of their ranges is used.
     """
     values = {**{name: d.lower for name, d in ACTION_DIMENSIONS.items()}, **scene.fixed}
     values |= {axis.name: 0.5 * (axis.lower + axis.upper) for axis in actions.axes}
@@ -318,7 +327,7 @@ def pour_time(laboratory: LaboratorySpec, scene: Scene, actions: Space) -> float
     motion = (angle or 0.0) / (speed or math.inf) + (scene.hold_cap / 2.0 if hold is None else hold)
     motion += (angle or 0.0) / back if back else 0.0
     bench = laboratory.bench
-    liquid = 0.0 if bench is None else PRICE * bench.liquid.particles  # that of a virtual bench is simulated
+    liquid = 0.0 if bench is None else PRICE * bench.liquid.particles  # a virtual bench simulates its liquid
     if laboratory.arm is not None:
         whole = laboratory.operator.time + laboratory.arm.announcement + WAYS + motion + WEIGHINGS
         return laboratory.arm.on_clock(whole) + liquid

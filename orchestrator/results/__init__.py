@@ -1,1 +1,1 @@
-"""The result of a run, and everything that renders it."""
+"""Results of a run: summary, tables, figures and HTML report."""

@@ -1,4 +1,7 @@
-"""The planned path of an arm as a picture: the pour from the side, and the arm in its cell from above and across."""
+"""Figure of an arm's planned path: the pour from the side, and the arm in its cell from above and from the front.
+
+`draw_path` returns the figure; `path_png` writes it.
+"""
 
 from __future__ import annotations
 
@@ -30,23 +33,23 @@ _STAND = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 _WAYS = (("approach", "way there and back", style.GREY), ("pour", "pour", style.POURER))
 _AXES = ("x: where the liquid goes [mm]", "y [mm]", "z: up [mm]")
 _LINE = 175
-"""Characters of a line above the picture."""
+"""Characters per line above the figure."""
 _MARGIN = 40.0
-"""Around what is drawn near by [mm]."""
+"""Margin around the close-up of the pour [mm]."""
 
 
 def path_png(
     file: Path, path: PourPath, spec: UrArmSpec, pourer: Vessel, receiver: Vessel, *, title: str, note: str = ""
 ) -> Path:
-    """Draw a path.
+    """Write the figure of a path.
 
     Args:
         file: PNG to write.
-        path: as planned.
-        spec: of the arm and its cell.
+        path: the planned path.
+        spec: settings of the arm and its cell.
         pourer, receiver: geometry.
         title: first line.
-        note: below it.
+        note: text below the title.
 
     Returns:
         `file`.
@@ -64,7 +67,8 @@ def draw_path(
     stretches = [SampledPath.of(name, getattr(path, name), spec) for name, _, _ in _WAYS]
     world = cell_transforms(spec).world.inverse
     base, table = 1e3 * world.position, float(1e3 * world.apply(np.array([[0.0, 0.0, spec.cell.table]]))[0, 2])
-    # Seen along the way to the robot its base would stand under the receiver: the arm is drawn from where it is long.
+    # Seen along the direction to the robot, the base would be hidden below the receiver, so the arm is drawn from the
+    # side.
     across = 0 if abs(base[0]) > abs(base[1]) else 1
     figure, (near, top, front) = style.new_figure(1, 3, size=(15.0, 6.0), width_ratios=(1.0, 1.0, 1.0))
     lines = [title, *textwrap.wrap(note, _LINE)]
@@ -88,7 +92,7 @@ def draw_path(
 def _near(
     axes: Axes, stretches: list[SampledPath], world: Transforms, table: float, pourer: Vessel, receiver: Vessel
 ) -> None:
-    """The pour: both vessels cut open, and the ways of tool and pourer near them."""
+    """The pour: cross-sections of both vessels, and the paths of tool and pourer near them."""
     shown = [_vessels_from_the_side(axes, stretches[1], pourer, receiver)]
     for stretch, (name, way, colour) in zip(stretches, _WAYS, strict=True):
         tool, underside = 1e3 * world.apply(stretch.tool), 1e3 * stretch.poses[:, :3]
@@ -108,7 +112,7 @@ def _near(
 
 
 def _cell(axes: Axes, pour: SampledPath, spec: UrArmSpec, world: Transforms, seen: tuple[int, int]) -> None:
-    """The box that the arm has to stay in, and the arm at the pour's beginning and at its largest tilt."""
+    """The box of the arm's limits, and the arm at the start of the pour and at its largest tilt."""
     corners = np.array(list(itertools.product(*zip(spec.limits.box_low, spec.limits.box_high, strict=True))))
     _outline(axes, world.apply(corners)[:, list(seen)], label="box of the laboratory's file")
     largest = int(np.argmax(pour.tilts))
@@ -139,7 +143,7 @@ def _outline(axes: Axes, points: FloatArray, *, label: str) -> None:
 
 
 def _vessels_from_the_side(axes: Axes, pour: SampledPath, pourer: Vessel, receiver: Vessel) -> FloatArray:
-    """Cut open: the receiver, and the pourer upright, half-way and at its largest tilt; their outlines [mm]."""
+    """Cross-sections of the receiver, and of the pourer upright, half-way and at its largest tilt; outlines [mm]."""
     outlines = [section(np.asarray(v.solid_vertices, float), np.asarray(v.solid_faces)) for v in (pourer, receiver)]
     stand = [1e3 * place(loop, _STAND) for loop in outlines[1]]
     fill_section(axes, stand, facecolor=style.RECEIVED, linewidth=0.0, label="receiver")
@@ -163,7 +167,7 @@ def _from_above(axes: Axes, pour: SampledPath, pourer: Vessel, receiver: Vessel)
 
 
 def _upright(axes: Axes, pour: SampledPath, pourer: Vessel, receiver: Vessel, across: int) -> None:
-    """Both vessels as boxes as wide and high as they are, the pourer before it is tilted."""
+    """Both vessels as rectangles of their width and height, the pourer before it tilts."""
     from matplotlib.patches import Rectangle
 
     for vessel, pose, colour in ((receiver, _STAND, style.RECEIVED), (pourer, pour.poses[0], style.POURER)):

@@ -1,4 +1,8 @@
-"""All figures of a run, under its directory."""
+"""All figures of a run.
+
+`draw_figures` writes them into a folder; `figures_of` returns them for notebooks. The modules of the single figures do
+the drawing.
+"""
 
 from __future__ import annotations
 
@@ -37,19 +41,19 @@ _log = logging.getLogger(__name__)
 def draw_figures(
     directory: Path, plan: CampaignPlan, results: Results, formats: tuple[str, ...] = (".svg",)
 ) -> dict[str, Path]:
-    """Draw what the results allow: discrepancy map and trials, test discrepancy, spillage against pours, loss maps,
-    and the first pours against what was simulated.
+    """Draw all figures that the results allow.
 
-    Of more than two searched axes a map shows the two that matter most; the trials against every axis are then a figure
-    of their own.
+    These are the discrepancy map and its trials, the test discrepancy, spillage against pours, loss maps, safe windows,
+    and the comparison of the first pours with simulations. With more than two searched axes, a map shows the two most
+    important ones, and the trials against every axis are a separate figure.
 
-    A figure that can't be drawn is reported and left out: days of pouring don't end in a traceback about a picture.
+    A figure that can't be drawn is reported and left out, so that it does not end a long run with an error.
 
     Args:
-        directory: where the PNGs go.
-        plan: of the campaign.
-        results: what the stages learnt.
-        formats: suffixes of the files that are written beside each PNG.
+        directory: folder of the PNGs.
+        plan: plan of the campaign.
+        results: results of the stages.
+        formats: suffixes of additional files next to each PNG.
 
     Returns:
         Name of each figure → its PNG.
@@ -65,7 +69,7 @@ def draw_figures(
 
 
 def figures_of(plan: CampaignPlan, results: Results) -> dict[str, Figure]:
-    """The same figures, not written: for notebooks. One that can't be drawn raises what went wrong with it."""
+    """The same figures for notebooks, not written to files. An error in a figure is raised."""
     found = {}
     for name, job in _jobs(Path(), plan, results).items():
         with style.unsaved() as figures:
@@ -75,7 +79,7 @@ def figures_of(plan: CampaignPlan, results: Results) -> dict[str, Figure]:
 
 
 def _jobs(directory: Path, plan: CampaignPlan, results: Results) -> dict[str, Callable[[], Path]]:
-    """What draws each figure."""
+    """The functions that draw the figures, by name."""
     jobs: dict[str, Callable[[], Path]] = {}
     calibration, evaluation, theta = calibration_of(results), evaluation_of(results), theta_of(results)
     if calibration is not None and (picture := calibration_picture(plan, calibration)) is not None:

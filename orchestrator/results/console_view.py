@@ -1,4 +1,4 @@
-"""What a run came to, for people: a table in the terminal."""
+"""Display of results in the terminal: the summary of a run, and tables of text."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rich.console import JustifyMethod, RenderableType
 
 PLAIN_WIDTH, LONGEST_LINE = 110, 1_000
-"""Columns of the table where stderr is not a terminal: at least, at most."""
+"""Minimum and maximum number of columns of the table if stderr is not a terminal."""
 
 
 def summary_table(plan: CampaignPlan, summary: RunSummary) -> RenderableType:
@@ -44,7 +44,7 @@ def summary_table(plan: CampaignPlan, summary: RunSummary) -> RenderableType:
     files = [*summary.figures.items(), *([("recording", summary.recording)] if summary.recording else [])]
     if files:
         width = max(len(name) for name, _ in files)
-        # Paths stand alone at their lines' ends, unbroken: terminals make them clickable, people copy them.
+        # Each path ends its line without a line break, so that it can be clicked and copied.
         parts.append(Text("\n".join(f"  {name:<{width}}  {path}" for name, path in files), overflow="fold"))
     if summary.dropped_events:
         parts.append(Text(f"  the recording lacks {summary.dropped_events} events: it could not keep up", "yellow"))
@@ -70,7 +70,7 @@ def _theta_lines(plan: CampaignPlan, summary: RunSummary) -> list[RenderableType
 
 
 def _has_losses(row: ReceiverSummary) -> bool:
-    """Whether it has any of the numbers that the table exists for."""
+    """Whether it has any of the table's main numbers."""
     return _has_numbers((row.first_loss, row.best_loss, row.predicted_loss))
 
 
@@ -128,7 +128,7 @@ def _best_measured(row: ReceiverSummary, unit: LossUnit) -> str:
 
 
 def _confirmed(found: Confirmed | None, unit: LossUnit) -> str:
-    """'1.40 ± 0.30 % (3 pours)': the mean, and how much a pour differs from it."""
+    """'1.40 ± 0.30 % (3 pours)': the mean, and the deviation of a single pour."""
     if found is None or found.loss is None:
         return ""
     count = "1 pour" if found.loss.count == 1 else f"{found.loss.count} pours"
@@ -224,11 +224,11 @@ def print_summary(plan: CampaignPlan, summary: RunSummary) -> None:
 
 
 def print_table(rows: Sequence[Mapping[str, str]], *, right: Sequence[str] = (), title: str | None = None) -> None:
-    """Write a table to stdout; columns in which nothing stands are left out.
+    """Write a table to stdout; empty columns are left out.
 
     Args:
         rows: head → cell, the same heads in each.
-        right: heads of columns with numbers.
+        right: heads of columns with numbers, which are right-aligned.
     """
     from rich.table import Table
     from rich.text import Text
@@ -243,7 +243,7 @@ def print_table(rows: Sequence[Mapping[str, str]], *, right: Sequence[str] = (),
 
 
 def _print(table: RenderableType, *, to_stderr: bool = False) -> None:
-    """Where that is not a terminal, nobody has a width to fit in: lines are as long as names and paths want them."""
+    """Print a table. If the output is not a terminal, lines are as long as names and paths need."""
     from rich.console import Console
     from rich.measure import Measurement
 

@@ -1,4 +1,7 @@
-"""How figures look: one palette that colour-blind readers can tell apart, units as people read them, Agg only."""
+"""Common style of all figures: a palette for colour-blind readers, display units, axis ticks, and saving.
+
+Figures use Matplotlib's Agg canvas without pyplot and without a window system.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ if TYPE_CHECKING:
 
 DPI = 150
 
-# Okabe and Ito's palette; each colour means one thing in every figure.
+# Okabe and Ito's palette; each colour has one meaning in all figures.
 INK = "#222222"
 GREY = "#8c8c8c"
 PALE = "#d9d9d9"
@@ -54,7 +57,7 @@ def label(name: str) -> str:
 
 
 def display_unit(name: str) -> str:
-    """Unit that people see ('' for pure numbers and for names that are neither action nor parameter)."""
+    """Display unit ('' for pure numbers and for names that are neither action nor parameter)."""
     if name in ACTION_DIMENSIONS:
         return ACTION_DIMENSIONS[name].display_unit.replace("^2", "²")
     info = SimulationParameters.info().get(name)
@@ -70,9 +73,9 @@ def display_factor(name: str) -> float:
 
 
 def display_value(name: str, value: float | None) -> str:
-    """One quantity as people read it, from its SI value: '41.2 deg/s', '1 840', '0.032 N/m'.
+    """A quantity in its display unit, from its SI value: '41.2 deg/s', '1 840', '0.032 N/m'.
 
-    None is shown as the word that switches the dimension off ('until_flow_ends'), '—' where there is none.
+    None is shown as the word that switches the dimension off ('until_flow_ends'), or as '—' without such a word.
     """
     if value is None:
         return (ACTION_DIMENSIONS[name].switched_off if name in ACTION_DIMENSIONS else "") or "—"
@@ -87,7 +90,7 @@ def display_values(values: dict[str, float | None]) -> str:
 
 
 def safe_name(name: str) -> str:
-    """A name that can be part of a file's name or of an entity's path."""
+    """A name that is valid as part of a file name or an entity path."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in name) or "_"
 
 
@@ -97,16 +100,16 @@ Layout = Literal["constrained"] | None
 def new_figure(
     rows: int = 1, columns: int = 1, *, size: tuple[float, float], layout: Layout = "constrained", **kwargs: Any
 ) -> tuple[Figure, Any]:
-    """A figure of our look, without a window system.
+    """A figure without a window system.
 
     Args:
         size: width and height [inch].
-        layout: who finds room for labels; None: the caller, since Matplotlib takes longer for it than for the drawing.
+        layout: layout engine; None: the caller places labels, because the engine takes longer than the drawing.
 
     Returns:
-        The figure and what `Figure.subplots` returns (axes, or an array of them).
+        The figure and the result of `Figure.subplots` (axes, or an array of them).
     """
-    # Figure is used without pyplot: nothing global, no backend to choose, no figures that live on in a daemon.
+    # Figure is used without pyplot: no global state, no backend to choose, no figures kept in a daemon.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -116,7 +119,7 @@ def new_figure(
 
 
 def dress(axes: Axes, *, title: str = "", x: str = "", y: str = "", grid: str | None = "y") -> None:
-    """Title, labels, thin grid; no box."""
+    """Set title, labels and a thin grid; remove the box."""
     axes.set_title(title, fontsize=11, loc="left", color=INK, pad=8)
     axes.set_xlabel(x, fontsize=9.5, color=INK)
     axes.set_ylabel(y, fontsize=9.5, color=INK)
@@ -133,7 +136,7 @@ def dress(axes: Axes, *, title: str = "", x: str = "", y: str = "", grid: str | 
 
 
 MARGIN = 0.045
-"""Room of a searched axis beyond either of its bounds, as a share of its length: what lies on a bound is seen whole."""
+"""Margin of a searched axis beyond its bounds, as a share of its length, which shows points on a bound."""
 
 FEWEST_TICKS = 3
 
@@ -146,11 +149,11 @@ _LOG_STEPS = (
 
 
 def frame(axes: Axes, axis: Axis, which: Literal["x", "y"]) -> None:
-    """Scale, limits and ticks of a searched axis; its line ends where the search did. Call it after `dress`.
+    """Set scale, limits and ticks of a searched axis; its line ends at the bounds. Call it after `dress`.
 
     Args:
-        axis: searched, its bounds in SI.
-        which: of the picture's axes.
+        axis: the searched axis, bounds in SI.
+        which: axis of the figure.
     """
     from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
@@ -177,7 +180,7 @@ def frame(axes: Axes, axis: Axis, which: Literal["x", "y"]) -> None:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Round numbers between two positive ones, `FEWEST_TICKS` or more where there are so many: 500, 700, 1000, 1500."""
+    """Round numbers between two positive ones, at least `FEWEST_TICKS` if possible: 500, 700, 1000, 1500."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     places: list[float] = []
     for steps in _LOG_STEPS:
@@ -189,16 +192,16 @@ def log_ticks(low: float, high: float) -> list[float]:
 
 
 def number(value: float) -> str:
-    """As people write it on an axis: '0.05', '1 500'."""
+    """A number for an axis: '0.05', '1 500'."""
     return f"{value:.6g}" if abs(value) < 1000 else f"{value:,.0f}".replace(",", " ")
 
 
 def at_ends(values: dict[str, float | None], axes: tuple[Axis, ...]) -> list[str]:
-    """Which searched values lie at an end of what was searched: 'angular velocity at its upper end (150 deg/s)'.
+    """Searched values that lie at an end of their range: 'angular velocity at its upper end (150 deg/s)'.
 
     Args:
-        values: of a point [SI].
-        axes: searched.
+        values: values of a point [SI].
+        axes: searched axes.
     """
     said = []
     for axis in axes:
@@ -217,7 +220,7 @@ _UNSAVED: ContextVar[list[Figure] | None] = ContextVar("unsaved figures", defaul
 
 @contextlib.contextmanager
 def unsaved() -> Iterator[list[Figure]]:
-    """What would be written as PNG meanwhile is collected instead: for notebooks, which show figures themselves."""
+    """Collect figures instead of writing PNGs within this context, for notebooks."""
     figures: list[Figure] = []
     token = _UNSAVED.set(figures)
     try:
@@ -231,7 +234,7 @@ _ALSO: ContextVar[tuple[str, ...]] = ContextVar("other formats", default=())
 
 @contextlib.contextmanager
 def also_as(*suffixes: str) -> Iterator[None]:
-    """Meanwhile every PNG gets files of other formats beside it, '.svg' or '.pdf': for print, lines stay lines."""
+    """Write every PNG in these additional formats within this context ('.svg' or '.pdf'), for print."""
     token = _ALSO.set(suffixes)
     try:
         yield
@@ -255,5 +258,5 @@ def save(figure: Figure, path: Path) -> Path:
         for suffix in (path.suffix, *_ALSO.get()):
             undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
             figure.savefig(path.with_suffix(suffix), dpi=DPI, facecolor="white", metadata=undated)
-            figure.set_layout_engine("none")  # the room that was found for the first one
+            figure.set_layout_engine("none")  # keep the layout of the first format
     return path

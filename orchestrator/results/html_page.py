@@ -1,7 +1,7 @@
-"""HTML pages that need nothing beside them: pieces of a page, and how a template is filled.
+"""Self-contained HTML pages: tables, pictures, and the rendering of templates.
 
-Whatever comes from a campaign is escaped by the templates (autoescape); nothing on a page is loaded from elsewhere, and
-a content security policy says so to the browser.
+The templates escape all content of a campaign (autoescape). A page loads nothing from other addresses, and its content
+security policy forbids it.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 STYLE = "style.css"
 
 LARGEST_VECTOR = 1_500_000
-"""Bytes of an SVG that goes into a page; of a larger one, with a surface of many facets, the PNG does."""
+"""Maximum size of an SVG in a page [bytes]; the PNG replaces a larger one, for example with many facets."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a table: the first cell names it.
+    """A row of a table; its first cell is the row's name.
 
     Attributes:
         look: 'best', 'bad' or ''.
@@ -37,11 +37,11 @@ class Row:
 
 @dataclass(frozen=True)
 class HtmlTable:
-    """A table for people.
+    """A table of a page.
 
     Attributes:
-        caption: above it; a screen reader says it first.
-        numbers: columns that are aligned to the right.
+        caption: text above the table, read first by screen readers.
+        numbers: columns that are right-aligned.
     """
 
     caption: str
@@ -50,7 +50,7 @@ class HtmlTable:
     numbers: frozenset[int] = frozenset()
 
     def filled(self) -> HtmlTable:
-        """Without columns in which no row has anything."""
+        """A copy without empty columns."""
         kept = [i for i in range(len(self.header)) if i == 0 or any(row.cells[i].strip("—") for row in self.rows)]
         rows = [Row([row.cells[i] for i in kept], row.look) for row in self.rows]
         numbers = frozenset(place for place, i in enumerate(kept) if i in self.numbers)
@@ -63,8 +63,8 @@ class Picture:
 
     Attributes:
         source: a data URI.
-        alt: what it shows, for those who don't see it.
-        wide: over the whole page.
+        alt: description for readers who do not see the picture.
+        wide: whether it covers the full width of the page.
     """
 
     source: str
@@ -74,7 +74,7 @@ class Picture:
 
     @classmethod
     def of(cls, file: Path, alt: str, caption: str, *, wide: bool = False) -> Picture:
-        """A file as a part of the page: SVG where it lies beside a PNG, so that print has lines.
+        """An embedded file: the SVG next to a PNG if there is one, for print.
 
         Raises:
             OSError: it can't be read.
@@ -100,11 +100,11 @@ def _templates() -> Environment:
 
 
 def render(template: str, **content: Any) -> str:
-    """A page.
+    """Render a page.
 
     Args:
         template: 'run.html.j2' or 'study.html.j2'.
-        content: what it asks for; all of it is escaped.
+        content: values for the template; all of them are escaped.
     """
     from markupsafe import Markup
 

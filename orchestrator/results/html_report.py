@@ -1,6 +1,7 @@
-"""The report of a run, finished or not: one HTML page that needs nothing beside it, `report.html`.
+"""The report of a run, finished or not: `report.html`, one self-contained page.
 
-Tables of a run's report: stages, cost, pours, receivers, questions.
+`run_page` renders the whole report; `reduced_run_page` is used if the campaign or its results can't be read. The tables
+of stages, costs, pours, receivers and questions are functions of their own.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from sim_engine.outcome import normalised_spillage
 
 
 def stage_table(record: Record) -> HtmlTable:
-    """How far each stage has come."""
+    """Progress of each stage."""
     rows = [
         Row(
             [
@@ -44,7 +45,7 @@ def stage_table(record: Record) -> HtmlTable:
 
 
 def cost_table(plan: CampaignPlan, summary: RunSummary, record: Record) -> HtmlTable:
-    """What the run took: pours, grams, minutes."""
+    """Costs of the run: pours, grams, minutes."""
     pours, weighed = record.pours, [p.measured for p in record.weighed if p.measured is not None]
     begun = [pour for pour in pours if pour.came != "not begun"]
     rows: list[tuple[str, str]] = []
@@ -94,14 +95,14 @@ def _pace(plan: CampaignPlan) -> str:
 
 
 def minutes(seconds: float) -> str:
-    """A time in the unit that people would take."""
+    """A duration in a suitable unit."""
     if seconds < 90.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.1f} min" if seconds < 5400.0 else f"{seconds / 3600:.1f} h"
 
 
 def pour_tables(plan: CampaignPlan, record: Record, names: Mapping[str, str]) -> list[HtmlTable]:
-    """Every pour that was asked for, one table for each stage."""
+    """Every requested pour, one table for each stage."""
     stages = dict.fromkeys(pour.stage for pour in record.pours)
     return [_pours(plan, stage, [p for p in record.pours if p.stage == stage], names) for stage in stages]
 
@@ -147,14 +148,14 @@ def _pours(plan: CampaignPlan, stage: str, pours: list[PourMade], names: Mapping
 
 
 def _varied(pours: list[PourMade]) -> list[str]:
-    """Dimensions in which the pours differ; of a single pour the speed and the distance."""
+    """Dimensions in which the pours differ; for a single pour the speed and the distance."""
     values = [pour.request.action.values() for pour in pours]
     varied = [name for name in values[0] if len({one[name] for one in values}) > 1]
     return varied or ["angular_velocity", "x_offset"]
 
 
 def _bare(name: str, value: float | None) -> str:
-    """A value without its unit, which stands in the column's head."""
+    """A value without its unit, which is in the column's head."""
     return style.display_value(name, value).removesuffix(style.display_unit(name)).rstrip()
 
 
@@ -172,7 +173,7 @@ def _remark(pour: PourMade) -> str:
 
 
 def receiver_table(plan: CampaignPlan, summary: RunSummary) -> HtmlTable:
-    """Receivers side by side."""
+    """Comparison of the receivers."""
     rows = []
     if plan.deployment is not None:
         unit = deployment_unit(plan.deployment)
@@ -200,7 +201,7 @@ def receiver_table(plan: CampaignPlan, summary: RunSummary) -> HtmlTable:
 
 
 def question_table(record: Record) -> HtmlTable:
-    """What people were asked, and said."""
+    """Questions to the operator and their answers."""
     rows = [
         Row(
             [
@@ -219,14 +220,14 @@ def question_table(record: Record) -> HtmlTable:
 REPORT_NAME = "report.html"
 
 MODES = {"virtual": "VIRTUAL", "hardware": "REAL", "none": "SIMULATION ONLY"}
-"""What the badge says by the bench's mode."""
+"""Text of the badge by the bench's mode."""
 
 MOST_DECISIONS = 300
 
 _THETA_FIGURES = ("discrepancy", "posterior", "test discrepancy")
 
 _NARROW = ("test discrepancy", "spillage", "posterior")
-"""Figures that may stand side by side."""
+"""Figures that can be placed next to each other."""
 
 _FIGURES: dict[str, tuple[str, str]] = {
     "discrepancy map": (
@@ -267,7 +268,7 @@ _FIGURES: dict[str, tuple[str, str]] = {
         "Whether the first pours bear out the simulator.",
     ),
 }
-"""Alt text and caption of a figure, by how its name begins."""
+"""Alt text and caption of a figure, by the beginning of its name."""
 
 
 def run_page(
@@ -282,12 +283,12 @@ def run_page(
     """The page of a run.
 
     Args:
-        plan: of the campaign.
-        summary: of what its closed stages learnt.
-        record: what its journal says was done.
-        directory: its folder.
-        versions: as `versions.json` has them; empty where that is missing.
-        check: of its journal; a journal that fails is reported at the top of the page.
+        plan: plan of the campaign.
+        summary: summary of its closed stages.
+        record: content of its journal.
+        directory: folder of the run.
+        versions: content of `versions.json`; empty if it is missing.
+        check: check of its journal; a journal that fails is reported at the top of the page.
 
     Returns:
         HTML.
@@ -342,15 +343,15 @@ def reduced_run_page(
     reason: str,
     found: Mapping[str, Any],
 ) -> str:
-    """The page of a run whose campaign or results can't be read, because a plug-in of it is not installed, say.
+    """The page of a run whose campaign or results can't be read, for example because a plug-in is not installed.
 
     Args:
-        name: of its campaign.
-        record: what its journal says was done.
-        directory: its folder.
-        versions: as `versions.json` has them.
-        check: of its journal.
-        reason: why the whole page can't be made.
+        name: name of its campaign.
+        record: content of its journal.
+        directory: folder of the run.
+        versions: content of `versions.json`.
+        check: check of its journal.
+        reason: why the full page can't be made.
         found: its row of the catalogue: mode, seed, θ*, recommended actions.
 
     Returns:
@@ -439,7 +440,7 @@ def _damage(check: JournalCheck) -> list[str]:
 
 
 def _resolved(plan: CampaignPlan) -> str:
-    """The campaign's file with everything filled in; where its runs are kept is nobody's business on a page."""
+    """The campaign's file with all values filled in, without the output paths of the machine."""
     kept = {key: value for key, value in plan.resolved.items() if key != "outputs"}
     return json.dumps(kept, indent=2, ensure_ascii=False) if kept else ""
 

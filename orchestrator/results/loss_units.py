@@ -1,4 +1,4 @@
-"""A loss as people read it: fractions in percent, masses in grams."""
+"""Display units of losses: fractions in percent, masses in grams."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from sim_engine.outcome import Loss, LossName, PourMeasurement, normalised_spill
 
 @dataclass(frozen=True)
 class LossUnit:
-    """How a loss is shown.
+    """Display unit of a loss.
 
     Attributes:
-        label: what an axis says, with the unit.
+        label: axis label, with the unit.
         unit: '%', 'g' or 'particles'.
-        factor: shown value over the loss' own value.
+        factor: displayed value over the loss's own value.
     """
 
     label: str
@@ -27,7 +27,7 @@ class LossUnit:
     factor: float
 
     def text(self, value: float, deviation: float | None = None) -> str:
-        """A value for people, from the loss' own unit: '1.2 %', or as a prediction '1.2 ± 0.9 %'."""
+        """A displayed value, from the loss's own unit: '1.2 %', or as a prediction '1.2 ± 0.9 %'."""
         if deviation is None:
             return f"{self.factor * value:.{self.decimals}f} {self.unit}"
         number = f"{self.factor * at_least_nothing(value):.{self.decimals}f}"
@@ -35,9 +35,9 @@ class LossUnit:
         return f"{number} {self.unit}"
 
     def prediction(self, predicted: Prediction) -> str:
-        """'1.2 ± 0.9 %, a pour ± 0.5 %': how well the mean is known, and how much a single pour differs from it.
+        """'1.2 ± 0.9 %, a pour ± 0.5 %': deviation of the mean, and deviation of a single pour.
 
-        Where its band is known: '1.2 ± 0.9 %, a pour: 0.0 … 3.1 %'.
+        If its prediction interval is known: '1.2 ± 0.9 %, a pour: 0.0 … 3.1 %'.
         """
         expected = self.text(predicted.mean, predicted.deviation)
         if predicted.band is None:
@@ -46,7 +46,7 @@ class LossUnit:
         return f"{expected}, a pour: {low} … {high} {self.unit}"
 
     def scatter(self, deviation: float | None) -> str:
-        """The end of a prediction: ', a pour ± 0.5 %'; empty if nobody knows."""
+        """The end of a prediction: ', a pour ± 0.5 %'; empty if unknown."""
         if deviation is None:
             return ""
         return f", a pour ± {self.factor * deviation:.{self.decimals}f} {self.unit}"
@@ -58,17 +58,18 @@ class LossUnit:
 
     @property
     def decimals(self) -> int:
-        """Places after the point that mean something: 0.01 % or g (20 mg of 200 g), whole particles."""
+        """Significant decimal places: 0.01 % or g (20 mg of 200 g), whole particles."""
         return 0 if self.unit == "particles" else 2
 
 
 def at_least_nothing(predicted: float) -> float:
-    """A predicted loss or discrepancy as it is shown. None is negative; a surrogate, which doesn't know, may say so."""
+    """A predicted loss or discrepancy for display. These are never negative, but a surrogate can predict negative
+    values."""
     return max(predicted, 0.0)
 
 
 def loss_unit(loss: Loss) -> LossUnit:
-    """How to show a deployment loss."""
+    """Display unit of a deployment loss."""
     match loss.name:
         case "spilled_and_retained":
             retained = "retained" if loss.retained_weight == 1.0 else f"{loss.retained_weight:g} × retained"
@@ -82,13 +83,13 @@ def loss_unit(loss: Loss) -> LossUnit:
 
 
 def named_loss_unit(name: str) -> LossUnit:
-    """How to show a loss of which only the name is known; what isn't one is a share."""
+    """Display unit of a loss that is known only by name; other names are shares."""
     names: tuple[str, ...] = get_args(LossName)
     return loss_unit(Loss(cast("LossName", name))) if name in names else SPILLAGE
 
 
 def deployment_unit(plan: DeploymentPlan) -> LossUnit:
-    """How to show what a deployment minimises, a loss or a weighted sum of objectives."""
+    """Display unit of a deployment's loss, or of its weighted sum of objectives."""
     if plan.objectives is None:
         return loss_unit(plan.loss)
     weights = [(part.weight, part.name.replace("_", " ")) for part in plan.objectives.parts]
@@ -96,17 +97,17 @@ def deployment_unit(plan: DeploymentPlan) -> LossUnit:
 
 
 def largest_loss(plan: DeploymentPlan) -> float:
-    """What a deployment's loss can be at most, in its own unit; infinite where that depends on the load."""
+    """Maximum of a deployment's loss, in its own unit; infinite if it depends on the load."""
     if plan.objectives is not None or plan.loss.name in ("grams", "particles"):
         return math.inf
     return max(plan.loss.retained_weight, 1.0) if plan.loss.name == "spilled_and_retained" else 1.0
 
 
 DISCREPANCY = LossUnit("|measured − simulated| spillage [%]", "%", 100.0)
-"""How a discrepancy Δ is shown."""
+"""Display unit of a discrepancy Δ."""
 
 SPILLAGE = LossUnit("spilled / poured [%]", "%", 100.0)
-"""How a calibration pour's spillage r is shown."""
+"""Display unit of a calibration pour's spillage r."""
 
 
 def is_calibration(plan: CampaignPlan, pour: Pour) -> bool:
@@ -116,14 +117,14 @@ def is_calibration(plan: CampaignPlan, pour: Pour) -> bool:
 
 
 def unit_of_pour(plan: CampaignPlan, pour: Pour) -> LossUnit:
-    """How the loss of a pour is shown."""
+    """Display unit of a pour's loss."""
     if plan.deployment is None or is_calibration(plan, pour):
         return SPILLAGE
     return deployment_unit(plan.deployment)
 
 
 def loss_of_pour(plan: CampaignPlan, pour: Pour, measured: PourMeasurement) -> float | None:
-    """Measured loss of a pour in its own unit; None where it is undefined (too little poured)."""
+    """Measured loss of a pour in its own unit; None if it is undefined (too little poured)."""
     if plan.deployment is None or is_calibration(plan, pour):
         return normalised_spillage(measured.fractions)
     if plan.deployment.objectives is not None:

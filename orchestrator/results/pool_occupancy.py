@@ -1,6 +1,7 @@
-"""How busy the pool was beside the arm, and how long the arm waited to be told what to pour next.
+"""Use of the simulator pool during stages that pour, and the arm's waiting times for the next request.
 
-How busy the pool was beside the arm, in words.
+`Occupancy` counts one stage, `occupancies` reads all stages of a journal, `occupancy_lines` formats them for the
+terminal.
 """
 
 from __future__ import annotations
@@ -18,20 +19,20 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 RESTS = "pool_rests"
-"""Number in a decision by which a strategy says that there is nothing worth simulating now."""
+"""Key in a decision's values with which a strategy reports that no simulation is worthwhile now."""
 
 
 @dataclass
 class Occupancy:
     """Counts over one stage in which the arm pours. Times are seconds of any clock.
 
-    The time counts from the first request to the end of the last pour, except while the strategy has said that the pool
-    may rest and nothing has been simulated since.
+    The time counts from the first request to the end of the last pour. It excludes periods in which the strategy has
+    reported that the pool may rest and no simulation has started since.
 
     Attributes:
-        slots: simulations that can run at a time.
-        busy, useful, total: slot seconds: spent on simulations while the pool was useful; of that time; of all time.
-        waits: of the arm, from a pour's outcome to the beginning of the next one.
+        slots: maximum number of simulations at a time.
+        busy, useful, total: slot seconds: used by simulations while the pool was useful; of useful time; of all time.
+        waits: waiting times of the arm, from a pour's outcome to the beginning of the next pour.
     """
 
     slots: int
@@ -52,40 +53,40 @@ class Occupancy:
         self._running, self._resting = self._running + 1, False
 
     def simulation_finished(self, time: float) -> None:
-        """It came back."""
+        """A simulation finished."""
         self._pass(time)
         self._running = max(self._running - 1, 0)
 
     def rests(self, time: float) -> None:
-        """Nothing is worth simulating for the time being."""
+        """No simulation is worthwhile for now."""
         self._pass(time)
         self._resting = True
 
     def pour_started(self, time: float) -> None:
-        """The arm begins."""
+        """A pour began."""
         self._pass(time)
         if self._poured_at is not None:
             self.waits.append(time - self._poured_at)
         self._poured_at = self._last_pour = None
 
     def pour_finished(self, time: float) -> None:
-        """It was weighed."""
+        """A pour was weighed."""
         self._pass(time)
         self._poured_at = time
         self._last_pour = (self.busy, self.useful, self.total)
 
     def interrupted(self) -> None:
-        """The run was paused or killed: nothing runs, and what comes next counts from then on."""
+        """The run was paused or killed: nothing runs, and counting restarts with the next event."""
         self._now, self._running, self._poured_at = None, 0, None
 
     def finish(self) -> None:
-        """The stage is over. What came after its last pour was done for no pour."""
+        """The stage is finished. The time after its last pour is not counted."""
         if self._last_pour is not None:
             self.busy, self.useful, self.total = self._last_pour
 
     @property
     def fraction(self) -> float | None:
-        """Busy share of the useful time; None where nothing was simulated beside pours."""
+        """Busy share of the useful time; None if nothing was simulated during pours."""
         return self.busy / self.useful if self.useful > 0.0 else None
 
     def _pass(self, time: float) -> None:
@@ -98,7 +99,7 @@ class Occupancy:
 
 
 def occupancies(entries: Iterable[Entry], slots: int) -> dict[str, Occupancy]:
-    """The occupancy in every stage of a journal that both simulated and poured, by the stage's name."""
+    """The occupancy in every stage of a journal with both simulations and pours, by the stage's name."""
     simulations: set[int] = set()
     stages: dict[str, Occupancy] = {}
     done: dict[str, set[str]] = {}

@@ -1,8 +1,8 @@
-"""A simulated pour as a picture: four moments from the side, and where the liquid was at every time.
+"""Figures of simulated pours and of vessels, as cross-sections in the plane y = 0.
 
-Vessels cut open: the section of a mesh by its plane y = 0, and poses in that plane.
-
-Pictures of a vessel that was measured: its section, what is uncertain about it, and what was measured.
+- `draw_pour` and `simulation_png`: snapshots of a pour from the side, and the shares of the liquid over time.
+- `section` and `place`: outlines of a mesh in its plane y = 0, and their transformation by a pose.
+- `draw_outline` and `draw_solid`: a measured vessel with its uncertainty and its measurements; a mesh.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 
 class Solid(Protocol):
-    """What is needed of a vessel: its closed surface in its own frame [m]."""
+    """The required part of a vessel: its closed surface in its own frame [m]."""
 
     @property
     def solid_vertices(self) -> Any:
@@ -44,17 +44,18 @@ class Solid(Protocol):
 
 
 def section(vertices: Floats, faces: NDArray[np.integer[Any]]) -> list[Floats]:
-    """Closed outlines where a watertight mesh meets the plane y = 0.
+    """Closed outlines of a watertight mesh in the plane y = 0.
 
     Args:
         vertices: (V, 3) [m].
         faces: (F, 3), consistently oriented.
 
     Returns:
-        One (n, 2) array of (x, z) [m] for each loop, oriented as the faces are, so that holes run the other way round.
+        One (n, 2) array of (x, z) [m] for each loop, oriented as the faces are, so that holes have the opposite
+        orientation.
 
     Raises:
-        ValueError: the mesh is open where it was cut.
+        ValueError: the mesh is open at the cut.
     """
     above = vertices[:, 1] >= 0.0
     count = above[faces].sum(axis=1)
@@ -93,21 +94,21 @@ def place(points: Floats, pose: Floats) -> Floats:
 
     Args:
         points: (n, 2) as (x, z) in the body's frame [m].
-        pose: x y z qw qx qy qz of the body; its turn must be about y.
+        pose: x y z qw qx qy qz of the body; its rotation must be about y.
 
     Returns:
         (n, 2) as (x, z) [m].
     """
     tilt = 2.0 * np.arctan2(pose[5], pose[3])
     c, s = np.cos(tilt), np.sin(tilt)
-    # A positive turn about +y tips z towards +x.
+    # A positive rotation about +y tips z towards +x.
     x = c * points[:, 0] + s * points[:, 1] + pose[0]
     z = -s * points[:, 0] + c * points[:, 1] + pose[2]
     return np.column_stack([x, z])
 
 
 def fill_section(axes: Axes, loops: list[Floats], **look: Any) -> None:
-    """Draw outlines as one filled shape with its holes left open."""
+    """Draw outlines as one filled shape with holes."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Outline
 
@@ -119,12 +120,12 @@ UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
 def simulation_png(path: Path, task: PourTask, result: SimulatedPour) -> Path:
-    """Picture of one simulated pour, for `decant simulate --png`.
+    """Figure of one simulated pour, for `decant simulate --png`.
 
     Args:
         path: PNG to write.
-        task: what was simulated, with `record_rate` > 0.
-        result: what came of it.
+        task: the simulated task, with `record_rate` > 0.
+        result: its result.
 
     Returns:
         `path`.
@@ -167,17 +168,17 @@ def draw_pour(
     receiver_shift: tuple[float, float] = (0.0, 0.0),
     snapshots: int = 4,
 ) -> Path:
-    """Snapshots of a pour seen from the side (vessels cut open at y = 0), above the shares of the liquid over time.
+    """Snapshots of a pour from the side (vessels cut at y = 0), above the shares of the liquid over time.
 
     Args:
         path: PNG to write.
         result: a simulated pour with frames.
         pourer: its surface.
-        receiver: its surface; it stands at x and z = `receiver_shift` [m].
+        receiver: its surface; its position is x and z = `receiver_shift` [m].
         title: first line.
         note: second line.
-        receiver_shift: see above.
-        snapshots: how many moments.
+        receiver_shift: x and z of the receiver [m].
+        snapshots: number of snapshots.
 
     Returns:
         `path`.
@@ -234,8 +235,11 @@ def _shares(states: Any) -> Floats:
 
 
 def _moments(times: Floats, shares: Floats, count: int) -> NDArray[np.intp]:
-    """Frames worth a picture: when shares 1/8 … 7/8 of what will leave had left, and the end; if
-    nothing left, evenly spread."""
+    """Frames for the snapshots.
+
+    They are the frames at which shares 1/8 … 7/8 of the leaving liquid have left, and the end. If no liquid leaves,
+    they are spread evenly.
+    """
     left = 1.0 - shares[:, IN_POURER]
     if left[-1] < 0.01:
         return np.linspace(0, len(times) - 1, count).round().astype(int)
@@ -245,7 +249,7 @@ def _moments(times: Floats, shares: Floats, count: int) -> NDArray[np.intp]:
 
 
 def _window(outlines: list[list[Floats]], poses: Floats, stand: Floats) -> tuple[float, float, float, float]:
-    """x and z range that shows both vessels in all snapshots and some table on either side."""
+    """Range of x and z that shows both vessels in all snapshots and some table on both sides."""
     corners = [place(loop, pose) for pose in poses for loop in outlines[0]]
     corners += [place(loop, stand) for loop in outlines[1]]
     everything = np.concatenate(corners)
@@ -269,7 +273,7 @@ def _snapshot(
     axes.set_aspect("equal")
     axes.axis("off")
     axes.axhline(0.0, color=style.GREY, linewidth=1.0, zorder=0)
-    # Far particles first, so that what is near covers what is far, as an eye at −y would see it.
+    # Distant particles are drawn first, so that near particles cover them, as seen from −y.
     order = np.argsort(-positions[:, 1])
     palette = np.array([colour for _, colour in style.PARTICLE_STATES])
     axes.add_collection(
@@ -318,11 +322,11 @@ def _timeline(axes: Axes, times: Floats, shares: Floats, marks: Floats) -> None:
 
 
 BAND = 2.0
-"""Standard deviations that the band shows to either side."""
+"""Half width of the uncertainty band, in standard deviations."""
 
 
 def draw_outline(name: str, outline: FittedOutline, evidence: Sequence[Evidence], path: Path) -> Path:
-    """The section of a turned vessel with its band, and the radii and levels that were measured."""
+    """The cross-section of a surface of revolution with its uncertainty band, and the measured radii and levels."""
     from sim_engine.vessel_acquisition.measurements import FillTable, Radii
 
     figure, axes = style.new_figure(size=(6.0, 5.0))
@@ -362,7 +366,7 @@ def draw_outline(name: str, outline: FittedOutline, evidence: Sequence[Evidence]
 
 
 def draw_solid(name: str, vessel: Vessel, path: Path) -> Path:
-    """The section of a mesh through its middle."""
+    """The cross-section of a mesh through its middle."""
     figure, axes = style.new_figure(size=(6.0, 5.0))
     for loop in section(vessel.solid_vertices, vessel.solid_faces):
         axes.fill(1e3 * loop[:, 0], 1e3 * (loop[:, 1] - vessel.inner_floor), fc=style.PALE, ec=style.INK, lw=1.6)

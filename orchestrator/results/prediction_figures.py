@@ -1,4 +1,4 @@
-"""Weighed pours beside their predictions, as a table and as a picture."""
+"""Comparison of weighed pours with their predictions, as a CSV table and as a figure."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from orchestrator.results.prediction_scores import ScoredRow, score
 from sim_engine.action import ACTION_DIMENSIONS
 
 NOTE_WIDTH = 44
-"""Characters of a line in the picture's lower right corner, where no pour lies unless it was foretold badly."""
+"""Characters per line in the figure's lower right corner, which contains pours only if predictions are bad."""
 
 COLOURS = {"train": style.PALE, "test": style.MEASURED, "transfer": style.BEST}
 SAID = {"train": "pours that θ was fitted to", "test": "unseen pours", "transfer": "another receiver"}
 
 
 def write_scored(path: Path, rows: Sequence[ScoredRow], dimensions: Sequence[str]) -> Path:
-    """One line a pour: its place in the table that was scored, its action, measured and predicted r, the band's ends.
+    """Write one line per pour: its line in the evaluated table, its action, measured and predicted r, and the interval.
 
     Args:
         path: CSV to write.
         rows: in the order of the table.
-        dimensions: of the action that get a column.
+        dimensions: action dimensions that get a column.
 
     Raises:
         OSError: it can't be written.
@@ -57,13 +57,13 @@ def write_scored(path: Path, rows: Sequence[ScoredRow], dimensions: Sequence[str
 
 
 def draw_scored(path: Path, rows: Sequence[ScoredRow], *, title: str, note: str) -> Path:
-    """Measured against predicted spillage, each with its band; what lies outside its band is ringed.
+    """Measured against predicted spillage, each with its prediction interval; pours outside their interval are ringed.
 
     Args:
         path: PNG to write.
-        rows: in any order; those without r or prediction are left out.
+        rows: in any order; rows without r or prediction are left out.
         title: first line.
-        note: what was predicted with.
+        note: description of the predictor.
 
     Raises:
         OSError: it can't be written.

@@ -1,4 +1,4 @@
-"""Weighed pours beside what the simulator foretells of them: a row each, and how good the foretelling is."""
+"""Comparison of weighed pours with the simulator's predictions: a row per pour, and scores per split."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ class ScoredRow:
     """A weighed pour and its prediction.
 
     Attributes:
-        line: of the table that it stands in.
+        line: line in the table of pours.
         split: 'train', 'test' or 'transfer'.
-        action: that was poured.
-        measured: r = spilled / poured as weighed; None where too little was poured for it.
-        predicted: r over the simulations; None where none of them could be used, or poured enough.
-        band: in which a single pour lies.
+        action: the action of the pour.
+        measured: r = spilled / poured as weighed; None if too little was poured.
+        predicted: r over the simulations; None if none of them could be used, or poured enough.
+        band: prediction interval of a single pour.
         lost: simulations that could not be used.
     """
 
@@ -42,19 +42,20 @@ class ScoredRow:
 
     @property
     def held(self) -> bool | None:
-        """Whether the band holds the pour; None where one of them is unknown."""
+        """Whether the interval contains the pour; None if one of them is unknown."""
         return None if self.measured is None or self.band is None else self.band.holds(self.measured)
 
 
 @dataclass(frozen=True)
 class Score:
-    """How well some pours were foretold.
+    """Quality of the predictions of some pours.
 
     Attributes:
-        pours: that have both r and a prediction.
+        pours: pours that have both r and a prediction.
         error: mean |Δ|; None without pours.
-        correlation: Spearman's, of measured with predicted r; None for fewer than three pours or where all are alike.
-        held: pours inside their band.
+        correlation: Spearman's, of measured and predicted r; None for fewer than three pours, or if all values are
+            equal.
+        held: pours inside their interval.
     """
 
     pours: int
@@ -64,7 +65,7 @@ class Score:
 
     @property
     def share_held(self) -> float | None:
-        """The share of the pours that lie inside their band."""
+        """The share of the pours inside their interval."""
         return self.held / self.pours if self.pours else None
 
     def as_json(self) -> dict[str, Any]:
@@ -87,7 +88,7 @@ class Score:
 
 
 def score(rows: Iterable[ScoredRow]) -> Score:
-    """Mean |Δ|, rank correlation, and how many bands held."""
+    """Mean |Δ|, rank correlation, and the number of pours inside their intervals."""
     known = [row for row in rows if row.difference is not None]
     differences = [abs(row.difference or 0.0) for row in known]
     measured = [row.measured or 0.0 for row in known]
@@ -101,14 +102,14 @@ def score(rows: Iterable[ScoredRow]) -> Score:
 
 
 def scores(rows: Sequence[ScoredRow]) -> dict[str, Score]:
-    """By split, and of 'all' where there is more than one."""
+    """Scores by split, and for 'all' if there is more than one split."""
     splits = list(dict.fromkeys(row.split for row in rows))
     found = {split: score(row for row in rows if row.split == split) for split in splits}
     return {**found, "all": score(rows)} if len(splits) > 1 else found
 
 
 def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float | None:
-    """Spearman's ρ; None for fewer than three pairs, or where one side has only equal values."""
+    """Spearman's ρ; None for fewer than three pairs, or if one side has only equal values."""
     if len(first) < 3 or len(set(first)) < 2 or len(set(second)) < 2:
         return None
     a, b = _ranks(first), _ranks(second)
@@ -119,7 +120,7 @@ def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float |
 
 
 def _ranks(values: Sequence[float]) -> list[float]:
-    """From 0; equal values share the mean of theirs."""
+    """Ranks from 0; equal values share their mean rank."""
     ordered = sorted(values)
     places: dict[float, list[int]] = {}
     for place, value in enumerate(ordered):

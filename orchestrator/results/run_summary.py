@@ -1,4 +1,8 @@
-"""What a run came to, for programs: `summary.json`. `summarise.py` makes it, `table.py` the table for people."""
+"""The summary of a run for programs: `summary.json` and its JSON schema.
+
+`RunSummary` is the content of the file. `orchestrator.results.summarise` creates it, and
+`orchestrator.results.console_view` displays it.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +33,13 @@ SUMMARY_NAME = "summary.json"
 
 
 class PoolUse(ResultPart):
-    """How busy the pool was beside the arm."""
+    """Use of the simulator pool in a stage with pours."""
 
     pool_busy: float | None
     """Busy share of the pool while it had useful work."""
 
     pool_useful: float | None
-    """Share of the time in which it had."""
+    """Share of the time in which the pool had useful work."""
 
     arm_longest_wait_s: float | None
     """Longest wait of the arm for a decision between two pours."""
@@ -45,16 +49,16 @@ class PoolUse(ResultPart):
 
 
 class Totals(ResultPart):
-    """How much a run took."""
+    """Costs of a run."""
 
     mode: str = "none"
     """Mode of the bench: 'virtual', 'hardware', or 'none' without one."""
 
     simulations: int = 0
-    """Finished ones, failed ones included."""
+    """Number of finished simulations, including failed ones."""
 
     pours: int = 0
-    """Finished ones, failed ones included."""
+    """Number of finished pours, including failed ones."""
 
     cpu_s: float = 0.0
     """CPU seconds of all simulations and suggestions."""
@@ -63,43 +67,43 @@ class Totals(ResultPart):
     """Wall time of the process that ended the run."""
 
     occupancy: dict[str, PoolUse] = Field(default_factory=dict)
-    """By stage, where both simulations and pours were made."""
+    """By stage, for stages with both simulations and pours."""
 
 
 class NotSimulated(ResultPart):
-    """Something that is not simulated in part of an action space."""
+    """An effect that is not simulated in part of an action space."""
 
     kind: str
     """'dribbling', 'wetting', 'viscous', 'thin_stream', 'glugging' or 'airtight'."""
 
     share: float
-    """Share of what is poured that leaves under such conditions, at the worst of the actions tried."""
+    """Share of the poured liquid that leaves under such conditions, for the worst of the actions tried."""
 
     text: str
-    """What it is and what to do about it, for people."""
+    """Description and advice."""
 
     action_si: dict[str, float]
-    """That action."""
+    """The worst action."""
 
     hit: int
-    """Actions that it holds for, of those tried."""
+    """Number of tried actions that are affected."""
 
     tried: int
 
 
 class ReceiverSummary(ResultPart):
-    """What a deployment came to in one scene. Losses are in the loss' own unit, r = spilled / poured."""
+    """Result of a deployment in one scene. Losses are in the loss's own unit, r = spilled / poured."""
 
     receiver: str
-    """What people call the scene."""
+    """Display name of the scene."""
 
     strategy: str
     pours: int
-    """Those that were weighed."""
+    """Number of weighed pours."""
 
     failed_pours: int
     failures: tuple[str, ...]
-    """Why these failed, in the order made: 'pour 2: the gripper slipped'."""
+    """Reasons of the failures, in order: 'pour 2: the gripper slipped'."""
 
     refused_pours: int
     simulations: int
@@ -108,23 +112,23 @@ class ReceiverSummary(ResultPart):
     best_loss: float | None
     best_spillage: float | None
     best_pour: int | None
-    """Number of the pour with the least loss."""
+    """Number of the pour with the smallest loss."""
 
     best_delivered_g: float | None
-    """That was in the receiver after it."""
+    """Mass in the receiver after this pour."""
 
     best_delivered_ml: float | None
-    """The same by the liquid's density."""
+    """Volume in the receiver, from the liquid's density."""
 
     best_measured_action: dict[str, float | None] | None
-    """Its action in display units."""
+    """Action of this pour in display units."""
 
     best_action: dict[str, float | None] | None
     """The recommended action in display units."""
 
     best_action_si: dict[str, float] | None
     predicted_loss: float | None
-    """Expected of the recommended action."""
+    """Expected loss of the recommended action."""
 
     predicted_deviation: float | None
     predicted_scatter: float | None
@@ -138,40 +142,41 @@ class ReceiverSummary(ResultPart):
     risk: RiskFound | None
     window: WindowFound | None
     prediction: dict[str, SampleStatistics] | None
-    """What fresh seeds of the recommended action came to, by quantity."""
+    """Result of repeated simulations of the recommended action with new seeds, by quantity."""
 
     prediction_band: PredictionInterval | None
-    """In which r of a single pour with it lies: of seeds, θ, what calibration left over, and resolution."""
+    """Prediction interval of r for a single pour with it: includes seeds, θ, the residual of calibration, and
+    resolution."""
 
     at_bounds: tuple[str, ...]
-    """Dimensions of the recommended action that lie at an end of what was searched, in words."""
+    """Dimensions of the recommended action at an end of their ranges, as text."""
 
     predicted_delivered_g: float | None
-    """Mean over these seeds of what is in the receiver."""
+    """Mean mass in the receiver over these simulations."""
 
     predicted_delivered_ml: float | None
-    """The same by the liquid's density."""
+    """Mean volume in the receiver, from the liquid's density."""
 
     confirmed: Confirmed | None
-    """What came of pouring the recommended action again; null where nobody asked for that."""
+    """Result of repeated pours of the recommended action; null if not requested."""
 
     not_covered: tuple[NotCovered, ...]
-    """What is not simulated of the recommended action."""
+    """Effects that are not simulated for the recommended action."""
 
 
 class RunSummary(Totals):
-    """A run; whatever it hasn't got is null or empty."""
+    """Summary of a run; missing parts are null or empty."""
 
     campaign: str
     seed: int
     theta: SimulationParameters | None
-    """θ to simulate with from now on: θ*, or the uncalibrated θ if the weighed pours do not justify θ*."""
+    """θ to simulate with: θ*, or the uncalibrated θ if the weighed pours do not justify θ*."""
 
     calibrated_theta: SimulationParameters | None
     """θ*."""
 
     calibration_gain: CalibrationGain | None
-    """Whether the weighed pours justify θ*; null where θ* was not compared with the uncalibrated θ."""
+    """Whether the weighed pours justify θ*; null if θ* was not compared with the uncalibrated θ."""
 
     predicted_discrepancy: float | None
     """Expected mean |r − c_s| of θ*."""
@@ -179,36 +184,36 @@ class RunSummary(Totals):
     predicted_deviation: float | None
     posterior: PosteriorSummary | None
     discrepancy: dict[str, dict[str, float | None]]
-    """Mean |r − c_s| by split and predictor, as fractions of what was poured."""
+    """Mean |r − c_s| by split and predictor, as fractions of the poured liquid."""
 
     loss: str | None
-    """Name of what deployments minimise."""
+    """Name of the loss that deployments minimise."""
 
     receivers: dict[str, ReceiverSummary]
     """By scene."""
 
     not_covered: dict[str, tuple[NotSimulated, ...]]
-    """What is not simulated in the action spaces, by scene."""
+    """Effects that are not simulated in the action spaces, by scene."""
 
     figures: dict[str, Path]
     recording: Path | None
     dropped_events: int
-    """Those that are missing in the recording."""
+    """Number of events missing in the recording."""
 
     results: dict[str, SerializeAsAny[StageResult]]
-    """What each stage learnt, in order."""
+    """Results of the stages, in order."""
 
 
 class _NoTitles(GenerateJsonSchema):
-    """JSON schema without titles: they only repeat the keys."""
+    """JSON schema without titles, which only repeat the keys."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:
-        """They are not."""
+        """Always false."""
         return False
 
 
 def summary_schema() -> dict[str, Any]:
-    """JSON schema of `summary.json`, with all kinds of results that installed packages have."""
+    """JSON schema of `summary.json`, with all kinds of results of the installed packages."""
     tagged: Any = Annotated[reduce(or_, cast("Any", kinds())), Field(discriminator="kind")]
     documented = create_model("RunSummary", __base__=RunSummary, __doc__=RunSummary.__doc__, results=dict[str, tagged])
     schema = documented.model_json_schema(mode="serialization", schema_generator=_NoTitles)
@@ -216,11 +221,11 @@ def summary_schema() -> dict[str, Any]:
 
 
 _NUMBERS = re.compile(r"\[\s+(-?\d[^\[\]{}\"]*?)\s+\]")
-"""A list of numbers that was written one to a line."""
+"""A list of numbers, written one per line."""
 
 
 def write_summary(directory: Path, summary: RunSummary) -> Path:
-    """Write `summary.json`, whole or not at all.
+    """Write `summary.json`, completely or not at all.
 
     Raises:
         OSError: the file can't be written.
@@ -235,5 +240,5 @@ def write_summary(directory: Path, summary: RunSummary) -> Path:
 
 
 def summary_json(summary: RunSummary) -> dict[str, Any]:
-    """What a command prints of a summary: all but the stages' results, which are in its file."""
+    """JSON of a summary for commands: without the stages' results, which are in its file."""
     return summary.model_dump(mode="json", exclude={"results"})

@@ -1,4 +1,7 @@
-"""The solver's physical cases for people: a table in the terminal, figures, and the page docs/validation.md."""
+"""Report of the solver's physical validation cases: a table in the terminal, figures, and the page docs/validation.md.
+
+The cases themselves are in `sim_engine.validation`.
+"""
 
 from __future__ import annotations
 
@@ -22,24 +25,24 @@ if TYPE_CHECKING:
 PAGE_NAME, DATA_NAME, IMAGES = "validation.md", "validation.json", "images"
 
 SHOWN_UNITS = {"1": (1.0, ""), "m": (1e3, "mm"), "m³": (1e6, "mL")}
-"""Factor and name of what people see of an SI unit; others are shown as they are."""
+"""Factor and name of the display unit of an SI unit; other units are displayed unchanged."""
 
 PANELS_ABREAST = 3
-"""More panels than these go into further rows."""
+"""Maximum number of panels per row."""
 
 CHARACTER = 0.075
 """Width of a character in a legend [inch]."""
 
 FEW = 20
-"""Points of a reference from which it is a line."""
+"""Number of points from which a reference is drawn as a line."""
 
 MOST_PLACES = 5
-"""Points of a logarithmic axis that each get their number; of more, round numbers do."""
+"""Maximum number of labelled points of a logarithmic axis; with more points, round numbers are labelled."""
 
 AGAIN = "decant physics --full --write docs"
 
 REFERENCES = (("--", "o"), (":", "s"), ("-.", "^"), ((0, (6, 2)), "D"))
-"""Line style, or marker where there are few points, of several references in a panel."""
+"""Line style, or marker for few points, of several references in a panel."""
 
 COLOURS = (style.MEASURED, style.PREDICTED, style.GOOD, style.BEST, style.FALLING, style.ESCAPED)
 
@@ -62,7 +65,7 @@ N is the number of particles.
 
 
 def shown(value: float | None, unit: str) -> str:
-    """A quantity as people read it, from its SI value: '39.8 mm', '0.92'; '—' for None."""
+    """A quantity in its display unit, from its SI value: '39.8 mm', '0.92'; '—' for None."""
     if value is None:
         return "—"
     factor, name = SHOWN_UNITS.get(unit, (1.0, unit))
@@ -71,14 +74,14 @@ def shown(value: float | None, unit: str) -> str:
 
 
 def verdict(row: Mapping[str, Any]) -> str:
-    """'pass', 'FAIL', or '' for what is only reported."""
+    """'pass', 'FAIL', or '' if the row is not judged."""
     if not row["judged"]:
         return ""
     return "pass" if row["passed"] else "FAIL"
 
 
 def results_table(rows: Sequence[tuple[str, Mapping[str, Any]]]) -> Table:
-    """The terminal's table.
+    """The table for the terminal.
 
     Args:
         rows: case title and `Measurement.as_json` of every measurement, case by case.
@@ -111,22 +114,22 @@ def draw(figure: Figure, path: Path) -> Path:
 
     Args:
         figure: its curves.
-        path: of the PNG; its folder is made if needed.
+        path: path of the PNG; its folder is made if needed.
     """
     panels = len(figure.titles)
     columns = min(panels, PANELS_ABREAST)
     rows = -(-panels // columns)
     wide, high = (6.2, 3.9) if panels == 1 else (3.4, 2.7)
     canvas, axes = style.new_figure(rows, columns, size=(wide * columns, 0.5 + high * rows), squeeze=False)
-    looks = _looks(figure)
+    styles = _curve_styles(figure)
     for number, place in enumerate(axes.flat):
         if number < panels:
-            _panel(place, figure, number, looks)
+            _panel(place, figure, number, styles)
         else:
             place.set_visible(False)
-    # Below the panels: inside it would lie on curves, wherever it stood.
+    # Below the panels, because inside it would cover curves.
     handles = {n: h for place in axes.flat for h, n in zip(*place.get_legend_handles_labels(), strict=True)}
-    names = [name for name in looks if name in handles]
+    names = [name for name in styles if name in handles]
     room = wide * columns / (0.55 + CHARACTER * max(map(len, names), default=1))
     canvas.legend(
         [handles[name] for name in names], names, loc="outside lower center", ncols=max(1, min(int(room), len(names))),
@@ -137,10 +140,10 @@ def draw(figure: Figure, path: Path) -> Path:
 
 @dataclass(frozen=True)
 class CaseFigureStyle:
-    """How the curves of one name are drawn, in all panels alike.
+    """Style of the curves with one name, the same in all panels.
 
     Attributes:
-        colour, line, marker: of them; '' for none. No two names of a figure share all three.
+        colour, line, marker: '' for none. No two names of a figure share all three.
     """
 
     colour: str
@@ -148,24 +151,24 @@ class CaseFigureStyle:
     marker: str = ""
 
 
-def _looks(figure: Figure) -> dict[str, CaseFigureStyle]:
-    """Measured curves differ in colour, references have the colour of their subject and differ in line or marker."""
+def _curve_styles(figure: Figure) -> dict[str, CaseFigureStyle]:
+    """Styles by name. Measured curves differ in colour; references have their subject's colour and another style."""
     measured = list(dict.fromkeys(s.name for s in figure.series if s.kind == "measured"))
-    looks = {name: CaseFigureStyle(colour) for name, colour in zip(measured, COLOURS * 4, strict=False)}
-    of_subject = {_subject(name): looks[name].colour for name in reversed(measured)}
-    styles = iter(REFERENCES * 4)
+    styles = {name: CaseFigureStyle(colour) for name, colour in zip(measured, COLOURS * 4, strict=False)}
+    of_subject = {_subject(name): styles[name].colour for name in reversed(measured)}
+    references = iter(REFERENCES * 4)
     for series in figure.series:
-        if series.name not in looks:
-            line, marker = next(styles)
+        if series.name not in styles:
+            line, marker = next(references)
             few = 2 < len(series.x) < FEW
             colour = of_subject.get(_subject(series.name), style.INK)
-            looks[series.name] = CaseFigureStyle(colour, "", marker) if few else CaseFigureStyle(colour, line)
-    return looks
+            styles[series.name] = CaseFigureStyle(colour, "", marker) if few else CaseFigureStyle(colour, line)
+    return styles
 
 
-def _panel(axes: Axes, figure: Figure, number: int, looks: Mapping[str, CaseFigureStyle]) -> None:
+def _panel(axes: Axes, figure: Figure, number: int, styles: Mapping[str, CaseFigureStyle]) -> None:
     for series in (s for s in figure.series if s.panel == number):
-        look = looks[series.name]
+        look = styles[series.name]
         above = 3 if series.kind == "reference" else 2
         axes.plot(
             series.x, series.y, color=look.colour, ls=look.line or "none", marker=look.marker or None, ms=5,
@@ -185,12 +188,12 @@ def _panel(axes: Axes, figure: Figure, number: int, looks: Mapping[str, CaseFigu
 
 
 def _subject(name: str) -> str:
-    """What a curve and its reference have in common: 'cone' of 'cone, 2,000 particles' and of 'cone, at rest'."""
+    """The common name of a curve and its reference: 'cone' of 'cone, 2,000 particles' and of 'cone, at rest'."""
     return name.split(", ", maxsplit=1)[0]
 
 
 def figure_of(record: Mapping[str, Any]) -> Figure | None:
-    """The figure whose curves a record keeps, so that it can be drawn again without measuring."""
+    """The figure from the curves in a record, to draw it again without measuring."""
     from sim_engine.validation.case_result import Figure, Series
 
     kept = record.get("figure")
@@ -219,7 +222,7 @@ def _curves(figure: Figure) -> dict[str, Any]:
 
 
 def case_record(case: Case, result: CaseResult, image: Path | None, fingerprint: str) -> dict[str, Any]:
-    """What is kept of a case between runs, JSON-ready; the image by its file name, the solver by its fingerprint."""
+    """The stored record of a case, JSON-ready; the image by its file name, the solver by its fingerprint."""
     return {
         "solver": fingerprint,
         "title": case.title,
@@ -240,14 +243,14 @@ def kept_records(folder: Path) -> dict[str, dict[str, Any]]:
 def write_page(
     folder: Path, records: Mapping[str, Mapping[str, Any]], order: Sequence[str], *, fingerprint: str, theta: str
 ) -> Path:
-    """Write the page and the data that it was made from.
+    """Write the page and its data.
 
     Args:
-        folder: of the page.
+        folder: folder of the page.
         records: `case_record`s by case.
-        order: of the cases on the page.
-        fingerprint: of the solver as it is now; cases that another one measured are marked.
-        theta: of the cases, as people read it.
+        order: order of the cases on the page.
+        fingerprint: fingerprint of the current solver; cases measured with another one are marked.
+        theta: θ of the cases, as text.
 
     Raises:
         OSError: it can't be written.
@@ -255,7 +258,7 @@ def write_page(
     sorted_records = {name: records[name] for name in order if name in records}
     data = {"solver": fingerprint, "theta": theta, "cases": sorted_records}
     text = json.dumps(data, indent=1, ensure_ascii=False)
-    # Curves in a line each: a number a line would be tens of thousands.
+    # One line per curve; one line per number would be tens of thousands of lines.
     text = re.sub(r"\[\s+([-+\d.eE,\s]+?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
     (folder / DATA_NAME).write_text(text + "\n", encoding="utf-8")
     page = folder / PAGE_NAME
@@ -264,7 +267,7 @@ def write_page(
 
 
 def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint: str) -> str:
-    """The page of some records, in their order, see `write_page`."""
+    """The page of some records, in their order; see `write_page`."""
     rows = [m for record in records.values() for m in record["measurements"]]
     judged = [m for m in rows if m["judged"]]
     failed = sum(not m["passed"] for m in judged)

@@ -1,4 +1,4 @@
-"""Figures of a campaign: spillage against pours, and how far the calibrated simulator is from the scale."""
+"""Figures of spillage against pours, and of the discrepancy between the calibrated simulator and weighed pours."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 TOP = 1.08
-"""Upper end of the axis, over the largest value in view."""
+"""Upper end of the axis, over the largest displayed value."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,10 @@ class PourSeries:
     """Pours into one receiver, in the order they were made.
 
     Attributes:
-        receiver: name for people.
-        losses: measured loss of each pour in the axis' unit; None where a pour failed.
-        predicted: (mean, low, high): what was expected of each pour, and the band that it should lie in with a
-            probability of `sim_engine.prediction_band.LEVEL`; None where nothing was.
+        receiver: display name.
+        losses: measured loss of each pour in the axis's unit; None if a pour failed.
+        predicted: (mean, low, high): expected loss of each pour, and its prediction interval with a probability of
+            `sim_engine.prediction_band.LEVEL`; None without prediction.
     """
 
     receiver: str
@@ -36,7 +36,7 @@ class PourSeries:
     predicted: Sequence[tuple[float, float, float] | None]
 
     def best_so_far(self) -> list[float | None]:
-        """Smallest loss up to each pour; None before the first that worked."""
+        """Smallest loss up to each pour; None before the first successful one."""
         best: float | None = None
         running: list[float | None] = []
         for loss in self.losses:
@@ -47,13 +47,13 @@ class PourSeries:
 
 
 def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title: str) -> Path:
-    """Loss against pours, one panel for each receiver: measured, best so far, and where it was to lie.
+    """Loss against pours, one panel for each receiver: measured, best so far, and prediction interval.
 
     Args:
         path: PNG to write.
         series: one per receiver.
         cost: label of the loss with its unit.
-        title: of the whole figure.
+        title: title of the whole figure.
 
     Returns:
         `path`.
@@ -83,7 +83,7 @@ def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title:
 
 
 def _pour_title(series: PourSeries, cost: str) -> str:
-    """Receiver, and the best pour: the number that the reader came for, with the unit of the cost's label."""
+    """Receiver and loss of the best pour, with the unit of the cost's label."""
     worked = [(loss, number) for number, loss in enumerate(series.losses, start=1) if loss is not None]
     if not worked:
         return f"{series.receiver}: every pour failed"
@@ -93,7 +93,7 @@ def _pour_title(series: PourSeries, cost: str) -> str:
 
 
 def _pour_panel(axes: Axes, series: PourSeries) -> float:
-    """Draw one receiver; returns the largest value that must stay in view."""
+    """Draw one receiver; returns the largest value that must be visible."""
     from matplotlib.ticker import MaxNLocator
 
     numbers = np.arange(1, len(series.losses) + 1)
@@ -104,7 +104,7 @@ def _pour_panel(axes: Axes, series: PourSeries) -> float:
     high = np.array([np.nan if p is None else p[2] for p in series.predicted], dtype=float)
     top = float(np.nanmax(measured)) if np.isfinite(measured).any() else 1.0
     if np.isfinite(mean).any():
-        # Bars, not a ribbon: every pour is another action, there is nothing between two of them.
+        # Bars, not a ribbon: every pour has another action, so there is nothing between two of them.
         axes.errorbar(
             numbers,
             mean,
@@ -118,7 +118,7 @@ def _pour_panel(axes: Axes, series: PourSeries) -> float:
             label=f"predicted: mean, {100 * LEVEL:.0f} % band",
             zorder=2,
         )
-        # A first, clueless prediction must not squeeze what was measured into the lowest tenth.
+        # A first, uncertain prediction must not compress the measured values into the lowest tenth.
         top = max(top, min(float(np.nanmax(high)), 2.0 * top))
         for number, end in zip(numbers, high, strict=True):
             if end > TOP * top:
@@ -156,13 +156,13 @@ class DiscrepancyGroup:
 
     Attributes:
         name: 'training pours', 'test pours', 'another receiver'.
-        pours: how many.
+        pours: number of pours.
         calibrated: of the calibrated simulator θ*.
         posterior: of the mean of its simulations over draws of θ's posterior; None if there is none.
-        uncalibrated: of the simulator as it is without calibration; None if not scored.
-        random: of the simulator with θ drawn at random, one number each; empty if not scored.
-        mean_predictor: of 'what the training pours spilled on average'; None if not scored.
-        regression: of a GP regression without simulator; None where it can't answer (another vessel).
+        uncalibrated: of the simulator without calibration; None if not evaluated.
+        random: of the simulator with random θ, one number each; empty if not evaluated.
+        mean_predictor: of the mean spillage of the training pours; None if not evaluated.
+        regression: of a GP regression without simulator; None if it can't predict (another vessel).
     """
 
     name: str
@@ -176,13 +176,14 @@ class DiscrepancyGroup:
 
 
 def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: str) -> Path:
-    """Mean |Δ| of θ* and its posterior beside their rivals: uncalibrated, random θ (median, quartiles), mean of
-    training pours, regression.
+    """Mean |Δ| of θ* and its posterior compared with rivals.
+
+    The rivals are the uncalibrated θ, random θ (median, quartiles), the mean of the training pours, and the regression.
 
     Args:
         path: PNG to write.
         groups: sets of pours; values are fractions (0 … 1), shown in percent.
-        title: of the figure.
+        title: title of the figure.
 
     Returns:
         `path`.
@@ -234,7 +235,7 @@ def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: s
                 color=style.INK,
                 fontweight="bold" if slot == 0 else "normal",
             )
-        left += (len(bars) + 1.5) * width  # a set of pours takes the room of those who had something to say
+        left += (len(bars) + 1.5) * width  # a set of pours is as wide as the number of its predictors
     style.dress(axes, title=title, y="mean |measured − predicted| spillage [%]")
     axes.set_ylim(0.0, 1.12 * top or 1.0)
     axes.set_xlim(-1.5 * width, left - width)

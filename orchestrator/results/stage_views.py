@@ -1,8 +1,7 @@
-"""From what the stages learnt to what figures and tables need.
+"""Views of stage results for figures and tables.
 
-A stage is known by the kind of its result, not by its name, so that a run of any composition can be reported.
-
-What people call a scene: by its receiver. The scene's own name is a key, for the journal and for programs.
+Stages are found by the kind of their result, not by their name, so that any composition of stages can be reported.
+Scenes are displayed by the names of their receivers; a scene's own name is the key in the journal and for programs.
 """
 
 from __future__ import annotations
@@ -32,7 +31,8 @@ from sim_engine.liquids import SimulationParameters
 
 
 def receiver_names(plan: CampaignPlan) -> dict[str, str]:
-    """Scene name → the receiver's name; of two deployment scenes with receivers of one name, the scenes' own names."""
+    """Scene name → the receiver's name; the scenes' own names if two deployment scenes have receivers with the same
+    name."""
     names: dict[str, str] = {}
     if plan.deployment is not None:
         scenes = plan.deployment.scenes
@@ -48,7 +48,7 @@ def receiver_names(plan: CampaignPlan) -> dict[str, str]:
 
 
 def receiver_name(plan: CampaignPlan, scene: str) -> str:
-    """What people call a scene; its own name if the plan doesn't know it."""
+    """Display name of a scene; its own name if the plan does not contain it."""
     return receiver_names(plan).get(scene, scene)
 
 
@@ -64,7 +64,7 @@ def all_of(results: Results, kind: type[L]) -> list[L]:
 
 
 def calibration_of(results: Results) -> Calibrated | None:
-    """What the calibration learnt, if it found a θ*."""
+    """The calibration's result, if it found a θ*."""
     return next((found for found in all_of(results, Calibrated) if found.found is not None), None)
 
 
@@ -80,7 +80,7 @@ def evaluation_of(results: Results) -> Scores | None:
 
 
 def gain_of(results: Results) -> CalibrationGain | None:
-    """Whether the weighed pours justify θ*; None where that was not compared."""
+    """Whether the weighed pours justify θ*; None if that was not compared."""
     evaluation = evaluation_of(results)
     return None if evaluation is None else evaluation.gain
 
@@ -92,28 +92,28 @@ def recommended_theta_of(results: Results) -> SimulationParameters | None:
 
 
 def deployments_of(results: Results) -> dict[str, Deployed]:
-    """What the deployments learnt, by scene."""
+    """Results of the deployments, by scene."""
     return {result.scene: result for result in all_of(results, Deployed)}
 
 
 def confirmations_of(results: Results) -> dict[str, Confirmed]:
-    """What came of pouring the recommended actions again, by scene."""
+    """Results of the repeated pours of the recommended actions, by scene."""
     return {result.scene: result for result in all_of(results, Confirmed)}
 
 
 def predictions_of(results: Results) -> dict[str, Foreseen]:
-    """What fresh seeds of the recommended actions came to, by scene."""
+    """Results of the repeated simulations of the recommended actions, by scene."""
     return {result.scene: result for result in all_of(results, Foreseen)}
 
 
 def calibrated_label(evaluation: Scores) -> str | None:
-    """Under which label an evaluation scored θ*: the one that is not a rival's."""
+    """The label of θ* in an evaluation: the one that is not a rival's."""
     rivals = ("random ", "posterior ", UNCALIBRATED)
     return next((label for label in evaluation.discrepancy if not label.startswith(rivals)), None)
 
 
 def rival_scores(evaluation: Scores) -> dict[str, dict[str, float | None]]:
-    """What θ* is held against, by name and split: see `CalibrationEvaluation`."""
+    """Scores of the rivals of θ*, by name and split: see `CalibrationEvaluation`."""
     return {
         "posterior": evaluation.posterior_mean,
         "uncalibrated": evaluation.discrepancy.get(UNCALIBRATED, {}),
@@ -150,7 +150,7 @@ def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:
 
 
 def calibration_picture(plan: CampaignPlan, result: Calibrated) -> SurrogatePicture | None:
-    """The discrepancy over θ; None where the plan calibrates nothing or no trial told anything."""
+    """The discrepancy over θ; None if the plan calibrates nothing or no trial has a discrepancy."""
     if plan.calibration is None:
         return None
     known = [(trial.theta, trial.discrepancy) for trial in result.trials if trial.discrepancy is not None]
@@ -170,7 +170,7 @@ def calibration_picture(plan: CampaignPlan, result: Calibrated) -> SurrogatePict
 
 
 def deployment_picture(plan: CampaignPlan, result: Deployed) -> SurrogatePicture | None:
-    """The loss over actions with the pours numbered; None before anything was learnt."""
+    """The loss over actions with numbered pours; None before the first data."""
     if plan.deployment is None:
         return None
     unit = deployment_unit(plan.deployment)
@@ -205,7 +205,7 @@ def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[Po
         predictions = [
             None
             if pour.predicted is None
-            else _told(
+            else _prediction_interval(
                 Prediction(
                     pour.predicted, pour.predicted_deviation or 0.0, pour.predicted_scatter, pour.predicted_band
                 ),
@@ -217,13 +217,13 @@ def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[Po
     return series
 
 
-def _told(predicted: Prediction, unit: LossUnit) -> tuple[float, float, float]:
+def _prediction_interval(predicted: Prediction, unit: LossUnit) -> tuple[float, float, float]:
     low, high = predicted.of_a_pour()
     return unit.factor * at_least_nothing(predicted.mean), unit.factor * low, unit.factor * high
 
 
 def _surrogate(shown: DisplayedMap | None, unit: LossUnit) -> dict[str, Any]:
-    """The map of a picture: which axes it is over, and where the others were held."""
+    """The map of a figure: its axes, and the values of the other axes."""
     if shown is None:
         return {}
     return {

@@ -1,4 +1,4 @@
-"""A run's summary, made of its plan and of what its stages learnt."""
+"""Creates the summary of a run from its plan and the results of its stages."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ def summarise(
     """The summary of a run.
 
     Args:
-        plan: of the campaign.
-        results: what the stages learnt.
+        plan: plan of the campaign.
+        results: results of the stages.
         figures: name → file.
-        recording: the `.rrd`.
-        dropped_events: that are missing in it.
-        not_covered: what is not simulated in the action spaces, by scene.
-        best_not_covered: and of the recommended actions.
-        totals: how much the run took.
+        recording: path of the `.rrd`.
+        dropped_events: number of events missing in the recording.
+        not_covered: effects that are not simulated in the action spaces, by scene.
+        best_not_covered: the same for the recommended actions.
+        totals: costs of the run.
     """
     found = theta_of(results)
     names, predictions, confirmations = receiver_names(plan), predictions_of(results), confirmations_of(results)
@@ -116,14 +116,14 @@ _NOTHING: dict[str, None] = dict.fromkeys(Recommended.model_fields)
 def _receiver(
     name: str,
     result: Deployed,
-    foreseen: Foreseen | None,
+    predicted: Foreseen | None,
     not_covered: Sequence[NotCovered],
     liquid: Liquid | None,
     confirmed: Confirmed | None,
     axes: tuple[Axis, ...],
 ) -> ReceiverSummary:
     pours, best = result.weighed, result.best
-    prediction = None if foreseen is None else foreseen.over_seeds
+    prediction = None if predicted is None else predicted.over_seeds
     received = None if prediction is None else prediction.get("received")
     delivered = None if received is None or liquid is None else received.mean * liquid.mass
     recommended: Mapping[str, Any] = _NOTHING if result.recommended is None else dict(result.recommended)
@@ -158,7 +158,7 @@ def _receiver(
         risk=result.risk,
         window=result.window,
         prediction=prediction,
-        prediction_band=None if foreseen is None else foreseen.band,
+        prediction_band=None if predicted is None else predicted.band,
         at_bounds=tuple(style.at_ends(dict(recommended["action_si"] or {}), axes)),
         predicted_delivered_g=None if delivered is None else 1e3 * delivered,
         predicted_delivered_ml=None if delivered is None or liquid is None else liquid.millilitres(delivered),

@@ -1,8 +1,8 @@
-"""Pictures of a surrogate: the discrepancy over θ, the predicted loss over actions.
+"""Figures of surrogates, safe windows and posteriors.
 
-The safe window as a picture: the loss over actions with the window in it, and the loss along each dimension.
-
-What the pours say about θ: in words, and as a corner plot of the posterior's draws.
+- `draw_surrogate` and `draw_trials`: the discrepancy over θ, or the predicted loss over actions.
+- `draw_window`: the safe window in the loss map, and the loss along each dimension.
+- `posterior_lines` and `draw_posterior`: the posterior of θ as text and as a corner plot.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ Values = Mapping[str, float | None]
 
 @dataclass(frozen=True)
 class SurrogatePicture:
-    """What a surrogate knows about a cost, ready to be drawn.
+    """A surrogate's cost function, prepared for a figure.
 
     Attributes:
-        title: of the picture.
+        title: title of the figure.
         cost: label of the cost with its unit, e.g. 'discrepancy [%]'.
-        space: searched box.
-        points: where the cost was observed, SI.
-        costs: what was observed there, in the unit of `cost`.
-        best: the chosen point, SI; None while there is none.
-        best_name: what it is called: 'θ*', 'best action'.
-        mean: (R, R) surrogate mean over the unit square, row i at the second axis' i-th place; None without a map.
+        space: search space.
+        points: observed points, SI.
+        costs: observed costs, in the unit of `cost`.
+        best: the chosen point, SI; None if there is none.
+        best_name: name of the chosen point: 'θ*', 'best action'.
+        mean: (R, R) surrogate mean over the unit square, row i at the second axis's i-th place; None without a map.
         deviation: (R, R) its standard deviation.
-        numbers: what to write on the points (pours); None: they are dots (simulations).
-        over: names of the map's two axes; empty: the space has no others.
-        held: values of the other axes at which the map cuts the surrogate, SI.
-        simulated: where simulations were made beside the observed pours, SI.
-        largest: what the cost can be at most; a surrogate that says more is shown as saying that.
+        numbers: labels of the points (pours); None: they are dots (simulations).
+        over: names of the map's two axes; empty if the space has no others.
+        held: values of the other axes in the displayed section, SI.
+        simulated: points of simulations in addition to the observed pours, SI.
+        largest: maximum possible cost; larger values of the surrogate are clipped.
     """
 
     title: str
@@ -69,14 +69,15 @@ class SurrogatePicture:
 
     @property
     def plane(self) -> Space:
-        """The two axes of the map, the first across, the second up."""
+        """The two axes of the map, the first horizontal, the second vertical."""
         return Space(tuple(axis for axis in self.space.axes if not self.over or axis.name in self.over))
 
 
 def draw_surrogate(path: Path, picture: SurrogatePicture) -> Path:
-    """Write a surrogate's picture: maps of mean and deviation over two axes; without a map, as `draw_trials`.
+    """Write a surrogate's figure: maps of mean and deviation over two axes; without a map, as `draw_trials`.
 
-    Of more than two axes the map is a cut through the surrogate; the observations, made anywhere, are projected on it.
+    With more than two axes the map is a section of the surrogate; observations from the whole space are projected on
+    it.
 
     Args:
         path: PNG to write.
@@ -95,7 +96,7 @@ def draw_surrogate(path: Path, picture: SurrogatePicture) -> Path:
 
 
 def draw_trials(path: Path, picture: SurrogatePicture) -> Path:
-    """Write the observed costs against each searched axis, side by side.
+    """Write the observed costs against each searched axis, in adjacent panels.
 
     Args:
         path: PNG to write.
@@ -133,7 +134,7 @@ def _maps(picture: SurrogatePicture) -> Figure:
 
 
 def _notes(picture: SurrogatePicture) -> list[str]:
-    """Where the map lies in the box, and whether the best lies at an end of what was searched."""
+    """Position of the map's section, and whether the best point is at an end of a range."""
     notes = []
     if picture.held:
         note = f"others at {picture.best_name}: {style.display_values(dict(picture.held))}"
@@ -149,7 +150,7 @@ def _map_panel(
     figure: Figure, axes: Axes, picture: SurrogatePicture, name: str, grid: NDArray[np.float64] | None
 ) -> None:
     x_axis, y_axis = picture.plane.axes
-    # Deviations say how sure the mean is, not how good a place is: another colour map, so that nobody mixes them up.
+    # Deviations show the accuracy of the mean, not the quality of a point, so they have another colour map.
     colours = "cividis" if name == "standard deviation" else "viridis"
     costs = np.asarray(picture.costs, dtype=float)
     low, high = _limits(np.minimum(costs if grid is None else np.asarray(grid, dtype=float), picture.largest))
@@ -166,13 +167,13 @@ def _map_panel(
             marker="X",
             s=26,
             linewidths=0.6,
-            facecolor="white",  # grey lines are lost in the middle of a colour map
+            facecolor="white",  # grey lines are hardly visible in the middle of a colour map
             edgecolor=style.INK,
             clip_on=False,
             zorder=3,
             label="simulation",
         )
-    # Observations are filled with their own cost on the same scale: where one stands out, the surrogate disagrees.
+    # Observations are filled with their own cost on the same scale: visible points disagree with the surrogate.
     filled: dict[str, Any] = {"c": "white"}
     if name != "standard deviation":
         filled = {"c": np.minimum(costs, picture.largest), "cmap": colours, "vmin": low, "vmax": high}
@@ -192,7 +193,7 @@ def _map_panel(
 def _coloured(
     axes: Axes, picture: SurrogatePicture, values: NDArray[np.float64], colours: str, low: float, high: float
 ) -> Any:
-    """The grid in its own range: single observations, far noisier, would flatten it."""
+    """Draw the grid in its own colour range: noisy single observations would flatten it."""
     x_axis, y_axis = picture.plane.axes
     places = np.linspace(0.0, 1.0, values.shape[0])
     beyond: Any = "max" if values.max() > high + 1e-9 * (high - low) else "neither"
@@ -221,7 +222,7 @@ def _contours(axes: Axes, picture: SurrogatePicture, values: NDArray[np.float64]
 
 
 def _observed(axes: Axes, picture: SurrogatePicture, filled: Mapping[str, Any], dark: NDArray[np.bool_]) -> None:
-    """Dots, or numbered discs; whole ones, also at the edge."""
+    """Dots, or numbered discs; not clipped at the edge."""
     if not len(picture.points):
         return
     xs, ys = (_column(picture.points, axis) for axis in picture.plane.axes)
@@ -262,7 +263,7 @@ def _things(picture: SurrogatePicture) -> str:
 def _mark_best(axes: Axes, picture: SurrogatePicture, x_axis: Axis, y_axis: Axis) -> None:
     assert picture.best is not None
     x, y = _column([picture.best], x_axis)[0], _column([picture.best], y_axis)[0]
-    # Above the map and below the numbers: where the best action was poured, its pour can still be read.
+    # Above the map and below the numbers, so that the number of a pour of the best action is readable.
     axes.scatter(
         [x], [y], marker="*", s=560, color=style.BEST, edgecolors="white", linewidths=1.3, zorder=4, clip_on=False,
         label=picture.best_name,
@@ -270,7 +271,7 @@ def _mark_best(axes: Axes, picture: SurrogatePicture, x_axis: Axis, y_axis: Axis
 
 
 def _slices(picture: SurrogatePicture) -> Figure:
-    """One or more than two axes: the cost against each of them, the other axes wherever they were."""
+    """One axis or more than two: the cost against each of them, over all values of the other axes."""
     count = picture.space.dimension
     figure, axes = style.new_figure(1, count, size=(max(5.4, 3.4 * count), 4.1), squeeze=False, sharey=True)
     figure.suptitle(picture.title, fontsize=12.5, color=style.INK, x=0.02, ha="left")
@@ -299,7 +300,7 @@ def _slices(picture: SurrogatePicture) -> Figure:
 
 
 def _decode(axis: Axis, places: NDArray[np.float64]) -> NDArray[np.float64]:
-    # Not Axis.decode for whole numbers: rounding would fold the grid's lines onto each other.
+    # Not Axis.decode for whole numbers: rounding would make grid lines coincide.
     smooth = Axis(axis.name, axis.lower, axis.upper, axis.scale)
     return np.array([smooth.decode(u) for u in places]) / style.display_factor(axis.name)
 
@@ -318,21 +319,23 @@ def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
 def draw_window(
     path: Path, result: Deployed, picture: SurrogatePicture | None, *, unit: LossUnit, receiver: str
 ) -> Path:
-    """A loss map with action and window, where there is one, and a panel for each dimension: what the surrogate
-    expects along it, what the checks came to, the tolerance.
+    """A loss map with action and window, and a panel for each dimension.
+
+    The map is omitted if there is none. Each panel shows the surrogate's mean, the results of the checks and the
+    tolerance.
 
     Args:
         path: PNG to write.
-        result: of a deployment, with its window and what it recommends.
+        result: result of a deployment, with its window and its recommendation.
         picture: its loss map.
-        unit: of the loss.
+        unit: unit of the loss.
         receiver: for the title.
 
     Returns:
         `path`.
 
     Raises:
-        ValueError: no window was looked for, or nothing is recommended.
+        ValueError: there is no window or no recommendation.
     """
     if result.window is None or result.recommended is None:
         raise ValueError("safe window: none was looked for")
@@ -408,10 +411,10 @@ BINS = 18
 
 
 def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
-    """What the pours determine of θ and what they don't, one sentence a line.
+    """Which parameters the pours determine and which they do not, one sentence per line.
 
     Args:
-        posterior: of a calibration's result.
+        posterior: posterior of a calibration's result.
         space: searched θ.
     """
     known, unknown = [], []
@@ -438,11 +441,11 @@ def _interval(name: str, low: float, high: float) -> str:
 
 
 def draw_posterior(path: Path, posterior: PosteriorFound, space: Space, theta: Mapping[str, float]) -> Path:
-    """One histogram per searched parameter with its region, one cloud per pair, θ* marked; logarithmic axes as such.
+    """One histogram per searched parameter with its region, one cloud per pair, θ* marked; logarithmic axes are kept.
 
     Args:
         path: PNG to write.
-        posterior: of a calibration's result.
+        posterior: posterior of a calibration's result.
         space: searched θ, the plot's range.
         theta: θ*.
 

@@ -1,4 +1,7 @@
-"""What a campaign's pours call for and the simulator lacks, for people and for summaries. Warnings, never errors."""
+"""Warnings about effects that a campaign's pours have and the simulator does not model, for displays and summaries.
+
+They are warnings, never errors. `sim_engine.model_validity` defines the limits of the model.
+"""
 
 from __future__ import annotations
 
@@ -20,19 +23,19 @@ from sim_engine.simulator import spacing
 from sim_engine.vessel.vessel import build_vessel
 
 MOST_CORNERS = 32
-"""A space of many dimensions has too many corners to try them all."""
+"""Maximum number of corners of a space that are tried."""
 
 _vessel = lru_cache(maxsize=16)(build_vessel)
 
 
 @dataclass(frozen=True)
 class SpaceWarning:
-    """Something that is not simulated in part of an action space.
+    """An effect that is not simulated in part of an action space.
 
     Attributes:
-        worst: of the actions tried, the one with the largest share.
+        worst: the finding of the tried action with the largest share.
         values: searched values of that action [SI].
-        hit, tried: actions that it holds for, and all of them.
+        hit, tried: number of affected actions, and of all tried actions.
     """
 
     worst: NotCovered
@@ -42,7 +45,7 @@ class SpaceWarning:
 
     @property
     def text(self) -> str:
-        """For people."""
+        """Text for displays."""
         at = style.display_values(dict(self.values))
         return f"{self.worst.text} (at {at}; {self.hit} of {self.tried} actions tried)"
 
@@ -52,10 +55,10 @@ class SpaceWarning:
 
 
 def regimes_of(scene: Scene, action: Action, particles: float) -> ModelValidity:
-    """What one action is like.
+    """Model validity of one action.
 
     Args:
-        particles: of a simulation of it.
+        particles: number of particles of a simulation.
 
     Raises:
         ValueError, OSError: its vessels can't be built, or don't hold the load.
@@ -65,7 +68,7 @@ def regimes_of(scene: Scene, action: Action, particles: float) -> ModelValidity:
 
 
 def space_warnings(scene: Scene, actions: Space, particles: float) -> list[SpaceWarning]:
-    """What is not simulated at the middle and the corners of an action space, each kind once.
+    """Effects that are not simulated at the middle and the corners of an action space, each kind once.
 
     Raises:
         ValueError, OSError: as `regimes_of`.
@@ -84,9 +87,9 @@ def space_warnings(scene: Scene, actions: Space, particles: float) -> list[Space
 
 
 def campaign_warnings(plan: CampaignPlan) -> dict[str, list[SpaceWarning]]:
-    """What is not simulated in a campaign's action spaces, by scene; scenes without warnings are left out.
+    """Effects that are not simulated in a campaign's action spaces, by scene; scenes without warnings are left out.
 
-    Where calibration searches the number of particles, the middle of its range counts.
+    If calibration searches the number of particles, the middle of its range is used.
 
     Raises:
         ValueError, OSError: as `regimes_of`.
@@ -103,7 +106,7 @@ def campaign_warnings(plan: CampaignPlan) -> dict[str, list[SpaceWarning]]:
 
 
 def best_action_warnings(plan: CampaignPlan, results: Results) -> dict[str, list[NotCovered]]:
-    """What is not simulated of the action that each deployment recommends, by scene.
+    """Effects that are not simulated for the action that each deployment recommends, by scene.
 
     Raises:
         ValueError, OSError: as `regimes_of`.
@@ -122,7 +125,7 @@ def lines(warnings: Mapping[str, Sequence[SpaceWarning]], names: Mapping[str, st
     """Warnings of a campaign for the terminal.
 
     Args:
-        names: what people call the scenes.
+        names: display names of the scenes.
     """
     if not warnings:
         return []
@@ -145,7 +148,7 @@ def numbers_line(found: ModelValidity) -> str:
 
 
 def _number(value: float) -> str:
-    """Two digits that mean something: '0.47', '5.2', '1 500'."""
+    """Two significant digits: '0.47', '5.2', '1 500'."""
     if value < 100.0:
         return f"{value:.2g}"
     digits = 10 ** (len(str(int(value))) - 2)

@@ -1,8 +1,9 @@
-"""What a run came to in plain sentences: what to do from now on, how far one may miss it, and what nobody knows.
+"""Results and settings of a run as plain sentences.
 
-What errors of execution do to a planned action, in words: its risk, and how far one may miss it.
-
-What a campaign asks for, for people who have not seen its file.
+- `advice`: recommended action per receiver, its expected result, its tolerance, and open questions.
+- `risk_line` and `window_line`: effect of execution errors on a planned action.
+- `standing`: state of an unfinished run and the next steps.
+- `what_was_asked`: the campaign's settings, for readers who have not seen its file.
 """
 
 from __future__ import annotations
@@ -51,20 +52,20 @@ def window_line(window: WindowFound, unit: LossUnit) -> str:
 
 
 FEW = 5
-"""Pours of an action below which their mean says little."""
+"""Number of pours of an action below which their mean is not reliable."""
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What a run says about one receiver.
+    """Advice for one receiver.
 
     Attributes:
         title: the receiver.
-        action: the dimensions that were searched, as people read them; empty where nothing is recommended.
-        fixed: the others, as the campaign has them.
-        sentences: what to do and what to expect of it.
-        window: how far the action may be missed, or that nobody knows.
-        open: what nobody knows.
+        action: searched dimensions in display units; empty without a recommendation.
+        fixed: other dimensions, as in the campaign.
+        sentences: recommendation and expected result.
+        window: allowed deviation from the action, or a statement that it is unknown.
+        open: open questions.
     """
 
     title: str
@@ -76,7 +77,7 @@ class Advice:
 
 
 def advice(plan: CampaignPlan, summary: RunSummary) -> list[Advice]:
-    """One for each receiver that a deployment learnt about."""
+    """Advice for each receiver with a deployment result."""
     if plan.deployment is None:
         return []
     scenes = {scene.name: scene for scene in plan.deployment.scenes}
@@ -130,20 +131,20 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
         said.append(f"{best}; the least of several is a lucky one, so that it is not what to expect of the next.")
     if row.risk is not None:
         said.append(_sentence(risk_line(row.risk, unit)))
-    if _borne_out(row) and (trust := trust_line(row.trust)) is not None:
+    if _is_confirmed(row) and (trust := trust_line(row.trust)) is not None:
         said.append(_sentence(trust))
     return said
 
 
-def _borne_out(row: ReceiverSummary) -> bool:
-    """Whether what is said of the simulator is something that the pours have shown, and no doubt."""
+def _is_confirmed(row: ReceiverSummary) -> bool:
+    """Whether the pours confirm the judgement about the simulator without doubt."""
     trust = row.trust
     return isinstance(trust, Believed) and bool(trust.after) and trust.after[-1].ignorance < DOUBT
 
 
 def _open(row: ReceiverSummary, unit: LossUnit) -> list[str]:
     said = []
-    if not _borne_out(row) and (alarm := trust_line(row.trust)) is not None:
+    if not _is_confirmed(row) and (alarm := trust_line(row.trust)) is not None:
         said.append(_sentence(alarm))
     if isinstance(row.trust, Compared) and row.trust.better:
         said.append(
@@ -171,7 +172,7 @@ def _open(row: ReceiverSummary, unit: LossUnit) -> list[str]:
 
 
 def unknown_of_all(plan: CampaignPlan, summary: RunSummary, record: Record) -> list[str]:
-    """What nobody knows after this run, whatever the receiver."""
+    """Open questions after this run that do not depend on the receiver."""
     said = []
     if plan.laboratory.mode == "virtual" and (record.pours or plan.laboratory.pours):
         said.append(
@@ -218,7 +219,7 @@ def _about_theta(summary: RunSummary) -> list[str]:
 
 
 def standing(record: Record, run: str) -> list[str]:
-    """Where an unfinished run stands, and what to do about it; empty for a finished one.
+    """State of an unfinished run and the next steps; empty for a finished one.
 
     Args:
         run: its folder's name.
@@ -255,7 +256,7 @@ def _sentence(text: str) -> str:
 
 
 def what_was_asked(plan: CampaignPlan) -> list[tuple[str, str]]:
-    """Names and values: what is poured, how the simulator is calibrated, how pours are found."""
+    """Names and values: the liquid, the calibration of the simulator, the search for pours."""
     found: list[tuple[str, str]] = []
     scenes = (list(plan.calibration.poured) if plan.calibration is not None else []) + (
         list(plan.deployment.scenes) if plan.deployment is not None else []

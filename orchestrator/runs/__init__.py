@@ -1,1 +1,1 @@
-"""One run of a campaign, from its plan to its journal."""
+"""One run of a campaign: stages, request execution, resuming and the run folder."""

@@ -1,7 +1,8 @@
-"""What those who only watch get to see: values, sent to every watcher, never waited for.
+"""Events of a run: immutable values for displays, recordings and APIs that follow a run.
 
-A watcher is any callable that takes an `Event`. It runs on the control loop and must return at once; one that raises
-is reported once and dropped.
+`Watchers` sends each `Event` to its subscribers. A subscriber (`Watcher`) is any callable that takes an `Event`. It
+runs on the control loop and must return at once. If it raises an exception, the error is reported once and the
+subscriber is removed. The run never waits for a subscriber and never depends on one.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ class Event:
     """Base of all events.
 
     Attributes:
-        time: when it happened (seconds since 1970); for replayed events, when it had happened.
-        stage: name of the stage it belongs to; empty outside any.
+        time: when it happened (seconds since 1970); for replayed events, the time of the original event.
+        stage: name of the stage that it belongs to; empty outside stages.
         replayed: read from the journal of an interrupted run, not happening now.
     """
 
@@ -40,12 +41,12 @@ class Event:
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignOpened(Event):
-    """A run begins, or goes on.
+    """A run begins or is resumed.
 
     Attributes:
         stages: names of all stages, in order.
         mode: 'virtual', 'hardware', or 'none' without a bench.
-        simulators: members of the pool.
+        simulators: number of simulators in the pool.
     """
 
     name: str
@@ -58,7 +59,7 @@ class CampaignOpened(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignStateChanged(Event):
-    """The campaign's state, see `orchestrator.states`."""
+    """The campaign's state changed, see `orchestrator.states`."""
 
     before: str
     after: str
@@ -70,8 +71,8 @@ class CampaignClosed(Event):
     """The last event of a run.
 
     Attributes:
-        state: in which the run ends.
-        results: of all closed stages, by name.
+        state: the state in which the run ends.
+        results: results of all closed stages, by name.
     """
 
     state: str
@@ -80,7 +81,7 @@ class CampaignClosed(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class StageOpened(Event):
-    """A strategy takes over. `index` counts from 1."""
+    """A stage begins. `index` counts from 1."""
 
     index: int
     count: int
@@ -89,7 +90,7 @@ class StageOpened(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class StageClosed(Event):
-    """A strategy is done; `result` is what it learnt."""
+    """A stage is finished; `result` is its final result."""
 
     result: StageResult
 
@@ -104,10 +105,10 @@ class RequestStarted(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class RequestFinished(Event):
-    """What came of it.
+    """A request has an outcome.
 
     Attributes:
-        seconds: wall time from start to end; 0 for replayed ones.
+        seconds: wall time from start to end; 0 for replayed requests.
         frames: particles, for the few simulations that are recorded.
     """
 
@@ -120,7 +121,7 @@ class RequestFinished(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class PourProgressed(Event):
-    """Where the running pour stands."""
+    """Progress of the running pour."""
 
     id: int
     number: int
@@ -129,11 +130,11 @@ class PourProgressed(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class MadeAhead(Event):
-    """Simulations that nobody has asked for yet: the pool has nothing else to do while the arm pours.
+    """Number of speculative simulations, which use the idle pool while the arm pours.
 
     Attributes:
-        running: being made.
-        waiting: made, and not yet asked for.
+        running: simulations that are running.
+        waiting: simulations that are finished and not yet requested.
     """
 
     running: int
@@ -142,7 +143,7 @@ class MadeAhead(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class StrategyProgressed(Event):
-    """The strategy was told something: what of its work is done, and what it has learnt so far."""
+    """The strategy has processed an outcome: its progress and its result so far."""
 
     progress: Progress
     result: StageResult
@@ -150,17 +151,17 @@ class StrategyProgressed(Event):
 
 @dataclass(frozen=True, kw_only=True)
 class DecisionMade(Event):
-    """Why a strategy asks for what it asks for."""
+    """The reason for a strategy's requests."""
 
     decision: Decision
 
 
 @dataclass(frozen=True, kw_only=True)
 class LogLine(Event):
-    """Something people should read.
+    """A message for the operator.
 
     Attributes:
-        asked: whether the operator reads it in a question at the terminal, where it need not stand twice.
+        asked: whether the operator already sees the text in a question at the terminal; a display can then omit it.
     """
 
     level: Literal["info", "warning", "error"]
@@ -172,20 +173,20 @@ Watcher = Callable[[Event], None]
 
 
 class Watchers:
-    """Sends events to all watchers; one that raises is reported once and dropped."""
+    """Sends events to all subscribers. A subscriber that raises is reported once and removed."""
 
     def __init__(self, watchers: Sequence[Watcher] = ()) -> None:
         self._watchers = list(watchers)
 
     def emit(self, event: Event) -> None:
-        """Hand an event to every watcher that is left. Never raises."""
-        broken: list[tuple[Watcher, Exception]] = []
+        """Send an event to every remaining subscriber. Never raises."""
+        failed: list[tuple[Watcher, Exception]] = []
         for watcher in self._watchers:
             try:
                 watcher(event)
             except Exception as error:
-                broken.append((watcher, error))
-        for watcher, problem in broken:
+                failed.append((watcher, error))
+        for watcher, problem in failed:
             self._watchers.remove(watcher)
             name = getattr(watcher, "__qualname__", type(watcher).__qualname__)
             text = f"{name} can't watch any longer: {type(problem).__name__}: {problem}"
@@ -193,5 +194,5 @@ class Watchers:
             self.emit(LogLine(level="warning", text=text))
 
     def log(self, level: Literal["info", "warning", "error"], text: str, stage: str = "") -> None:
-        """A line for people."""
+        """Emit a `LogLine`."""
         self.emit(LogLine(level=level, text=text, stage=stage))

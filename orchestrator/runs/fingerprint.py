@@ -1,6 +1,7 @@
-"""What of a plan decides which requests are made: a run may only be resumed with the same.
+"""Fingerprint of a plan: the values that decide which requests are made.
 
-Everything does, but for fields that say otherwise where they are declared (`sim_engine.settings.model`).
+A run can only be resumed with an equal fingerprint. Every field is included, unless its declaration marks it as free
+(`sim_engine.settings.model`).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from sim_engine.vessel.shapes import ProfileShape
 
 
 def fingerprint(plan: CampaignPlan) -> dict[str, Any]:
-    """JSON-ready copy of everything that matters; meshes by content, so that the project may be moved.
+    """JSON-ready copy of all values that decide requests. Meshes are included by content, so the project can be moved.
 
     Raises:
         OSError: a mesh file can't be read.
@@ -30,7 +31,7 @@ def fingerprint(plan: CampaignPlan) -> dict[str, Any]:
 
 
 def scene_by_content(scene: Scene) -> dict[str, Any]:
-    """A scene as fingerprints have it: comparable with one in the header of a journal.
+    """A scene in the form of a fingerprint, comparable with a scene in the header of a journal.
 
     Raises:
         OSError: a mesh file can't be read.
@@ -39,11 +40,11 @@ def scene_by_content(scene: Scene) -> dict[str, Any]:
 
 
 def deciding(value: Any) -> Any:
-    """What of a value decides requests, JSON-ready.
+    """The part of a value that decides requests, JSON-ready.
 
     Raises:
-        OSError: a file that matters by its content can't be read.
-        CodecError: it holds something that JSON can't.
+        OSError: a file that is included by content can't be read.
+        CodecError: the value contains something that JSON can't represent.
     """
     if isinstance(value, BaseModel) or (dataclasses.is_dataclass(value) and not isinstance(value, type)):
         free = value.free_fields() if isinstance(value, Liquid | ProfileShape) else frozenset()

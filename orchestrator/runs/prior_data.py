@@ -1,4 +1,8 @@
-"""Pours weighed before a campaign: read from a former run's journal, and held against the scene they enter."""
+"""Pours weighed before a campaign, read from the journal of a previous run.
+
+`read_former_run` reads a `PreviousRun`. `pours_in` selects its pours in the same scene. `fitting` selects the pours
+that the action space covers, and gives a reason for each pour that it leaves out.
+"""
 
 from __future__ import annotations
 
@@ -23,18 +27,18 @@ from sim_engine.scene import Scene
 from sim_engine.search_space import Space
 
 SAME = 1e-6
-"""Largest difference [SI] between two values of a dimension that are called the same."""
+"""Largest difference [SI] between two values of a dimension that count as equal."""
 
 
 @dataclass(frozen=True)
 class PreviousRun:
-    """What a run poured.
+    """Pours of a previous run.
 
     Attributes:
-        path: of its journal.
-        mode: of its laboratory, 'virtual' or 'hardware'.
-        scenes: by name, as they are in the journal's header.
-        pours: (scene, pour) in the order in which they were made; failed ones are left out.
+        path: path of its journal.
+        mode: mode of its laboratory, 'virtual' or 'hardware'.
+        scenes: scenes by name, as in the journal's header.
+        pours: (scene, pour) in the order in which they were made; without failed pours.
     """
 
     path: Path
@@ -44,13 +48,13 @@ class PreviousRun:
 
 
 def read_former_run(directory: Path) -> PreviousRun:
-    """Read the weighed pours of a run, also of one that was never finished.
+    """Read the weighed pours of a run, finished or not.
 
-    Pours made for calibration keep their split where the run finished making them; all others are 'train'.
+    Pours made for calibration keep their split if the stage that made them was finished; all others are 'train'.
 
     Raises:
-        JournalError: there is no run, or it was written by another version.
-        CodecError: what stands in it can't be read.
+        JournalError: there is no run, or another version wrote it.
+        CodecError: an entry can't be decoded.
     """
     path = directory / JOURNAL_NAME
     with JournalReader(path) as journal:
@@ -80,7 +84,7 @@ def _recorded(action: Action, measured: PourMeasurement, split: str) -> Recorded
 
 
 def _splits(results: Results) -> dict[tuple[str, int], str]:
-    """Stage and number of a designed pour → what it was kept for."""
+    """(stage, pour number) of a designed pour → its split ('train' or 'test')."""
     return {
         (stage, pour.number): pour.split
         for stage, result in results.items()
@@ -90,7 +94,7 @@ def _splits(results: Results) -> dict[tuple[str, int], str]:
 
 
 def scenes_in(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """The scenes of a run, as they are in its journal's header (a fingerprint)."""
+    """The scenes of a run, as in its journal's header (a fingerprint)."""
     calibration, deployment = header.get("calibration") or {}, header.get("deployment") or {}
     if calibration:
         yield calibration["scene"]
@@ -102,7 +106,7 @@ def scenes_in(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
 
 
 def pours_in(run: PreviousRun, scene: Scene) -> tuple[list[RecordedPour], str]:
-    """The run's pours in the same scene: vessels by their shapes, liquid, pivot; and why there are none."""
+    """The run's pours in the same scene (shapes of the vessels, liquid, pivot), and the reason if there are none."""
     ours = scene_by_content(scene)
     differences = {name: _difference(theirs, ours) for name, theirs in run.scenes.items()}
     same = {name for name, difference in differences.items() if not difference}
@@ -132,11 +136,11 @@ def _difference(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]
 
 @dataclass(frozen=True)
 class Fitting:
-    """Pours that a strategy may learn from.
+    """Pours that a strategy can use as data.
 
     Attributes:
-        pours: inside the searched box, and in all else as the scene has it.
-        left_out: why others are not, one text each.
+        pours: pours inside the search space whose other dimensions agree with the scene.
+        left_out: reasons why the others are excluded, one text per reason.
     """
 
     pours: tuple[RecordedPour, ...]
@@ -144,7 +148,7 @@ class Fitting:
 
 
 def fitting(pours: Sequence[RecordedPour], scene: Scene, actions: Space) -> Fitting:
-    """Those pours that the action space could have asked for."""
+    """The pours that the action space could have requested."""
     reasons = [_unfit(pour.action, scene, actions) for pour in pours]
     counted = Counter(reason for reason in reasons if reason)
     return Fitting(

@@ -1,4 +1,9 @@
-"""Resuming a stage: a fresh strategy is asked and told what the journal says the interrupted one was asked and told."""
+"""Replay of a stage from the journal, to resume an interrupted run.
+
+`read_history` reads a stage into a `StageHistory`. `replay` then repeats the recorded sequence of ask and tell on a new
+strategy, which must make the recorded requests again. `replayed_events` repeats the events for subscribers. Nothing
+here runs a request.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +22,12 @@ from orchestrator.strategies.strategy import Strategy
 
 
 class ReplayError(RunError):
-    """The strategy doesn't ask again for what the journal says it asked for."""
+    """The strategy's requests differ from those in the journal."""
 
 
 @dataclass(frozen=True)
 class AskedStep:
-    """The strategy was asked, with these slots, and answered with these requests."""
+    """A call of `ask` with these slots, which returned the requests with these ids."""
 
     slots: Slots
     ids: tuple[int, ...]
@@ -30,25 +35,25 @@ class AskedStep:
 
 @dataclass(frozen=True)
 class ToldStep:
-    """The strategy was told the outcome of a request."""
+    """A call of `tell` with the outcome of a request."""
 
     id: int
 
 
 @dataclass
 class StageHistory:
-    """What the journal knows of one stage.
+    """The journal's content for one stage.
 
     Attributes:
-        seed: of the stage; None if it was never opened.
+        seed: seed of the stage; None if the stage was never opened.
         steps: asks and tells in their order.
-        requests: JSON of each request by id, in the order in which they were asked for.
-        outcomes: outcome by id, in the order in which they were finished.
-        finished_at: when they were, by id (seconds since 1970).
+        requests: JSON of each request by id, in the order in which they were made.
+        outcomes: outcome by id, in the order in which the requests finished.
+        finished_at: time at which each request finished, by id (seconds since 1970).
         pour_attempts: how often each pour was begun.
-        withdrawn: pours that were begun last without pouring anything.
+        withdrawn: pours whose last attempt ended without pouring anything.
         decisions: number of decisions written.
-        result: of a closed stage.
+        result: result of a closed stage.
     """
 
     seed: int | None = None
@@ -63,11 +68,11 @@ class StageHistory:
 
     @property
     def ask_is_due(self) -> bool:
-        """Whether the strategy was told something (or nothing at all happened) since it was asked last."""
+        """Whether the next step is `ask`: the last step was a tell, or there is no step yet."""
         return not self.steps or isinstance(self.steps[-1], ToldStep)
 
     def request(self, key: int) -> Request:
-        """The request of that id."""
+        """The request with this id."""
         return decode_request(self.requests[key])
 
     def unknown_pours(self) -> list[int]:
@@ -75,16 +80,16 @@ class StageHistory:
         return [key for key in self.pour_attempts if key not in self.outcomes and key not in self.withdrawn]
 
     def open_questions(self) -> dict[int, Ask]:
-        """Questions to a person that nobody has answered."""
+        """Questions to the operator without an answer."""
         asked = {key: self.request(key) for key, body in self.requests.items() if body["type"] == Ask.__name__}
         return {key: ask for key, ask in asked.items() if isinstance(ask, Ask) and key not in self.outcomes}
 
 
 def read_history(journal: JournalReader, stage: str) -> StageHistory:
-    """Everything that the journal holds about a stage.
+    """Read all entries of a stage.
 
     Raises:
-        RunError: an outcome or a result can't be read.
+        RunError: an outcome or a result can't be decoded.
     """
     history = StageHistory()
     for entry in journal.entries(stage=stage):
@@ -116,9 +121,9 @@ def read_history(journal: JournalReader, stage: str) -> StageHistory:
 
 
 def replayed_events(history: StageHistory, stage: str) -> Iterator[RequestFinished]:
-    """What watchers of the interrupted run have seen, for those of the resumed one."""
+    """The finished requests of the interrupted run as events, for the subscribers of the resumed run."""
     for key, outcome in history.outcomes.items():
-        if isinstance(outcome, Answered):  # nothing in the laboratory was asked for it
+        if isinstance(outcome, Answered):  # not a request to the laboratory
             continue
         yield RequestFinished(
             time=history.finished_at[key],
@@ -131,29 +136,29 @@ def replayed_events(history: StageHistory, stage: str) -> Iterator[RequestFinish
 
 
 def replay(strategy: Strategy, history: StageHistory, stage: str) -> dict[int, Request]:
-    """Bring a fresh strategy to where the journal ends.
+    """Bring a new strategy to the state at the end of the journal.
 
     Returns:
-        The requests that it has not been told the outcome of, by id, in the order in which they were asked for.
+        The requests whose outcome the strategy has not received, by id, in the order in which they were made.
 
     Raises:
-        ReplayError: it asks for something else than the journal says.
+        ReplayError: the strategy's requests differ from those in the journal.
     """
-    untold: dict[int, Request] = {}
+    undelivered: dict[int, Request] = {}
     for step in history.steps:
         if isinstance(step, ToldStep):
-            strategy.tell(untold.pop(step.id), history.outcomes[step.id])
+            strategy.tell(undelivered.pop(step.id), history.outcomes[step.id])
             continue
         requests = strategy.ask(step.slots)
         for key, request in zip(step.ids, requests, strict=False):
             _check_same(history.requests[key], encode_request(request), key, stage)
-            untold[key] = request
+            undelivered[key] = request
         if len(requests) != len(step.ids):
             raise ReplayError(
                 f"stage {stage}: the journal has {len(step.ids)} request(s) from {step.ids[:1] or 'none'} on, "
                 f"the replayed strategy asks for {len(requests)}. {_ADVICE}"
             )
-    return untold
+    return undelivered
 
 
 _ADVICE = (
@@ -165,7 +170,7 @@ _ADVICE = (
 def _check_same(written: dict[str, Any], now: dict[str, Any], key: int, stage: str) -> None:
     if canonical(written) == canonical(now):
         return
-    # A field that was added since, with a default that changes nothing, makes no other request.
+    # A field that was added later, with a default that changes nothing, does not make the request different.
     if canonical(encode_request(decode_request(written))) != canonical(now):
         raise ReplayError(
             f"stage {stage}: request {key} differs from the journal's at {first_difference(written, now)}. {_ADVICE}"

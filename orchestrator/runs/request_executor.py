@@ -1,7 +1,8 @@
-"""How one request is run on the laboratory: scenes, deadlines, and what counts as an answer.
+"""Executes single requests on the laboratory: scenes, deadlines, retries, and the translation of errors into outcomes.
 
-Three lanes: the real one of width one (there is one arm), the optimiser's of width one, and that of simulations, whose
-width is the number of free slots that strategies are shown.
+`RequestExecutor` runs pours one at a time, because there is one arm. Queries to the optimiser also run one at a time.
+Simulations run in parallel; strategies limit their number to the free slots that they receive. The executor does not
+write the journal and does not decide which request comes next.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ from sim_engine.scene import PourTask, Scene
 
 
 class RequestExecutorError(RunError):
-    """The laboratory can't serve the campaign any longer, or was asked for something it can't know.
+    """The laboratory can't serve the campaign any longer, or it received a request that it can't fulfil.
 
     Attributes:
-        problem: what is wrong, without what to do about a run that can be resumed.
+        problem: the cause, without the advice for a run that can be resumed.
     """
 
     def __init__(self, problem: str, way_on: str = "") -> None:
@@ -42,34 +43,34 @@ class RequestExecutorError(RunError):
 
 
 class PourNotMadeError(RequestExecutorError):
-    """A pour did not begin, and somebody has to see to that: nothing is lost, and resuming asks for it again."""
+    """A pour did not begin and the operator must correct the cause. Nothing is lost: resuming requests it again."""
 
     exit_code = 3
 
 
 class PourUnknownError(RequestExecutorError):
-    """A pour began and broke off: a person has to say what came of it."""
+    """A pour began and was interrupted; the operator must report its outcome."""
 
     exit_code = 3
 
 
 SUGGESTIONS = 3
-"""How often the optimiser is asked one question: it is idempotent, and a process may die of bad luck."""
+"""Attempts per query to the optimiser. A query is idempotent, and its process may have failed by chance."""
 
 
 @dataclass(frozen=True)
 class Deadlines:
-    """When a request that has not answered is given up [s of wall time].
+    """Time limits for requests [s of wall time].
 
     Attributes:
-        simulate: time in the pool's queue included. A pour of 50 000 particles takes minutes on one core; half an
-            hour means that the pool is dead, not slow.
-        suggest: for one answer; a fit to some hundred points takes seconds. Longer than the optimiser's own deadline
-            (`actors.optimizer.optimizer_actor`), since only that replaces a process that hangs.
-        pour: 90 s in a laboratory, but an operator may be fetched from another room for each of its steps, and these
-            have deadlines of their own. After it the outcome is not waited for: nobody knows it, and a person is asked.
+        simulate: includes the time in the pool's queue. A pour of 50 000 particles takes minutes on one core; after
+            half an hour the pool is dead, not slow.
+        suggest: for one answer; a fit to some hundred points takes seconds. It is longer than the optimiser's own
+            deadline (`actors.optimizer.optimizer_actor`), because only that deadline replaces a process that hangs.
+        pour: a pour takes 90 s in a laboratory, but the operator may be needed for each of its steps, which have
+            deadlines of their own. After this time the outcome is unknown, and the operator must report it.
         pour_grace: how long a pause waits for a pour that has begun.
-        cleanup: how long cancelled requests may take to let go.
+        cleanup: how long cancelled requests may take to stop.
     """
 
     simulate: float = 1800.0
@@ -80,7 +81,7 @@ class Deadlines:
 
 
 class RequestExecutor:
-    """Runs requests on a laboratory; turns what may go wrong with one of them into its outcome."""
+    """Runs requests on a laboratory and converts errors of single requests into outcomes."""
 
     def __init__(
         self, laboratory: Laboratory, scenes: Mapping[str, Scene], deadlines: Deadlines, record_rate: float
@@ -91,9 +92,9 @@ class RequestExecutor:
         self._record_rate = record_rate
         self._real = asyncio.Lock()
         self._optimiser = asyncio.Lock()
-        self.ahead = SpeculativeExecution(self._foreseen, laboratory.simulators.size)
+        self.ahead = SpeculativeExecution(self._speculate, laboratory.simulators.size)
 
-    async def _foreseen(self, request: Simulate) -> Outcome:
+    async def _speculate(self, request: Simulate) -> Outcome:
         return (await self._simulated(request))[0]
 
     async def simulate(
@@ -102,13 +103,13 @@ class RequestExecutor:
         """Run a simulation.
 
         Args:
-            record: whether frames are kept; changes nothing about the outcome. Those made ahead have none.
-            started: called when it is handed to the pool.
+            record: whether frames are kept; does not affect the outcome. Speculative simulations have no frames.
+            started: called when the simulation is handed to the pool.
         """
         if not record and self.ahead.knows(request):
             started()
-            if (foreseen := await self.ahead.take(request)) is not None:
-                return foreseen, None
+            if (speculated := await self.ahead.take(request)) is not None:
+                return speculated, None
         else:
             started()
         with self.ahead.asked_for():
@@ -150,16 +151,16 @@ class RequestExecutor:
         """Pour once.
 
         Args:
-            started: called when nothing stands between the request and the arm any more; must have made a durable
-                record of it when it returns.
-            withdrawn: called when the bench says that nothing was poured, with the reason; likewise.
-            progress: handed to the bench.
+            started: called immediately before the arm starts; must have written a durable record of it when it returns.
+            withdrawn: called with the reason when the bench reports that nothing was poured; must write a durable
+                record too.
+            progress: passed to the bench.
 
         Raises:
-            LaneError: there is no bench, or it was lost during the pour, whose outcome nobody knows then.
+            RequestExecutorError: there is no bench, or it was lost during the pour, whose outcome is then unknown.
             PourNotMadeError: nothing was poured.
-            PourUnknownError: nobody knows what was poured; so it is of a pour that has not been weighed in time.
-            BenchLostError: it was lost before.
+            PourUnknownError: the poured amount is unknown, for example because the pour was not weighed in time.
+            BenchLostError: the bench was lost before the pour.
         """
         bench, scene = self.bench, self._scene(request.scene)
         async with self._real:
@@ -177,7 +178,7 @@ class RequestExecutor:
                 _raise_if_cancelled()
                 raise PourUnknownError(str(error), "; resuming asks what came of it") from error
             except BenchLostError as error:
-                # No outcome: a person has to look, and there is nothing left to pour with.
+                # No outcome: the operator must inspect the bench, and there is nothing left to pour with.
                 _raise_if_cancelled()
                 raise RequestExecutorError(
                     f"{error}; what was poured is unknown: see to the bench", ", then resume the run"
@@ -196,10 +197,11 @@ class RequestExecutor:
     async def suggest(
         self, request: Suggest, *, started: Callable[[], None], retrying: Callable[[str], None]
     ) -> Outcome:
-        """Ask the optimiser, up to `SUGGESTIONS` times. Nobody below asks again of their own accord.
+        """Query the optimiser, up to `SUGGESTIONS` times. No layer below repeats a query.
 
         Raises:
-            LaneError: it failed each time, or its machine is gone. Nothing is made up in its place.
+            RequestExecutorError: every attempt failed, or the optimiser's machine is lost. There is no substitute
+                answer.
         """
         async with self._optimiser:
             started()
@@ -220,12 +222,12 @@ class RequestExecutor:
 
     @property
     def simulators(self) -> SimulatorPool:
-        """The pool that simulations run on."""
+        """The pool that runs simulations."""
         return self._laboratory.simulators
 
     @property
     def bench(self) -> Bench:
-        """The bench. Raises LaneError if there is none."""
+        """The bench. Raises RequestExecutorError if there is none."""
         if self._laboratory.bench is None:
             raise RequestExecutorError(
                 "a pour is asked for, but this laboratory has no bench; add one to the laboratory's file"
@@ -248,7 +250,10 @@ def _duration(seconds: float) -> str:
 
 
 def _raise_if_cancelled() -> None:
-    """An error that comes of our own cancelling says nothing about the request: it has no outcome."""
+    """Raise `CancelledError` if this task is being cancelled.
+
+    An error caused by that cancellation is not an outcome of the request.
+    """
     task = asyncio.current_task()
     if task is not None and task.cancelling():
         raise asyncio.CancelledError

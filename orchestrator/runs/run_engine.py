@@ -1,4 +1,9 @@
-"""Runs the stages of a campaign on a laboratory, and resumes them."""
+"""Runs the stages of a campaign on a laboratory and resumes interrupted runs.
+
+`run_campaign` is the entry point. It opens the journal and the laboratory, settles pours with unknown outcome, runs
+each stage with a `StageScheduler`, and records the campaign's state. Parsing of files and displays are outside this
+module.
+"""
 
 from __future__ import annotations
 
@@ -57,23 +62,24 @@ async def run_campaign(
     stages: Sequence[StageDefinition] | None = None,
     deadlines: Deadlines | None = None,
 ) -> CampaignResult:
-    """Run a campaign to its end, or go on with one.
+    """Run a campaign to its end, or resume one.
 
-    Cancelling the awaiting task pauses the run: simulations are dropped, a pour that has begun is finished and
-    weighed, then `asyncio.CancelledError` is raised. Cancelling it again gives the pour up, too; it is UNKNOWN then.
+    Cancelling the awaiting task pauses the run: simulations are dropped, a pour that has begun is finished and weighed,
+    then `asyncio.CancelledError` is raised. A second cancellation also abandons the pour, whose outcome is then
+    UNKNOWN.
 
     Args:
-        laboratory: not opened yet; it is opened here, after everything that can be checked without it was, and closed.
-        run_directory: where the journal is, or will be.
-        resume: go on with the journal in `run_directory`; without, there must be none.
-        ask_operator: asked about pours whose outcome is unknown; None if nobody is there.
-        stages: in place of those that the plan asks for.
-        deadlines: other than the usual ones.
+        laboratory: not opened yet. It is opened here, after all checks that do not need it, and closed here.
+        run_directory: the directory of the journal.
+        resume: continue with the journal in `run_directory`; otherwise there must be none.
+        ask_operator: called for pours whose outcome is unknown; None if no operator is present.
+        stages: replaces the stages of the plan.
+        deadlines: replaces the default deadlines.
 
     Raises:
-        RunError: the run can't begin or go on: another process runs it (JournalLockedError), its journal doesn't fit
-            (JournalError, ReplayError), a person is needed (OperatorNeededError), the disk is too full for a pour's
-            records (NoSpaceError), the laboratory or a strategy fails.
+        RunError: the run can't begin or continue. Another process runs it (JournalLockedError), its journal doesn't fit
+            (JournalError, ReplayError), the operator is needed (OperatorNeededError), the disk has too little space for
+            a pour's records (NoSpaceError), or the laboratory or a strategy fails.
         LaboratoryError: the laboratory can't be opened.
     """
     run = _Run(
@@ -83,13 +89,13 @@ async def run_campaign(
         Watchers(watchers),
         ask_operator,
         tuple(stages_of(plan) if stages is None else stages),
-        deadlines or _patience(plan),
+        deadlines or _default_deadlines(plan),
     )
     return await run.run(resume)
 
 
-def _patience(plan: CampaignPlan) -> Deadlines:
-    """A person who has to weigh what was poured takes the time that questions may take."""
+def _default_deadlines(plan: CampaignPlan) -> Deadlines:
+    """Deadlines of a plan: with an operator who weighs, a pause waits for a pour as long as a question may take."""
     usual, laboratory = Deadlines(), plan.laboratory
     if laboratory.arm is None or laboratory.operator.answers == "virtual":
         return usual
@@ -98,7 +104,7 @@ def _patience(plan: CampaignPlan) -> Deadlines:
 
 @dataclass
 class _Run:
-    """One process' part of a campaign's run."""
+    """One process's part of a campaign's run."""
 
     _plan: CampaignPlan
     _laboratory: Laboratory
@@ -138,7 +144,7 @@ class _Run:
                 self._come_to_rest(State.PAUSED, str(error))
                 raise
             except Exception as error:
-                if self._is_finished():  # the results are safe; only the tidying up went wrong
+                if self._is_finished():  # the results are complete; only the cleanup failed
                     self._watchers.log("warning", f"while closing the laboratory: {error}")
                 else:
                     self._come_to_rest(State.FAILED, f"{type(error).__name__}: {error}")
@@ -160,10 +166,10 @@ class _Run:
                 histories[stage.name] = await self._settle(stage, history)
         async with self._laboratory as laboratory:
             if isinstance(laboratory, Telling):
-                laboratory.listen(self._hear)
+                laboratory.listen(self._on_notice)
             self._check_bench(laboratory, histories)
-            lanes = RequestExecutor(laboratory, self._scenes, self._deadlines, self._plan.outputs.record_rate)
-            lanes.ahead.changed = lambda running, waiting: self._watchers.emit(
+            executor = RequestExecutor(laboratory, self._scenes, self._deadlines, self._plan.outputs.record_rate)
+            executor.ahead.changed = lambda running, waiting: self._watchers.emit(
                 MadeAhead(running=running, waiting=waiting)
             )
             opened = CampaignOpened(
@@ -175,14 +181,14 @@ class _Run:
                 resumed=resume,
             )
             self._watchers.emit(opened)
-            self._tell_of_idle(laboratory.simulators.size)
+            self._log_idle_simulators(laboratory.simulators.size)
             self._enter(State.RUNNING)
             results: dict[str, StageResult] = {}
             try:
                 for index, stage in enumerate(self._stages, start=1):
-                    results[stage.name] = await self._run_stage(stage, index, histories[stage.name], results, lanes)
+                    results[stage.name] = await self._run_stage(stage, index, histories[stage.name], results, executor)
             finally:
-                await lanes.ahead.close()
+                await executor.ahead.close()
             self._enter(State.FINISHED)
 
     async def _run_stage(
@@ -191,7 +197,7 @@ class _Run:
         index: int,
         history: StageHistory,
         results: Results,
-        lanes: RequestExecutor,
+        executor: RequestExecutor,
     ) -> StageResult:
         done = history.result is not None
         opened = StageOpened(
@@ -214,7 +220,7 @@ class _Run:
             stage.name,
             stage.build(results, seed),
             journal=self._journal,
-            lanes=lanes,
+            lanes=executor,
             watchers=self._watchers,
             capacity=self._plan.parallel_simulations,
             order=stage.order,
@@ -223,35 +229,38 @@ class _Run:
             on_stopping=lambda reason: self._enter(State.STOPPING, reason),
         )
         scheduler.restore(history)
-        used = lanes.ahead.used
+        used = executor.ahead.used
         try:
-            with self._foreseeing(stage, index, results, lanes):
+            with self._speculating(stage, index, results, executor):
                 result = await scheduler.run()
         finally:
             self._unknown_pours = bool(scheduler.unknown_pours)
-        if lanes.ahead.used > used:
-            text = f"{lanes.ahead.used - used} simulation(s) of {stage.name} were made while the arm was pouring before"
+        if executor.ahead.used > used:
+            text = (
+                f"{executor.ahead.used - used} simulation(s) of {stage.name} were made while the arm was pouring before"
+            )
             self._journal.append(Kind.NOTE, {"text": text}, stage=stage.name)
         self._watchers.emit(StageClosed(stage=stage.name, result=result))
         return result
 
     @contextmanager
-    def _foreseeing(
-        self, stage: StageDefinition, index: int, results: Results, lanes: RequestExecutor
+    def _speculating(
+        self, stage: StageDefinition, index: int, results: Results, executor: RequestExecutor
     ) -> Iterator[None]:
-        """While the arm pours, simulate what later stages will ask for, where that disturbs nobody."""
+        """While the arm pours, run simulations that later stages will request, if the pool does not share the arm's
+        CPUs."""
         later = self._stages[index - 1 :]
-        if not stage.pours or len(later) < 2 or not lanes.simulators.separate:
+        if not stage.pours or len(later) < 2 or not executor.simulators.separate:
             yield
             return
-        rehearsal = RequestForecast(later, results, self._plan.seed, self._plan.parallel_simulations, lanes)
-        task = asyncio.create_task(rehearsal.run(), name=f"rehearsal beside {stage.name}")
+        forecast = RequestForecast(later, results, self._plan.seed, self._plan.parallel_simulations, executor)
+        task = asyncio.create_task(forecast.run(), name=f"rehearsal beside {stage.name}")
         try:
             yield
         finally:
             task.cancel()
-            lanes.ahead.pause()
-            # Awaited nowhere: whatever goes wrong in a rehearsal shows when its stage's turn comes.
+            executor.ahead.pause()
+            # Not awaited: an error in speculative execution appears again when its stage runs.
             task.add_done_callback(lambda task: task.cancelled() or task.exception())
 
     async def _settle(self, stage: StageDefinition, history: StageHistory) -> StageHistory:
@@ -290,7 +299,7 @@ class _Run:
                 f"the plan is for a {self._plan.laboratory.mode} bench, but the laboratory's is {laboratory.bench.mode}"
             )
 
-    def _tell_of_idle(self, simulators: int) -> None:
+    def _log_idle_simulators(self, simulators: int) -> None:
         slots = self._plan.parallel_simulations
         if simulators > slots:
             self._watchers.log(
@@ -299,11 +308,11 @@ class _Run:
                 f"{simulators - slots} will have nothing to do; 'parallel_simulations' in the campaign changes that",
             )
 
-    def _hear(self, notice: Notice) -> None:
-        """Something happened to the laboratory: written down, and shown."""
+    def _on_notice(self, notice: Notice) -> None:
+        """Write a notice of the laboratory to the journal and emit it."""
         try:
             self._journal.append(Kind.NOTE, {"text": notice.text})
-        except JournalError:  # it ends the run with the next write that matters; until then the screen holds everything
+        except JournalError:  # the next important write ends the run; until then the display shows everything
             self._watchers.log("error", f"can't be written down: {notice.text}")
             return
         if notice.level != "note":
@@ -326,7 +335,7 @@ class _Run:
             state, reason = State.UNKNOWN, f"{reason}, while a pour was under way: nobody knows what came of it"
         try:
             self._enter(state, reason)
-        except JournalError as problem:  # the next process sees it from what is missing
+        except JournalError as problem:  # the next process finds the run interrupted
             self._watchers.log("error", f"can't write that the run is {state}: {problem}")
         results = decode_results(self._journal.stage_results())
         self._watchers.emit(CampaignClosed(state=str(self._state), results=results))

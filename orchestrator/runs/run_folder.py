@@ -1,4 +1,8 @@
-"""Run directories: their names, what is kept in them beside the journal, and how an unfinished one is found again."""
+"""Run folders: their names, the files next to the journal, and the search for an unfinished run.
+
+`create_run` makes the folder, `write_provenance` stores plan and versions, `find_run` returns the run to resume. The
+journal itself is in `orchestrator.journal`.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +29,7 @@ from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
 RESOLVED, VERSIONS = "resolved.json", "versions.json"
-"""What a run was asked for, and by which program."""
+"""Files with the resolved plan of a run and with the versions of the program that began it."""
 
 
 class RunNotFoundError(JournalError):
@@ -33,13 +37,13 @@ class RunNotFoundError(JournalError):
 
 
 def create_run(plan: CampaignPlan) -> Path:
-    """Make the directory of a new run, NAME-DATE-N (NAME-hardware-DATE-N), N counting the day's.
+    """Make the directory of a new run, NAME-DATE-N (NAME-hardware-DATE-N), where N counts the runs of the day.
 
-    It is made in the plan's output directory, and entered into the catalogue of runs.
+    The directory is created in the plan's output directory and registered in the catalogue of runs.
 
     Raises:
-        NoSpaceError: there is too little room for a run.
-        OSError: it can't be made.
+        NoSpaceError: there is too little space for a run.
+        OSError: the directory can't be created.
     """
     parent = plan.outputs.directory
     require_space(parent, TO_BEGIN, "to begin a run")
@@ -52,7 +56,7 @@ def create_run(plan: CampaignPlan) -> Path:
     while True:
         directory = parent / f"{stem}-{number}"
         try:
-            directory.mkdir()  # two runs begun at the same moment get two directories
+            directory.mkdir()  # two runs that begin at the same moment get two directories
             break
         except FileExistsError:
             number += 1
@@ -61,13 +65,13 @@ def create_run(plan: CampaignPlan) -> Path:
 
 
 def write_provenance(directory: Path, plan: CampaignPlan) -> None:
-    """Keep with the run what is needed to reproduce it: resolved.json (the plan) and versions.json."""
+    """Write what is needed to reproduce the run: resolved.json (the plan) and versions.json."""
     _write_json(directory / RESOLVED, plan.resolved)
     _write_json(directory / VERSIONS, {"campaign": str(plan.source), "seed": plan.seed, **versions()})
 
 
 def versions() -> dict[str, Any]:
-    """Versions of Python, platform, Decant, what it is built on, and packages that add plug-ins."""
+    """Versions of Python, the platform, Decant, its dependencies, and packages that add plug-ins."""
     packages: dict[str, str] = {}
     names = ["decant"]
     try:
@@ -91,10 +95,10 @@ def versions() -> dict[str, Any]:
 
 
 def missing_plugins(versions: Mapping[str, Any]) -> list[str]:
-    """Packages with plug-ins that a run had and that are not installed here: 'decant-example 1.0 (decant.arms: stand)'.
+    """Plug-in packages of a run that are not installed here, for example 'decant-example 1.0 (decant.arms: stand)'.
 
     Args:
-        versions: as `versions.json` has them.
+        versions: content of `versions.json`.
     """
     here, packages = plugin_packages(), versions.get("packages") or {}
     return [
@@ -105,7 +109,7 @@ def missing_plugins(versions: Mapping[str, Any]) -> list[str]:
 
 
 def read_versions(directory: Path) -> dict[str, Any]:
-    """`versions.json` of a run; empty where it is missing or damaged."""
+    """Content of `versions.json` of a run; empty if the file is missing or damaged."""
     try:
         found = json.loads((directory / VERSIONS).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -114,13 +118,13 @@ def read_versions(directory: Path) -> dict[str, Any]:
 
 
 def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
-    """The run to resume: the one named, or the campaign's newest unfinished one.
+    """The run to resume: the one with this id, or the campaign's newest unfinished run.
 
-    Among several, one that was begun with the same settings is preferred; if there is none, the newest is returned,
-    so that resuming it can say what was changed.
+    Among several unfinished runs, one with the same settings is preferred. Otherwise the newest is returned, so that
+    resuming it can report the changed settings.
 
     Raises:
-        RunNotFoundError: no such run, or none that is unfinished.
+        RunNotFoundError: no such run, or no unfinished run.
         JournalDamagedError: its journal has lost or changed entries, so that resuming it could repeat pours.
     """
     parent = plan.outputs.directory
@@ -145,7 +149,8 @@ def _newest_unfinished(plan: CampaignPlan, parent: Path) -> Path:
                     same = digest(journal.header.fingerprint) == mine
                     found.append((same, journal.header.created, directory))
         except JournalError:
-            # Another program's or version's; a damaged run of this campaign is a candidate, and is refused.
+            # Written by another program or version. A damaged run of this campaign is a candidate, and is refused
+            # later.
             begun = readable_lines(directory / LEDGER_NAME)[:1]
             found += [(True, line.t, directory) for line in begun if line.body.get("name") == plan.name]
     if not found:

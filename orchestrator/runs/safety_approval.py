@@ -1,6 +1,6 @@
-"""Which safety settings of a controller people have accepted: a small file beside the laboratory's, for review.
+"""The accepted safety settings of a controller, kept in a small file next to the laboratory's file for review.
 
-Decant can't judge safety settings. It can notice that they are not those that somebody has looked at.
+Decant can't judge safety settings. It only detects that they differ from the settings that were accepted.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ _CHECKSUM = re.compile(r"[0-9A-F]{8}")
 
 
 class SafetyRecordError(RunError):
-    """The record can't be read; the text says why."""
+    """The record can't be read; the text gives the reason."""
 
     exit_code = 2
 
 
 def record_path(laboratory: Path) -> Path:
-    """Where the record of a laboratory's file is kept: NAME.safety.json beside NAME.yaml."""
+    """Path of the record of a laboratory's file: NAME.safety.json next to NAME.yaml."""
     return laboratory.with_name(laboratory.stem + SUFFIX)
 
 
 def read_record(laboratory: Path) -> SafetyRecord | None:
-    """What was accepted for a laboratory.
+    """The accepted safety settings of a laboratory.
 
     Args:
-        laboratory: its file.
+        laboratory: the laboratory's file.
 
     Returns:
-        None if nothing was.
+        None if none were accepted.
 
     Raises:
-        SafetyRecordError: there is a record, and it makes no sense.
+        SafetyRecordError: the record exists but is invalid.
     """
     path = record_path(laboratory)
     try:
@@ -62,10 +62,10 @@ def read_record(laboratory: Path) -> SafetyRecord | None:
 
 
 def write_record(laboratory: Path, record: SafetyRecord) -> Path:
-    """Keep what was accepted.
+    """Store the accepted settings.
 
     Raises:
-        OSError: it can't be written there.
+        OSError: the file can't be written.
     """
     path = record_path(laboratory)
     path.write_text(json.dumps(asdict(record), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -73,13 +73,13 @@ def write_record(laboratory: Path, record: SafetyRecord) -> Path:
 
 
 def accepted_checksum(laboratory: Path) -> str | None:
-    """Checksum that was accepted for a laboratory; None if none was.
+    """Accepted checksum of a laboratory; None if none was accepted.
 
     Args:
-        laboratory: the file that describes it, which is a campaign's where it stands in there.
+        laboratory: the file that describes the laboratory; the campaign's file if it contains the laboratory.
 
     Raises:
-        SafetyRecordError: the record makes no sense.
+        SafetyRecordError: the record is invalid.
     """
     record = read_record(laboratory)
     return None if record is None else record.checksum.upper()

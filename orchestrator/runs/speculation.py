@@ -1,8 +1,9 @@
-"""Simulations made before they are asked for, while the pool has nothing else to do.
+"""Speculative execution of simulations: they run before they are requested, while the pool is idle.
 
-A simulation is a value: the same request gives the same outcome whenever it is made. So what a later stage will ask for
-can be simulated while the arm pours, and is there when it is asked for. Nothing that is decided depends on it: what was
-foreseen wrongly is thrown away, and the journal knows only what strategies asked for.
+A simulation is a value: the same request gives the same outcome at any time. Simulations that a later stage will
+request can therefore run while the arm pours. No decision depends on speculation: wrong predictions are discarded, and
+the journal contains only what strategies requested. `SpeculativeExecution` holds the outcomes;
+`orchestrator.runs.speculative_requests` predicts the requests.
 """
 
 from __future__ import annotations
@@ -16,21 +17,21 @@ from functools import partial
 from orchestrator.requests import Failed, Outcome, Simulate, Simulated
 
 KEPT = 2000
-"""Outcomes that wait to be asked for; beyond that nothing more is made ahead."""
+"""Maximum number of queued requests and unused outcomes; beyond it, nothing more is queued."""
 
 
 class SpeculativeExecution:
-    """Outcomes of simulations that nobody has asked for yet, and those that are being made.
+    """Outcomes of simulations that no strategy has requested yet, and speculative simulations in progress.
 
-    Whatever is asked for comes first: a simulation that was only foreseen is given up where its simulator is needed,
-    and made again when there is room.
+    Requested simulations have priority. A speculative simulation is cancelled if its simulator is needed, and queued
+    again for later.
 
     Args:
-        simulate: makes one simulation; cancelling gives it up.
-        width: simulations that run at a time, those that were asked for included.
+        simulate: runs one simulation; cancelling abandons it.
+        width: maximum number of simulations at a time, including requested ones.
 
     Attributes:
-        changed: told how many are being made, and how many are known and wait to be asked for.
+        changed: called with the number of running simulations and the number of unused outcomes.
     """
 
     def __init__(self, simulate: Callable[[Simulate], Awaitable[Outcome]], width: int) -> None:
@@ -41,13 +42,13 @@ class SpeculativeExecution:
         self._known: dict[Simulate, Outcome] = {}
         self._promised: dict[Simulate, asyncio.Future[Outcome | None]] = {}
         self._asked_for = 0
-        self._told = (0, 0)
+        self._reported = (0, 0)
         self.changed: Callable[[int, int], None] = lambda running, waiting: None
         self.made = 0
         self.used = 0
 
     def foresee(self, request: Simulate) -> None:
-        """Make this simulation as soon as a simulator has nothing else to do."""
+        """Queue a simulation that runs as soon as a simulator is idle."""
         if request in self._known or request in self._running or request in self._waiting:
             return
         if len(self._known) + len(self._waiting) < KEPT:
@@ -55,7 +56,7 @@ class SpeculativeExecution:
             self._fill()
 
     async def outcome(self, request: Simulate) -> Outcome | None:
-        """What a foreseen simulation came to, once it has been made; it stays known. None: it came to nothing."""
+        """Outcome of a speculative simulation, once it is finished; it stays stored. None: it has no outcome."""
         self.foresee(request)
         if request in self._known:
             return self._known[request]
@@ -65,11 +66,11 @@ class SpeculativeExecution:
         return await asyncio.shield(promise)
 
     def knows(self, request: Simulate) -> bool:
-        """Whether this request need not be made anew."""
+        """Whether this request is finished or running speculatively."""
         return request in self._known or request in self._running
 
     async def take(self, request: Simulate) -> Outcome | None:
-        """The outcome of a simulation that is asked for now, if it was foreseen; None: it has to be made."""
+        """Outcome of a simulation that is requested now, if it ran speculatively; None: it must be run."""
         if (known := self._known.pop(request, None)) is not None:
             self.used += 1
             self._fill()
@@ -84,7 +85,7 @@ class SpeculativeExecution:
                     task.cancel()
                     raise
                 return None
-            except Exception:  # whoever makes it for good says why
+            except Exception:  # the regular simulation reports the cause
                 return None
         self.used += 1
         self._keep_promise(request, outcome)
@@ -92,7 +93,7 @@ class SpeculativeExecution:
 
     @contextmanager
     def asked_for(self) -> Iterator[None]:
-        """A simulation that was asked for needs a simulator: those that were only foreseen make room."""
+        """Reserve a simulator for a requested simulation; speculative simulations in excess are cancelled."""
         self._asked_for += 1
         while self._running and self._asked_for + len(self._running) > self._width:
             request, task = self._running.popitem()
@@ -105,7 +106,7 @@ class SpeculativeExecution:
             self._fill()
 
     async def close(self) -> None:
-        """Give up what is being made."""
+        """Cancel all speculative simulations."""
         self._waiting.clear()
         tasks = [*self._running.values()]
         self._running.clear()
@@ -116,7 +117,7 @@ class SpeculativeExecution:
             promise.cancel()
 
     def pause(self) -> None:
-        """Begin nothing more; what is being made goes on until its simulator is needed."""
+        """Start no more simulations; running ones continue until their simulator is needed."""
         for request in self._waiting:
             self._keep_promise(request, None)
         self._waiting.clear()
@@ -127,8 +128,8 @@ class SpeculativeExecution:
             task = asyncio.ensure_future(self._simulate(request))
             self._running[request] = task
             task.add_done_callback(partial(self._done, request))
-        if (now := (len(self._running), len(self._known))) != self._told:
-            self._told = now
+        if (now := (len(self._running), len(self._known))) != self._reported:
+            self._reported = now
             self.changed(*now)
 
     def _done(self, request: Simulate, task: asyncio.Future[Outcome]) -> None:
@@ -138,7 +139,8 @@ class SpeculativeExecution:
         if task.cancelled():
             self._fill()
             return
-        failed = task.exception() is not None  # asked for, so that nobody complains that it never was
+        # read the exception, so that asyncio does not report it as never retrieved
+        failed = task.exception() is not None
         if not ours:
             return
         outcome = None if failed else task.result()
@@ -155,5 +157,5 @@ class SpeculativeExecution:
 
 
 def _lasts(outcome: Outcome) -> bool:
-    """Whether it would come out the same again: not what died of bad luck."""
+    """Whether a repetition would give the same outcome; false for failures by chance."""
     return isinstance(outcome, Simulated) or (isinstance(outcome, Failed) and outcome.kind == "invalid_action")

@@ -1,9 +1,9 @@
-"""What later stages will ask to be simulated, found by acting them out beforehand.
+"""Prediction of the simulations that later stages will request.
 
-A strategy is a pure object behind ask and tell, so it can be played through before its turn comes. Where a stage needs
-what is not known yet, something made up stands in for it: pours that are still to be made, θ* that is still to be
-found. Then only what comes first is foreseen, which depends on seeds and actions alone: initial designs, rivals of θ*
-on the weighed pours. A later receiver's prior needs nothing that is unknown, and is played through to its first pour.
+A strategy is a pure object with `ask` and `tell`, so `RequestForecast` can execute it before its stage begins. Unknown
+inputs are replaced by placeholders: pours that are not made yet, and θ* that is not found yet. With placeholders, only
+a stage's first simulations are predicted. They depend on seeds and actions alone: initial designs, and rivals of θ* on
+the weighed pours. The prior of a later receiver needs no unknown input, and is executed up to its first pour.
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement
 
 MANY = 1000
-"""Simulations that a stage may ask for at once where only its first requests are looked for."""
+"""Simulation slots offered to a stage when only its first requests are of interest."""
 
 POURS_MADE_UP = 500
-"""Pours after which a stage that is acted out with made-up ones is given up."""
+"""Maximum number of placeholder pours; a stage that needs more is not predicted."""
 
 
 @dataclass(frozen=True)
 class RequestForecast:
-    """Acts out the stages of a campaign from one of them on.
+    """Executes the stages of a campaign speculatively, from a given stage on.
 
     Args:
-        stages: the one that is running, then all later ones.
-        results: of the stages before.
-        seed: of the campaign.
+        stages: the running stage, then all later ones.
+        results: results of the earlier stages.
+        seed: seed of the campaign.
         capacity: logical slots for simulations.
+        lanes: the executor that runs the simulations and the optimiser's queries.
     """
 
     stages: Sequence[StageDefinition]
@@ -45,14 +46,14 @@ class RequestForecast:
     lanes: RequestExecutor
 
     async def run(self) -> None:
-        """Have everything made that is foreseen; returns when there is nothing more to find out."""
+        """Queue all predicted simulations; returns when nothing more can be predicted."""
         now, *later = self.stages
         results: dict[str, StageResult] = dict(self.results)
-        made_up = self._acted_out(now)
-        guessed = made_up is not None
+        placeholder = self._placeholder_result(now)
+        guessed = placeholder is not None
         unknown: list[SimulationParameters] = []
-        if made_up is not None:
-            results[now.name] = made_up
+        if placeholder is not None:
+            results[now.name] = placeholder
         for stage in later:
             strategy = self._built(stage, results)
             if strategy is None:
@@ -68,11 +69,11 @@ class RequestForecast:
     def _built(self, stage: StageDefinition, results: Results) -> Strategy | None:
         try:
             return stage.build(results, stage_seed(self.seed, stage.name))
-        except Exception:  # it needs what nobody can know yet: whatever is wrong is reported when its turn comes
+        except Exception:  # its input is unknown yet; a real problem is reported when the stage runs
             return None
 
-    def _acted_out(self, stage: StageDefinition) -> StageResult | None:
-        """What a stage of nothing but pours comes to if they go somehow; None if it is no such stage."""
+    def _placeholder_result(self, stage: StageDefinition) -> StageResult | None:
+        """Result of a stage that only pours, with placeholder outcomes; None for any other stage."""
         strategy = self._built(stage, self.results)
         if strategy is None:
             return None
@@ -83,12 +84,12 @@ class RequestForecast:
             if not requests or not all(isinstance(request, Pour) for request in requests):
                 return None
             for request in requests:
-                strategy.tell(request, _made_up_pour(number))
+                strategy.tell(request, _placeholder_pour(number))
         return None
 
     async def _first(self, strategy: Strategy, unknown: Sequence[SimulationParameters]) -> None:
-        """All that a strategy asks to be simulated before it is told of any, but for θ that are not known yet."""
-        slots = self.capacity  # a strategy may take its width from the first slots that it is shown
+        """Queue all simulations that a strategy requests before its first outcome, except those with an unknown θ."""
+        slots = self.capacity  # a strategy may choose its number of parallel simulations from its first slots
         while not strategy.finished:
             requests = strategy.ask(Slots(slots, 0))
             for request in requests:
@@ -102,7 +103,7 @@ class RequestForecast:
                 strategy.tell(question, await self._answer(question))
 
     async def _until_a_pour(self, strategy: Strategy) -> None:
-        """All that comes before the first pour, told in logical order as it will be."""
+        """Queue all simulations before the first pour; outcomes are delivered in logical order, as in the stage."""
         open_: list[Request] = []
         while not strategy.finished:
             simulations = sum(isinstance(request, Simulate) for request in open_)
@@ -129,6 +130,6 @@ class RequestForecast:
         return await self.lanes.suggest(question, started=lambda: None, retrying=lambda text: None)
 
 
-def _made_up_pour(number: int) -> Outcome:
-    """A pour that went somehow, and not twice the same way: a regression has to make something of them."""
+def _placeholder_pour(number: int) -> Outcome:
+    """An arbitrary outcome that varies with the number, because a regression needs different values."""
     return Poured(PourMeasurement(loaded=0.2, spilled=0.2 * (0.05 + 0.1 * (number % 7)), retained=0.002))

@@ -1,16 +1,17 @@
-"""Runs one stage: asks a strategy, runs what it asks for, writes everything down, tells it what came of it.
+"""Runs one stage: takes requests from a strategy, executes them, writes the journal, and returns the outcomes.
 
-The strategy is asked once at the start and once after every tell. Two orders of delivery:
+`StageScheduler` calls `ask` once at the start and once after every `tell`. A `PendingRequest` is a request whose
+outcome was not delivered yet. There are two orders of delivery:
 
-* *logical*: suggestions first, then simulations, then the pour, each in the order in which they were asked for. The
-  sequence of asks and tells then depends on plan and outcomes only, not on how fast anything was, and neither the
-  optimiser nor the pool stands still while the arm pours. A strategy that wants k simulations beside each pour asks
-  for k and no more until it is told.
-* *completion*: told as they come. The clock takes part in the decisions; only the journal can replay them.
+- *logical*: suggestions first, then simulations, then the pour; within a kind, in the order of the requests. The
+  sequence of asks and tells then depends on plan and outcomes only, not on speed. Neither the optimiser nor the pool is
+  idle while the arm pours. A strategy that wants k simulations next to each pour requests k, and no more until the next
+  `tell`.
+- *completion*: in the order in which requests finish. Time then affects the decisions, and only the journal can replay
+  them.
 
-In both, the slots that a strategy is shown are capacity minus what was asked for and not yet told.
-
-What is under way in a stage: requests that were asked for and whose outcome was not told yet.
+In both orders, the slots that a strategy receives are the capacity minus the pending requests. The scheduler does not
+know how a request is executed (`orchestrator.runs.request_executor`).
 """
 
 from __future__ import annotations
@@ -44,20 +45,19 @@ from orchestrator.strategies.strategy import Strategy
 from sim_engine.outcome import RecordedFrames
 
 _LOGICAL_ORDER: dict[type[Request], int] = {Suggest: 0, Ask: 0, Simulate: 1, Pour: 2}
-"""What is told first when several are under way: quick things before slow ones, so that a free slot is never kept
-waiting for the strategy's next idea."""
+"""Order of delivery of pending requests: fast kinds first, so that a free slot does not wait for `ask`."""
 
 
 @dataclass
 class PendingRequest:
-    """One request that is under way.
+    """A request whose outcome was not delivered yet.
 
     Attributes:
         record: whether a simulation keeps its frames.
-        attempt: how often a pour has been begun, this time included.
-        started: something may have happened because of it.
+        attempt: how often a pour was begun, including this attempt.
+        started: whether execution has begun, so that it may have had an effect.
         finished: place in the order of finishing, from 1; 0 while there is no outcome.
-        task: that runs it; None if its outcome was read from the journal.
+        task: the task that runs it; None if its outcome was read from the journal.
     """
 
     id: int
@@ -71,37 +71,40 @@ class PendingRequest:
 
     @property
     def running(self) -> bool:
-        """A task is busy with it."""
+        """Whether a task is executing it."""
         return self.task is not None and not self.task.done()
 
 
 def is_recorded(number: int, recordings: int) -> bool:
-    """Whether the `number`-th simulation of a stage (from 1) keeps its frames: the 1st, 2nd, 4th, 8th, … until
-    `recordings` have been kept, so that early and late ones are seen whatever the budget."""
+    """Whether the `number`-th simulation of a stage (from 1) keeps its frames.
+
+    The 1st, 2nd, 4th, 8th, … keep theirs until `recordings` are kept. Early and late simulations are thus recorded for
+    any budget.
+    """
     return number.bit_count() == 1 and number.bit_length() <= recordings
 
 
-def free_slots(flights: Sequence[PendingRequest], capacity: int) -> Slots:
-    """Capacity minus what was asked for and not yet told: the same wherever and however fast it runs."""
-    simulations = sum(isinstance(f.request, Simulate) for f in flights)
-    pours = sum(isinstance(f.request, Pour) for f in flights)
+def free_slots(pending_requests: Sequence[PendingRequest], capacity: int) -> Slots:
+    """Capacity minus the pending requests: the same on every machine and at any speed."""
+    simulations = sum(isinstance(f.request, Simulate) for f in pending_requests)
+    pours = sum(isinstance(f.request, Pour) for f in pending_requests)
     return Slots(max(capacity - simulations, 0), max(1 - pours, 0))
 
 
-def next_to_tell(flights: Sequence[PendingRequest], order: Order) -> PendingRequest | None:
-    """The flight whose outcome the strategy is told next, if there is one already; None: wait."""
+def next_to_tell(pending_requests: Sequence[PendingRequest], order: Order) -> PendingRequest | None:
+    """The pending request whose outcome is delivered next; None if it has no outcome yet."""
     if order == "completion":
-        return min((f for f in flights if f.outcome is not None), key=lambda f: f.finished, default=None)
-    first = min(flights, key=lambda f: (_LOGICAL_ORDER[type(f.request)], f.id), default=None)
+        return min((f for f in pending_requests if f.outcome is not None), key=lambda f: f.finished, default=None)
+    first = min(pending_requests, key=lambda f: (_LOGICAL_ORDER[type(f.request)], f.id), default=None)
     return first if first is not None and first.outcome is not None else None
 
 
 _REPORT_INTERVAL = 0.3
-"""Least time between two reports of a strategy's progress to watchers, unless one matters [s]."""
+"""Minimum time between two progress events of a strategy, unless the event is urgent [s]."""
 
 
 class StrategyError(RunError):
-    """A strategy breaks the rules of ask and tell: a defect in the program, not in the laboratory."""
+    """A strategy violates the ask–tell protocol: a defect in the program, not in the laboratory."""
 
 
 class StageScheduler:
@@ -125,21 +128,21 @@ class StageScheduler:
 
         Args:
             capacity: logical slots for simulations, ≥ 1.
-            recordings: how many simulations keep their frames.
+            recordings: number of simulations that keep their frames.
             on_pausing: called when the stage begins to wind down.
-            on_stopping: called when it is told to do so at once.
+            on_stopping: called when winding down is cancelled to stop at once.
         """
         self._stage = stage
         self._strategy = strategy
         self._journal = journal
-        self._lanes = lanes
+        self._executor = lanes
         self._watchers = watchers
         self._capacity = capacity
         self._order = order
         self._recordings = recordings
         self._on_pausing = on_pausing
         self._on_stopping = on_stopping
-        self._flights: dict[int, PendingRequest] = {}
+        self._pending: dict[int, PendingRequest] = {}
         self._next_id = journal.last_id() + 1
         self._simulations = 0
         self._finished = 0
@@ -149,22 +152,22 @@ class StageScheduler:
 
     @property
     def unknown_pours(self) -> list[int]:
-        """Pours that have begun and whose outcome nobody knows."""
-        return [f.id for f in self._flights.values() if isinstance(f.request, Pour) and f.started and f.outcome is None]
+        """Pours that have begun and whose outcome is unknown."""
+        return [f.id for f in self._pending.values() if isinstance(f.request, Pour) and f.started and f.outcome is None]
 
     def restore(self, history: StageHistory) -> None:
-        """Bring the strategy to where the journal ends. Runs nothing.
+        """Bring the strategy to the state at the end of the journal. Executes nothing.
 
         Raises:
-            ReplayError: it doesn't ask for what the journal says.
+            ReplayError: the strategy's requests differ from those in the journal.
         """
-        untold = replay(self._strategy, history, self._stage)
+        undelivered = replay(self._strategy, history, self._stage)
         simulations = [key for key, written in history.requests.items() if written["type"] == Simulate.__name__]
         numbers = {key: number for number, key in enumerate(simulations, start=1)}
         order = {key: place for place, key in enumerate(history.outcomes, start=1)}
         self._simulations, self._finished = len(numbers), len(order)
-        for key, request in untold.items():
-            self._flights[key] = PendingRequest(
+        for key, request in undelivered.items():
+            self._pending[key] = PendingRequest(
                 key,
                 request,
                 record=is_recorded(numbers.get(key, 0), self._recordings),
@@ -180,23 +183,23 @@ class StageScheduler:
             self._report_progress()
 
     async def run(self) -> StageResult:
-        """Ask, run and tell until the strategy is finished.
+        """Ask, execute and tell until the strategy is finished.
 
         Returns:
-            What it has learnt, as it is in the journal.
+            The strategy's result, as in the journal.
 
         Raises:
-            StrategyError: it asks for more than it may, or for nothing while there is nothing to wait for.
-            LaneError: the laboratory can't go on.
-            asyncio.CancelledError: told to pause; what had begun is finished or given up, and written down.
+            StrategyError: it requests more than its slots allow, or nothing while no request is pending.
+            RequestExecutorError: the laboratory can't continue.
+            asyncio.CancelledError: the run is paused; requests that had begun were finished or abandoned, and recorded.
         """
         try:
-            for flight in self._flights.values():
-                self._launch(flight)
+            for pending in self._pending.values():
+                self._launch(pending)
             while True:
                 if self._ask_is_due and not self._strategy.finished:
                     self._ask()
-                if not self._flights:
+                if not self._pending:
                     if self._strategy.finished:
                         break
                     raise StrategyError(
@@ -212,26 +215,26 @@ class StageScheduler:
         return result
 
     def _ask(self) -> None:
-        slots = free_slots(list(self._flights.values()), self._capacity)
+        slots = free_slots(list(self._pending.values()), self._capacity)
         requests = self._strategy.ask(slots)
         self._check(requests, slots)
-        flights = []
+        pending_requests = []
         for request in requests:
             record = False
             if isinstance(request, Simulate):
                 self._simulations += 1
                 record = is_recorded(self._simulations, self._recordings)
-            flights.append(PendingRequest(self._next_id, request, record=record))
+            pending_requests.append(PendingRequest(self._next_id, request, record=record))
             self._next_id += 1
-        asked = {"simulations": slots.simulations, "pours": slots.pours, "ids": [f.id for f in flights]}
+        asked = {"simulations": slots.simulations, "pours": slots.pours, "ids": [f.id for f in pending_requests]}
         drafts = [Draft(Kind.ASKED, asked, self._stage)]
-        for f in flights:
+        for f in pending_requests:
             drafts.append(Draft(Kind.REQUESTED, {"id": f.id, "request": encode_request(f.request)}, self._stage))
         self._write_with_decisions(drafts)
         self._ask_is_due = False
-        for flight in flights:
-            self._flights[flight.id] = flight
-            self._launch(flight)
+        for pending in pending_requests:
+            self._pending[pending.id] = pending
+            self._launch(pending)
 
     def _check(self, requests: Sequence[Request], slots: Slots) -> None:
         simulations = sum(isinstance(r, Simulate) for r in requests)
@@ -242,104 +245,105 @@ class StageScheduler:
                 f"{slots.simulations} and {slots.pours} slot(s) are free"
             )
 
-    def _launch(self, flight: PendingRequest) -> None:
-        if flight.outcome is None:
-            flight.task = asyncio.create_task(self._perform(flight), name=f"{self._stage} request {flight.id}")
+    def _launch(self, pending: PendingRequest) -> None:
+        if pending.outcome is None:
+            pending.task = asyncio.create_task(self._perform(pending), name=f"{self._stage} request {pending.id}")
 
-    async def _perform(self, flight: PendingRequest) -> None:
-        """Run one request and write down its outcome."""
-        begin, frames, request = time.monotonic(), None, flight.request
+    async def _perform(self, pending: PendingRequest) -> None:
+        """Execute one request and write its outcome to the journal."""
+        begin, frames, request = time.monotonic(), None, pending.request
 
         def started() -> None:
             nonlocal begin
             begin = time.monotonic()
             if isinstance(request, Pour):
-                body = {"id": flight.id, "attempt": flight.attempt, "number": request.number}
+                body = {"id": pending.id, "attempt": pending.attempt, "number": request.number}
                 self._append(Kind.POUR_STARTED, body)
             else:
-                self._append(Kind.STARTED, {"id": flight.id})
-            flight.started = True
-            self._watchers.emit(RequestStarted(stage=self._stage, id=flight.id, request=request))
+                self._append(Kind.STARTED, {"id": pending.id})
+            pending.started = True
+            self._watchers.emit(RequestStarted(stage=self._stage, id=pending.id, request=request))
 
         match request:
             case Simulate():
-                outcome, frames = await self._lanes.simulate(request, record=flight.record, started=started)
+                outcome, frames = await self._executor.simulate(request, record=pending.record, started=started)
             case Pour():
 
                 def progress(p: PourProgress) -> None:
-                    event = PourProgressed(stage=self._stage, id=flight.id, number=request.number, progress=p)
+                    event = PourProgressed(stage=self._stage, id=pending.id, number=request.number, progress=p)
                     self._watchers.emit(event)
 
                 def withdrawn(reason: str) -> None:
-                    self._append(Kind.POUR_WITHDRAWN, {"id": flight.id, "reason": reason})
-                    flight.started = False
+                    self._append(Kind.POUR_WITHDRAWN, {"id": pending.id, "reason": reason})
+                    pending.started = False
 
                 self._journal.check_space_for_pour()
-                outcome = await self._lanes.pour(request, started=started, withdrawn=withdrawn, progress=progress)
+                outcome = await self._executor.pour(request, started=started, withdrawn=withdrawn, progress=progress)
             case Suggest():
 
                 def retrying(text: str) -> None:
                     self._append(Kind.NOTE, {"text": text})
                     self._watchers.log("warning", text, self._stage)
 
-                outcome = await self._lanes.suggest(request, started=started, retrying=retrying)
+                outcome = await self._executor.suggest(request, started=started, retrying=retrying)
             case Ask():
-                # A question is answered on resume: nobody types into a display that is redrawn, and no arm waits.
+                # A question is answered on resume: a display that is redrawn takes no input, and the arm does not wait.
                 raise needs_answer(request)
-        self._finish(flight, outcome, time.monotonic() - begin, frames)
+        self._finish(pending, outcome, time.monotonic() - begin, frames)
 
-    def _finish(self, flight: PendingRequest, outcome: Outcome, seconds: float, frames: RecordedFrames | None) -> None:
+    def _finish(self, pending: PendingRequest, outcome: Outcome, seconds: float, frames: RecordedFrames | None) -> None:
         written = encode_outcome(outcome)
-        kind = Kind.POUR_FINISHED if isinstance(flight.request, Pour) else Kind.FINISHED
+        kind = Kind.POUR_FINISHED if isinstance(pending.request, Pour) else Kind.FINISHED
         try:
-            self._append(kind, {"id": flight.id, "outcome": written, "seconds": seconds})
+            self._append(kind, {"id": pending.id, "outcome": written, "seconds": seconds})
         except JournalError as error:
-            if isinstance(flight.request, Pour) and isinstance(outcome, Poured):
-                raise JournalError(f"{error}. {weighed_by_hand(flight.request, outcome.measurement)}") from error
+            if isinstance(pending.request, Pour) and isinstance(outcome, Poured):
+                raise JournalError(f"{error}. {weighed_by_hand(pending.request, outcome.measurement)}") from error
             raise
-        # The strategy is told what the journal holds, so that a replay can't tell it anything else.
-        flight.outcome = decode_outcome(written)
+        # The strategy receives the outcome as decoded from the journal, so that a replay delivers the same.
+        pending.outcome = decode_outcome(written)
         self._finished += 1
-        flight.finished = self._finished
+        pending.finished = self._finished
         event = RequestFinished(
             stage=self._stage,
-            id=flight.id,
-            request=flight.request,
-            outcome=flight.outcome,
+            id=pending.id,
+            request=pending.request,
+            outcome=pending.outcome,
             seconds=seconds,
             frames=frames,
         )
         self._watchers.emit(event)
 
     async def _next(self) -> PendingRequest:
-        """The flight whose outcome is to be told next, once it has one."""
+        """Wait until the next request to deliver has an outcome, and return it."""
         while True:
             self._raise_failures()
-            flight = next_to_tell(list(self._flights.values()), self._order)
-            if flight is not None:
-                return flight
-            running = [f.task for f in self._flights.values() if f.task is not None and f.running]
+            pending = next_to_tell(list(self._pending.values()), self._order)
+            if pending is not None:
+                return pending
+            running = [f.task for f in self._pending.values() if f.task is not None and f.running]
             await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
 
     def _raise_failures(self) -> None:
-        for flight in self._flights.values():
-            task = flight.task
+        for pending in self._pending.values():
+            task = pending.task
             if task is not None and task.done():
                 if task.cancelled():
-                    raise StrategyError(f"request {flight.id} of stage {self._stage} was cancelled from outside")
+                    raise StrategyError(f"request {pending.id} of stage {self._stage} was cancelled from outside")
                 if (error := task.exception()) is not None:
                     raise error
 
-    def _tell(self, flight: PendingRequest) -> None:
-        assert flight.outcome is not None
-        del self._flights[flight.id]
-        self._strategy.tell(flight.request, flight.outcome)
-        self._write_with_decisions([Draft(Kind.TOLD, {"id": flight.id}, self._stage)])
+    def _tell(self, pending: PendingRequest) -> None:
+        assert pending.outcome is not None
+        del self._pending[pending.id]
+        self._strategy.tell(pending.request, pending.outcome)
+        self._write_with_decisions([Draft(Kind.TOLD, {"id": pending.id}, self._stage)])
         self._ask_is_due = True
-        self._report_progress(urgent=isinstance(flight.request, Pour) or self._strategy.finished)
+        self._report_progress(urgent=isinstance(pending.request, Pour) or self._strategy.finished)
 
     def _write_with_decisions(self, drafts: list[Draft]) -> None:
-        """Write entries and the decisions that came with them together, so that a replay knows which are written."""
+        """Write entries together with the decisions that belong to them, so that a replay has the same number of
+        decisions."""
         decisions: Sequence[Decision] = getattr(self._strategy, "decisions", ())[self._decisions :]
         for decision in decisions:
             drafts.append(Draft(Kind.DECISION, cast("dict[str, Any]", to_json(decision, Decision)), self._stage))
@@ -349,7 +353,7 @@ class StageScheduler:
             self._watchers.emit(DecisionMade(stage=self._stage, decision=decision))
 
     def _report_progress(self, *, urgent: bool = True) -> None:
-        """Tell watchers where the strategy stands; often only now and then, as results grow long."""
+        """Emit the strategy's progress; limited in frequency unless urgent, because results grow large."""
         if not urgent and time.monotonic() - self._reported < _REPORT_INTERVAL:
             return
         self._reported = time.monotonic()
@@ -360,42 +364,42 @@ class StageScheduler:
         self._journal.append(kind, body, stage=self._stage)
 
     async def _wind_down(self, error: BaseException) -> None:
-        """Drop what can be repeated, finish what can't: simulations are cancelled, a pour that has begun is awaited.
+        """Cancel simulations and suggestions, which can be repeated, and wait for a pour that has begun.
 
-        Cancelled again, it gives the pour up as well.
+        A second cancellation abandons the pour as well.
         """
         if isinstance(error, asyncio.CancelledError):
             reason = "asked to pause"
-        else:  # the text of an error of ours says all; another one's is a defect, whose kind matters
+        else:  # the text of a RunError is complete; for a defect the type matters
             reason = str(error) if isinstance(error, RunError) else f"{type(error).__name__}: {error}"
         pours: list[asyncio.Task[None]] = []
         others: list[asyncio.Task[None]] = []
-        for flight in self._flights.values():
-            if flight.task is not None and flight.running:
-                begun = isinstance(flight.request, Pour) and flight.started
-                (pours if begun else others).append(flight.task)
+        for pending in self._pending.values():
+            if pending.task is not None and pending.running:
+                begun = isinstance(pending.request, Pour) and pending.started
+                (pours if begun else others).append(pending.task)
         for task in others:
             task.cancel()
         try:
             self._on_pausing(reason)
-        except Exception as problem:  # a full disk, say: no reason to leave a pour alone
+        except Exception as problem:  # for example a full disk: the pour must be awaited nevertheless
             self._watchers.log("error", f"can't write that the run is pausing: {problem}", self._stage)
         try:
             if pours:
-                grace = self._lanes.deadlines.pour_grace
+                grace = self._executor.deadlines.pour_grace
                 self._watchers.log(
                     "info", f"a pour is under way; it is finished first (up to {grace:g} s)", self._stage
                 )
                 await asyncio.wait(pours, timeout=grace)
             if others:
-                await asyncio.wait(others, timeout=self._lanes.deadlines.cleanup)
+                await asyncio.wait(others, timeout=self._executor.deadlines.cleanup)
         except asyncio.CancelledError:
             self._on_stopping("asked again")
         unfinished = [task for task in (*pours, *others) if not task.done()]
         for task in unfinished:
             task.cancel()
         if unfinished:
-            await asyncio.wait(unfinished, timeout=self._lanes.deadlines.cleanup)
+            await asyncio.wait(unfinished, timeout=self._executor.deadlines.cleanup)
         for task in (*pours, *others):
             if task.done() and not task.cancelled() and (late := task.exception()) is not None and late is not error:
                 self._watchers.log("warning", f"while winding down: {type(late).__name__}: {late}", self._stage)

@@ -1,4 +1,9 @@
-"""The stages of a campaign: which strategy comes next, and what it is given of those before it."""
+"""The stages of a campaign: their order, their strategies, and the earlier results that each strategy receives.
+
+`stages_of` returns one `StageDefinition` per stage: designed pours, calibration, evaluation, then deployment and
+confirmation for each receiver. `stage_seed` derives each stage's seed. The module does not run stages
+(`orchestrator.runs.stage_scheduler`).
+"""
 
 from __future__ import annotations
 
@@ -45,10 +50,10 @@ from sim_engine.scene import Scene
 
 POURS, CALIBRATION, EVALUATION = "pours", "calibration", "evaluation"
 DEPLOYMENT, CONFIRMATION, PREDICTION = "deployment:", "confirmation:", "prediction:"
-"""Names of a calibration's stages, and what those of receivers begin with."""
+"""Names of the calibration's stages, and prefixes of the receivers' stage names."""
 
 POSTERIOR_DRAWS = 64
-"""θ of a posterior that a deployment under risk draws from."""
+"""Number of draws from the posterior of θ that a deployment under risk uses."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +62,10 @@ class StageDefinition:
 
     Attributes:
         name: unique in the campaign; part of the stage's seed.
-        build: makes the strategy from the former stages' results and the stage's seed.
-        order: in which outcomes are told.
+        build: makes the strategy from the earlier stages' results and the stage's seed.
+        order: order in which outcomes are delivered.
         pours: whether it needs a bench.
-        stand_in: what takes its result's place where later stages are acted out beforehand
-        (`orchestrator.runs.speculative_requests`).
+        stand_in: placeholder for its result in speculative execution (`orchestrator.runs.speculative_requests`).
     """
 
     name: str
@@ -72,7 +76,7 @@ class StageDefinition:
 
 
 def stage_seed(seed: int, stage: str) -> int:
-    """The seed of a stage: the same anywhere, and independent of the other stages'."""
+    """The seed of a stage: the same on every machine, and independent of the other stages' seeds."""
     words = np.frombuffer(hashlib.sha256(stage.encode()).digest(), dtype="<u4")
     high, low = np.random.SeedSequence([seed, *(int(w) for w in words)]).generate_state(2, dtype=np.uint32)
     return (int(high) >> 1) << 32 | int(low)
@@ -82,7 +86,7 @@ def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
     """All scenes of a plan by name.
 
     Raises:
-        RunError: two different scenes bear the same name.
+        RunError: two different scenes have the same name.
     """
     found: list[Scene] = []
     if plan.calibration is not None:
@@ -108,10 +112,10 @@ def stages_of(plan: CampaignPlan) -> tuple[StageDefinition, ...]:
 
 
 def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None = None) -> list[StageDefinition]:
-    """Pours (unless records take their place), the strategy, and what came of it beside its rivals.
+    """Pours (unless records replace them), the calibration strategy, and its evaluation against rivals.
 
     Args:
-        deployment: what pours that are chosen actively are to teach about; None: about calibration's own actions.
+        deployment: the deployment that actively chosen pours serve; None: they serve calibration's own actions.
     """
     stages = []
     if plan.pour_count > 0:
@@ -149,7 +153,7 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
 
 
 def _stand_in(plan: CalibrationPlan) -> Calibrated:
-    """A θ* that has not been found: one of the box that no campaign would name."""
+    """Placeholder for a θ* that is not found yet: a point of the box that is unlikely to occur otherwise."""
     values = plan.parameters.decode([math.sqrt(0.3)] * plan.parameters.dimension)
     theta = CalibratedTheta(
         theta=SimulationParameters.from_values({**plan.fixed_parameters, **values}),
@@ -165,9 +169,9 @@ def _stand_in(plan: CalibrationPlan) -> Calibrated:
 
 
 def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[StageDefinition]:
-    """One stage for each receiver, all with the recommended θ (the plan's where nothing is calibrated).
+    """One stage for each receiver, all with the recommended θ (the plan's θ if nothing is calibrated).
 
-    Each is followed by one that pours what was recommended again, where the plan asks for that.
+    A confirmation stage, which repeats the recommended pour, follows each if the plan requests it.
     """
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
@@ -201,11 +205,11 @@ def prediction_stages(
     seeds: int,
     thetas: Sequence[SimulationParameters] = (),
 ) -> list[StageDefinition]:
-    """One stage for each receiver: what was recommended there is simulated again with fresh seeds.
+    """One stage for each receiver, which simulates its recommended pour again with new seeds.
 
     Args:
-        seeds: how many, each.
-        thetas: draws of a posterior that the seeds take turns with; none: the θ that was planned with.
+        seeds: number of simulations per receiver.
+        thetas: posterior draws that the simulations use in turn; empty: the θ that was planned with.
     """
 
     def build_for(name: str, scene: Scene) -> Callable[[Results, int], Strategy]:
@@ -227,10 +231,10 @@ def prediction_stages(
 
 
 def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPlan:
-    """The deployment with the draws of θ that its settings ask for, from the calibration before it.
+    """The deployment with the posterior draws of θ that its settings need, from the preceding calibration.
 
     Raises:
-        RunError: it has none.
+        RunError: the calibration has no posterior.
     """
     if not deployment.settings.needs_posterior or deployment.thetas:
         return deployment
@@ -241,7 +245,7 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
 
 
 def with_left_over(deployment: DeploymentPlan, results: Results) -> DeploymentPlan:
-    """The deployment with what the calibration before it left over of its pours, where that was scored."""
+    """The deployment with the residual of the preceding calibration, if the calibration was evaluated."""
     if deployment.left_over is not None or CALIBRATION not in results or EVALUATION not in results:
         return deployment
     scores = result_of(results, EVALUATION, Scores)
@@ -249,7 +253,7 @@ def with_left_over(deployment: DeploymentPlan, results: Results) -> DeploymentPl
 
 
 def posterior_draws(found: CalibratedTheta, count: int) -> tuple[SimulationParameters, ...]:
-    """So many draws of θ's posterior, or all that there are; none where it has none."""
+    """At most `count` draws of the posterior of θ; none if there is no posterior."""
     rows = () if found.posterior is None else found.posterior.thetas
     count = min(count, len(rows))
     kept = [rows[i * len(rows) // count] for i in range(count)]
@@ -257,9 +261,10 @@ def posterior_draws(found: CalibratedTheta, count: int) -> tuple[SimulationParam
 
 
 def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationParameters) -> DeploymentPlan:
-    """The deployment with what is known of the bench: by pours into the receiver before, or by the calibration.
+    """The deployment with the known bench offsets, from earlier pours into a receiver or from the calibration.
 
-    A calibration says something of it where it searched nuisances; those that it did not search have their tolerances.
+    A calibration contributes if it searched nuisance parameters; parameters that it did not search keep their
+    tolerances.
     """
     if not deployment.settings.learns_of_benches or deployment.bench:
         return deployment
@@ -277,13 +282,13 @@ def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationPar
 
 
 def _by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:
-    """Scenes by their receivers' names, or by their own where receivers share one."""
+    """Scenes by the names of their receivers, or by their own names if receivers are shared."""
     distinct = len({scene.receiver.name for scene in deployment.scenes}) == len(deployment.scenes)
     return {scene.receiver.name if distinct else scene.name: scene for scene in deployment.scenes}
 
 
 def _theta(plan: CampaignPlan, results: Results) -> SimulationParameters:
-    """The θ that calibration recommends; the plan's where nothing was calibrated."""
+    """The θ that calibration recommends; the plan's if nothing was calibrated."""
     return deployed_theta(results) if CALIBRATION in results else plan.parameters
 
 
@@ -298,7 +303,7 @@ def deployed_theta(results: Results) -> SimulationParameters:
 
 
 def calibrated_theta(results: Results) -> CalibratedTheta:
-    """θ* of the calibration's stage.
+    """θ* of the calibration stage.
 
     Raises:
         RunError: there is none.
@@ -321,7 +326,7 @@ def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:
 
 
 def known_simulations(plan: CalibrationPlan, results: Results) -> tuple[KnownSimulation, ...]:
-    """What the stage that made the pours has simulated in the calibration's scenes; what is known without one."""
+    """Simulations in the calibration's scenes by the stage that made the pours; the plan's without such a stage."""
     if POURS not in results:
         return plan.known
     simulated = result_of(results, POURS, DesignPoured).simulated

@@ -1,4 +1,8 @@
-"""Pours that had begun when their run died: nobody knows what came of them, and software must not guess."""
+"""Pours that had begun when their run was interrupted: their outcome is unknown, and software must not guess it.
+
+`settle_unknown_pours` asks the operator for each outcome (lost, weighed, or repeat on a virtual bench) and records it.
+`settle_open_questions` does the same for questions of strategies. `parse_answer` converts an answer to an outcome.
+"""
 
 from __future__ import annotations
 
@@ -15,17 +19,17 @@ from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 
 AskOperator = Callable[[str, Sequence[str]], str | Awaitable[str]]
-"""Asked with a question and the answers allowed; returns one of them, 'weighed' being followed by its numbers."""
+"""Called with a question and the allowed answers; returns one of them. Masses follow the word 'weighed'."""
 
 LOST, REPEAT, WEIGHED = "lost", "repeat", "weighed SPILLED RETAINED [LOADED]"
 _TRIES = 3
 
 LOAD_WITHIN, LOAD_WITHIN_MASS = 0.1, 5e-3
-"""How far a load that the operator weighed may lie from the nominal one: as a share of it, or [kg] if that is more."""
+"""Maximum difference between a load weighed by the operator and the nominal one: relative, or [kg] if larger."""
 
 
 class OperatorNeededError(RunError):
-    """A person has to say what happened, and nobody is there to be asked."""
+    """The operator must answer a question, and no operator is present."""
 
     exit_code = 3
 
@@ -40,16 +44,16 @@ async def settle_unknown_pours(
     ask: AskOperator | None,
     on_waiting: Callable[[str], None],
 ) -> None:
-    """Find out what becomes of each pour that had started and has no outcome, and write it down.
+    """Ask for the outcome of each pour that had started and has none, and write it to the journal.
 
-    A pour that is to be repeated (virtual bench only) stays without outcome and will be run again with its seed.
+    A pour that will be repeated (virtual bench only) stays without outcome and runs again with its seed.
 
     Args:
-        ask: None if nobody can be asked.
-        on_waiting: called with the question before it is asked.
+        ask: None if no operator is present.
+        on_waiting: called with the question before it is shown.
 
     Raises:
-        OperatorNeededError: nobody is there, or no sensible answer came.
+        OperatorNeededError: no operator is present, or no valid answer was given.
         RunError: the plan repeats pours, but the bench is not virtual.
     """
     virtual = plan.laboratory.mode == "virtual"
@@ -88,10 +92,10 @@ async def settle_open_questions(
     ask: AskOperator | None,
     on_waiting: Callable[[str], None],
 ) -> None:
-    """Have each question that a strategy paused the run with answered, and write the answer down.
+    """Ask each question with which a strategy paused the run, and write the answers to the journal.
 
     Raises:
-        OperatorNeededError: nobody is there, or no sensible answer came.
+        OperatorNeededError: no operator is present, or no valid answer was given.
     """
     for key, request in history.open_questions().items():
         if ask is None:
@@ -113,7 +117,7 @@ async def settle_open_questions(
 
 
 def needs_answer(request: Ask) -> OperatorNeededError:
-    """The run pauses with this, and says how to answer."""
+    """The error that pauses the run; its text explains how to answer."""
     options = "; ".join(request.options)
     return OperatorNeededError(
         f"{request.question} The run is paused. Resume with one of these answers: {options}, for example "
@@ -122,18 +126,18 @@ def needs_answer(request: Ask) -> OperatorNeededError:
 
 
 def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome | None:
-    """What an operator's answer means.
+    """Convert an operator's answer to an outcome.
 
     Args:
-        answer: 'repeat', 'lost', or 'weighed' with the masses spilled, retained and perhaps loaded [g].
+        answer: 'repeat', 'lost', or 'weighed' with the masses spilled, retained and optionally loaded [g].
         options: allowed answers.
-        loaded: mass that the pourer should have held [kg].
+        loaded: nominal load of the pourer [kg].
 
     Returns:
-        The outcome; None if the pour is to be repeated.
+        The outcome; None if the pour will be repeated.
 
     Raises:
-        ValueError: what is wrong with the answer.
+        ValueError: the answer is invalid; the text gives the reason.
     """
     words = answer.lower().replace(",", " ").split()
     text = answer.strip().lower()
@@ -166,7 +170,7 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
 
 
 def weighed_by_hand(pour: Pour, measured: PourMeasurement) -> str:
-    """What a person types on resume about a pour that was weighed and can't be written down."""
+    """Message with the answer to type on resume, for a pour that was weighed but can't be written to the journal."""
     loaded, spilled, retained = (f"{1e3 * mass:.1f}" for mass in (measured.loaded, measured.spilled, measured.retained))
     return (
         f"Pour {pour.number} was made and weighed, and is not written down: {loaded} g loaded, {spilled} g spilled, "

@@ -1,1 +1,1 @@
-"""Reading YAML: places of errors, units, sections with strict keys, files that name other files."""
+"""YAML files: reading with places, validation of sections, references between files, problems, and writing."""

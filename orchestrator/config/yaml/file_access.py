@@ -1,4 +1,4 @@
-"""Files and folders that people name: what they turn out to be, and their text up to a limit."""
+"""Access to files and folders named by the user: checks with clear reasons, and text up to a size limit."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _roots: ContextVar[tuple[Path, ...] | None] = ContextVar("roots", default=None)
 
 
 class UnreadableError(Exception):
-    """A file can't be read; the message says why, without its name."""
+    """A file can't be read; the message gives the reason without the file's name."""
 
 
 @contextlib.contextmanager
 def confined(roots: Sequence[Path]) -> Iterator[None]:
-    """As long as this lasts no file is read but these, and those in these folders: for campaigns of strangers.
+    """Restrict reading to these files and folders within this context, for campaigns from untrusted sources.
 
     Args:
-        roots: absolute, behind links.
+        roots: absolute paths without links.
     """
     token = _roots.set(tuple(roots))
     try:
@@ -38,7 +38,7 @@ def confined(roots: Sequence[Path]) -> Iterator[None]:
 
 
 def out_of_bounds(path: Path) -> str | None:
-    """Why a path may not be looked at; None where it may. What is behind it decides, not how it is written."""
+    """Reason why a path may not be read; None if it may. The target of a link decides."""
     roots = _roots.get()
     if roots is None:
         return None
@@ -49,7 +49,7 @@ def out_of_bounds(path: Path) -> str | None:
 
 
 def resolved(path: Path) -> Path:
-    """The absolute path behind links, for any path: of links that lead in a circle the first one is kept."""
+    """The absolute path without links; for links that form a cycle, the first one is kept."""
     try:
         return Path(os.path.realpath(path))
     except (OSError, ValueError):
@@ -57,7 +57,7 @@ def resolved(path: Path) -> Path:
 
 
 def why_unreadable(path: Path) -> str | None:
-    """What is wrong with a path that should be that of a file; None where it is one."""
+    """Reason why a path is not a readable file; None if it is."""
     if (outside := out_of_bounds(path)) is not None:
         return outside
     try:
@@ -82,7 +82,7 @@ def why_unreadable(path: Path) -> str | None:
 
 
 def missing_file(path: Path) -> str | None:
-    """What to say where a file is named that can't be read; None where it can."""
+    """Message for a named file that can't be read; None if it can be read."""
     why = why_unreadable(path)
     if why is None:
         return None
@@ -92,7 +92,7 @@ def missing_file(path: Path) -> str | None:
 
 
 def similar(path: Path) -> str | None:
-    """'did you mean …?' with a file of the same directory; None where none resembles it."""
+    """'did you mean …?' with a similar file of the same directory; None if there is none."""
     try:
         guess = did_you_mean(path.name, [p.name for p in path.parent.iterdir()])
     except OSError:
@@ -101,7 +101,7 @@ def similar(path: Path) -> str | None:
 
 
 def why_not_writable(directory: Path) -> str | None:
-    """Why nothing could be kept in a directory, which need not exist; None where nothing speaks against it."""
+    """Reason why a directory, which need not exist, can't be written; None if there is no known reason."""
     for path in (directory, *directory.parents):
         try:
             mode = path.stat().st_mode
@@ -123,9 +123,9 @@ def read_text(path: Path, *, encoding: str = "utf-8", limit: int = SIZE_LIMIT) -
     """The text of a file.
 
     Args:
-        path: of the file.
-        encoding: 'utf-8', or 'utf-8-sig' where a byte order mark may stand first.
-        limit: largest size [bytes].
+        path: the file.
+        encoding: 'utf-8', or 'utf-8-sig' if a byte order mark may come first.
+        limit: maximum size [bytes].
 
     Raises:
         UnreadableError: it does not exist, is not a file, is too large, or is not text.

@@ -1,4 +1,4 @@
-"""Values that may stand in a file of their own: vessels, liquids, laboratories. Each file is read once."""
+"""References to values in other files: vessels, liquids, laboratories. Each file is read once."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ S = TypeVar("S", bound=Section)
 YAML_SUFFIXES = (".yaml", ".yml", ".json")
 
 KINDS: dict[type[Section], str] = {VesselFile: "vessel", LaboratoryFile: "laboratory"}
-"""Kinds of whole files that can be told apart by their keys."""
+"""Kinds of whole files that their keys identify."""
 
 
 @dataclass
 class References:
-    """Follows paths from files to files; problems in any of them go to the report with their own place."""
+    """Follows paths from files to files. Problems in any of them are added to the report with their own place."""
 
     report: Report
     _read: dict[tuple[Path, type[Section]], tuple[Section, Place] | None] = field(default_factory=dict)
     _vessels: dict[tuple[Path, Any], VesselSpec | None] = field(default_factory=dict)
 
     def section(self, value: Any, place: Place, model: type[S]) -> tuple[S, Place] | None:
-        """The section behind a path, or the inline one, with its place; None where there is none to look at."""
+        """The section behind a path, or the inline one, with its place; None if there is none."""
         if isinstance(value, model):
             return value, place
         if not isinstance(value, str):
@@ -53,12 +53,12 @@ class References:
         return self.file(path, model, place)
 
     def file(self, path: Path, model: type[S], named: Place | None = None) -> tuple[S, Place] | None:
-        """The section that a whole file holds.
+        """The section of a whole file.
 
         Args:
-            path: of the file.
-            model: of the section.
-            named: where it is referred to; None where it was given by itself.
+            path: the file.
+            model: class of the section.
+            named: place of the reference; None for a file given directly.
         """
         key = (path, model)
         if key not in self._read:
@@ -84,7 +84,7 @@ class References:
         return section, place
 
     def vessel(self, value: Any, place: Place) -> VesselSpec | None:
-        """A vessel; None where something is wrong with it (which is reported)."""
+        """A vessel; None after a problem (which is reported)."""
         found = self.section(value, place, VesselFile)
         if found is None:
             return None
@@ -94,11 +94,11 @@ class References:
         return self._vessels[key]
 
     def liquid(self, value: Any, place: Place) -> Liquid | None:
-        """A liquid; None where something is wrong with it."""
+        """A liquid; None after a problem."""
         found = self.section(value, place, LiquidFile)
         return None if found is None else resolve_liquid(*found, self.report)
 
     def laboratory(self, value: Any, place: Place) -> Any:
-        """A `LaboratorySpec`; None where something is wrong with it."""
+        """A `LaboratorySpec`; None after a problem."""
         found = self.section(value, place, LaboratoryFile)
         return None if found is None else resolve_laboratory(*found, self.report)

@@ -1,6 +1,7 @@
-"""From plain data with places to sections: pydantic's errors in our words, as many at once as there are.
+"""Validates plain data with places into sections, and reports pydantic's errors as problems with their places.
 
-What a strategy finds wrong with its settings, put where it stands in the file.
+`validate` finds as many problems as possible in one pass. `PlacedProblems` places problems that a strategy finds in its
+settings.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ S = TypeVar("S", bound=Section)
 
 
 def validate(model: type[S], place: Place, report: Report) -> S | None:
-    """The section at a place; everything that is wrong with it goes to the report.
+    """The section at a place; all problems are added to the report.
 
-    What is wrong is cut out and the rest validated again, so that the answer still has all that is right and later
-    checks can look at that. None only where nothing is left to look at.
+    Invalid parts are removed and the rest is validated again. The result thus has all valid parts, which later checks
+    can use. It is None only if nothing is left.
     """
     document = place.document
     if place.loc == ():
@@ -44,7 +45,7 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
         try:
             section = model.model_validate(data, context=FROM_FILE)
         except ValidationError as error:
-            # Deepest first and last items first, so that cutting does not move what is still to be cut.
+            # Deepest first and last items first, so that a removal does not move the others.
             details = sorted(
                 error.errors(include_url=False), key=lambda e: (len(e["loc"]), str(e["loc"])), reverse=True
             )
@@ -66,7 +67,7 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
                 else:
                     report.add(place.at(*loc), _message(model, detail, loc, data), key=unknown)
                     if unknown and (meant := _meant(model, loc, data)) is not None:
-                        # Nobody needs to hear that the key is also missing.
+                        # the key is not reported as missing as well
                         report.broken.add((place.document.path, place.at(*loc[:-1], meant).loc))
                 cut = _cut(data, loc) or cut
             if not cut:
@@ -77,7 +78,7 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
 
 
 def _guess_variant(variants: set[type[Section]], data: dict[str, Any], place: Place, report: Report) -> None:
-    """Say that the key that tells variants apart is missing or wrong; go on with the one that has most of the keys."""
+    """Report that the key that selects the variant is missing or wrong; continue with the best-matching variant."""
     key, word = next(iter(variants)).tag, data.get(next(iter(variants)).tag)
     words = sorted(map(_tag, variants))
     if word is None:
@@ -93,12 +94,12 @@ def _guess_variant(variants: set[type[Section]], data: dict[str, Any], place: Pl
 
 
 def _tag(section: type[Section]) -> str:
-    """The word that tells a variant apart from its siblings."""
+    """The word that selects a variant."""
     return section.variant or str(section.model_fields[section.tag].default)
 
 
 def _variant(sections: set[type[Section]], data: Any) -> set[type[Section]]:
-    """Those of the sections that may stand somewhere that the data there are meant to be."""
+    """The sections that the data are meant to be, among those that are possible at their place."""
     if not isinstance(data, dict):
         return sections
     return {
@@ -110,7 +111,7 @@ def _variant(sections: set[type[Section]], data: Any) -> set[type[Section]]:
 
 
 def _owners(model: type[Section], loc: Loc, data: Any) -> set[type[Section]]:
-    """The variants that have a key which the one that was written has not."""
+    """The variants that have a key which the selected variant lacks."""
     variants = {section for section in _sections_at(model, loc[:-1], data) if section.tag}
     if not variants and len(loc) > 1 and any(section.variant for section in _sections_at(model, loc[:-1], data)):
         for parent in _sections_at(model, loc[:-2], data):
@@ -125,8 +126,8 @@ def _node(data: Any, loc: Loc) -> Any:
 
 
 def _cut(data: Any, loc: Loc) -> bool:
-    """Take what stands at a location out of the data; False where that is everything, or gone already."""
-    # An item of a list can't be left out without changing the meaning of its neighbours: the list goes as a whole.
+    """Remove a location from the data; False if that is everything, or it was removed already."""
+    # Removing an item of a list would change the meaning of its neighbours, so the whole list is removed.
     target = loc
     while target and isinstance(target[-1], int):
         target = target[:-1]
@@ -242,14 +243,14 @@ def _keys(sections: set[type[Section]]) -> set[str]:
 
 
 def _meant(model: type[Section], loc: Loc, data: Any) -> str | None:
-    """The key that a misspelt one resembles most: of the variant that was written, or of another one."""
+    """The key most similar to a misspelt one: of the selected variant, or of another one."""
     variants = _sections_at(model, loc[:-1], data)
     own = _keys(_variant(variants, _node(data, loc[:-1])))
     return did_you_mean(str(loc[-1]), own) or did_you_mean(str(loc[-1]), _keys(variants))
 
 
 def _sections_at(model: type[Section], loc: Loc, data: Any) -> set[type[Section]]:
-    """The sections that may stand at a location of the data (several where a union is possible)."""
+    """The sections that are possible at a location of the data (several for a union)."""
     candidates: set[type[Section]] = {model}
     for part in loc:
         if not isinstance(part, int):
@@ -293,11 +294,11 @@ def _name(value: Any) -> str:
 
 
 class PlacedProblems:
-    """Complaints about a section, by its keys; see `orchestrator.strategies.campaign_plan.Complaints`.
+    """Problems of a section, placed by its keys; see `orchestrator.strategies.campaign_plan.Complaints`.
 
     Args:
-        place: of the section.
-        common: keys of the section that are not the strategy's.
+        place: place of the section.
+        common: keys of the section that do not belong to the strategy.
     """
 
     def __init__(self, place: Place, report: Report, common: frozenset[str]) -> None:
@@ -305,7 +306,7 @@ class PlacedProblems:
         self._before = len(report.problems)
 
     def add(self, text: str, *at: str | int, key: bool = False, of: str = "") -> None:
-        """Note a problem, unless something is wrong there already."""
+        """Add a problem, unless one was added at the same place."""
         where = self._place.at(*at)
         if (at and self._below(where.loc)) or (of and self._below(self._place.at(of).loc)):
             return
@@ -313,7 +314,7 @@ class PlacedProblems:
 
     @property
     def any(self) -> bool:
-        """Whether something is wrong with the strategy's settings."""
+        """Whether the strategy's settings have problems."""
         if len(self._report.problems) > self._before:
             return True
         start = len(self._place.loc)

@@ -1,4 +1,4 @@
-"""Problems of campaign files, told with their place to the person who can mend them."""
+"""Problems of input files with their places, and the error that reports them."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from sim_engine.errors import DecantError
 
 PROBLEMS_SHOWN = 20
 LINE_SHOWN, TEXT_SHOWN = 200, 1500
-"""Characters of a line of a file and of a message that are shown: a person mends one thing after the other."""
+"""Maximum number of characters of a source line and of a message in a report."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong in one place.
+    """One problem at one place.
 
     Attributes:
-        path: file it stands in.
-        line: from 1; 0 where a file as a whole is meant.
+        path: the file.
+        line: from 1; 0 for the file as a whole.
         column: from 1.
         where: dotted location in the file, e.g. 'deployment.pours'; empty for the whole file.
-        message: what is wrong; what would be right.
-        source_line: the line as it stands in the file.
+        message: the problem, and a correct value.
+        source_line: the line as written in the file.
     """
 
     path: Path
@@ -42,17 +42,17 @@ class Problem:
         # Tabs would move the caret: both lines are shown with each tab as one space.
         source = self.source_line.replace("\t", " ").rstrip()
         before = self.column - 1
-        if len(source) > LINE_SHOWN:  # only what stands around the place
+        if len(source) > LINE_SHOWN:  # only the part around the place
             begin = max(0, before - LINE_SHOWN // 2)
             source, before = source[begin : begin + LINE_SHOWN], before - begin
         return f"{head}\n{self.line:5d} | {source}\n      | {' ' * before}^"
 
 
 class ConfigError(DecantError):
-    """A campaign, vessel, laboratory, record or parameter file can't be used; its text is the whole report.
+    """A campaign, vessel, laboratory, record or parameter file is invalid; the text is the whole report.
 
     Attributes:
-        problems: everything found, in the order of the files and lines.
+        problems: all problems, in the order of the files and lines.
     """
 
     def __init__(self, problems: Iterable[Problem]) -> None:
@@ -68,7 +68,7 @@ def _cut(text: str) -> str:
 
 
 def shown_path(path: Path) -> str:
-    """A path as people like to read it: relative to the working directory where it lies below it."""
+    """A path for messages: relative to the working directory if it lies below it."""
     try:
         return str(path.relative_to(Path.cwd()))
     except ValueError:

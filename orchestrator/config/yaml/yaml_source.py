@@ -1,9 +1,10 @@
-"""YAML as plain values that remember where they stood.
+"""YAML files as plain values with their places, and the collection of problems.
 
-The node graph of the parser is turned into plain data here, rather than by its constructor, because every duplicate
-key, tag and merge is to be reported at once and with its place.
+`Document` is a parsed file, `Place` a location in it, `Report` collects problems. `kind_of` recognises the kind of a
+file by its keys, so that a file of another kind gives one error instead of one per key.
 
-What a YAML file describes, by its keys: so that a file of another kind gets one error and not one per key.
+The parser's node graph is converted to plain data here instead of by its constructor, so that all duplicate keys, tags
+and merges are reported together with their places.
 """
 
 from __future__ import annotations
@@ -26,15 +27,16 @@ from sim_engine.vessel.shapes import VESSELS
 Loc = tuple[str | int, ...]
 
 NODE_LIMIT = 20_000
-"""Nodes of a file after aliases are followed: a campaign has a few hundred; a loop or bomb of aliases has more."""
+"""Maximum number of nodes after aliases are followed. A campaign has a few hundred; cyclic or exponential aliases
+exceed it."""
 
 DEPTH_LIMIT = 30
-"""Mappings and lists in each other: a campaign has eight."""
+"""Maximum nesting of mappings and lists: a campaign has eight levels."""
 
 
 @dataclass(frozen=True)
 class SourcePosition:
-    """Where something stands, from 1: its key (or list item) and its value; `inline` if the value is on one line."""
+    """Position of a value, from 1: its key (or list item) and its value; `inline` if the value is on one line."""
 
     key: tuple[int, int]
     value: tuple[int, int]
@@ -43,7 +45,7 @@ class SourcePosition:
 
 @lru_cache(maxsize=16)
 def _known(text: str, path: Path) -> Document:
-    """Vessels and laboratories are named by many files. Nobody changes a document once it has been read."""
+    """Cached, because many files name the same vessels and laboratories. A document is not changed after reading."""
     return Document.parse(text, path)
 
 
@@ -53,10 +55,10 @@ class Document:
 
     Attributes:
         path: the file.
-        lines: its text, for showing source lines.
+        lines: its text, to display source lines.
         data: plain dicts, lists, strings, numbers, booleans and None.
-        marks: place of everything in `data`.
-        problems: what was found while reading that does not prevent reading on (duplicate keys, tags, merges).
+        marks: place of every value in `data`.
+        problems: problems that do not prevent reading (duplicate keys, tags, merges).
     """
 
     path: Path
@@ -80,7 +82,7 @@ class Document:
 
     @classmethod
     def parse(cls, text: str, path: Path) -> Document:
-        """Parse a text as if it were the file's.
+        """Parse a text as the content of the file.
 
         Raises:
             ConfigError: it is not YAML, or is empty.
@@ -95,7 +97,7 @@ class Document:
         except MarkedYAMLError as error:
             raise ConfigError([document._syntax_problem(error)]) from None
         except ReaderError as error:
-            # The parser counts characters of the text; people count lines.
+            # The parser counts characters of the text; messages need lines.
             before = text[: error.position]
             line, column = before.count("\n") + 1, len(before) - before.rfind("\n")
             message = f"not YAML: an unprintable character (code {ord(text[error.position])}); is this a text file?"
@@ -128,14 +130,14 @@ class Document:
         return known
 
     def problem(self, loc: Loc, message: str, *, key: bool = False) -> Problem:
-        """A problem at a location, pointing at the value where that fits on a line, else (or with `key`) at the key."""
+        """A problem at a location. It points at the value if that fits on a line, else (or with `key`) at the key."""
         mark = self.marks[self.known_loc(loc)]
         line, column = mark.value if mark.inline and not key else mark.key
         return Problem(self.path, line, column, dotted(loc), message, self.line(line))
 
     def _plain(self, node: Node, loc: Loc, active: frozenset[int] = frozenset()) -> Any:
         self._nodes += 1
-        if len(loc) > DEPTH_LIMIT:  # by aliases within aliases
+        if len(loc) > DEPTH_LIMIT:  # through nested aliases
             raise ConfigError([self._too_deep(_start(node))])
         if self._nodes > NODE_LIMIT:
             raise ConfigError([self._too_many(_start(node), loc)])
@@ -191,7 +193,7 @@ class Document:
                 case "str" | "timestamp":
                     return text
         except ValueError:
-            pass  # e.g. 0123: a number to the resolver, none to us; the text says more than a guess
+            pass  # e.g. 0123: a number for the resolver, but not a valid one; the text is kept
         if tag.startswith("tag:yaml.org,2002:") and tag.rsplit(":", 1)[-1] in ("int", "float"):
             return text
         line, column = _start(node)
@@ -235,7 +237,7 @@ class Document:
 
 @dataclass(frozen=True)
 class Place:
-    """A location in a document; what referenced files and inline mappings have in common."""
+    """A location in a document; the same for referenced files and inline mappings."""
 
     document: Document
     loc: Loc = ()
@@ -246,33 +248,33 @@ class Place:
 
     @property
     def directory(self) -> Path:
-        """Directory against which paths written here resolve."""
+        """Directory that relative paths in this document start from."""
         return self.document.path.parent
 
 
 @dataclass
 class Report:
-    """Collects the problems of a campaign file and of everything it refers to."""
+    """Collects the problems of a campaign file and of all files that it refers to."""
 
     problems: list[Problem] = field(default_factory=list)
     broken: set[tuple[Path, Loc]] = field(default_factory=set)
 
     def add(self, place: Place, message: str, *, key: bool = False) -> None:
-        """Note a problem; the place counts as broken from now on."""
+        """Add a problem; its place then counts as invalid."""
         self.problems.append(place.document.problem(place.loc, message, key=key))
         self.broken.add((place.document.path, place.document.known_loc(place.loc)))
 
     def is_broken(self, place: Place) -> bool:
-        """Whether a problem was noted at this very place."""
+        """Whether a problem was reported at exactly this place."""
         return (place.document.path, place.loc) in self.broken
 
     def is_broken_within(self, place: Place) -> bool:
-        """Whether a problem was noted there or at anything in it."""
+        """Whether a problem was reported at this place or inside it."""
         size = len(place.loc)
         return any(path == place.document.path and loc[:size] == place.loc for path, loc in self.broken)
 
     def raise_if_any(self) -> None:
-        """Raise everything collected, file by file and line by line.
+        """Raise all collected problems, sorted by file and line.
 
         Raises:
             ConfigError: there are problems.
@@ -285,7 +287,7 @@ class Report:
 
 
 class _TooManyNodesError(MarkedYAMLError):
-    """Raised while reading, before everything has been read."""
+    """Raised during parsing, before the whole file is read."""
 
 
 class _Composer(Composer):
@@ -299,7 +301,7 @@ class _Composer(Composer):
 
 
 def _parser() -> YAML:
-    """Without the comments, whose keeping takes a round-trip parser a minute where there are a million of them."""
+    """A parser without comments: a round-trip parser needs a minute for a million comments."""
     parser = YAML(typ="safe", pure=True)
     parser.Composer = _Composer
     parser.max_depth = DEPTH_LIMIT
@@ -325,7 +327,7 @@ TELLING = {
     "vessel": {"profile", "mesh", "inner", "wall", "up"},
     "laboratory": {"bench", "mode", "simulators", "arm", "cell"},
 }
-"""Top-level keys that only one kind of file has, or that give away what was meant; looked for in this order."""
+"""Top-level keys that identify one kind of file, including wrong keys with a clear meaning; checked in this order."""
 
 NEEDED = {
     "study": "a study has keys such as campaign, mismatch, calibration, deployment",
@@ -336,18 +338,18 @@ NEEDED = {
 
 
 def kind_of(data: Any) -> str | None:
-    """'study', 'campaign', 'vessel' or 'laboratory'; None if no key tells."""
+    """'study', 'campaign', 'vessel' or 'laboratory'; None if no key identifies it."""
     keys = set(data) if isinstance(data, dict) else set()
     return next((kind for kind in TELLING if keys & telling(kind)), None)
 
 
 def telling(kind: str) -> set[str]:
-    """Keys that tell a kind of file, with those that packages add."""
+    """Keys that identify a kind of file, including keys that packages add."""
     return TELLING[kind] | (set(VESSELS.names) if kind == "vessel" else set())
 
 
 def wrong_kind(document: Document, wanted: str) -> Problem | None:
-    """The problem with a file that plainly is of another kind than the one wanted; None otherwise."""
+    """The problem of a file that is clearly of another kind than the wanted one; None otherwise."""
     found = kind_of(document.data)
     keys = set(document.data) if isinstance(document.data, dict) else set()
     if found is None or found == wanted or keys & telling(wanted):

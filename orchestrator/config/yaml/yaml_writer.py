@@ -1,4 +1,4 @@
-"""From validated sections back to what a file would say: whole, exact, and alone, wherever it will lie."""
+"""Converts validated sections back to file content that is complete, exact and independent of other files."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ T = TypeVar("T")
 
 
 def as_file(section: Section, place: Place, references: References, *, whole: bool = True) -> dict[str, Any]:
-    """A section as a file would have it, JSON-ready: loading that gives an equal section.
+    """A section in the format of a file, JSON-ready: loading it gives an equal section.
 
-    Defaults are written out (unless the section is recorded as it was given), numbers keep all their digits, paths are
-    absolute, and sections that stand in other files are written in.
+    Defaults are written (unless the section is recorded as given), numbers keep all digits, paths are absolute, and
+    sections from other files are included.
 
     Args:
-        section: without problems.
-        place: where it stands.
-        references: that its other files were read by.
-        whole: with defaults.
+        section: the section, without problems.
+        place: place of the section.
+        references: the references that read its other files.
+        whole: whether defaults are included.
     """
     whole = whole and not section.recorded_as_given
     return _Writer(references, whole).section(section.completed() if whole else section, place)
@@ -46,7 +46,7 @@ class _Writer:
             if value is None or not (self.whole or name in section.model_fields_set):
                 continue
             found = self._value(value, info.annotation, tuple(info.metadata), place.at(key))
-            if found != {}:  # an empty mapping says nothing, and would only stand beside others
+            if found != {}:  # an empty mapping has no content and could conflict with other keys
                 table[key] = found
         return table
 
@@ -75,7 +75,7 @@ class _Writer:
 
 
 def _parts(annotation: Any) -> list[tuple[Any, tuple[Any, ...]]]:
-    """What an annotation may be, each with its metadata: the members of unions, the content of Annotated."""
+    """The alternatives of an annotation, each with its metadata: the members of unions, the content of Annotated."""
     origin = typing.get_origin(annotation)
     if origin is typing.Annotated:
         inner, *metadata = typing.get_args(annotation)
@@ -86,7 +86,7 @@ def _parts(annotation: Any) -> list[tuple[Any, tuple[Any, ...]]]:
 
 
 def _behind_a_path(annotation: Any) -> type[Section] | None:
-    """The section that may stand in a file of its own, whose path is written."""
+    """The section that may be in its own file, referenced by a path."""
     for part, metadata in _parts(annotation):
         if any(isinstance(m, Tag) and m.tag == "inline" for m in metadata):
             return typing.cast("type[Section]", part)
@@ -94,7 +94,7 @@ def _behind_a_path(annotation: Any) -> type[Section] | None:
 
 
 def _find(kind: type[T], annotation: Any, metadata: tuple[Any, ...]) -> T | None:
-    """What an annotation says of one kind."""
+    """The first metadata of one kind in an annotation."""
     every = [*metadata, *(m for _, own in _parts(annotation) for m in own)]
     return next((m for m in every if isinstance(m, kind)), None)
 
