@@ -1,4 +1,8 @@
-"""Questions to the operator: reminders while nobody answers, a deadline, and a record of everything said."""
+"""Questions to the operator, with reminders, a deadline and a log.
+
+`OperatorQuestions` forwards questions to one operator and records each answer as an `AnsweredQuestion`. The wording of
+the questions belongs to `consent` and `weighing_plan`.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +21,13 @@ class NoAnswerError(LaboratoryError):
 
 @dataclass(frozen=True)
 class AnsweredQuestion:
-    """A question and what came of it.
+    """A question and its answer.
 
     Attributes:
-        about: of the question.
+        about: subject of the question.
         answer: as given; '' if none was.
-        after: how long it took [s of the clock].
-        problem: why it was asked again; '' the first time.
+        after: time until the answer [s of the clock].
+        problem: why the question was repeated; '' the first time.
     """
 
     about: str
@@ -36,11 +40,11 @@ class OperatorQuestions:
     """Asks one operator.
 
     Args:
-        operator: who answers.
+        operator: answers the questions.
         spec: reminder and deadline.
-        tell: takes notices: what is asked, answered and not answered, for the journal; problems as warnings. The
+        tell: receives notices for the journal: questions, answers, missing answers, and problems as warnings. The
             operator's own screen shows questions with their problems, and reminders.
-        time_scale: bench seconds per second of the clock; times of `spec` run so much faster for a virtual operator.
+        time_scale: bench seconds per second of the clock; for a virtual operator the times of `spec` are divided by it.
     """
 
     def __init__(
@@ -53,11 +57,11 @@ class OperatorQuestions:
         self.log: list[AnsweredQuestion] = []
 
     async def ask(self, question: OperatorQuestion) -> str:
-        """Put a question and await the answer.
+        """Ask a question and wait for the answer.
 
         Raises:
-            NobodyAnsweredError: none came in time.
-            LaboratoryError: the operator gave it up.
+            NoAnswerError: no answer came before the deadline.
+            LaboratoryError: the operator gave up.
         """
         if question.problem:
             self._tell(Notice("warning", question.problem, asked=self._on_screen))
@@ -77,12 +81,12 @@ class OperatorQuestions:
             self._tell(Notice("note", f"operator ({question.about}): {question.text} → {said}"))
 
     async def announce(self, text: str, seconds: float) -> None:
-        """Say that something moves in so many seconds [s of the clock]."""
+        """Announce that something moves after the given time [s of the clock]."""
         self._tell(Notice("note", f"operator told: {text}"))
         await self._operator.announce(text, seconds)
 
     def take_log(self) -> list[dict[str, Any]]:
-        """What was asked and answered since this was called last, JSON-ready."""
+        """Return the questions and answers since the last call, JSON-ready."""
         log, self.log = self.log, []
         return [
             {k: round(v, 3) if isinstance(v, float) else v for k, v in asdict(one).items() if v != ""} for one in log
