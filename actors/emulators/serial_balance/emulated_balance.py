@@ -1,6 +1,7 @@
-"""Who sits at the far end of a virtual line: an emulated balance.
+"""An emulated balance with injectable faults, as bytes in and bytes out.
 
-What may go wrong with a virtual balance, and how it then shows on display and line.
+`EmulatedBalance` is the interface that the pty server serves. `Emulation` implements it with a dialect and a scale;
+`FaultyDisplay` and `spoil` apply the `BalanceFaults` to display and line. The module opens no port.
 """
 
 from __future__ import annotations
@@ -20,21 +21,21 @@ from actors.balance.simulated_balance import EmulatedScale, Load, ScaleSettings
 
 @dataclass(frozen=True)
 class BalanceFaults:
-    """Faults in force; all off at first.
+    """Active faults; all are off at first.
 
     Attributes:
-        silent: says nothing and hears nothing.
-        frozen: the display stands as it was when this began, load and tare notwithstanding.
+        silent: sends nothing and ignores all input.
+        frozen: the display keeps its reading from the start of the fault, independent of load and tare.
         restless: never stable.
-        powerless: acknowledges tare and zero, and does nothing.
+        powerless: acknowledges tare and zero, but does nothing.
         fault: reports this error instead of weights.
-        stranger: understands no question, and says so where its dialect has words for it.
+        stranger: recognises no query, and sends an error if its dialect has one.
         unit: shown instead of its own, e.g. 'pcs'.
-        garbage: share of lines that noise is mixed into.
-        halved: share of lines that lose their first half.
-        unasked: prints by itself every so many seconds of the clock; 0: never.
-        interleaved: unasked lines may cut answers in two.
-        delay: answers come so much later [s of the clock].
+        garbage: fraction of lines with random bytes inserted.
+        halved: fraction of lines that lose their first half.
+        unasked: interval of unsolicited lines [s of the clock]; 0: none.
+        interleaved: unsolicited lines may split replies.
+        delay: additional delay of replies [s of the clock].
     """
 
     silent: bool = False
@@ -52,7 +53,7 @@ class BalanceFaults:
 
 
 class FaultyDisplay:
-    """A scale's display with faults. See `voice.Display`."""
+    """A scale's display with faults. See `protocol_encoder.EncoderDisplay`."""
 
     def __init__(self, scale: EmulatedScale) -> None:
         self.scale = scale
@@ -65,7 +66,7 @@ class FaultyDisplay:
         self._frozen = (self._frozen or self.reading()) if self.faults.frozen else None
 
     def reading(self) -> Reading:
-        """What the display shows."""
+        """Return the display's reading."""
         if self._frozen is not None:
             return self._frozen
         if self.faults.fault:
@@ -85,12 +86,12 @@ class FaultyDisplay:
 
 
 def spoil(line: bytes, faults: BalanceFaults, rng: np.random.Generator) -> bytes:
-    """A line as it comes off a bad cable.
+    """Apply the line faults to a line.
 
     Args:
-        line: as said.
-        faults: in force.
-        rng: of chance.
+        line: as sent.
+        faults: the active faults.
+        rng: random number generator.
     """
     if rng.random() < faults.halved:
         line = line[len(line) // 2 :]
@@ -101,45 +102,45 @@ def spoil(line: bytes, faults: BalanceFaults, rng: np.random.Generator) -> bytes
 
 
 REPEAT_INTERVAL = 0.2
-"""From one repeated reading to the next [s of bench time]."""
+"""Interval of repeated readings [s of bench time]."""
 
 COMMAND_PATIENCE = 5.0
-"""How long a command waits for rest before the balance gives it up [s of bench time]."""
+"""Longest time that a command waits for a stable display [s of bench time]."""
 
 
 class EmulatedBalance(Protocol):
-    """Hears and speaks; knows no ports."""
+    """Receives and returns bytes; does not depend on a port."""
 
     def hear(self, data: bytes, now: float) -> None:
-        """Take in what a client sent."""
+        """Process bytes from a client."""
         ...
 
     def speak(self, now: float) -> bytes:
-        """What is to be sent by now."""
+        """Return the bytes that are due now."""
         ...
 
     def due(self, now: float) -> float | None:
-        """When to ask again though nothing was received; None: not before."""
+        """Return the next time at which `speak` must be called without new input; None: not before new input."""
         ...
 
     def control(self, order: dict[str, Any], now: float) -> dict[str, Any]:
-        """Carry out what the one who holds the strings wants; an answer, JSON-ready.
+        """Execute a control command; return the result, JSON-ready.
 
         Raises:
-            KeyError, TypeError, ValueError: an order that isn't known.
+            KeyError, TypeError, ValueError: unknown command.
         """
         ...
 
 
 class Emulation:
-    """A balance that speaks a dialect.
+    """A balance with a dialect.
 
     Args:
-        dialect: one of `doors.voices`.
+        dialect: one of `actors.balance.dialect_registry.voices`.
         settings: of its scale.
-        time_scale: bench seconds per second of the clock; 0: bench time passes by order only.
-        latency: from question to answer [s of the clock].
-        seed: of its chance.
+        time_scale: bench seconds per second of the clock; 0: bench time passes by command only.
+        latency: time between query and reply [s of the clock].
+        seed: of its random numbers.
     """
 
     def __init__(
@@ -252,7 +253,7 @@ class Emulation:
             self._say(said, now)
 
     def _wait_on(self, now: float) -> None:
-        """Carry out the command that waits for rest, or give it up."""
+        """Execute the pending command if the display is stable, or end it after its time limit."""
         assert self._waiting is not None
         waiting, until = self._waiting
         if self._scale.stable and not self._display.faults.restless:
@@ -263,7 +264,7 @@ class Emulation:
             self._say(waiting.expired if isinstance(waiting.expired, bytes) else waiting.expired(), now)
 
     def _follow(self, following: Follow, now: float) -> None:
-        """Report the weight once it stands, and its changes."""
+        """Report the weight once it is stable, and its changes."""
         reading = self._display.reading()
         if self._stood_at is None:
             if reading.status is ReadingStatus.STABLE and reading.value is not None:
