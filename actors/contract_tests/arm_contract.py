@@ -507,7 +507,7 @@ class ArmContract:
 
     @staticmethod
     def _true_time(bench: ArmBench) -> float:
-        """Current time of the witness's clock [s]; 0 without a witness."""
+        """Now, by the clock of the witness [s]; 0 without one."""
         return 0.0 if bench.true_poses is None else float(bench.true_poses(-math.inf)[0][-1])
 
     def _rest(self, bench: ArmBench) -> FloatArray:
