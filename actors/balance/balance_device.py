@@ -1,4 +1,4 @@
-"""Asynchronous access to a balance: a blocking driver in a process or thread of its own, awaited from the event loop."""
+"""Asynchronous access to a balance: its blocking driver runs in a process or thread, awaited from the event loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plug-in registry of balances, built-in and installed: dialects of serial balances, and settings of whole drivers."""
+"""The plug-in registry of balances, built-in and installed: dialects of serial lines, and settings of drivers."""
 
 from __future__ import annotations
 

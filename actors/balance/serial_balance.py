@@ -134,7 +134,7 @@ class Conversation:
             wire.send(self.dialect.query)
             end = time.monotonic() + self._spec.answer_time
             while (line := self._line(wire, end)) is not None:
-                reply = self._understood(line)
+                reply = self._decoded(line)
                 if isinstance(reply, Reading):
                     return reply, time.monotonic()
                 if isinstance(reply, Acknowledgement) and not reply.command:
@@ -163,7 +163,7 @@ class Conversation:
             wanted = data.strip().decode("ascii")
             end = time.monotonic() + max(patience, self._spec.answer_time)
             while (line := self._line(wire, end)) is not None:
-                reply = self._understood(line)
+                reply = self._decoded(line)
                 if isinstance(reply, Acknowledgement) and reply.command in (wanted, ""):
                     return reply
         self.counters.unanswered += 1
@@ -178,7 +178,7 @@ class Conversation:
         with self._wire_at_rest() as wire:
             end = time.monotonic() + seconds
             while (line := self._line(wire, end)) is not None:
-                self._understood(line)
+                self._decoded(line)
 
     @contextlib.contextmanager
     def _wire_at_rest(self) -> Iterator[Wire]:
@@ -205,7 +205,7 @@ class Conversation:
                 return line
         return None
 
-    def _understood(self, line: bytes) -> Reply | None:
+    def _decoded(self, line: bytes) -> Reply | None:
         try:
             reply = self.dialect.decode(line)
         except LineError:
@@ -296,7 +296,7 @@ class SerialBalance:
             return self._display.last
         try:
             if time.monotonic() - self._display.last.time >= 0.9 * self._conversation.interval:
-                self._glance()
+                self._read_once()
             return self._display.last
         finally:
             self._lock.release()
@@ -452,7 +452,7 @@ class SerialBalance:
             self._wait_for_return(error)
             return None
 
-    def _glance(self) -> None:
+    def _read_once(self) -> None:
         """Take one reading; only if the balance is already identified."""
         if self._conversation.found is None:
             return
@@ -476,11 +476,11 @@ class SerialBalance:
                 self._conversation.open()
         except NoConnectionError as error:
             self._check_interrupted()
-            raise self._said(error) from error
+            raise self._connection_error(error) from error
 
     def _wait_for_return(self, error: NoConnectionError) -> None:
         if self._conversation.found is None:
-            raise self._said(error) from error
+            raise self._connection_error(error) from error
         self._note_loss()
         self._losses += 1
         if self._losses > LOSSES:
@@ -491,9 +491,9 @@ class SerialBalance:
                 self._conversation.reopen(time.monotonic() + self._spec.reconnect_time)
         except NoConnectionError as gone:
             self._check_interrupted()
-            raise self._said(gone) from gone
+            raise self._connection_error(gone) from gone
 
-    def _said(self, error: NoConnectionError) -> BalanceError:
+    def _connection_error(self, error: NoConnectionError) -> BalanceError:
         return self._error(type(error), str(error).removeprefix(f"{self._spec.port}: "))
 
     def _error(self, kind: type[BalanceError], text: str) -> BalanceError:

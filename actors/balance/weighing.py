@@ -61,7 +61,7 @@ class Weighings:
         weighed: Callable[[str, PourMasses], None] = lambda key, weight: None,
         nominal: float | None = None,
     ) -> None:
-        self._spec, self._balance, self._ask, self._tell, self._nominal = spec, balance, ask, weighed, nominal
+        self._spec, self._balance, self._ask, self._notify, self._nominal = spec, balance, ask, weighed, nominal
         self._known = dict(known or {})
         self._steps = weighings(spec.placement, known=self._known, pourer_elsewhere=spec.pourer_elsewhere)
         self._weighed: dict[str, PourMasses] = {}
@@ -163,7 +163,7 @@ class Weighings:
 
     def _note(self, key: str, weighed: PourMasses) -> None:
         self._weighed[key] = weighed
-        self._tell(key, weighed)
+        self._notify(key, weighed)
 
     def _typed(self, answer: str) -> PourMasses:
         typed = typed_weight(answer)

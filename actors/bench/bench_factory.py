@@ -160,14 +160,14 @@ async def open_bench(
         if spec.arm is None:
             assert spec.bench is not None
             assert liquid is not None
-            return _numbers(spec.bench, opening, liquid)
+            return _open_simulated(spec.bench, opening, liquid)
         if spec.balance is None:
             raise LaboratoryError(f"laboratory {spec.name}: an arm that pours needs a balance; add a 'balance' to it")
         if operator is None and needs_person(spec):
             raise LaboratoryError(
                 f"laboratory {spec.name} needs a person beside it who answers questions, and nobody is here to be asked"
             )
-        return await _wired(spec, spec.arm, spec.balance, opening, liquid, operator, tell)
+        return await _open_devices(spec, spec.arm, spec.balance, opening, liquid, operator, tell)
     except BaseException:
         for device in reversed(opening.devices):
             with contextlib.suppress(LaboratoryError):
@@ -175,22 +175,24 @@ async def open_bench(
         raise
 
 
-def _numbers(spec: VirtualBenchSpec, opening: _Opening, liquid: SimulatorPool) -> OpenBench:
+def _open_simulated(spec: VirtualBenchSpec, opening: _Opening, liquid: SimulatorPool) -> OpenBench:
     arm_spec, balance_spec = NumbersSpec(spec.time_scale), simulated_balance(spec)
     arm = opening.arm(arm_spec)
     assert balance_spec.device is not None
     balance = opening.balance(balance_spec.device, "virtual")
     nature = SimulatedBench(spec, liquid, arm, balance)
     operator = SimulatedOperator(nature, balance, spec.operator_time)
-    setup = Setup("virtual", arm_spec, balance_spec, spec.operator_time, arm, balance, operator, nature, _nobody)
+    setup = Setup(
+        "virtual", arm_spec, balance_spec, spec.operator_time, arm, balance, operator, nature, _discard_notice
+    )
     return OpenBench(PouringBench(setup), opening.devices, operator=operator)
 
 
-def _nobody(notice: Notice) -> None:
+def _discard_notice(notice: Notice) -> None:
     """Discards the notices of a simulated bench, for example every weighing."""
 
 
-async def _wired(
+async def _open_devices(
     spec: LaboratorySpec,
     arm_spec: ArmSpec,
     balance_spec: BalanceSpec,

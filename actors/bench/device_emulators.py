@@ -123,14 +123,14 @@ class BenchEmulators:
 
     def history(self, since: float) -> History:
         """See `ArmEmulator.history`."""
-        return self._of_the_arm.history(since)
+        return self._arm_emulator.history(since)
 
     def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """See `ArmEmulator.fault`."""
-        return self._of_the_arm.fault(name, arguments)
+        return self._arm_emulator.fault(name, arguments)
 
     @property
-    def _of_the_arm(self) -> ArmEmulator:
+    def _arm_emulator(self) -> ArmEmulator:
         if self._arm is None:
             raise LaboratoryError("nothing stands in for the arm here")
         return self._arm

@@ -50,7 +50,7 @@ class OperatorQuestions:
     def __init__(
         self, operator: Operator, spec: OperatorSpec, tell: Callable[[Notice], None], time_scale: float = 1.0
     ) -> None:
-        self._operator, self._tell = operator, tell
+        self._operator, self._notify = operator, tell
         self._on_screen = spec.answers == "person"
         pace = time_scale if spec.answers == "virtual" else 1.0
         self._reminder, self._deadline = spec.reminder / pace, spec.deadline / pace
@@ -64,7 +64,7 @@ class OperatorQuestions:
             LaboratoryError: the operator gave up.
         """
         if question.problem:
-            self._tell(Notice("warning", question.problem, asked=self._on_screen))
+            self._notify(Notice("warning", question.problem, asked=self._on_screen))
         begun, answer = time.monotonic(), ""
         answering = asyncio.ensure_future(self._operator.ask(question))
         try:
@@ -77,12 +77,12 @@ class OperatorQuestions:
                 answering.exception()
             after = time.monotonic() - begun
             self.log.append(AnsweredQuestion(question.about, answer, after, question.problem))
-            said = f"'{answer}' after {after:.1f} s" if answer else f"no answer within {after:.1f} s"
-            self._tell(Notice("note", f"operator ({question.about}): {question.text} → {said}"))
+            reply = f"'{answer}' after {after:.1f} s" if answer else f"no answer within {after:.1f} s"
+            self._notify(Notice("note", f"operator ({question.about}): {question.text} → {reply}"))
 
     async def announce(self, text: str, seconds: float) -> None:
         """Announce that something moves after the given time [s of the clock]."""
-        self._tell(Notice("note", f"operator told: {text}"))
+        self._notify(Notice("note", f"operator told: {text}"))
         await self._operator.announce(text, seconds)
 
     def take_log(self) -> list[dict[str, Any]]:
@@ -102,4 +102,4 @@ class OperatorQuestions:
             if waited >= self._deadline:
                 raise NoAnswerError(f"nobody answered within {self._deadline:g} s: '{question.text}'")
             unseen: Literal["note", "warning"] = "note" if self._on_screen else "warning"
-            self._tell(Notice(unseen, f"still waiting, for {waited:.0f} s now: {question.text}"))
+            self._notify(Notice(unseen, f"still waiting, for {waited:.0f} s now: {question.text}"))

@@ -75,7 +75,7 @@ class PourReport:
                 break
             before += duration
         self._fraction = max(self._fraction, before / sum(self._parts.values()))
-        self._tell()
+        self._publish()
 
     def move(self, phase: str, fraction: float, tilt: float | None, *, moving: bool = True) -> None:
         """Report the arm's progress during the pour itself.
@@ -92,17 +92,17 @@ class PourReport:
         start = sum(duration for name, duration in self._parts.items() if name in ("operator", "tare", "approach"))
         self._checkpoint = phase if phase in self._parts else self._checkpoint
         self._fraction = max(self._fraction, (start + fraction * self._motion_time) / sum(self._parts.values()))
-        self._tell()
+        self._publish()
 
     def stand(self, joints: tuple[float, ...], pourer: tuple[float, ...]) -> None:
         """Report the arm's joints and the pourer's pose, as far as available; see `PourProgress`."""
         self._joints, self._pourer = joints or self._joints, pourer or self._pourer
-        self._tell()
+        self._publish()
 
     def show(self, balance: float, stable: bool | None = None) -> None:
         """Report the balance's display [kg] and its stability flag."""
         self._balance, self._stable = balance, stable
-        self._tell()
+        self._publish()
 
     @property
     def watched(self) -> bool:
@@ -111,11 +111,11 @@ class PourReport:
 
     def pour(self, liquid: RecordedFrames) -> None:
         """Report the frames of the liquid of a virtual bench."""
-        self._tell(liquid)
+        self._publish(liquid)
 
-    def _tell(self, liquid: RecordedFrames | None = None) -> None:
+    def _publish(self, liquid: RecordedFrames | None = None) -> None:
         if self._progress is not None:
-            told = PourProgress(
+            state = PourProgress(
                 self._checkpoint,
                 self._fraction,
                 self._tilt,
@@ -126,7 +126,7 @@ class PourReport:
                 liquid,
             )
             with contextlib.suppress(Exception):
-                self._progress(told)
+                self._progress(state)
 
 
 WEIGHING_TIME = 3.0
@@ -205,9 +205,9 @@ class PourProcedure:
             raise
         except LaboratoryError as error:
             if self._begun and not isinstance(error, BalanceError):
-                await self._keep_what_shows()
+                await self._weigh_remaining()
             await self._consent.leave_safe()
-            raise self._said(error) from error
+            raise self._pour_error(error) from error
         finally:
             watching.cancel()
             await asyncio.gather(watching, return_exceptions=True)
@@ -282,7 +282,7 @@ class PourProcedure:
         """The motion is over: let the ground truth pour the liquid and load the balance."""
         await self._setup.nature.lands(self._executed, self._broken)
 
-    async def _keep_what_shows(self) -> None:
+    async def _weigh_remaining(self) -> None:
         """After an aborted pour, weigh whatever can be weighed without touching anything."""
         with contextlib.suppress(LaboratoryError):
             await self._let_it_land()
@@ -295,7 +295,7 @@ class PourProcedure:
         """Write a weight to the journal at once, so that no later failure can lose it."""
         self._setup.tell(Notice("note", f"weighed, {key}: {grams(weighed.mass)} ± {1e3 * weighed.uncertainty:.2f} g"))
 
-    def _said(self, error: Exception) -> LaboratoryError:
+    def _pour_error(self, error: Exception) -> LaboratoryError:
         """Return the error for the caller, with the known facts about the liquid."""
         if not self._begun:
             return NotPouredError(f"{error}. Nothing was poured")
@@ -317,7 +317,7 @@ class PourProcedure:
         return {
             "mode": self._setup.mode,
             **measured.notes,
-            "arm": _who(self._facts),
+            "arm": _arm_identity(self._facts),
             "executed_s": float(executed.times[-1]),
             "largest_tilt_deg": _largest_tilt(executed),
             "executed": executed.record(),
@@ -365,9 +365,9 @@ def _largest_tilt(executed: Executed) -> float:
     return math.degrees(float(SampledMotion(executed.times, executed.poses).tilt(executed.times).max()))
 
 
-def _who(facts: ArmFacts | None) -> dict[str, Any]:
+def _arm_identity(facts: ArmFacts | None) -> dict[str, Any]:
     """Identification of the robot for the record: model, serial number, version, checksum."""
     if facts is None:
         return {}
-    told = {name: getattr(facts, name) for name in ("model", "serial", "version", "checksum")}
-    return {name: text for name, text in told.items() if text}
+    values = {name: getattr(facts, name) for name in ("model", "serial", "version", "checksum")}
+    return {name: text for name, text in values.items() if text}

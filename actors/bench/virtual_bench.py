@@ -130,7 +130,7 @@ class PourAsk:
 
     @property
     def record_rate(self) -> float:
-        """Frame rate of the hidden liquid's particles [1/s]; 0 without a live view. It does not affect the simulation."""
+        """Frame rate of the hidden liquid's particles [1/s]; 0 without a live view. The simulation is unaffected."""
         return 0.0 if self.show is None else WATCHED_RATE
 
     def shown(self, frames: RecordedFrames | None) -> None:

@@ -1,4 +1,4 @@
-"""Acquisition functions: lower confidence bound, local penalisation of pending points, and the search for the minimum."""
+"""Acquisition functions: lower confidence bound, local penalisation of pending points, search for the minimum."""
 
 from __future__ import annotations
 

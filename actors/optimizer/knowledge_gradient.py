@@ -126,29 +126,29 @@ def most_instructive(
     leaders = np.array(list(dict.fromkeys([*by_bound[:LEADERS], *np.argsort(mean, kind="stable")[:LEADERS]])))
     others = by_bound[LEADERS : LEADERS + ELSEWHERE]
     places = candidates[np.concatenate([leaders, others])]
-    belief = _Belief(process, np.concatenate([places, busy]), np.concatenate([candidates[leaders], pouring]))
+    joint = _JointCovariance(process, np.concatenate([places, busy]), np.concatenate([candidates[leaders], pouring]))
     reals = len(places) + len(busy)
     here, targets = np.arange(len(places)), reals + np.arange(len(leaders))
     for index in range(len(places), reals):
-        belief.observe(index, process.simulated_noise)
+        joint.observe(index, process.simulated_noise)
     for index in range(reals + len(leaders), reals + len(leaders) + len(pouring)):
-        belief.observe(index, process.noise)
+        joint.observe(index, process.noise)
 
     m = mean[leaders]
-    pours = belief.values(targets, targets, m, process.noise)
+    pours = joint.values(targets, targets, m, process.noise)
     allowed = np.ones(len(places)) if feasibility is None else np.exp(feasibility.log_probability(places))
     chosen, values = [], []
     for _ in range(problem.count):
-        worth = belief.values(here, targets, m, process.simulated_noise) * allowed
+        worth = joint.values(here, targets, m, process.simulated_noise) * allowed
         best = int(np.argmax(worth))
         chosen.append(places[best])
         values.append(float(worth[best]))
-        belief.observe(best, process.simulated_noise)
+        joint.observe(best, process.simulated_noise)
     points = np.array(chosen).reshape(problem.count, candidates.shape[1])
     return KnowledgeGradient(points, np.array(values), float(pours.max()))
 
 
-class _Belief:
+class _JointCovariance:
     """Joint covariance of the simulated cost at some places and the real one at others, updated by observations."""
 
     def __init__(self, process: GaussianProcess, simulated: Array, real: Array) -> None:
@@ -169,8 +169,8 @@ class _Belief:
         u = gain / doubt
         improvement = np.maximum(doubt * np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi) + gain * ndtr(u), 0.0)
         improvement[targets == best] = 0.0
-        told = G[np.ix_(observed, targets)] - G[observed, best][:, None]
-        removed = np.minimum(told**2 / self._variance(observed, noise)[:, None] / doubt**2, 1.0)
+        covariances = G[np.ix_(observed, targets)] - G[observed, best][:, None]
+        removed = np.minimum(covariances**2 / self._variance(observed, noise)[:, None] / doubt**2, 1.0)
         return np.asarray((improvement * (1.0 - np.sqrt(1.0 - removed))).max(axis=1))
 
     def _variance(self, indices: Indices, noise: float) -> Array:
@@ -312,7 +312,7 @@ def _allowed(
 
 
 def worth(process: ModelAveragedProcess, points: Array, known: Array) -> Array:
-    """Gain g (m,) of one more pour at points (m, dimension), given poured ones (k ≥ 1, dimension); in the cost's unit."""
+    """Gain g (m,) of one more pour at points (m, dimension), given poured ones (k ≥ 1, dimension), in cost units."""
     place = known[int(np.argmin(process.predict(known)[0]))]
     means, deviations, noises = process.components(points)
     at_best, its_deviation, _ = (part[:, 0] for part in process.components(place[None, :]))

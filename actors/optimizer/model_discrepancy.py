@@ -175,12 +175,12 @@ class ModelAveragedProcess:
         logs = np.concatenate([informed + np.log(prior), ignorant + np.log(half / len(ignorant))])
         weights = np.exp(logs - logs.max())
         self.weights = weights / weights.sum()
-        told, alone = self.weights[: len(informed)], self.weights[len(informed) :]
-        self._trusting = np.where(self._all.contrary, 0.0, told)
-        self.ignorance = float(told[self._all.contrary].sum() + alone.sum())
-        kept, times = np.unique(_evenly_drawn(told, KEPT), return_counts=True)
+        informed_weights, ignorant_weights = self.weights[: len(informed)], self.weights[len(informed) :]
+        self._trusting = np.where(self._all.contrary, 0.0, informed_weights)
+        self.ignorance = float(informed_weights[self._all.contrary].sum() + ignorant_weights.sum())
+        kept, times = np.unique(_evenly_drawn(informed_weights, KEPT), return_counts=True)
         self._kept = self._all.only(kept)
-        self.mixture = np.concatenate([times / KEPT * told.sum(), alone])
+        self.mixture = np.concatenate([times / KEPT * informed_weights.sum(), ignorant_weights])
         self._lengths = np.concatenate([self._kept.lengths, IGNORANT_LENGTHS])
         self._least_noises = np.concatenate([self._kept.noises, IGNORANT_NOISES])
         self._at_data = self._prior(points, self._costs)

@@ -248,7 +248,7 @@ def _search(
         candidates = _candidates(problem, asked, model, rng)
     for index in range(problem.count):
         taken = np.concatenate([asked.busy, np.array(chosen).reshape(-1, problem.space.dimension)])
-        if _looks_round(problem, asked, model, index):
+        if _fills_space(problem, asked, model, index):
             avoided = np.concatenate([asked.known, taken, asked.refused])
             chosen.append(acquisition.spread_out(1, avoided, asked.region, rng, feasibility)[0])
             continue
@@ -259,11 +259,11 @@ def _search(
     return np.array(chosen).reshape(problem.count, problem.space.dimension)
 
 
-def _looks_round(problem: SuggestProblem, asked: Asked, model: Model, index: int) -> bool:
+def _fills_space(problem: SuggestProblem, asked: Asked, model: Model, index: int) -> bool:
     """Whether the next point only fills space: every third one, while the costs may be pure noise.
 
     On a plateau the best pours look like a slope by chance. Following them, mostly along the faces of the cube, would
-    use up the whole budget. The same holds if every pour costs more than `_promised`, and the pours alone show no
+    use up the whole budget. The same holds if every pour costs more than `_expected_cost`, and the pours alone show no
     structure: the simulated optimum is not confirmed. The paper's methods (`plain`, 'zero', 'simulated'), contexts and
     risks are excluded.
     """
@@ -276,7 +276,7 @@ def _looks_round(problem: SuggestProblem, asked: Asked, model: Model, index: int
         return model.process.evidence < STRUCTURE
     if problem.mean not in ("pooled", "scaled") or len(asked.known) < 2 or len(asked.simulated) < 2:
         return False
-    if asked.costs.min() <= _promised(problem, asked):
+    if asked.costs.min() <= _expected_cost(problem, asked):
         return False
     return constant_mean_process(asked.points, asked.costs).evidence < STRUCTURE
 
@@ -292,7 +292,7 @@ def _kappa(problem: SuggestProblem, model: Model) -> float:
     return problem.kappa * (SETTLED if settled else 1.0)
 
 
-def _promised(problem: SuggestProblem, asked: Asked) -> float:
+def _expected_cost(problem: SuggestProblem, asked: Asked) -> float:
     """Cost that pours should at least reach according to the simulations.
 
     It is the median of the simulated costs. If simulations are chosen by their value (`effort`), most of them lie in

@@ -251,7 +251,7 @@ class StatusLineEncoder:
         return None if number is None or factor is None else float(number) * factor
 
     def follow(self, display: EncoderDisplay, mass: float | None = None, *, moving: bool = True) -> Follow:
-        """Report changes of at least `mass` [kg]; by default, of an eighth of the weight and at least 30 display steps."""
+        """Report changes of at least `mass` [kg]; by default, an eighth of the weight and at least 30 display steps."""
         scale = display.scale
         if mass is None:
             return Follow(self.line, lambda stood: max(abs(stood) / 8, 30 * scale.step), moving)

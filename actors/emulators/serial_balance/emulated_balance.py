@@ -146,18 +146,18 @@ class Emulation:
     def __init__(
         self, dialect: str, settings: ScaleSettings, time_scale: float, latency: float, seed: tuple[int, ...]
     ) -> None:
-        self._voice = voices()[dialect]()
+        self._encoder = voices()[dialect]()
         self._scale = EmulatedScale(settings, seed)
         self._display = FaultyDisplay(self._scale)
         self._time_scale, self._latency = time_scale, latency
         self._rng = np.random.default_rng((*seed, 7))
-        self._heard = bytearray()
+        self._received = bytearray()
         self._questions = 0
         self._waiting: tuple[PendingReply, float] | None = None
         self._repeat = Repeat()
         self._repeat_at: float | None = None
         self._following: Follow | None = None
-        self._stood_at: Decimal | None = None
+        self._stable_value: Decimal | None = None
         self._unasked_at: float | None = None
         self._answers: list[tuple[float, bytes]] = []
         self._now: float | None = None
@@ -167,8 +167,8 @@ class Emulation:
         self._advance(now)
         if self._display.faults.silent:
             return
-        self._heard += data
-        for command in self._voice.commands(self._heard):
+        self._received += data
+        for command in self._encoder.commands(self._received):
             self._questions += 1
             self._repeat_at = self._following = None
             self._carry_out(command, now)
@@ -237,20 +237,20 @@ class Emulation:
         self._now = now
 
     def _carry_out(self, command: bytes, now: float) -> None:
-        said = self._voice.answer(b"?" if self._display.faults.stranger else command, self._display)
-        if isinstance(said, Repeat):
-            self._repeat, self._repeat_at = said, now
-        elif isinstance(said, Follow):
-            self._following, self._stood_at = said, None
-        elif isinstance(said, Cancel):
+        reply = self._encoder.answer(b"?" if self._display.faults.stranger else command, self._display)
+        if isinstance(reply, Repeat):
+            self._repeat, self._repeat_at = reply, now
+        elif isinstance(reply, Follow):
+            self._following, self._stable_value = reply, None
+        elif isinstance(reply, Cancel):
             self._waiting = None
-            self._say(said.line, now)
-        elif isinstance(said, PendingReply):
-            patience = COMMAND_PATIENCE if said.patience is None else said.patience
-            self._waiting = (said, now + (patience / self._time_scale if self._time_scale > 0.0 else math.inf))
+            self._reply(reply.line, now)
+        elif isinstance(reply, PendingReply):
+            patience = COMMAND_PATIENCE if reply.patience is None else reply.patience
+            self._waiting = (reply, now + (patience / self._time_scale if self._time_scale > 0.0 else math.inf))
             self._wait_on(now)
         else:
-            self._say(said, now)
+            self._reply(reply, now)
 
     def _wait_on(self, now: float) -> None:
         """Execute the pending command if the display is stable, or end it after its time limit."""
@@ -258,27 +258,27 @@ class Emulation:
         waiting, until = self._waiting
         if self._scale.stable and not self._display.faults.restless:
             self._waiting = None
-            self._say(waiting.done(), now)
+            self._reply(waiting.done(), now)
         elif now > until and waiting.expired is not None:
             self._waiting = None
-            self._say(waiting.expired if isinstance(waiting.expired, bytes) else waiting.expired(), now)
+            self._reply(waiting.expired if isinstance(waiting.expired, bytes) else waiting.expired(), now)
 
     def _follow(self, following: Follow, now: float) -> None:
         """Report the weight once it is stable, and its changes."""
         reading = self._display.reading()
-        if self._stood_at is None:
+        if self._stable_value is None:
             if reading.status is ReadingStatus.STABLE and reading.value is not None:
-                self._stood_at = reading.value
+                self._stable_value = reading.value
                 self._answers.append((now, following.line(reading)))
-        elif reading.value is None or abs(reading.value - self._stood_at) >= following.step(self._stood_at):
-            self._stood_at = None
+        elif reading.value is None or abs(reading.value - self._stable_value) >= following.step(self._stable_value):
+            self._stable_value = None
             if following.moving and reading.status is not ReadingStatus.STABLE:
                 self._answers.append((now, following.line(reading)))
 
-    def _say(self, line: bytes, now: float) -> None:
+    def _reply(self, line: bytes, now: float) -> None:
         if line:
             faults = self._display.faults
             self._answers.append((now + self._latency + faults.delay, spoil(line, faults, self._rng)))
 
     def _weight(self) -> bytes:
-        return weight_line(self._voice.dialect, self._display.reading())
+        return weight_line(self._encoder.dialect, self._display.reading())

@@ -65,7 +65,7 @@ class PtyEnd:
         """Return the bytes from the client; none if it uses another speed."""
         with contextlib.suppress(OSError):
             data = os.read(self._master, 4096)
-            return data if self._understands() else b""
+            return data if self._speed_matches() else b""
         return b""
 
     def send(self, data: bytes, now: float) -> None:
@@ -94,12 +94,12 @@ class PtyEnd:
         while self._queue and self._queue[0][0] <= now:
             due.append(self._queue.popleft()[1])
         if due:
-            data = bytes(due) if self._understands() else bytes((37 * byte + 91) & 0xFF for byte in due)
+            data = bytes(due) if self._speed_matches() else bytes((37 * byte + 91) & 0xFF for byte in due)
             with contextlib.suppress(OSError):  # if the client does not read, bytes beyond the buffer are lost
                 os.write(self._master, data)
         return self._queue[0][0] if self._queue else None
 
-    def _understands(self) -> bool:
+    def _speed_matches(self) -> bool:
         if self._speed is None:
             return True
         with contextlib.suppress(termios.error):
@@ -122,21 +122,21 @@ class Replay:
     def __init__(self, recording: LineRecording, speed: float = 1.0) -> None:
         self._events, self._speed = recording.events, speed
         self._at = 0
-        self._heard = b""
+        self._received = b""
         self._queue: list[tuple[float, bytes]] = []
         self._begun = False
 
     def hear(self, data: bytes, now: float) -> None:
         """See `EmulatedBalance.hear`."""
         self._begin(now)
-        self._heard += data
+        self._received += data
         while (found := self._find()) is not None:
-            self._heard = self._heard[len(self._events[found].data) :]
+            self._received = self._received[len(self._events[found].data) :]
             self._at = found + 1
             self._play(found, now)
         longest = max((len(e.data) for e in self._events if e.direction == "out"), default=0)
-        if len(self._heard) >= longest:
-            self._heard = b""
+        if len(self._received) >= longest:
+            self._received = b""
 
     def speak(self, now: float) -> bytes:
         """See `EmulatedBalance.speak`."""
@@ -166,7 +166,7 @@ class Replay:
         for step in range(count):
             index = (self._at + step) % count
             event = self._events[index]
-            if event.direction == "out" and event.data and self._heard.startswith(event.data):
+            if event.direction == "out" and event.data and self._received.startswith(event.data):
                 return index
         return None
 

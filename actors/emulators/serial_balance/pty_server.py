@@ -33,7 +33,7 @@ class Server:
     """
 
     def __init__(self, line: PtyEnd, character: EmulatedBalance) -> None:
-        self._line, self._character = line, character
+        self._line, self._balance = line, character
         self._orders = bytearray()
         self._parent = os.getppid()
 
@@ -49,9 +49,9 @@ class Server:
             if 0 in ready and not self._take_orders(now):
                 return
             if self._line.descriptor is not None and self._line.descriptor in ready:
-                self._character.hear(self._line.receive(), now)
-            self._line.send(self._character.speak(now), now)
-            times = [self._line.pump(now), self._character.due(now)]
+                self._balance.hear(self._line.receive(), now)
+            self._line.send(self._balance.speak(now), now)
+            times = [self._line.pump(now), self._balance.due(now)]
             wake = min((moment for moment in times if moment is not None), default=None)
 
     def _take_orders(self, now: float) -> bool:
@@ -75,7 +75,7 @@ class Server:
             case "plug":
                 self._line.plug()
             case _:
-                return self._character.control(order, now)
+                return self._balance.control(order, now)
         return {}
 
 

@@ -134,15 +134,15 @@ class Host:
 
     # ---- ports
 
-    def _doors(self) -> list[tuple[int, Callable[[], asyncio.Protocol]]]:
-        def primary_door(messages: bool, writable: bool) -> Callable[[], asyncio.Protocol]:
+    def _port_factories(self) -> list[tuple[int, Callable[[], asyncio.Protocol]]]:
+        def primary_factory(messages: bool, writable: bool) -> Callable[[], asyncio.Protocol]:
             return lambda: PrimaryConnection(self.primary, messages=messages, writable=writable)
 
         return [
             (rtde_server.PORT, lambda: RtdeConnection(self.rtde)),
             (script_server.PORT, lambda: ScriptConnection(self.connections)),
             (dashboard_server.PORT, lambda: DashboardConnection(self.connections, self.dashboard)),
-            *((port, primary_door(*kind)) for port, kind in primary_server.PORTS.items()),
+            *((port, primary_factory(*kind)) for port, kind in primary_server.PORTS.items()),
         ]
 
     async def open(self) -> None:
@@ -152,7 +152,7 @@ class Host:
             OSError: a port is taken.
         """
         loop = asyncio.get_running_loop()
-        for port, factory in self._doors():
+        for port, factory in self._port_factories():
             self._servers.append(await loop.create_server(factory, self.address, port))
 
     def close(self) -> None:

@@ -324,10 +324,10 @@ class Controller:
         if self.runtime is RuntimeState.PLAYING:
             due = self.watchdogs.step(self.dt / self.time_scale)
             if due is not None:
-                self._bite(*due)
+                self._trigger_watchdog(*due)
             else:
                 self._run()
-        self.secondary = [program for program in self.secondary if self._goes_on(program)]
+        self.secondary = [program for program in self.secondary if self._continues(program)]
         try:
             self.robot.step(self.now, self.dt)
         except (ViolationError, ValueError, ArithmeticError) as violation:
@@ -340,7 +340,7 @@ class Controller:
         if self.safety.mode in _POWERLESS and self.power.powered and not self._in_motion():
             self.power.off()
 
-    def _bite(self, action: str, why: str) -> None:
+    def _trigger_watchdog(self, action: str, why: str) -> None:
         self.tell("key", why)
         if action == "pause":
             self.pause()
@@ -352,10 +352,10 @@ class Controller:
 
     def _run(self) -> None:
         program = self.program
-        if program is not None and not self._goes_on(program) and self.program is program:
+        if program is not None and not self._continues(program) and self.program is program:
             self.stop()
 
-    def _goes_on(self, program: Program) -> bool:
+    def _continues(self, program: Program) -> bool:
         """Run one cycle of a program; return whether it continues."""
         self.running = program
         try:

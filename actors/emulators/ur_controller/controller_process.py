@@ -87,12 +87,12 @@ class VirtualController:
             return cls(process, address, int(ready["fault_port"]))
         except BaseException as error:
             process.kill()
-            said = process.last_error or str(error)
+            reason = process.last_error or str(error)
             process.release()
             if not isinstance(error, Exception):
                 raise
             raise VirtualControllerError(
-                f"virtual controller at {address}: not ready within {patience:g} s: {said}"
+                f"virtual controller at {address}: not ready within {patience:g} s: {reason}"
             ) from error
 
     def fault(self, name: str, *, patience: float = 5.0, **arguments: Any) -> dict[str, Any]:
@@ -206,7 +206,7 @@ class UrEmulator:
 
 def _start_controller(arm: UrArmSpec) -> VirtualController:
     """Start a controller at a free random loopback address, because campaigns and tests run in parallel."""
-    chance, said = random.SystemRandom(), ""
+    chance, reason = random.SystemRandom(), ""
     for _ in range(ATTEMPTS):
         address = f"127.{chance.randint(1, 254)}.{chance.randint(0, 254)}.{chance.randint(1, 254)}"
         if not _is_free(address):
@@ -216,8 +216,8 @@ def _start_controller(arm: UrArmSpec) -> VirtualController:
                 address, arm.model, arm.time_scale, FREQUENCY if arm.time_scale > 1.0 else None, joints=arm.home
             )
         except VirtualControllerError as error:
-            said = str(error)
-    raise LaboratoryError(f"no virtual controller could be started: {said or 'no free loopback address was found'}")
+            reason = str(error)
+    raise LaboratoryError(f"no virtual controller could be started: {reason or 'no free loopback address was found'}")
 
 
 def _is_free(address: str) -> bool:

@@ -46,7 +46,7 @@ class Uploads:
         self._controller = controller
         self._waiting: deque[tuple[str, Sender]] = deque()
         self._held: set[Sender] = set()
-        self._apart: asyncio.Task[None] | None = None
+        self._translation: asyncio.Task[None] | None = None
 
     def put(self, text: str, sender: Sender) -> None:
         """Queue a program; the sender's privilege is checked when its turn comes."""
@@ -62,22 +62,22 @@ class Uploads:
     def work(self, seconds: float = 0.0) -> None:
         """Run the next program, and further ones for a time [s]; none while a separate translation is pending."""
         end = time.monotonic() + seconds
-        while self._waiting and (self._apart is None or self._apart.done()):
+        while self._waiting and (self._translation is None or self._translation.done()):
             text, sender = self._waiting.popleft()
             if not sender.privileged:
                 sender.refuse()
             elif len(text) <= LONGEST_HERE:
                 self._controller.upload(text)
             else:
-                self._apart = asyncio.get_running_loop().create_task(self._upload_apart(text, sender))
+                self._translation = asyncio.get_running_loop().create_task(self._upload_translated(text, sender))
             if time.monotonic() >= end:
                 break
         while self._held and len(self._waiting) < MOST_WAITING:
             self._held.pop().wait(False)
 
-    async def _upload_apart(self, text: str, sender: Sender) -> None:
+    async def _upload_translated(self, text: str, sender: Sender) -> None:
         try:
-            translated = await self._translate_apart(text)
+            translated = await self._translate_in_process(text)
         except Exception as error:
             self._controller.refuse(error)
             return
@@ -86,7 +86,7 @@ class Uploads:
         else:
             sender.refuse()
 
-    async def _translate_apart(self, text: str) -> Translated:
+    async def _translate_in_process(self, text: str) -> Translated:
         asked = question(text, self._controller.known_commands)
         try:
             answer = await run_async(python_module("actors.emulators.ur_controller.urscript"), asked, timeout=PATIENCE)

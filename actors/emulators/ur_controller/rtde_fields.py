@@ -224,7 +224,7 @@ def _bit(bits: Callable[[], int], at: int) -> Callable[[], bool]:
 
 
 class _Slow:
-    """Values derived from gravity: computed ten times per second of controller time, because no control loop uses them."""
+    """Values derived from gravity: computed ten times per second of controller time, as no control loop uses them."""
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller

@@ -102,7 +102,7 @@ class MoveCommands:
                     path = self._mover.follow(line, speed, acceleration, duration=duration, radius=radius)
             done = True
         finally:
-            self._let_go(thread, done)
+            self._release(thread, done)
 
     # ---- servo and speed
 
@@ -170,7 +170,7 @@ class MoveCommands:
                     break
             done = True
         finally:
-            self._let_go(thread, done)
+            self._release(thread, done)
 
     # ---- stops and time
 
@@ -192,7 +192,7 @@ class MoveCommands:
                 if self._mover.action is None:
                     break
         finally:
-            self._let_go(thread, True)
+            self._release(thread, True)
 
     def sync(self) -> Steps:
         """Suspend the thread until the next cycle."""
@@ -215,7 +215,7 @@ class MoveCommands:
             raise ScriptError(str(error)) from None
         return program.current
 
-    def _let_go(self, thread: int, done: bool) -> None:
+    def _release(self, thread: int, done: bool) -> None:
         self._mover.let_go(thread)
         if not done:
             self._mover.abandon()

@@ -35,7 +35,7 @@ class PrimaryServer:
         self.controller = controller
         self.connections = connections
         self._due = 0.0
-        controller.listeners.append(self._told)
+        controller.listeners.append(self._on_message)
 
     def publish(self, clock: float) -> None:
         """Send a state if it is due; see `RtdeServer.publish`."""
@@ -93,7 +93,7 @@ class PrimaryServer:
             primary.kinematics_info(a, d, _ALPHA), configuration
         )
 
-    def _told(self, message: ControllerMessage) -> None:
+    def _on_message(self, message: ControllerMessage) -> None:
         clients = [c for c in self.connections.open if isinstance(c, PrimaryConnection) and c.messages]
         if not clients:
             return

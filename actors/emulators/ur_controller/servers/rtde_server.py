@@ -120,9 +120,9 @@ class RtdeConnection(Connection):
             case rtde.TEXT_MESSAGE:
                 pass
             case _:
-                self._complain(f"unknown package type {kind}")
+                self._report_error(f"unknown package type {kind}")
 
-    def _complain(self, text: str) -> None:
+    def _report_error(self, text: str) -> None:
         # Not before the start: during its setup, a client takes the next message for its reply.
         if self._started:
             self.send(text_message(self._protocol, text, "RTDE", 1))
@@ -169,7 +169,7 @@ class RtdeConnection(Connection):
         recipe = self._inputs.get(payload[0]) if payload else None
         values = recipe.read(payload[1:]) if recipe is not None else None
         if values is None:
-            self._complain("a data package that fits no recipe is ignored")
+            self._report_error("a data package that fits no recipe is ignored")
             return
         write(self.controller, values)
 

@@ -303,7 +303,7 @@ class _Parser:
         self._brackets -= 1
         return expression
 
-    def _goes_on(self) -> bool:
+    def _continues(self) -> bool:
         return self._brackets > 0 or not self._word.fresh
 
     def _expression(self, level: int = 0) -> Expression:
@@ -322,7 +322,7 @@ class _Parser:
             self._depth -= 1
             return Operation("not", (operand,))
         left = self._binary(level + 1)
-        while self._is(*_LEVELS[level]) and self._goes_on():
+        while self._is(*_LEVELS[level]) and self._continues():
             operator = self._next().text
             left = Operation(operator, (left, self._binary(level + 1)))
         return left
@@ -339,7 +339,7 @@ class _Parser:
         return self._postfix(self._primary())
 
     def _postfix(self, value: Expression) -> Expression:
-        while self._is("[") and self._goes_on():
+        while self._is("[") and self._continues():
             self._next()
             at = self._list("]")
             if not 1 <= len(at) <= 2:
