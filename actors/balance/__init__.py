@@ -1,1 +1,1 @@
-"""Balances: the protocol, a virtual one, and the actor around a driver."""
+"""Balances: the driver interface, drivers for serial and simulated balances, dialects, and the weighings of a pour."""

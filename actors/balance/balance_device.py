@@ -1,4 +1,4 @@
-"""The balance behind its protocol: a blocking driver in a process (or thread) of its own, reached from the loop."""
+"""Asynchronous access to a balance: its blocking driver runs in a process or thread, awaited from the event loop."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from actors.balance.simulated_balance import PATIENCE, Load
 from actors.runtime.remote_object import Device
 
 ANSWER_DEADLINE = 30.0
-"""Wall time an idle balance may take to answer [s]; its process may still be starting."""
+"""Wall time within which an idle balance must reply [s]; its process may still be starting."""
 
 
 class DeviceBalance:
-    """A balance with a tray: a `BalanceDriver` behind a `Device`, awaited.
+    """A `BalanceDriver` behind a `Device`, with awaitable calls.
 
     Args:
-        device: of the driver.
-        time_scale: bench seconds per wall second, for deadlines; 0 waits for nothing.
-        longest_call: wall time that the driver allows itself [s], see `BalanceDevice.longest_call`.
+        device: holds the driver.
+        time_scale: bench seconds per wall second, for deadlines; 0 disables waiting.
+        longest_call: wall time limit of the driver's calls [s], see `BalanceDevice.longest_call`.
     """
 
     def __init__(self, device: Device, time_scale: float = 1.0, *, longest_call: float = 0.0) -> None:
@@ -46,7 +46,7 @@ class DeviceBalance:
         return weight
 
     async def stream(self, interval: float = 0.1) -> AsyncIterator[Weight]:
-        """What the display shows, again and again.
+        """Yield the display's weight repeatedly.
 
         Args:
             interval: wall time between two readings [s].
@@ -61,7 +61,7 @@ class DeviceBalance:
         return said
 
     async def zero(self) -> None:
-        """Balances on serial lines only: set the zero of the empty balance."""
+        """Set the zero of the empty balance; serial balances only."""
         await self.device.call("zero", deadline=self._deadline(PATIENCE))
 
     async def keep_reference(self) -> None:
@@ -69,7 +69,7 @@ class DeviceBalance:
         await self.device.call("keep_reference", deadline=ANSWER_DEADLINE, urgent=True)
 
     async def statistics(self) -> dict[str, int]:
-        """Balances on serial lines only: what the line has seen."""
+        """Return the counters of the serial line; serial balances only."""
         counts: dict[str, int] = await self.device.call("statistics", deadline=ANSWER_DEADLINE, urgent=True)
         return counts
 
@@ -78,21 +78,21 @@ class DeviceBalance:
         await self.device.call("resume", deadline=ANSWER_DEADLINE, urgent=True)
 
     async def release(self) -> None:
-        """Let go of it."""
+        """Close the driver."""
         await self.device.call("close", deadline=ANSWER_DEADLINE)
 
     async def prepare(self, seed: tuple[int, ...]) -> None:
-        """Balances that are only given what stands on them: empty tray, bench time 0, noise of a new pour."""
+        """Empty the tray, set bench time to 0 and reseed the noise; simulated balances only."""
         await self.device.call("prepare", seed, deadline=ANSWER_DEADLINE)
 
     async def put(self, load: Load) -> None:
-        """Balances that are only given what stands on them: what comes onto the tray from now on."""
+        """Set the load on the tray from now on; simulated balances only."""
         await self.device.call("put", load, deadline=ANSWER_DEADLINE)
 
     async def pass_time(self, seconds: float) -> None:
-        """Balances that are only given what stands on them: bench time passes [s]."""
+        """Let bench time pass [s]; simulated balances only."""
         await self.device.call("pass_time", seconds, deadline=self._deadline(seconds))
 
     async def interrupt(self) -> None:
-        """End the wait that is under way."""
+        """End the current wait."""
         await self.device.call("interrupt", deadline=ANSWER_DEADLINE, urgent=True)

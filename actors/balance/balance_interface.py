@@ -1,10 +1,8 @@
-"""What a balance can be asked. Values and a protocol; no driver.
+"""The interface of balances: readings, the driver protocol and the errors. It contains no driver.
 
-What can go wrong with a balance, for the person who stands beside it.
-
-Why a balance gave no weight, in words for the person beside it.
-
-What was last seen on a balance's display: its weight, its unit where lines leave it out, its step.
+`Weight` is one reading and `BalanceDriver` the protocol that every driver implements. Every `BalanceError` has a text
+for the operator at the balance; `unsettled` builds the text for a weight that never settled. `BalanceDisplay` keeps the
+last reading of a display: its weight, its step, and its unit for lines without one.
 """
 
 from __future__ import annotations
@@ -23,12 +21,12 @@ class Weight:
     """A reading.
 
     Attributes:
-        mass: net of the tare [kg]; nan where the display shows none (`read` only).
-        stable: the balance vouches for it; only stable weights count as measurements.
-        time: of the reading [s]: bench time of a virtual balance in this process, `time.monotonic` of one on a serial
-            line.
+        mass: net of the tare [kg]; nan if the display shows none (`read` only).
+        stable: whether the balance reports it as stable; only stable weights count as measurements.
+        time: of the reading [s]: bench time for a simulated balance in this process, `time.monotonic` for a serial
+            balance.
         status: 'stable', 'unstable', 'over range', 'under range', 'busy', 'error', 'silent' or 'lost'.
-        step: of the display [kg]; 0 where it is not known.
+        step: of the display [kg]; 0 if unknown.
         shown: as the balance sent it, e.g. '12.34 g'.
     """
 
@@ -41,74 +39,74 @@ class Weight:
 
 
 class BalanceDriver(Protocol):
-    """What talks to one balance: plain and blocking; it is put into a process (or thread) of its own.
+    """The driver of one balance. It is plain and blocking, and runs in a process or thread of its own.
 
     `actors.contract_tests.balance_contract` has the tests that every driver has to pass.
     """
 
     def connect(self) -> str:
-        """Find out what is there.
+        """Identify the balance.
 
         Returns:
-            What was found, for people.
+            Description of the balance, for the operator.
 
         Raises:
-            LaboratoryError: nobody understandable is there.
+            LaboratoryError: no balance with a supported dialect replies.
         """
         ...
 
     def tare(self) -> None:
-        """Wait until the balance is at rest and count what is on it as zero.
+        """Wait for a stable weight and tare the balance.
 
         Raises:
-            LaboratoryError: not at rest in time, or lost.
+            LaboratoryError: not stable in time, or connection lost.
         """
         ...
 
     def weigh(self) -> Weight:
-        """Wait for a stable weight. After a lost connection it refuses until `keep_reference` or another tare.
+        """Wait for a stable weight. After a lost connection it fails until `keep_reference` or another tare.
 
         Raises:
-            ReferenceLostError: the balance may have been off since the last tare, and begun at a new zero.
-            LaboratoryError: no stable weight in time, or lost; the text is for the person beside it.
+            ReferenceLostError: the balance may have been switched off since the last tare, and may have a new zero.
+            LaboratoryError: no stable weight in time, or connection lost; the text is for the operator at the balance.
         """
         ...
 
     def read(self) -> Weight:
-        """What the display shows now, stable or not; never fails, and doesn't wait for a call that is under way."""
+        """Return the display's weight, stable or not; never fails, and does not wait for a running call."""
         ...
 
     def keep_reference(self) -> None:
-        """After a lost connection: a person has seen that the tare still holds."""
+        """Confirm after a lost connection that the operator has checked the tare."""
         ...
 
     def interrupt(self) -> None:
-        """End the wait that is under way with a LaboratoryError, and later ones at once, until `resume`."""
+        """End the current wait with a LaboratoryError, and later waits at once, until `resume`."""
         ...
 
     def resume(self) -> None:
-        """Let waits last again."""
+        """Allow waits again."""
         ...
 
     def close(self) -> None:
-        """Let go of it; never fails, and may be called again."""
+        """Release the balance; never fails, and may be called again."""
         ...
 
 
 class BalanceError(LaboratoryError):
-    """A balance can't do what was asked."""
+    """A balance cannot carry out a request."""
 
 
 class NoConnectionError(BalanceError):
-    """The port can't be opened, has vanished, or nobody answers on it."""
+    """The port cannot be opened or has vanished, or no device replies on it."""
 
 
 class LineSettingsError(NoConnectionError):
-    """The port can't be set to this speed or format."""
+    """The port cannot be set to this speed or format."""
 
 
 class UnknownDialectError(NoConnectionError):
-    """Something may be there, but it speaks none of the dialects."""
+    """A device may be connected, but it uses none of the known dialects."""
 
 
 class NotStableError(BalanceError):
@@ -116,23 +114,23 @@ class NotStableError(BalanceError):
 
 
 class OutOfRangeError(BalanceError):
-    """More on the balance than it weighs, or less."""
+    """The load is above or below the balance's range."""
 
 
 class CommandError(BalanceError):
-    """Tare or zero was refused, or did not take effect."""
+    """Tare or zero was refused, or had no effect."""
 
 
 class UnitError(BalanceError):
-    """The balance shows something that is not a mass."""
+    """The balance shows a unit that is not a mass."""
 
 
 class ReferenceLostError(BalanceError):
-    """The connection was lost since the last tare: the balance may have been off and begun at a new zero."""
+    """The connection was lost since the last tare: the balance may have been switched off and have a new zero."""
 
 
 class BalanceFaultError(BalanceError):
-    """The balance reports a fault of its own."""
+    """The balance reports an internal fault."""
 
 
 _OUTSIDE = {
@@ -143,14 +141,14 @@ _OUTSIDE = {
 }
 
 REFUSED = "it refuses the question"
-"""Begins the detail of a reading that is not a reading."""
+"""Prefix of the detail of a reading that reports a refused query."""
 
 LOST_REFERENCE = (
     "the connection was lost since the last tare. If it stayed switched on, its display still holds the weight (last "
     "seen: {shown}): look whether it does, and confirm. If it was off, its zero is new, and what lay on it is not "
     "known any more"
 )
-"""A balance that was switched off and on counts what lies on it as nothing: a spill would be read as none."""
+"""After a power cycle, a balance takes its current load as zero; a spill would then be read as zero."""
 
 WITHOUT_EFFECT = (
     "{name} was sent {times} times without effect: {said}. Is something dripping on it or touching it, is its display "
@@ -159,16 +157,16 @@ WITHOUT_EFFECT = (
 
 
 def unsettled(seen: Reading, shown: str, within: float, damaged: int) -> tuple[type[BalanceError], str]:
-    """What to say when the time for a weight is over.
+    """Return the error for a weight that did not settle before the deadline.
 
     Args:
-        seen: last reading that was an answer at all.
+        seen: the last reading other than silence.
         shown: last weight on the display, '' for none.
-        within: time that was allowed [s].
-        damaged: lines that were not understood so far.
+        within: the time limit [s].
+        damaged: number of invalid lines so far.
 
     Returns:
-        Kind and text of the error.
+        Class and text of the error.
     """
     cable = f" {damaged} lines were damaged so far: look at cable and plug." if damaged else ""
     match seen.status:
@@ -194,26 +192,26 @@ def unsettled(seen: Reading, shown: str, within: float, damaged: int) -> tuple[t
 
 
 class BalanceDisplay:
-    """Remembers readings.
+    """Keeps the last reading of a display.
 
     Args:
-        step: of the display [kg], where it is not one of the last digit sent.
+        step: of the display [kg], if it differs from one unit of the last digit sent.
     """
 
     def __init__(self, step: float | None = None) -> None:
         self._given = step
         self._unit = ""
         self.step = step or 0.0
-        """Step of the display [kg]; 0 while it is not known."""
+        """Step of the display [kg]; 0 while unknown."""
         self.last = Weight(math.nan, False, 0.0, str(ReadingStatus.LOST))
         """Last reading."""
 
     def note(self, reading: Reading, moment: float) -> None:
-        """Take note of a reading.
+        """Record a reading.
 
         Args:
             reading: as the balance sent it.
-            moment: when it came [s].
+            moment: time of the reading [s].
         """
         if kilograms(reading.unit) is not None:
             self._unit = reading.unit
@@ -232,11 +230,11 @@ class BalanceDisplay:
         )
 
     def lose(self) -> None:
-        """The connection is gone; what was last shown is kept for messages."""
+        """Record the loss of the connection; the last shown text is kept for messages."""
         self.last = Weight(math.nan, False, time.monotonic(), str(ReadingStatus.LOST), self.step, self.last.shown)
 
     def in_grams(self, mass: float) -> str:
-        """A mass with the display's digits.
+        """Format a mass with the display's digits.
 
         Args:
             mass: [kg].

@@ -1,6 +1,8 @@
-"""Settings of a balance: its serial line, where it stands. Plain values.
+"""Settings of a balance: its device, its serial line, its placement, and the rule for a settled weight.
 
-When a weight counts: the balance vouches for several readings in a row, and they agree.
+`BalanceSpec` is a laboratory's balance. Its `BalanceDevice` is a `SerialBalanceSpec`, a `NumbersBalanceSpec` or a
+plug-in's class, and names the driver. `Settling` applies a `SettlingRule`: a weight counts if the balance reports
+several stable readings in a row and they agree. The drivers themselves are in other modules.
 """
 
 from __future__ import annotations
@@ -23,16 +25,16 @@ from sim_engine.settings.model import FREE
 
 @dataclass(frozen=True)
 class SettlingRule:
-    """What must be seen before a weight counts.
+    """Conditions for a weight to count.
 
-    One stable reading isn't enough: characters get lost on serial lines, some balances call a slowly filling vessel
-    stable, and some are set up to print a unit always.
+    One stable reading is not enough: characters get lost on serial lines, some balances report a slowly filling vessel
+    as stable, and some are configured to always print a unit.
 
     Attributes:
-        readings: stable ones in a row, nothing else in between; 2 or more.
-        span: from the first of them to the last [s].
-        steps: how far they may lie apart, in steps of the display.
-        deadline: after which a weight that has not settled is given up [s].
+        readings: number of consecutive stable readings; 2 or more.
+        span: time from the first of them to the last [s].
+        steps: largest difference between them, in steps of the display.
+        deadline: time limit for settling [s].
     """
 
     readings: int = 4
@@ -41,7 +43,7 @@ class SettlingRule:
     deadline: float = 20.0
 
     def scaled(self, time_scale: float) -> SettlingRule:
-        """The same in a laboratory whose time runs faster.
+        """The same rule for a laboratory with scaled time.
 
         Args:
             time_scale: bench seconds per second of the clock.
@@ -55,8 +57,8 @@ class Settled:
 
     Attributes:
         mass: median of the readings [kg].
-        time: of the last of them [s].
-        spread: largest minus smallest [kg].
+        time: of the last reading [s].
+        spread: largest minus smallest reading [kg].
     """
 
     mass: float
@@ -65,18 +67,18 @@ class Settled:
 
 
 class Settling:
-    """Watches readings until a weight counts."""
+    """Collects readings until a weight counts."""
 
     def __init__(self, rule: SettlingRule) -> None:
         self._rule = rule
         self._window: deque[tuple[float, float]] = deque()
 
     def feed(self, mass: float | None, time: float, step: float) -> Settled | None:
-        """Take note of a reading.
+        """Add a reading.
 
         Args:
-            mass: a stable one [kg], or None for one that is anything else.
-            time: when it came [s].
+            mass: of a stable reading [kg]; None for any other reading.
+            time: of the reading [s].
             step: of the display [kg].
 
         Returns:
@@ -101,55 +103,55 @@ class Settling:
 
 
 AUTO = "auto"
-"""Dialect that is found out."""
+"""Value of `dialect` that selects automatic detection."""
 
 SERIAL_EMULATOR = "actors.emulators.serial_balance.balance_process:SerialStandIn"
 """Emulates a balance on a serial line of a virtual bench; a name, because drivers do not import emulators."""
 
 DRIFTING = 60.0
-"""From a tare to the weighing after it, at most, on a bench of numbers [s of bench time]."""
+"""Longest bench time from a tare to the weighing after it, on a simulated bench [s]."""
 
 Handshake = Literal["none", "software", "hardware"]
 
 
 COARSE = 0.5e-3
-"""A display with larger steps tells little of small spills [kg]."""
+"""Displays with larger steps cannot resolve small spills [kg]."""
 
 
 class BalanceEmulator(Protocol):
-    """What a driver finds at its far end on a virtual bench, in place of a balance."""
+    """Emulates a balance on a virtual bench; the driver connects to it as to a real balance."""
 
     @property
     def device(self) -> BalanceDevice:
-        """The settings, with its address filled in."""
+        """The settings, with the emulator's address."""
         ...
 
     def prepare(self, seed: tuple[int, ...]) -> None:
-        """A new pour: its chance begins anew, and it is empty."""
+        """Prepare a new pour: reseed the random numbers and empty the balance."""
         ...
 
     def put(self, mass: float) -> None:
-        """What stands on it from now on [kg]."""
+        """Set the mass on the balance from now on [kg]."""
         ...
 
     def order(self, what: str, values: dict[str, Any]) -> dict[str, Any]:
-        """Have something else done to it, for tests."""
+        """Send another command to the emulator, for tests."""
         ...
 
     def close(self) -> None:
-        """End it. May be called again."""
+        """End the emulator. May be called again."""
         ...
 
 
 class BalanceDevice(ABC):
-    """Settings of what weighs: frozen values that travel to where the bench is, and know which driver they are for.
+    """Settings of a weighing device: frozen values that can be sent to the bench's machine and name their driver.
 
     Attributes:
-        kind: as registered at the door `decant.balances`, and as written in files.
-        told: on a virtual bench nothing is at its far end: the driver itself is given what stands on it, and has
-            `prepare` and `put` as `actors.balance.simulated_balance.VirtualBalance` has them.
-        time_scale: bench seconds per second of the clock; 1 for anything real, 0 waits for nothing.
-        repeatability: standard deviation of weighing the same thing again [kg].
+        kind: as registered in the plug-in registry `decant.balances`, and as written in files.
+        told: whether, on a virtual bench, the driver itself receives the load instead of an emulator. It then has
+            `prepare` and `put` as in `actors.balance.simulated_balance.VirtualBalance`.
+        time_scale: bench seconds per second of the clock; 1 for a real device, 0 disables waiting.
+        repeatability: standard deviation of repeated weighings of the same load [kg].
     """
 
     kind: ClassVar[str]
@@ -159,8 +161,8 @@ class BalanceDevice(ABC):
 
     @abstractmethod
     def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
-        """The class of the driver (an `actors.balance.balance_interface.BalanceDriver`), importable by name, and its
-        arguments.
+        """Return the class of the driver (an `actors.balance.balance_interface.BalanceDriver`, importable by name) and
+        its arguments.
 
         Args:
             name: for messages.
@@ -168,22 +170,22 @@ class BalanceDevice(ABC):
 
     @property
     def longest_call(self) -> float:
-        """No call lasts longer than this [s of the clock]; what holds the driver should wait a little longer."""
+        """Upper limit of a call's duration [s of the clock]; deadlines around the driver should be a little longer."""
         return 120.0
 
     def stand_in(self) -> BalanceEmulator | None:
-        """Start what stands in for it on a virtual bench; None where nothing does."""
+        """Start the emulator on a virtual bench; None if the device needs none."""
         return None
 
     def paced(self, time_scale: float) -> BalanceDevice:
-        """The same balance in a virtual bench's time."""
+        """The same balance with a virtual bench's time scale."""
         return replace(self, time_scale=time_scale)  # type: ignore[type-var]
 
     def look(self, *, tare: bool) -> list[DeviceCheck]:
-        """What `decant doctor` tells of it: who is there, a stable reading, its step; and whether it obeys a tare.
+        """Return the checks of `decant doctor`: identification, a stable reading, its step, and optionally a tare.
 
         Args:
-            tare: also tare it.
+            tare: also tare the balance.
         """
         cls, arguments = self.driver("balance")
         driver: BalanceDriver = cls(*arguments)
@@ -211,10 +213,10 @@ class BalanceDevice(ABC):
 
 @dataclass(frozen=True)
 class NumbersBalanceSpec(BalanceDevice):
-    """A balance of numbers.
+    """A simulated balance.
 
     Attributes:
-        sheet: what its data sheet says; its pace is the bench's.
+        sheet: data sheet of the balance; its time scale is the bench's.
     """
 
     sheet: BalanceSettings
@@ -252,19 +254,19 @@ class SerialBalanceSpec(BalanceDevice):
 
     Attributes:
         port: device; under `/dev/serial/by-id/` it keeps its name when it is plugged in again.
-        dialect: one of `doors.dialects`, or 'auto'.
-        baud: bits per second; None: found out.
-        format: bits, parity and stop bits, as '8N1'; None: found out.
-        handshake: whether the balance may stop the line: by characters (Xon/Xoff), by wires (CTS), or not.
-        settling: when a weight counts.
-        step: of the display [kg], where it is not one of the last digit sent.
-        repeatability: standard deviation of weighing the same thing again [kg], from the data sheet.
-        interval: from one question to the next [s].
-        answer_time: longest wait for an answer [s of the clock].
-        reconnect_time: how long a vanished port is waited for [s].
-        time_scale: bench seconds per second of the clock; 1 for everything real.
-        virtual: what the data sheet of the balance at the other end would say, where there is none: it is started on a
-            virtual bench, and `port` filled in.
+        dialect: one of `actors.balance.dialect_registry.dialects`, or 'auto'.
+        baud: bits per second; None: detected.
+        format: bits, parity and stop bits, as '8N1'; None: detected.
+        handshake: how the balance may pause the line: by characters (Xon/Xoff), by wires (CTS), or not at all.
+        settling: conditions for a weight to count.
+        step: of the display [kg], if it differs from one unit of the last digit sent.
+        repeatability: standard deviation of repeated weighings of the same load [kg], from the data sheet.
+        interval: between two queries [s].
+        answer_time: longest wait for a reply [s of the clock].
+        reconnect_time: longest wait for a vanished port [s].
+        time_scale: bench seconds per second of the clock; 1 for real devices.
+        virtual: data sheet of the emulated balance, if there is no real one; it is started on a virtual bench, and
+            `port` is filled in.
     """
 
     kind: ClassVar[str] = "serial"
@@ -303,7 +305,7 @@ class SerialBalanceSpec(BalanceDevice):
         return emulator
 
     def look(self, *, tare: bool) -> list[DeviceCheck]:
-        """See `BalanceDevice.look`: the port first."""
+        """See `BalanceDevice.look`; checks the port first."""
         from actors.balance.serial_port import look_at_port
 
         port = look_at_port(self.port)
@@ -316,17 +318,17 @@ class SerialBalanceSpec(BalanceDevice):
 
     @property
     def allowed(self) -> tuple[Dialect, ...]:
-        """Dialects that it may speak."""
+        """Dialects that the balance may use."""
         return tuple(dialects().values()) if self.dialect == AUTO else (dialects()[self.dialect],)
 
     def candidates(self) -> tuple[LineSettings, ...]:
-        """Line settings to try, the likeliest first."""
+        """Line settings to try, the most likely first."""
         usual = _interleaved([dialect.lines for dialect in self.allowed])
         if self.baud is None and self.format is None:
             return usual
         forms = [parse_format(self.format)] if self.format is not None else [(s.bits, s.parity, s.stop) for s in usual]
         bauds = [self.baud] if self.baud is not None else [s.baud for s in usual]
-        if self.format is None:  # a known speed: the formats that are usual at any
+        if self.format is None:  # a known speed: the usual formats at any speed
             return tuple(dict.fromkeys(LineSettings(bauds[0], *form) for form in forms))
         return tuple(dict.fromkeys(LineSettings(baud, *forms[0]) for baud in bauds))
 
@@ -337,9 +339,9 @@ class BalanceSpec:
 
     Attributes:
         placement: where it stands.
-        device: what weighs; None where the operator types what it shows.
-        pourer_elsewhere: the pourer is weighed on another balance, and typed.
-        load_tolerance: how far a load may lie from the one asked for [kg].
+        device: the weighing device; None if the operator types the weights.
+        pourer_elsewhere: whether the pourer is weighed on another balance, and typed.
+        load_tolerance: largest deviation from the requested load [kg].
     """
 
     placement: Placement
@@ -349,15 +351,15 @@ class BalanceSpec:
 
     @property
     def repeatability(self) -> float:
-        """Standard deviation of weighing the same thing again [kg]."""
+        """Standard deviation of repeated weighings of the same load [kg]."""
         return 0.0 if self.device is None else self.device.repeatability
 
 
 def parse_format(text: str) -> tuple[int, str, int]:
-    """'7O1' → (7, 'O', 1).
+    """Parse a character format: '7O1' → (7, 'O', 1).
 
     Raises:
-        ValueError: anything else than bits 7 or 8, parity N, O or E, stop bits 1 or 2.
+        ValueError: not bits 7 or 8, parity N, O or E, stop bits 1 or 2.
     """
     if len(text) != 3 or text[0] not in "78" or text[1].upper() not in "NOE" or text[2] not in "12":
         raise ValueError(f"'{text}' should be bits, parity and stop bits, as '8N1' or '7O1'")
@@ -365,6 +367,6 @@ def parse_format(text: str) -> tuple[int, str, int]:
 
 
 def _interleaved(tables: list[tuple[LineSettings, ...]]) -> tuple[LineSettings, ...]:
-    """First choices of all before second choices of any."""
+    """Merge the tables: the first entries of all, then the second entries, and so on."""
     longest = max(len(table) for table in tables)
     return tuple(dict.fromkeys(table[i] for i in range(longest) for table in tables if i < len(table)))

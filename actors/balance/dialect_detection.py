@@ -1,4 +1,8 @@
-"""Which dialect, at which speed? Asked with questions only: nothing is tared, zeroed or restarted."""
+"""Detection of a balance's dialect and line settings.
+
+`detect` tries line settings and sends queries only: it never tares, zeroes or restarts a balance. It returns a
+`Detected` and the open wire; an `Attempt` records the bytes received with one setting.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +17,10 @@ from actors.balance.readings import LineError, Reading
 from actors.balance.serial_port import Wire
 
 LISTENING = 0.3
-"""How long unasked lines are waited for at each setting [s]."""
+"""Wait for unsolicited lines at each setting [s]."""
 
 ANSWERING = 0.35
-"""How long an answer may take in a quick search, beside the time of its characters [s]."""
+"""Wait for a reply in the quick search, in addition to the transmission time of its characters [s]."""
 
 _LONGEST_ANSWER = 48
 _OTHER_KERN = re.compile(rb"\s*(?:ST|US|OL),")
@@ -24,15 +28,15 @@ _OTHER_KERN = re.compile(rb"\s*(?:ST|US|OL),")
 
 @dataclass
 class Attempt:
-    """What came of one line setting.
+    """Result of one line setting.
 
     Attributes:
         line: the setting.
-        heard: what came unasked.
-        answers: question → what came.
-        possible: whether the port can be set so.
-        began, ended: when it was tried [s of `time.monotonic`].
-        moments: when anything came [s of `time.monotonic`].
+        heard: unsolicited bytes.
+        answers: query → received bytes.
+        possible: whether the port accepts the setting.
+        began, ended: time of the attempt [s of `time.monotonic`].
+        moments: times at which bytes arrived [s of `time.monotonic`].
     """
 
     line: LineSettings
@@ -44,7 +48,7 @@ class Attempt:
     moments: list[float] = field(default_factory=list)
 
     def may_be_late(self, attempts: Sequence[Attempt], patience: float) -> bool:
-        """Whether something came that may have been an answer to this attempt's questions."""
+        """Whether some received bytes may have been a late reply to this attempt's queries."""
         return self.possible and any(
             self.began <= moment <= self.ended + patience for other in attempts for moment in other.moments
         )
@@ -59,13 +63,13 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Detected:
-    """A balance was recognised.
+    """A recognised balance.
 
     Attributes:
-        dialect: that it speaks.
-        line: at which setting.
-        identity: what it says of itself, '' where it says nothing.
-        unasked: it sends without being asked.
+        dialect: its dialect.
+        line: its line settings.
+        identity: its identification, '' if it sends none.
+        unasked: whether it sends without a query.
     """
 
     dialect: Dialect
@@ -83,26 +87,26 @@ def detect(
     *,
     answer_time: float = ANSWERING,
 ) -> tuple[Detected, Wire]:
-    """Find out what is at the other end.
+    """Detect the dialect and the line settings of a balance.
 
-    Settings are tried quickly. A slow balance answers when the next ones are being tried, and looks like one that talks
-    at another speed; so where anything came, those that it may have been an answer to are tried once more, with
-    patience.
+    Settings are tried quickly at first. The reply of a slow balance arrives while the next settings are being tried,
+    and looks like a reply at another speed. If bytes arrived, the settings that may have caused them are therefore
+    tried again with a longer wait.
 
     Args:
         port: for messages.
-        candidates: settings to try, the likeliest first.
-        allowed: dialects that may be found.
+        candidates: settings to try, the most likely first.
+        allowed: dialects to consider.
         open_wire: opens the port with a setting.
-        interrupted: asked between settings; ends the search.
-        answer_time: longest time that an answer takes [s of the clock].
+        interrupted: checked between settings; True ends the search.
+        answer_time: longest time until a reply [s of the clock].
 
     Returns:
-        What was found, and the wire, open.
+        The detected balance, and the open wire.
 
     Raises:
-        UnknownDialectError: nothing was recognised; says what was tried and what came back.
-        NoConnectionError: the port can't be opened.
+        UnknownDialectError: no dialect was recognised; the text lists the attempts and the received bytes.
+        NoConnectionError: the port cannot be opened.
     """
     patience = max(answer_time, ANSWERING)
     quick: list[Attempt] = []
@@ -133,7 +137,7 @@ def _attempt(
     patience: float,
     late: float = 0.0,
 ) -> tuple[Detected, Wire] | None:
-    """Try one setting, and listen for what is late afterwards."""
+    """Try one setting, and collect late bytes afterwards."""
     if interrupted():
         return None
     attempt.began = time.monotonic()
@@ -165,7 +169,7 @@ def _try(wire: Wire, attempt: Attempt, allowed: Sequence[Dialect], patience: flo
     wait = patience + _LONGEST_ANSWER * attempt.line.character_time
     for probe, speakers in _probes(allowed).items():
         wire.flush()
-        # An empty line first ends what an earlier question may have left in the balance's ear.
+        # A leading line end terminates an incomplete earlier query in the balance's input buffer.
         wire.send(b"\r\n" + probe if probe.endswith(b"\r\n") and attempt.answers else probe)
         lines = _lines(wire, wait, lambda line, speakers=speakers: _is_weight(speakers[0], line), attempt)  # type: ignore[misc]
         attempt.answers[", ".join(dialect.title for dialect in speakers)] = b"\n".join(lines)
@@ -175,7 +179,7 @@ def _try(wire: Wire, attempt: Attempt, allowed: Sequence[Dialect], patience: flo
 
 
 def _probes(allowed: Sequence[Dialect]) -> dict[bytes, list[Dialect]]:
-    """Questions in the order of their turns, each with the dialects that ask it."""
+    """Return the queries in order of `turn`, each with the dialects that use it."""
     probes: dict[bytes, list[Dialect]] = {}
     for dialect in sorted(allowed, key=lambda dialect: dialect.turn):
         probes.setdefault(dialect.query, []).append(dialect)
@@ -197,7 +201,7 @@ def _recognised(
 
 
 def _identity(wire: Wire, question: str, patience: float) -> str:
-    """What the balance answers to I1, I2 …, without the question's echo; '' for nothing."""
+    """Return the reply to I1, I2 …, without the echo of the query; '' for no reply."""
     wire.flush()
     wire.send(question.encode("ascii") + b"\r\n")
     wait = patience + _LONGEST_ANSWER * wire.line.character_time
@@ -222,9 +226,10 @@ def _lines(
     enough: Callable[[bytes], bool] = lambda line: False,
     attempt: Attempt | None = None,
 ) -> list[bytes]:
-    """Lines that come within a time, or until one is enough; once something has come, only what follows soon.
+    """Return the lines that arrive within a time, or until `enough` accepts one; after the first line, only lines that
+    follow soon.
 
-    What has no end counts as a line.
+    A rest without a line end counts as a line.
     """
     end = time.monotonic() + wait
     lines: list[bytes] = []
@@ -252,7 +257,7 @@ def _shown(data: bytes) -> str:
 
 
 def _failure(port: str, attempts: Sequence[Attempt], allowed: Sequence[Dialect]) -> str:
-    """What was tried, what came back, and what to look at."""
+    """Error text: the attempts, the received bytes, and advice."""
     came = [data for attempt in attempts for data in (attempt.heard, *attempt.answers.values()) if data]
     everything = b"".join(came)
     if not any(attempt.possible for attempt in attempts):

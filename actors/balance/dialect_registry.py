@@ -1,4 +1,4 @@
-"""The door for balances, ours as everybody's: dialects of balances on serial lines, and settings of whole drivers."""
+"""The plug-in registry of balances, built-in and installed: dialects of serial lines, and settings of drivers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _balance(loaded: Any, name: str) -> Dialect | type[Any]:
 
 
 BALANCES: PluginRegistry[Dialect | type[Any]] = PluginRegistry("decant.balances", "balance", _balance)
-"""All balances that are installed: instances of dialects, and classes of settings that make a `BalanceDevice`."""
+"""All installed balances: instances of dialects, and settings classes that create a `BalanceDevice`."""
 
 
 def dialects() -> dict[str, Dialect]:
@@ -38,5 +38,5 @@ def kinds() -> dict[str, type[Any]]:
 
 
 def voices() -> dict[str, Callable[[], ProtocolEncoder]]:
-    """What a virtual balance may be started as: the dialects, and what else balances of these families are set to."""
+    """Protocol encoders for emulated balances, by name: one per dialect, and one per further mode of such balances."""
     return {name: voice for dialect in dialects().values() for name, voice in dialect.voices().items()}

@@ -1,4 +1,7 @@
-"""Raw bytes of a serial line with their times, in a file that people can read and a test can play."""
+"""Recordings of a serial line: raw bytes with their times, in a readable file that tests can replay.
+
+`LineRecording` reads and writes such files; `Recorder` writes one during a connection.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +13,17 @@ from typing import Any, Literal, TextIO
 
 Direction = Literal["out", "in"]
 Source = Literal["hardware", "virtual", "typed"]
-"""Where the bytes come from: a real balance, our own virtual one, or somebody's keyboard and a manual."""
+"""Origin of the bytes: a real balance, an emulated one, or a person who typed them from a manual."""
 
 FORMAT = 1
 
 
 @dataclass(frozen=True)
 class LineEvent:
-    """Bytes that went over the line together.
+    """Bytes that were transferred together.
 
     Attributes:
-        time: since the recording began [s].
+        time: since the start of the recording [s].
         direction: 'out' to the balance, 'in' from it.
         data: the bytes.
     """
@@ -35,9 +38,9 @@ class LineRecording:
     """A recording.
 
     Attributes:
-        source: where the bytes come from.
-        events: in the order of time.
-        about: what else is known: balance, line settings, dialect, date, remarks.
+        source: origin of the bytes.
+        events: in order of time.
+        about: metadata: balance, line settings, dialect, date, remarks.
     """
 
     source: Source
@@ -49,7 +52,7 @@ class LineRecording:
         """Read a file.
 
         Raises:
-            ValueError: it is not a recording, or a line is damaged; says which.
+            ValueError: it is not a recording, or a line is invalid; the text names the line.
         """
         lines = path.read_text(encoding="utf-8").splitlines()
         number = 0
@@ -80,12 +83,12 @@ class LineRecording:
 
 
 class Recorder:
-    """Writes while it listens; use it as a wire's tap.
+    """Writes the bytes of a line as they arrive; use it as a wire's tap.
 
     Args:
         file: open for writing.
-        source: where the bytes come from.
-        about: what else is known.
+        source: origin of the bytes.
+        about: metadata.
     """
 
     def __init__(self, file: TextIO, source: Source, about: dict[str, Any]) -> None:
@@ -95,7 +98,7 @@ class Recorder:
         file.write(header(source, about))
 
     def __call__(self, direction: str, data: bytes) -> None:
-        """Note bytes."""
+        """Record bytes."""
         self.count += len(data)
         way: Direction = "out" if direction == "out" else "in"
         self._file.write(line_of(LineEvent(time.monotonic() - self._start, way, data)))
@@ -103,12 +106,12 @@ class Recorder:
 
 
 def header(source: Source, about: dict[str, Any]) -> str:
-    """First line of a file."""
+    """Return the first line of a file."""
     return json.dumps({"decant_serial_recording": FORMAT, "source": source, **about}, ensure_ascii=False) + "\n"
 
 
 def line_of(event: LineEvent) -> str:
-    """A line of a file; the text is for people, the hexadecimal digits count."""
+    """Return a line of a file. The text is for readers; only the hexadecimal digits are read back."""
     text = event.data.decode("ascii", "backslashreplace")
     entry = {"t": round(event.time, 4), "dir": event.direction, "hex": event.data.hex(), "text": text}
     return json.dumps(entry) + "\n"

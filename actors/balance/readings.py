@@ -1,8 +1,7 @@
-"""What a balance says in one line, before anybody asks what it means for a pour.
+"""One line of a balance as a value, units of mass, and typed weights.
 
-Units that balances print, in kilograms.
-
-Weights that people type: '12.34 g' → kilograms.
+`Reading` and `Acknowledgement` are the two kinds of lines. `kilograms` converts units, and `typed_weight` parses '12.34
+g'. The meaning of a reading for a pour belongs to `weighing_plan`.
 """
 
 from __future__ import annotations
@@ -25,12 +24,12 @@ KILOGRAMS = {
     "gn": 6.479891e-5,
 }
 """Mass of one unit [kg], by its name in lower case: pounds and ounces avoirdupois, `ozt` the troy ounce, `gn` the
-grain, `dwt` the pennyweight, `ct` the metric carat. Exact by definition. No tonne: a
-damaged `ct` must not become one."""
+grain, `dwt` the pennyweight, `ct` the metric carat. Exact by definition. The tonne is left out, so that a damaged `ct`
+cannot become one."""
 
 
 def kilograms(unit: str) -> float | None:
-    """Mass of one unit [kg]; None where it is not a mass (pcs, %), or no single one (taels differ between cities).
+    """Mass of one unit [kg]; None if it is not a mass (pcs, %), or not a unique one (taels differ between cities).
 
     Args:
         unit: as a balance prints it, in any case.
@@ -39,27 +38,27 @@ def kilograms(unit: str) -> float | None:
 
 
 class LineError(ValueError):
-    """Bytes that are not a line of the dialect: damaged, half a line, or another dialect's."""
+    """Bytes that are not a line of the dialect: damaged, incomplete, or from another dialect."""
 
 
 class ReadingStatus(StrEnum):
-    """What a line says about the weight in it."""
+    """Status of the weight in a line."""
 
     STABLE = "stable"
     UNSTABLE = "unstable"
     OVER = "over range"
     UNDER = "under range"
     BUSY = "busy"
-    """Carrying out a command, or not at rest in the time that it allows itself."""
+    """The balance executes a command, or did not become stable within its own time limit."""
 
     ERROR = "error"
-    """The balance reports a fault of its own."""
+    """The balance reports an internal fault."""
 
     SILENT = "silent"
-    """No answer came; only the driver says this, no line does."""
+    """No reply came; set by the driver, never by a line."""
 
     LOST = "lost"
-    """No connection; only the driver says this."""
+    """No connection; set by the driver, never by a line."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +66,10 @@ class Reading:
     """One weight as a balance sends it.
 
     Attributes:
-        status: what the balance says about it.
-        value: number as sent, decimals kept; None where none was sent.
-        unit: as sent, '' where none was sent (some dialects leave it out while unstable).
-        detail: what else stood in the line, e.g. an error's number.
+        status: as reported by the balance.
+        value: number as sent, decimals kept; None if none was sent.
+        unit: as sent, '' if none was sent (some dialects leave it out while unstable).
+        detail: further content of the line, e.g. an error's number.
     """
 
     status: ReadingStatus
@@ -79,19 +78,19 @@ class Reading:
     detail: str = ""
 
     def mass(self, unit: str = "") -> float | None:
-        """The weight [kg]; None without a number, or where its unit is not a mass.
+        """The weight [kg]; None without a number, or if its unit is not a mass.
 
         Args:
-            unit: taken where the line has none.
+            unit: used if the line has none.
         """
         factor = kilograms(self.unit or unit)
         return None if self.value is None or factor is None else float(self.value) * factor
 
     def step(self, unit: str = "") -> float | None:
-        """One of the last digit sent [kg]; the balance's display may step by 2 or 5 of them.
+        """One unit of the last digit sent [kg]; the balance's display may step by 2 or 5 of them.
 
         Args:
-            unit: taken where the line has none.
+            unit: used if the line has none.
         """
         factor = kilograms(self.unit or unit)
         if self.value is None or factor is None:
@@ -105,7 +104,7 @@ class Reading:
 
 
 class ReadingReply(StrEnum):
-    """How a balance answers a command that is not a question for a weight."""
+    """Result in the reply to a command that is not a query for a weight."""
 
     DONE = "done"
     BUSY = "busy"
@@ -116,12 +115,12 @@ class ReadingReply(StrEnum):
 
 @dataclass(frozen=True)
 class Acknowledgement:
-    """Answer to a command.
+    """Reply to a command.
 
     Attributes:
-        command: that is answered, as the balance names it ('T', 'Z', '@'); '' where it names none.
-        answer: what became of it.
-        text: what it said beside.
+        command: the command, as the balance names it ('T', 'Z', '@'); '' if it names none.
+        answer: the result.
+        text: the rest of the line.
     """
 
     command: str
@@ -130,7 +129,7 @@ class Acknowledgement:
 
 
 Reply = Reading | Acknowledgement
-"""A line that was understood."""
+"""A decoded line."""
 
 
 _TYPED = re.compile(r"\s*(?P<number>[+−-]?\s*[0-9]+(?:[.,][0-9]+)?)\s*(?P<unit>[A-Za-zµ%]*)\s*")
@@ -142,7 +141,7 @@ class TypedWeight:
 
     Attributes:
         mass: [kg].
-        step: one of the last digit [kg]: as well as the scale was read.
+        step: one unit of the last digit [kg]: the resolution of the typed number.
     """
 
     mass: float
@@ -150,13 +149,13 @@ class TypedWeight:
 
 
 def typed_weight(text: str) -> TypedWeight:
-    """Understand a weight that somebody typed; the unit must be there, for a kilogram is not a gram.
+    """Parse a typed weight; the unit is mandatory, because a wrong guess would be a factor of 1000.
 
     Args:
         text: a number with a point or a comma, and a unit.
 
     Raises:
-        ValueError: anything else; says what would be right.
+        ValueError: any other text; the message gives a valid form.
     """
     match = _TYPED.fullmatch(text)
     if match is None:

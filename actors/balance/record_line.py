@@ -1,4 +1,4 @@
-"""Record what a balance says, for a replay in tests: `python -m actors.balance.record_line --port … --to file`."""
+"""Record the lines of a balance, for replay in tests: `python -m actors.balance.record_line --port … --to file`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from actors.balance.serial_balance import SerialBalance
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Record. Returns the exit code."""
+    """Record a line. Returns the exit code."""
     parser = _parser()
     asked = parser.parse_args(arguments)
     if asked.to.exists():

@@ -1,10 +1,11 @@
-"""A balance on a serial line: one driver for all dialects. Plain and blocking; `actors.runtime.remote_object` puts
-it in a process.
+"""The driver for balances on a serial line, for all dialects.
 
-Every call has a deadline. What counts has settled (`settling`), and a tare is believed once it is read back. What only
-watches (`read`, `stream`) never fails and never disturbs.
+`SerialBalance` is the `BalanceDriver`. It blocks; `actors.runtime.remote_object` runs it in a process. Every call has a
+deadline. A weight counts once it has settled (`settling`), and a tare is confirmed by reading it back. `read` and
+`stream` only observe: they never fail and never disturb a measurement.
 
-Questions and commands over a wire: pace, stale lines, what answers what. Not for several threads.
+`Conversation` sends queries and commands over a wire: it keeps the minimum interval, discards stale lines and matches
+replies to requests. It is not thread-safe.
 """
 
 from __future__ import annotations
@@ -41,19 +42,19 @@ _GLANCE = 0.1
 
 
 class Conversation:
-    """The way to one balance.
+    """The connection to one balance.
 
     Args:
         spec: port and settings; nothing is opened before `open`.
         interrupted: ends waits.
-        tap: sees all bytes.
+        tap: receives all bytes.
     """
 
     def __init__(self, spec: SerialBalanceSpec, interrupted: threading.Event, tap: Tap | None = None) -> None:
         self._spec, self._interrupted, self._tap = spec, interrupted, tap
         self.counters = Counters()
         self.found: Detected | None = None
-        """What is at the other end, once it was found out; kept when the port vanishes."""
+        """The detected balance; kept when the port vanishes."""
         self._wire: Wire | None = None
         self._asked_at = -math.inf
 
@@ -70,20 +71,20 @@ class Conversation:
 
     @property
     def interval(self) -> float:
-        """Time from question to question [s of the clock]."""
+        """Time between two queries [s of the clock]."""
         gap = self.found.dialect.gap if self.found is not None else 0.0
         return max(self._spec.interval, gap) / self._spec.time_scale
 
     def open(self) -> None:
-        """Open the port; the first time, find out what the settings leave open.
+        """Open the port; the first time, detect the settings that are not given.
 
         Raises:
-            NoConnectionError: no port, or nobody understandable there.
+            NoConnectionError: no port, or no balance recognised on it.
         """
         if self._wire is not None:
             return
         allowed, candidates = self._spec.allowed, self._spec.candidates()
-        if self.found is not None:  # plugged in again: nothing has to be found out
+        if self.found is not None:  # reconnected: no detection needed
             self._wire = self._open_wire(self.found.line)
         elif len(allowed) == 1 and len(candidates) == 1:
             self._wire = self._open_wire(candidates[0])
@@ -105,7 +106,7 @@ class Conversation:
             deadline: of `time.monotonic`.
 
         Raises:
-            NoConnectionError: it has not by then, or a wait was interrupted.
+            NoConnectionError: it did not return before the deadline, or the wait was interrupted.
         """
         while True:
             try:
@@ -121,19 +122,19 @@ class Conversation:
             wire.close()
 
     def ask(self) -> tuple[Reading, float]:
-        """What the balance shows now.
+        """Request the display's current weight.
 
         Returns:
-            The reading, status 'silent' if no answer came, and when it came [s of `time.monotonic`].
+            The reading (status 'silent' if no reply came) and its time [s of `time.monotonic`].
 
         Raises:
-            NoConnectionError: the port vanished, or can't be opened.
+            NoConnectionError: the port vanished, or cannot be opened.
         """
         with self._wire_at_rest() as wire:
             wire.send(self.dialect.query)
             end = time.monotonic() + self._spec.answer_time
             while (line := self._line(wire, end)) is not None:
-                reply = self._understood(line)
+                reply = self._decoded(line)
                 if isinstance(reply, Reading):
                     return reply, time.monotonic()
                 if isinstance(reply, Acknowledgement) and not reply.command:
@@ -142,18 +143,18 @@ class Conversation:
         return Reading(ReadingStatus.SILENT), time.monotonic()
 
     def command(self, data: bytes, patience: float) -> Acknowledgement | None:
-        """Send tare or zero, and wait for the answer if the dialect has one.
+        """Send tare or zero, and wait for the reply if the dialect has one.
 
         Args:
             data: the command.
-            patience: how long the balance may wait for rest before it answers [s of the clock].
+            patience: longest time for which the balance may wait for stability before it replies [s of the clock].
 
         Returns:
-            The answer; None where the dialect has none.
+            The reply; None if the dialect has none.
 
         Raises:
             NoConnectionError: the port vanished.
-            CommandError: no answer came.
+            CommandError: no reply came.
         """
         with self._wire_at_rest() as wire:
             wire.send(data)
@@ -162,14 +163,14 @@ class Conversation:
             wanted = data.strip().decode("ascii")
             end = time.monotonic() + max(patience, self._spec.answer_time)
             while (line := self._line(wire, end)) is not None:
-                reply = self._understood(line)
+                reply = self._decoded(line)
                 if isinstance(reply, Acknowledgement) and reply.command in (wanted, ""):
                     return reply
         self.counters.unanswered += 1
         raise CommandError(f"it does not answer '{wanted}'")
 
     def listen(self, seconds: float) -> None:
-        """Take in what comes by itself, for recording.
+        """Receive unsolicited lines, for recording.
 
         Raises:
             NoConnectionError: the port vanished.
@@ -177,11 +178,11 @@ class Conversation:
         with self._wire_at_rest() as wire:
             end = time.monotonic() + seconds
             while (line := self._line(wire, end)) is not None:
-                self._understood(line)
+                self._decoded(line)
 
     @contextlib.contextmanager
     def _wire_at_rest(self) -> Iterator[Wire]:
-        """The open wire, the pace kept and nothing unread in it; closed if it is lost in use."""
+        """The open wire, with the query interval kept and no unread bytes; closed if it is lost in use."""
         self.open()
         assert self._wire is not None
         wait = self._asked_at + self.interval - time.monotonic()
@@ -196,7 +197,7 @@ class Conversation:
             raise
 
     def _line(self, wire: Wire, end: float) -> bytes | None:
-        """The next line, looking up for an interruption."""
+        """Return the next line; checks for an interruption while waiting."""
         while not self._interrupted.is_set():
             now = time.monotonic()
             line = wire.line_until(min(end, now + _GLANCE))
@@ -204,7 +205,7 @@ class Conversation:
                 return line
         return None
 
-    def _understood(self, line: bytes) -> Reply | None:
+    def _decoded(self, line: bytes) -> Reply | None:
         try:
             reply = self.dialect.decode(line)
         except LineError:
@@ -218,33 +219,33 @@ class Conversation:
 
 
 ZERO_STEPS = 2.0
-"""How far from zero a balance may read after taring, in steps of its display (and three times its repeatability)."""
+"""Largest reading after a tare, in display steps; three times the repeatability is added."""
 
 OUT_OF_RANGE_TIME = 3.0
-"""How long over or under range, or a fault, is waited out before it is an error [s of bench time]."""
+"""Longest time over or under range, or with a fault, before it is an error [s of bench time]."""
 
 COMMAND_ATTEMPTS = 3
-"""How often tare or zero is sent before it has failed; nothing is poured meanwhile."""
+"""Number of attempts for tare or zero before it fails; no pour runs meanwhile."""
 
 COMMAND_TIME = 3.0
-"""How long the display may take to follow tare or zero [s of bench time]."""
+"""Longest time until the display follows tare or zero [s of bench time]."""
 
 _RETRY_INTERVAL = 0.5
 
 STRANGE_UNITS = 3
-"""Readings in a row in a unit that is not a mass, before that is an error."""
+"""Number of consecutive readings in a unit that is not a mass before it is an error."""
 
 LOSSES = 3
-"""How often the connection may be lost during one weighing."""
+"""Number of lost connections allowed during one weighing."""
 
 
 class SerialBalance:
-    """See the module's text.
+    """Driver of a serial balance; see the module docstring.
 
     Args:
         spec: port and settings; nothing is opened before the first call.
         name: for messages.
-        tap: sees all bytes, for recording.
+        tap: receives all bytes, for recording.
     """
 
     def __init__(self, spec: SerialBalanceSpec, name: str = "balance", tap: Tap | None = None) -> None:
@@ -257,24 +258,24 @@ class SerialBalance:
         self._tared = self._reference_lost = False
         self._losses = self._strange_units = 0
 
-    # What counts.
+    # Measurements.
 
     def connect(self) -> str:
-        """See `BalanceDriver.connect`: open the port and find out what is not set."""
+        """See `BalanceDriver.connect`; opens the port and detects the settings that are not given."""
         with self._exclusive():
             self._open()
         return self.describe()
 
     def tare(self) -> None:
-        """See `BalanceDriver.tare`; refused, or without effect, is an error, too."""
+        """See `BalanceDriver.tare`; a tare that is refused or has no effect is an error, too."""
         self._open()
         self._set_reference("tare", self._conversation.dialect.tare)
 
     def zero(self) -> None:
-        """Set the zero of the empty balance, and see it do so.
+        """Set the zero of the empty balance, and verify it.
 
         Raises:
-            BalanceError: as `tare`; or something is on the balance, or the dialect has no such command.
+            BalanceError: as `tare`; or the balance is loaded, or the dialect has no such command.
         """
         self._open()
         dialect = self._conversation.dialect
@@ -283,38 +284,38 @@ class SerialBalance:
         self._set_reference("zero", dialect.zero)
 
     def weigh(self) -> Weight:
-        """See `BalanceDriver.weigh`: wait until the weight has settled."""
+        """See `BalanceDriver.weigh`; waits until the weight has settled."""
         settled, seen = self._settle(reference_needed=True), self._display
         return Weight(settled.mass, True, settled.time, str(ReadingStatus.STABLE), seen.step, seen.last.shown)
 
-    # What only watches.
+    # Observation.
 
     def read(self) -> Weight:
-        """See `BalanceDriver.read`. While another call waits for an answer, the last reading."""
+        """See `BalanceDriver.read`; returns the last reading while another call waits for a reply."""
         if not self._lock.acquire(timeout=self._spec.answer_time / 4.0):
             return self._display.last
         try:
             if time.monotonic() - self._display.last.time >= 0.9 * self._conversation.interval:
-                self._glance()
+                self._read_once()
             return self._display.last
         finally:
             self._lock.release()
 
     def stream(self, interval: float = 0.15) -> Iterator[Weight]:
-        """What the display shows, until `interrupt`.
+        """Yield the display's weight until `interrupt`.
 
         Args:
-            interval: from one reading to the next [s of the clock].
+            interval: between two readings [s of the clock].
         """
         while not self._interrupted.is_set():
             yield self.read()
             self._interrupted.wait(interval)
 
     def listen(self, seconds: float) -> None:
-        """Ask nothing, and take in what comes by itself (for recording).
+        """Send nothing, and receive unsolicited lines (for recording).
 
         Args:
-            seconds: for how long.
+            seconds: duration.
 
         Raises:
             NoConnectionError: the port vanished.
@@ -324,11 +325,11 @@ class SerialBalance:
             self._conversation.listen(seconds)
 
     def statistics(self) -> dict[str, int]:
-        """Lines understood, damaged and stale, unanswered questions, lost connections."""
+        """Counts of valid, damaged and stale lines, unanswered queries and lost connections."""
         return asdict(self._conversation.counters)
 
     def describe(self) -> str:
-        """'Kern KCP on /dev/…, 9600 baud 8N1', as far as it is known."""
+        """Describe the connection: 'Kern KCP on /dev/…, 9600 baud 8N1', as far as it is known."""
         found = self._conversation.found
         if found is None:
             return f"{self._name} on {self._spec.port}, not yet connected"
@@ -355,10 +356,10 @@ class SerialBalance:
         with self._lock:
             self._conversation.close()
 
-    # How.
+    # Implementation.
 
     def _set_reference(self, name: str, data: bytes) -> None:
-        """Rest, command, and a display near zero afterwards."""
+        """Wait for a stable weight, send the command, and verify that the display is near zero."""
         said, end = "", time.monotonic() + 2.0 * self._rule.deadline
         for _ in range(COMMAND_ATTEMPTS):
             if time.monotonic() > end:
@@ -376,7 +377,7 @@ class SerialBalance:
         raise self._error(CommandError, WITHOUT_EFFECT.format(name=name, times=COMMAND_ATTEMPTS, said=said))
 
     def _send(self, name: str, data: bytes) -> str:
-        """Send a command; '' if it was taken (or nobody says), else why it may be sent again."""
+        """Send a command; return '' if it was accepted or has no reply, otherwise the reason for a retry."""
         try:
             with self._exclusive():
                 answer = self._conversation.command(data, 2.0 * COMMAND_TIME / self._spec.time_scale)
@@ -398,7 +399,7 @@ class SerialBalance:
                 raise self._error(CommandError, f"{name} refused: {text or 'it does not say why'}")
 
     def _near_zero(self) -> Settled | None:
-        """None once the display rests near zero, else where it rests when the time for following is over."""
+        """Return None once the display settles near zero; after the time limit, return the settled weight."""
         end = time.monotonic() + COMMAND_TIME / self._spec.time_scale
         while True:
             settled = self._settle()
@@ -408,7 +409,7 @@ class SerialBalance:
                 return settled
 
     def _settle(self, *, reference_needed: bool = False) -> Settled:
-        """Ask until the weight has settled."""
+        """Send queries until the weight has settled."""
         settling = Settling(self._rule)
         deadline = time.monotonic() + self._rule.deadline
         outside_since: float | None = None
@@ -418,7 +419,7 @@ class SerialBalance:
             if reference_needed:
                 self._check_reference()
             exchanged = self._exchange()
-            if exchanged is None:  # connected anew
+            if exchanged is None:  # reconnected
                 deadline, settling = time.monotonic() + self._rule.deadline, Settling(self._rule)
                 continue
             reading, moment = exchanged
@@ -440,7 +441,7 @@ class SerialBalance:
         raise self._error(*unsettled(seen, self._display.last.shown, self._spec.settling.deadline, damaged))
 
     def _exchange(self) -> tuple[Reading, float] | None:
-        """One question and its answer; None after the connection was lost and made again."""
+        """Send one query and return its reply; None after a lost connection was restored."""
         try:
             with self._exclusive():
                 self._conversation.open()
@@ -451,8 +452,8 @@ class SerialBalance:
             self._wait_for_return(error)
             return None
 
-    def _glance(self) -> None:
-        """Take one reading if that is quickly done."""
+    def _read_once(self) -> None:
+        """Take one reading; only if the balance is already identified."""
         if self._conversation.found is None:
             return
         try:
@@ -467,7 +468,7 @@ class SerialBalance:
         self._display.lose()
 
     def _open(self) -> None:
-        """Open for the first time; a port that isn't there then won't come by waiting."""
+        """Open the port for the first time; a port that is missing then is not waited for."""
         if self._conversation.found is not None:
             return
         try:
@@ -475,11 +476,11 @@ class SerialBalance:
                 self._conversation.open()
         except NoConnectionError as error:
             self._check_interrupted()
-            raise self._said(error) from error
+            raise self._connection_error(error) from error
 
     def _wait_for_return(self, error: NoConnectionError) -> None:
         if self._conversation.found is None:
-            raise self._said(error) from error
+            raise self._connection_error(error) from error
         self._note_loss()
         self._losses += 1
         if self._losses > LOSSES:
@@ -490,9 +491,9 @@ class SerialBalance:
                 self._conversation.reopen(time.monotonic() + self._spec.reconnect_time)
         except NoConnectionError as gone:
             self._check_interrupted()
-            raise self._said(gone) from gone
+            raise self._connection_error(gone) from gone
 
-    def _said(self, error: NoConnectionError) -> BalanceError:
+    def _connection_error(self, error: NoConnectionError) -> BalanceError:
         return self._error(type(error), str(error).removeprefix(f"{self._spec.port}: "))
 
     def _error(self, kind: type[BalanceError], text: str) -> BalanceError:
@@ -507,7 +508,9 @@ class SerialBalance:
             raise self._error(ReferenceLostError, LOST_REFERENCE.format(shown=self._display.last.shown or "nothing"))
 
     def _check_unit(self, reading: Reading) -> None:
-        """Refuse what is not a mass; but a unit that lost a letter on the line is none either, so not at once."""
+        """Reject a unit that is not a mass. A unit that lost a letter on the line is no mass either, so this needs
+        several readings.
+        """
         strange = reading.value is not None and bool(reading.unit) and reading.mass() is None
         self._strange_units = self._strange_units + 1 if strange else 0
         if self._strange_units >= STRANGE_UNITS:
@@ -519,7 +522,7 @@ class SerialBalance:
 
     @contextlib.contextmanager
     def _exclusive(self) -> Iterator[None]:
-        """The line for one question or command."""
+        """Hold the line for one query or command."""
         if not self._lock.acquire(timeout=self._rule.deadline + self._spec.reconnect_time):
             raise self._error(BalanceError, "another call has not ended in time")
         try:

@@ -1,6 +1,7 @@
-"""A serial port that may vanish and return: lines in, bytes out, every call with a deadline.
+"""A serial port that may vanish and return: it reads lines and writes bytes, and every call has a deadline.
 
-What `decant doctor` says about a serial port, before anything is opened for good.
+`Wire` is one open port, and `Counters` holds its statistics. `look_at_port` returns the check of a serial port for
+`decant doctor`. The meaning of the bytes belongs to the dialects.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ if TYPE_CHECKING:
 
 try:
     from termios import error as _TermiosError  # noqa: N812
-except ImportError:  # not on Windows, and not raised there
+except ImportError:  # not on Windows, where it is not raised either
     _TermiosError = OSError  # type: ignore[misc, assignment]
 
 Tap = Callable[[str, bytes], None]
-"""Sees the bytes of a wire: direction 'out' (to the balance) or 'in', and what went."""
+"""Receives the bytes of a wire: direction 'out' (to the balance) or 'in', and the bytes."""
 
 _WRITE_TIME = 2.0
 _GLANCE = 0.02
-"""Longest single wait for a character [s]; fixed, since pyserial sets the whole port anew for another."""
+"""Longest single wait for a character [s]; fixed, because pyserial reconfigures the whole port for another value."""
 
 
 class PortLostError(NoConnectionError):
@@ -41,14 +42,14 @@ class PortLostError(NoConnectionError):
 
 @dataclass
 class Counters:
-    """What a wire has seen, for `doctor` and for error messages.
+    """Statistics of a wire, for `doctor` and for error messages.
 
     Attributes:
-        lines: understood.
-        damaged: not understood.
-        stale: waiting unread when a new question was asked.
-        unanswered: questions without an answer.
-        lost: connections lost.
+        lines: valid lines.
+        damaged: invalid lines.
+        stale: unread lines that were discarded before a new query.
+        unanswered: queries without a reply.
+        lost: lost connections.
     """
 
     lines: int = 0
@@ -59,18 +60,18 @@ class Counters:
 
 
 class Wire:
-    """One open port with fixed line settings. Not for several threads.
+    """One open port with fixed line settings. Not thread-safe.
 
     Args:
         port: device.
         line: baud rate and character format.
         handshake: 'none', 'software' or 'hardware'.
         counters: where to count.
-        tap: sees all bytes.
+        tap: receives all bytes.
 
     Raises:
-        LineSettingsError: it can't be set to that line.
-        NoConnectionError: it can't be opened; says why and what to do.
+        LineSettingsError: the port cannot be set to that line.
+        NoConnectionError: the port cannot be opened; the text gives the reason and a remedy.
     """
 
     def __init__(
@@ -88,33 +89,33 @@ class Wire:
         self._serial = _open(port, line, handshake)
 
     def send(self, data: bytes) -> None:
-        """Write.
+        """Write bytes.
 
         Raises:
-            PortLostError: the port vanished, or doesn't take the bytes.
+            PortLostError: the port vanished, or does not accept the bytes.
         """
         try:
-            self._serial.write(data)  # not drained: that has no deadline where the other side stops the line
+            self._serial.write(data)  # no drain: it has no deadline if the other side pauses the line
         except OSError as error:  # pyserial's errors are OSErrors
             raise self._lost(error) from error
         if self._tap is not None:
             self._tap("out", data)
 
     def flush(self) -> None:
-        """Throw away what came unasked; whole lines are counted as stale."""
+        """Discard unread bytes; complete lines are counted as stale."""
         while self._pull(only_waiting=True):
             pass
         self.counters.stale += self._buffer.count(b"\n")
         self._buffer.clear()
 
     def line_until(self, moment: float) -> bytes | None:
-        """The next line, without its end.
+        """Return the next line, without its end.
 
         Args:
-            moment: of `time.monotonic` to give up at.
+            moment: deadline of `time.monotonic`.
 
         Returns:
-            None if no whole line came by then.
+            None if no complete line came by then.
 
         Raises:
             PortLostError: the port vanished.
@@ -131,29 +132,29 @@ class Wire:
 
     @property
     def waiting(self) -> bool:
-        """Whether something has come that has no end of line yet."""
+        """Whether bytes without a line end have been received."""
         return bool(self._buffer)
 
     def take(self) -> bytes:
-        """What is waiting and has no end of line yet, taken out."""
+        """Remove and return the received bytes that have no line end yet."""
         rest = bytes(self._buffer)
         self._buffer.clear()
         return rest
 
     def close(self) -> None:
         """Close the port; never fails."""
-        for step in (self._serial.reset_output_buffer, self._serial.close):  # unsent bytes would hold the closing up
+        for step in (self._serial.reset_output_buffer, self._serial.close):  # unsent bytes would delay the close
             with contextlib.suppress(OSError, _TermiosError):
                 step()
 
     def _pull(self, *, only_waiting: bool = False) -> bool:
-        """Take in what has come, or wait a moment for a first character; whether anything came."""
+        """Read the received bytes, or wait briefly for a first character; return whether any came."""
         try:
             count = self._serial.in_waiting
             data = self._serial.read(count or 1) if count or not only_waiting else b""
         except OSError as error:
             raise self._lost(error) from error
-        except TypeError as error:  # pyserial, closed by another thread in the middle of a read
+        except TypeError as error:  # pyserial, if another thread closes the port during a read
             raise self._lost(OSError("closed")) from error
         if data and self._tap is not None:
             self._tap("in", data)
@@ -187,12 +188,12 @@ def _open(port: str, line: LineSettings, handshake: str) -> Serial:
         if isinstance(error, OSError):
             raise NoConnectionError(f"{port}: {_reason(port, error)}") from error
         raise LineSettingsError(f"{port}: can't be set to {line}") from error
-    except OSError as error:  # pyserial's errors are such
+    except OSError as error:  # pyserial's errors are OSErrors
         raise NoConnectionError(f"{port}: {_reason(port, error)}") from error
 
 
 def _reason(port: str, error: OSError) -> str:
-    """Why a port can't be opened, and what to do."""
+    """Return why a port cannot be opened, and a remedy."""
     number = error.errno
     if number == 2 or not Path(port).exists():
         found = ports()
@@ -206,7 +207,7 @@ def _reason(port: str, error: OSError) -> str:
 
 
 def ports() -> list[str]:
-    """Serial ports of this machine, by the names that they keep where there are such."""
+    """Serial ports of this machine, by their persistent names if there are any."""
     by_id = sorted(str(path) for path in Path("/dev/serial/by-id").glob("*"))
     if by_id:
         return by_id
@@ -216,7 +217,8 @@ def ports() -> list[str]:
 
 
 def port_advice(port: str) -> str | None:
-    """What is wrong with a port's name, if anything: 'ttyUSB0' may be another device after the next plugging.
+    """Return advice about an unstable port name; None if it is fine. 'ttyUSB0' may be another device after
+    reconnection.
 
     Args:
         port: as in the settings.
@@ -230,7 +232,7 @@ def port_advice(port: str) -> str | None:
 
 
 def look_at_port(name: str) -> DeviceCheck:
-    """Whether it is there, is a serial port, and may be opened.
+    """Check that a port exists, is a serial port, and may be opened.
 
     Args:
         name: as in the laboratory's file.
@@ -258,7 +260,7 @@ def _group(port: Path) -> str:
 
 
 def _other_than_a_port(port: Path) -> str | None:
-    """What stands there, if it is not a serial port; None where it is one, or can't be opened to see."""
+    """Return what kind of file the port is, if it is not a serial port; None if it is one, or cannot be opened."""
     if port.is_dir():
         return "a folder"
     if not stat.S_ISCHR(port.stat().st_mode):

@@ -1,6 +1,7 @@
-"""A balance without a balance: noise, resolution, settling, drift, and a display that needs time to become stable.
+"""Simulated balances: noise, resolution, settling, drift, and a display that needs time to become stable.
 
-What a virtual balance weighs and shows: settling, drift, noise, steps, range. No bytes, no clock.
+`VirtualBalance` is the driver of a simulated bench. `EmulatedScale` models the weighing cell and display of an emulated
+serial balance, including its range; it has no bytes and no clock.
 """
 
 from __future__ import annotations
@@ -22,25 +23,25 @@ INTERVAL = 0.1
 """Bench time between two readings [s]."""
 
 WINDOW = 10
-"""Readings that must agree for a stable weight."""
+"""Number of readings that must agree for a stable weight."""
 
 PATIENCE = 20.0
-"""Bench time after which a balance that is not at rest is given up [s]."""
+"""Bench time limit for a stable weight [s]."""
 
 _SETTLED = math.log(100.0)
-"""Time constants until the display is within a hundredth of a step."""
+"""Number of time constants until the display is within 1 % of a change."""
 
 
 @dataclass(frozen=True)
 class BalanceSettings:
-    """What a data sheet says.
+    """Data sheet of a simulated balance.
 
     Attributes:
         resolution: smallest step of the display [kg]; 0: no rounding.
         noise: standard deviation of one reading [kg].
         drift: of the zero point [kg/s].
-        settling_time: until a new load is shown to within a hundredth of it [s].
-        time_scale: bench seconds per wall second; 0 waits for nothing.
+        settling_time: until the display shows a new load to within 1 % of it [s].
+        time_scale: bench seconds per wall second; 0 disables waiting.
     """
 
     resolution: float
@@ -52,7 +53,7 @@ class BalanceSettings:
 
 @dataclass(frozen=True)
 class Load:
-    """What comes onto the tray from now on.
+    """The load on the tray from now on.
 
     Attributes:
         times: since now, increasing [s].
@@ -64,11 +65,11 @@ class Load:
 
 
 class VirtualBalance:
-    """Plain and blocking; `actors.runtime.remote_object` puts it into a thread or a process.
+    """Driver of a simulated balance. It blocks; `actors.runtime.remote_object` runs it in a thread or a process.
 
     The display follows the load as a first-order lag, with a drifting zero, noise on every reading, and rounding.
-    Measurements depend on the seed, the loads and the bench time that passed, never on the clock or on who looked at
-    the display meanwhile.
+    Measurements depend on the seed, the loads and the elapsed bench time, but not on the clock or on earlier calls of
+    `read`.
     """
 
     def __init__(self, settings: BalanceSettings, name: str = "virtual") -> None:
@@ -79,7 +80,7 @@ class VirtualBalance:
         self.prepare((0,))
 
     def prepare(self, seed: tuple[int, ...]) -> None:
-        """Empty tray, bench time 0, noise of a new pour."""
+        """Empty the tray, set bench time to 0, and reseed the noise."""
         with self._lock:
             self._rng = np.random.default_rng(seed)
             self._display_rng = np.random.default_rng((*seed, 1))
@@ -89,12 +90,12 @@ class VirtualBalance:
         self._pace.resume()
 
     def put(self, load: Load) -> None:
-        """Change what is (or will be) on the tray."""
+        """Change the load on the tray, now and in the future."""
         with self._lock:
             self._load, self._loaded_at = load, self._time
 
     def pass_time(self, seconds: float) -> None:
-        """Stand there for some bench time [s].
+        """Let bench time pass [s].
 
         Raises:
             LaboratoryError: interrupted.
@@ -106,22 +107,22 @@ class VirtualBalance:
             self._advance(seconds / steps)
 
     def interrupt(self) -> None:
-        """End the wait that is under way, until the next `prepare` or `resume`."""
+        """End the current wait, until the next `prepare` or `resume`."""
         self._pace.interrupt()
 
     def resume(self) -> None:
-        """Let waits last again after `interrupt`."""
+        """Allow waits again after `interrupt`."""
         self._pace.resume()
 
     def close(self) -> None:
-        """Nothing has to be let go of."""
+        """Do nothing: there is no resource to release."""
 
     def connect(self) -> str:
         """See `BalanceDriver.connect`."""
         return f"{self._name}: a balance of numbers, step {1e3 * self._settings.resolution:g} g"
 
     def keep_reference(self) -> None:
-        """Its connection can't be lost."""
+        """Do nothing: the connection cannot be lost."""
 
     def tare(self) -> None:
         """See `BalanceDriver.tare`."""
@@ -135,19 +136,19 @@ class VirtualBalance:
         return Weight(mass, True, self._time, step=self._settings.resolution)
 
     def read(self) -> Weight:
-        """See `BalanceDriver.read`. Its noise is a stream of its own, so that watching changes no measurement."""
+        """See `BalanceDriver.read`. It has a separate noise stream, so that it does not affect measurements."""
         with self._lock:
             lag = abs(self._load_at(self._time) - self._shown)
             return Weight(self._reading(self._display_rng), lag <= self._tolerance, self._time)
 
     @property
     def _tolerance(self) -> float:
-        """How far the readings of a window may lie apart: their noise and rounding must not look like motion."""
+        """Largest difference of the readings in a window: noise and rounding must not be taken for motion."""
         s = self._settings
         return 2.0 * s.resolution + 6.0 * s.noise + abs(s.drift) * WINDOW * INTERVAL
 
     def _stable(self) -> float:
-        """Take readings until a window of them agrees; the last one counts [kg]."""
+        """Take readings until a window of them agrees; return the last one [kg]."""
         self._pace.restart()
         window: deque[float] = deque(maxlen=WINDOW)
         for count in range(1, round(PATIENCE / INTERVAL) + 1):
@@ -177,35 +178,34 @@ class VirtualBalance:
             self._shown += (self._load_at(self._time) - self._shown) * share
 
     def _reading(self, rng: np.random.Generator) -> float:
-        """One reading of the display [kg]."""
+        """Return one reading of the display [kg]."""
         s = self._settings
         raw = self._shown + s.drift * self._time + rng.normal(0.0, s.noise) - self._tare
         return float(round(raw / s.resolution) * s.resolution if s.resolution > 0.0 else raw)
 
 
 _STEP = 0.01
-"""Bench time in which a moving display is computed anew [s]."""
+"""Bench time step of a moving display [s]."""
 
-"""Time constants until the display is within a hundredth of a change."""
 
 ZERO_SHARE = 0.02
-"""How much of the capacity may be on it when it is zeroed."""
+"""Largest load for a zero command, as a fraction of the capacity."""
 
 
 @dataclass(frozen=True)
 class ScaleSettings:
-    """What a data sheet says.
+    """Data sheet of an emulated scale.
 
     Attributes:
         resolution: step of the display [kg].
-        capacity: heaviest load [kg].
-        noise: standard deviation of weighing the same thing again [kg]. Drawn once for each load that is put on, as
-            the display of a real one stands still while nothing moves: a weight then depends on seed and loads alone,
-            however often and whenever it was asked for.
+        capacity: maximum load [kg].
+        noise: standard deviation of repeated weighings of the same load [kg]. It is drawn once per load, because a real
+            display stands still while nothing moves. A weight therefore depends on seed and loads only, not on the
+            number or times of the queries.
         drift: of the zero point [kg/s].
-        settling_time: until a change is shown to within a hundredth of it [s].
-        rest_time: how long the display must stand before it is called stable [s].
-        unit: that it shows.
+        settling_time: until the display shows a change to within 1 % of it [s].
+        rest_time: time without change until the display is stable [s].
+        unit: of the display.
     """
 
     resolution: float = 1e-4
@@ -228,7 +228,7 @@ class EmulatedScale:
         self.prepare(seed)
 
     def prepare(self, seed: tuple[int, ...]) -> None:
-        """Empty, bench time 0, no tare, chance begun anew."""
+        """Empty the scale, set bench time to 0, clear the tare, and reseed the noise."""
         self._rng = np.random.default_rng(seed)
         self.time = 0.0
         self._tare = self._zero = self._offset = 0.0
@@ -237,13 +237,13 @@ class EmulatedScale:
         self._resting = math.inf
 
     def put(self, load: Load) -> None:
-        """Change what is, or will be, on it."""
+        """Change the load, now and in the future."""
         self._load, self._loaded_at = load, self.time
         self._offset = float(self._rng.normal(0.0, self.settings.noise))
         self._resting = 0.0
 
     def advance(self, seconds: float) -> None:
-        """Bench time passes [s]."""
+        """Let bench time pass [s]."""
         end = self.time + seconds
         lag = self.settings.settling_time / _SETTLED
         while self.time < end:
@@ -264,37 +264,37 @@ class EmulatedScale:
 
     @property
     def stable(self) -> bool:
-        """Whether the display stands."""
+        """Whether the display is stable."""
         return self._resting >= self.settings.rest_time
 
     @property
     def gross(self) -> float:
-        """On the cell, as it measures it [kg]; 0 after switching on."""
+        """Load as measured by the cell [kg]; 0 after switching on."""
         return self._lagging + self._offset + self.settings.drift * self.time - self._zero
 
     @property
     def truth(self) -> float:
-        """What is on it now [kg]."""
+        """The true load now [kg]."""
         return self._true(self.time)
 
     def tare(self) -> ReadingStatus:
-        """Count what is on it as nothing; the status says whether it could."""
+        """Tare the scale; the status reports whether the load is within range."""
         if self.range is not ReadingStatus.STABLE:
             return self.range
         self._tare = self.gross
         return ReadingStatus.STABLE
 
     def clear_tare(self) -> None:
-        """Forget the tare."""
+        """Clear the tare."""
         self._tare = 0.0
 
     @property
     def tared(self) -> Decimal:
-        """The tare as it would be shown, in the unit."""
+        """The tare as displayed, in the unit."""
         return self._rounded(self._tare)
 
     def preset_tare(self, mass: float) -> bool:
-        """Take a known mass for the tare [kg]. Returns whether it is within the range."""
+        """Set the tare to a known mass [kg]. Returns whether it is within the range."""
         if not 0.0 <= mass <= self.settings.capacity:
             return False
         self._tare = mass
@@ -302,7 +302,7 @@ class EmulatedScale:
 
     @property
     def capacity(self) -> Decimal:
-        """The heaviest load as it would be shown, in the unit."""
+        """The maximum load as displayed, in the unit."""
         return self._rounded(self.settings.capacity)
 
     @property
@@ -311,7 +311,7 @@ class EmulatedScale:
         return self._decimal_step
 
     def zero(self) -> ReadingStatus:
-        """Set the zero; refused where more than a little is on it."""
+        """Set the zero; refused if the load exceeds `ZERO_SHARE` of the capacity."""
         if abs(self.gross) > ZERO_SHARE * self.settings.capacity:
             return ReadingStatus.OVER if self.gross > 0.0 else ReadingStatus.UNDER
         self._zero += self.gross
@@ -319,26 +319,26 @@ class EmulatedScale:
         return ReadingStatus.STABLE
 
     def power_cycle(self) -> None:
-        """Switched off and on: what is on it is the new zero, and the tare is gone."""
+        """Switch the scale off and on: the current load becomes the zero, and the tare is cleared."""
         self._zero += self.gross
         self._tare = 0.0
 
     @property
     def range(self) -> ReadingStatus:
-        """Stable where the load is within range, else over or under."""
+        """STABLE if the load is within range, otherwise OVER or UNDER."""
         if self.gross > self.settings.capacity + 9.0 * self.settings.resolution:
             return ReadingStatus.OVER
         return ReadingStatus.UNDER if self.gross < -0.2 * self.settings.capacity else ReadingStatus.STABLE
 
     def reading(self) -> Reading:
-        """What the display shows."""
+        """Return the display's reading."""
         if self.range is not ReadingStatus.STABLE:
             return Reading(self.range)
         status = ReadingStatus.STABLE if self.stable else ReadingStatus.UNSTABLE
         return Reading(status, self._rounded(self.gross - self._tare), self.settings.unit)
 
     def _rounded(self, mass: float) -> Decimal:
-        """As digits of the display."""
+        """Round a mass to digits of the display."""
         steps = round(mass / self.settings.resolution)
         return steps * self._decimal_step if steps else abs(0 * self._decimal_step)
 

@@ -1,4 +1,8 @@
-"""The weighings of one pour, step by step, each asked for: what a bench calls before and after its arm moves."""
+"""The weighings of one pour, step by step, as a bench calls them before and after its arm moves.
+
+`Weighings` carries out the steps of `actors.balance.weighing_plan`, asks the operator where hands are needed, and
+repeats a step after a fixable error.
+"""
 
 from __future__ import annotations
 
@@ -27,25 +31,25 @@ from actors.interfaces import OperatorQuestion
 from sim_engine.outcome import PourMeasurement
 
 MENDABLE = (NotStableError, OutOfRangeError, CommandError, UnitError)
-"""Errors that a person beside the balance can mend and have tried again; nothing is lost by it."""
+"""Errors that the operator can fix at the balance before a retry; no data is lost."""
 
 AGAIN = "The balance can't be used as it is. Mend it, and leave what is on it. Is it mended, to be tried again?"
 
 
 AskOperator = Callable[[OperatorQuestion], Awaitable[str]]
-"""Asks a person and awaits the answer; raises `LaboratoryError` where none comes, or the pour is given up."""
+"""Asks the operator and awaits the answer; raises `LaboratoryError` if none comes, or if the pour is aborted."""
 
 
 class Weighings:
     """The weighings of one pour.
 
     Args:
-        spec: where the balance stands.
-        balance: None where the operator types all weights.
+        spec: placement and device of the balance.
+        balance: None if the operator types all weights.
         ask: asks the operator.
-        known: weighings of an earlier pour with the same vessels that still hold, see `lasting`.
-        weighed: told of each weighing at once, with its key: so that it is kept whatever comes after.
-        nominal: load that is asked for [kg]; a pourer filled otherwise is filled anew, before anything is poured.
+        known: weighings of an earlier pour with the same vessels that are still valid, see `lasting`.
+        weighed: called at once for each weighing, with its key, so that no later failure can lose it.
+        nominal: requested load [kg]; a pourer with another load is refilled before the pour.
     """
 
     def __init__(
@@ -57,39 +61,39 @@ class Weighings:
         weighed: Callable[[str, PourMasses], None] = lambda key, weight: None,
         nominal: float | None = None,
     ) -> None:
-        self._spec, self._balance, self._ask, self._tell, self._nominal = spec, balance, ask, weighed, nominal
+        self._spec, self._balance, self._ask, self._notify, self._nominal = spec, balance, ask, weighed, nominal
         self._known = dict(known or {})
         self._steps = weighings(spec.placement, known=self._known, pourer_elsewhere=spec.pourer_elsewhere)
         self._weighed: dict[str, PourMasses] = {}
 
     @property
     def lasting(self) -> dict[str, PourMasses]:
-        """Weighings that hold for later pours with the same vessels."""
+        """Weighings that remain valid for later pours with the same vessels."""
         once = {step.key: self._weighed[step.key] for step in self._steps if self._lasts(step)}
         return self._known | once
 
     @property
     def weighed(self) -> dict[str, PourMasses]:
-        """All weighings so far, those of earlier pours that still hold included."""
+        """All weighings so far, including valid ones of earlier pours."""
         return self._known | self._weighed
 
     async def before(self) -> None:
-        """All steps before the pour.
+        """Carry out all steps before the pour.
 
         Raises:
-            BalanceError: what the operator could not mend, e.g. no connection.
-            LaboratoryError: whatever `ask` raises.
+            BalanceError: an error that the operator could not fix, e.g. no connection.
+            LaboratoryError: any error of `ask`.
         """
         for step in self._steps[: self._pour]:
             await self._do(step)
 
     async def at_once(self) -> None:
-        """Make those weighings after the pour that need no hands, once and without asking anybody.
+        """Carry out the weighings after the pour that need no hands, once and without questions.
 
-        For a pour that was broken off: so that a weight is kept that may be lost later.
+        Used for an aborted pour, so that a weight is kept that may be lost later.
 
         Raises:
-            BalanceError: the first that failed.
+            BalanceError: the first weighing that failed.
         """
         for step in self._steps[self._pour + 1 :]:
             if step.do != "weigh" or step.hands:
@@ -98,18 +102,18 @@ class Weighings:
                 await self._read(step)
 
     async def after(self) -> None:
-        """All steps after the pour; raises as `before`."""
+        """Carry out all steps after the pour; raises as `before`."""
         for step in self._steps[self._pour + 1 :]:
             await self._do(step)
 
     def measurement(self, nominal: float | None = None) -> PourMeasurement:
-        """What the weighings say.
+        """Return the result of the weighings.
 
         Args:
-            nominal: load that was asked for [kg].
+            nominal: requested load [kg].
 
         Raises:
-            WeighingError: they are incomplete, or can't all be right.
+            WeighingError: the weighings are incomplete or inconsistent.
         """
         return measurement(self._spec.placement, self.weighed, nominal=nominal, tolerance=self._spec.load_tolerance)
 
@@ -121,7 +125,7 @@ class Weighings:
         return step.when == "once" and step.key in self._weighed
 
     async def _do(self, step: WeighingStep) -> None:
-        """One step; asked for where hands are needed, and again until it is done."""
+        """Carry out one step. If hands are needed, ask the operator first; repeat until it succeeds."""
         problem, typed = "", step.by == "operator"
         while True:
             answer = ""
@@ -140,7 +144,7 @@ class Weighings:
             except (*MENDABLE, ValueError) as error:
                 problem = str(error)
             except ReferenceLostError:
-                raise  # asked already
+                raise  # the operator was already asked
             except BalanceError as error:
                 question = OperatorQuestion(AGAIN, "yes or no", str(error), about="balance")
                 if self._balance is None or not _is_yes(await self._ask(question)):
@@ -148,7 +152,7 @@ class Weighings:
                 problem = ""
 
     def _misfilled(self, step: WeighingStep) -> str:
-        """What is wrong with the load that was just weighed; '' if nothing is."""
+        """Return the problem with the load that was just weighed; '' if there is none."""
         if step.key != "pourer_full" or self._nominal is None:
             return ""
         loaded = loaded_mass(self._spec.placement, self.weighed)
@@ -159,14 +163,14 @@ class Weighings:
 
     def _note(self, key: str, weighed: PourMasses) -> None:
         self._weighed[key] = weighed
-        self._tell(key, weighed)
+        self._notify(key, weighed)
 
     def _typed(self, answer: str) -> PourMasses:
         typed = typed_weight(answer)
         return PourMasses(typed.mass, weighing_uncertainty(typed.step, self._repeatability, tared=False))
 
     async def _read(self, step: WeighingStep) -> None:
-        """Tare or weigh on the balance here."""
+        """Tare or weigh on the connected balance."""
         if self._balance is None:
             raise BalanceError(f"'{step.put}' needs a balance, and none is connected")
         if step.do == "tare":

@@ -1,10 +1,9 @@
-"""Where the balance stands, and what therefore has to be weighed. Pure; what the weighings say is in `masses`.
+"""Placements of the balance, the weighings that each one needs, and the masses that follow from them.
 
 Four masses belong to a pour: loaded = received + spilled + retained. No balance reads all of them at once. Each
-placement is a list of steps and a table that says each mass as a sum of weighings: uncertainties follow from the same
-table, and what is in two weighings (the pourer's own mass) cancels where it does.
-
-What the weighings of a pour say: its masses, their uncertainties, and whether they can be right. Pure.
+placement is a `Plan`: a list of steps, and a table that gives each mass as a sum of weighings. Uncertainties follow
+from the same table, and a mass that occurs in two weighings, such as the pourer's own, cancels. `measurement` computes
+the masses and their uncertainties and checks them for consistency. All functions here are pure.
 """
 
 from __future__ import annotations
@@ -23,16 +22,16 @@ class Placement(StrEnum):
     """Where the balance stands."""
 
     TRAY = "tray"
-    """Under a tray, with the receiver on a stand of its own: it reads what was spilled."""
+    """Under a tray, with the receiver on a separate stand: it reads the spilled mass."""
 
     RECEIVER = "receiver"
-    """Under the receiver alone: it reads what was received."""
+    """Under the receiver only: it reads the received mass."""
 
     EVERYTHING = "everything"
-    """Under tray and receiver together: it reads what was poured."""
+    """Under tray and receiver together: it reads the poured mass."""
 
     TARED = "tared"
-    """The weighings of the bench of numbers: vessels are tared away, so that each is liquid alone."""
+    """The weighings of a simulated bench: vessels are tared, so that each weight is that of liquid only."""
 
     MANUAL = "manual"
     """Anywhere, and not connected: the operator weighs and types."""
@@ -43,16 +42,16 @@ When = Literal["once", "before", "pour", "after"]
 
 @dataclass(frozen=True)
 class WeighingStep:
-    """Something to do, in order.
+    """One step of a plan.
 
     Attributes:
-        do: 'tare' the balance with what is listed on it, 'weigh' what is listed, or 'pour'.
-        put: what has to stand where, for the person who puts it there; whole sentences.
-        when: 'once' for a vessel (and again when it is replaced), else 'before' or 'after' the pour.
+        do: 'tare' the balance with the listed objects on it, 'weigh' them, or 'pour'.
+        put: instruction to the operator about the objects and their places; complete sentences.
+        when: 'once' for a vessel (and again when it is replaced), otherwise 'before' or 'after' the pour.
         key: of the weighing; '' for other steps.
-        by: who gives the number: the 'balance' that stands here, or the 'operator', who types it.
-        hands: whether somebody has to do something first; else it is done at once, before anything drifts or dries.
-        about: what it is about, for programs, where it has no key.
+        by: source of the number: the connected 'balance', or the 'operator', who types it.
+        hands: whether the operator has to act first; otherwise the step runs at once, before anything drifts or dries.
+        about: identifier for programs, if the step has no key.
     """
 
     do: Literal["tare", "weigh", "pour"]
@@ -177,12 +176,12 @@ PLANS: dict[Placement, Plan] = {
 def weighings(
     placement: Placement, *, known: Collection[str] = (), pourer_elsewhere: bool = False
 ) -> tuple[WeighingStep, ...]:
-    """What has to be done, in order, the pour among it.
+    """Return the steps in order, including the pour.
 
     Args:
         placement: where the balance stands.
-        known: keys of weighings of before that still hold; their 'once' steps are left out.
-        pourer_elsewhere: the pourer is weighed on another balance and typed.
+        known: keys of earlier weighings that are still valid; their 'once' steps are left out.
+        pourer_elsewhere: whether the pourer is weighed on another balance and typed.
     """
     steps = [step for step in PLANS[placement].steps if not (step.when == "once" and step.key in known)]
     if not pourer_elsewhere or placement is Placement.MANUAL:
@@ -192,7 +191,7 @@ def weighings(
 
 
 def needed(placement: Placement) -> tuple[str, ...]:
-    """Keys of all weighings that a measurement is made of."""
+    """Return the keys of all weighings that a measurement needs."""
     return tuple(step.key for step in PLANS[placement].steps if step.key)
 
 
@@ -206,7 +205,7 @@ def _elsewhere(step: WeighingStep) -> WeighingStep:
 
 
 def _idle(steps: list[WeighingStep], index: int) -> bool:
-    """Whether a tare serves no weighing: another tare comes before this balance is read, or none is read after it."""
+    """Whether a tare is useless: another tare precedes the next reading of this balance, or no reading follows."""
     if steps[index].do != "tare":
         return False
     for step in steps[index + 1 :]:
@@ -218,11 +217,11 @@ def _idle(steps: list[WeighingStep], index: int) -> bool:
 
 
 SURE = 4.0
-"""Standard deviations beyond which a mass below nothing is a mistake and no noise."""
+"""Number of standard deviations beyond which a negative mass is an error instead of noise."""
 
 
 class WeighingError(BalanceError):
-    """The weighings of a pour are incomplete, or can't all be right."""
+    """The weighings of a pour are incomplete or inconsistent."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +238,7 @@ class PourMasses:
 
 
 def loaded_mass(placement: Placement, weighed: Mapping[str, PourMasses]) -> float:
-    """What was filled in [kg], by the weighings before the pour."""
+    """Loaded mass [kg] from the weighings before the pour."""
     return sum(c * weighed[key].mass for key, c in PLANS[placement].masses["loaded"].items())
 
 
@@ -250,20 +249,19 @@ def measurement(
     nominal: float | None = None,
     tolerance: float = math.inf,
 ) -> PourMeasurement:
-    """The masses of a pour.
+    """Return the masses of a pour.
 
-    A mass that comes out a little below nothing, within `SURE` standard deviations, is nothing; the notes keep what was
-    read.
+    A slightly negative mass, within `SURE` standard deviations, is set to zero; the notes keep the weighed value.
 
     Args:
         placement: where the balance stood.
-        weighed: all that `needed` names.
-        nominal: load that was asked for [kg].
-        tolerance: how far the load may lie from it [kg].
+        weighed: all weighings that `needed` lists.
+        nominal: requested load [kg].
+        tolerance: largest deviation of the load from it [kg].
 
     Raises:
-        WeighingError: a weighing is missing or no number, a mass is less than nothing beyond noise, more came out
-            than was in, or the load is not the one that was asked for. Nothing is assumed in place of what is missing.
+        WeighingError: a weighing is missing or not a number, a mass is negative beyond noise, a mass exceeds the load,
+            or the load differs from the requested one. Missing weighings are never replaced by assumptions.
     """
     _check_complete(placement, weighed)
     table = PLANS[placement].masses
@@ -293,15 +291,15 @@ def weighing_uncertainty(step: float, repeatability: float, *, tared: bool = Tru
     """Standard deviation of one weighing [kg].
 
     Args:
-        step: of the display [kg]; a value within it is as likely as another.
-        repeatability: standard deviation of weighing the same thing again [kg].
-        tared: net of a tare, which was a weighing too.
+        step: of the display [kg]; all values within it are equally likely.
+        repeatability: standard deviation of repeated weighings of the same load [kg].
+        tared: whether the weight is net of a tare, which was a weighing too.
     """
     return math.sqrt((step**2 / 12.0 + repeatability**2) * (2.0 if tared else 1.0))
 
 
 def _difference(table: Mapping[str, Mapping[str, float]]) -> Mapping[str, float]:
-    """received = loaded − spilled − retained, by weighings; what cancels is left out."""
+    """received = loaded − spilled − retained in terms of weighings; terms that cancel are left out."""
     total: dict[str, float] = {}
     for name, sign in (("loaded", 1.0), ("spilled", -1.0), ("retained", -1.0)):
         for key, c in table[name].items():
@@ -328,7 +326,7 @@ def _check_complete(placement: Placement, weighed: Mapping[str, PourMasses]) -> 
 
 
 def _check_sense(mass: dict[str, float], sigma: dict[str, float], nominal: float | None, tolerance: float) -> None:
-    """Refuse what can't be; rounding of the sums is not an offence."""
+    """Raise an error for inconsistent masses; rounding errors of the sums are tolerated."""
     slack = {name: SURE * sigma[name] + 1e-9 for name in mass}
     shown = {name: f"{_grams(mass[name]):g} ± {_grams(sigma[name]):g} g" for name in mass}
     if mass["loaded"] <= slack["loaded"]:
@@ -361,5 +359,5 @@ def _all(shown: dict[str, str]) -> str:
 
 
 def _grams(mass: float) -> Any:
-    """[g], with a microgram's digits: the rest is noise of the computer."""
+    """Convert to grams, rounded to a microgram; further digits are floating-point noise."""
     return round(1e3 * mass, 6)

@@ -1,1 +1,1 @@
-"""The virtual bench: a whole laboratory's pour without hardware."""
+"""Benches: one pour from the first question to the last weight, with hardware, emulated devices or simulated ones."""

@@ -1,4 +1,7 @@
-"""Bench time: scaled against the wall clock, or not waited for at all."""
+"""Bench time: the clock of a virtual bench, scaled against the wall clock.
+
+`Pace` converts bench time to wall time and waits. With a time scale of 0 it does not wait at all.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,10 @@ import time
 
 
 class Pace:
-    """Waits for bench time to pass, and can be interrupted from another thread.
+    """Waits until bench time has passed; another thread can interrupt the wait.
 
     Args:
-        time_scale: bench seconds per wall second; 0 waits for nothing.
+        time_scale: bench seconds per wall second; 0 disables waiting.
     """
 
     def __init__(self, time_scale: float) -> None:
@@ -22,16 +25,16 @@ class Pace:
         self._start = time.monotonic()
 
     def restart(self) -> None:
-        """Bench time is 0 now."""
+        """Set bench time to 0."""
         self._start = time.monotonic()
 
     @property
     def now(self) -> float:
-        """Bench time since `restart` [s]; infinite where nothing is waited for."""
+        """Bench time since `restart` [s]; infinite if waiting is disabled."""
         return (time.monotonic() - self._start) * self._scale if self._scale > 0.0 else math.inf
 
     def nap(self, wall: float) -> bool:
-        """Wait for some wall time [s], or not at all where nothing is waited for.
+        """Wait for a wall time [s]; return at once if waiting is disabled.
 
         Returns:
             False if interrupted.
@@ -39,23 +42,23 @@ class Pace:
         return not self._interrupted.wait(wall if self._scale > 0.0 else 0.0)
 
     def wait_until(self, moment: float) -> bool:
-        """Wait for a bench time since `restart` [s].
+        """Wait until a bench time since `restart` [s].
 
         Returns:
-            False if interrupted before it.
+            False if interrupted before that time.
         """
         left = (moment - self.now) / self._scale if self._scale > 0.0 else 0.0
         return not self._interrupted.wait(max(left, 0.0))
 
     def interrupt(self) -> None:
-        """End waits now and later ones at once, until `resume`."""
+        """End current waits, and end later waits at once until `resume` is called."""
         self._interrupted.set()
 
     def resume(self) -> None:
-        """Let waits last again."""
+        """Allow waits again after `interrupt`."""
         self._interrupted.clear()
 
     @property
     def interrupted(self) -> bool:
-        """Whether `interrupt` is in force."""
+        """Whether `interrupt` was called without a later `resume`."""
         return self._interrupted.is_set()

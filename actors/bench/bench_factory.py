@@ -1,6 +1,7 @@
-"""Opens a bench: drivers of arm and balance, and on a virtual bench what is at their other ends.
+"""Opens the bench of a laboratory: the drivers of arm and balance, the operator, and the emulators of a virtual bench.
 
-The bench: an arm, a balance and somebody beside them, be they hardware, virtual or numbers. One pour at a time.
+`open_bench` starts the devices and returns an `OpenBench`. Its `PouringBench` runs one pour at a time, on hardware,
+with emulated devices or with simulated ones. The steps of a pour are in `actors.bench.pour_procedure`.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ from sim_engine.scene import Scene
 
 
 class PouringBench:
-    """`Bench`. Nothing moves before everything was checked, weighed and confirmed.
+    """The `Bench` interface for every kind of bench. The arm moves only after all checks, weighings and confirmations.
 
     Args:
-        setup: arm, balance, operator, and what happens around them.
+        setup: arm, balance, operator and ground truth of the bench.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -57,9 +58,9 @@ class PouringBench:
         """See `Bench.pour`. Cancelling stops the arm.
 
         Raises:
-            InvalidActionError: refused before anything moved, and before anybody was asked.
-            NotPouredError: it did not begin.
-            UnknownPourError: it began, and did not go as it should.
+            InvalidActionError: the pour was rejected before any motion and before any question.
+            NotPouredError: the pour did not begin.
+            UnknownPourError: the pour began, but did not run as planned.
         """
         async with self._one_at_a_time:
             path = await asyncio.to_thread(self._checked, scene, action)
@@ -79,18 +80,18 @@ class PouringBench:
 
 
 MakeDevice = Callable[..., Device]
-"""Makes a device of a name, a class and its arguments, where the bench is."""
+"""Creates a device on the bench's machine from a name, a class and its arguments."""
 
 
 @dataclass
 class OpenBench:
-    """What was opened.
+    """An open bench and everything that has to be closed with it.
 
     Attributes:
-        bench: pours.
-        devices: to be closed after `close`.
-        stand_ins: of a virtual bench with wires.
-        operator: who answers.
+        bench: runs pours.
+        devices: the caller closes them after `close`.
+        stand_ins: the emulators of a virtual bench with device drivers; None otherwise.
+        operator: answers the questions.
     """
 
     bench: PouringBench
@@ -99,7 +100,7 @@ class OpenBench:
     operator: Operator | None = None
 
     async def close(self) -> None:
-        """Let go of arm and balance; end what was started in their place."""
+        """Close the arm, release the balance, and end the emulators that were started for them."""
         with contextlib.suppress(LaboratoryError):
             await self.bench.arm.close()
         if self.bench.balance is not None:
@@ -112,7 +113,7 @@ class OpenBench:
 
 @dataclass
 class _Opening:
-    """Devices so far, for what fails half-way."""
+    """The devices created so far; they are closed if opening the bench fails."""
 
     make: MakeDevice
     devices: list[Device] = field(default_factory=list)
@@ -131,7 +132,7 @@ class _Opening:
 
 
 def needs_person(spec: LaboratorySpec) -> bool:
-    """Whether somebody has to be there to answer."""
+    """Whether the laboratory needs a person who answers questions."""
     return spec.arm is not None and spec.operator.answers == "person"
 
 
@@ -142,31 +143,31 @@ async def open_bench(
     operator: Operator | None,
     tell: Callable[[Notice], None],
 ) -> OpenBench:
-    """The bench of a laboratory that pours.
+    """Open the bench of a laboratory that pours.
 
     Args:
-        spec: of the laboratory.
-        make: makes devices where the bench is.
+        spec: settings of the laboratory.
+        make: creates devices on the bench's machine.
         liquid: simulates the hidden liquid of a virtual bench.
-        operator: a person, where one answers.
-        tell: takes notices.
+        operator: the person who answers, if one does.
+        tell: receives notices.
 
     Raises:
-        LaboratoryError: something does not start, or nobody is there to answer.
+        LaboratoryError: a device does not start, or the laboratory needs an operator and none is available.
     """
     opening = _Opening(make)
     try:
         if spec.arm is None:
             assert spec.bench is not None
             assert liquid is not None
-            return _numbers(spec.bench, opening, liquid)
+            return _open_simulated(spec.bench, opening, liquid)
         if spec.balance is None:
             raise LaboratoryError(f"laboratory {spec.name}: an arm that pours needs a balance; add a 'balance' to it")
         if operator is None and needs_person(spec):
             raise LaboratoryError(
                 f"laboratory {spec.name} needs a person beside it who answers questions, and nobody is here to be asked"
             )
-        return await _wired(spec, spec.arm, spec.balance, opening, liquid, operator, tell)
+        return await _open_devices(spec, spec.arm, spec.balance, opening, liquid, operator, tell)
     except BaseException:
         for device in reversed(opening.devices):
             with contextlib.suppress(LaboratoryError):
@@ -174,22 +175,24 @@ async def open_bench(
         raise
 
 
-def _numbers(spec: VirtualBenchSpec, opening: _Opening, liquid: SimulatorPool) -> OpenBench:
+def _open_simulated(spec: VirtualBenchSpec, opening: _Opening, liquid: SimulatorPool) -> OpenBench:
     arm_spec, balance_spec = NumbersSpec(spec.time_scale), simulated_balance(spec)
     arm = opening.arm(arm_spec)
     assert balance_spec.device is not None
     balance = opening.balance(balance_spec.device, "virtual")
     nature = SimulatedBench(spec, liquid, arm, balance)
     operator = SimulatedOperator(nature, balance, spec.operator_time)
-    setup = Setup("virtual", arm_spec, balance_spec, spec.operator_time, arm, balance, operator, nature, _nobody)
+    setup = Setup(
+        "virtual", arm_spec, balance_spec, spec.operator_time, arm, balance, operator, nature, _discard_notice
+    )
     return OpenBench(PouringBench(setup), opening.devices, operator=operator)
 
 
-def _nobody(notice: Notice) -> None:
-    """Whoever would get every weighing on a bench of numbers."""
+def _discard_notice(notice: Notice) -> None:
+    """Discards the notices of a simulated bench, for example every weighing."""
 
 
-async def _wired(
+async def _open_devices(
     spec: LaboratorySpec,
     arm_spec: ArmSpec,
     balance_spec: BalanceSpec,

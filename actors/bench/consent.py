@@ -1,6 +1,8 @@
-"""Who may let the arm move, and the way back from a stop: nothing moves unless somebody has just said that it may.
+"""The operator's consent: the arm moves only after the operator has confirmed it.
 
-What a person beside the arm is asked before it moves, and after it has stopped. Words only.
+`Consent` requests permission before each motion, makes the bench safe before hands enter the cell, and leads the
+recovery after a stop. The functions `..._question` build the questions. `Setup` holds what all pours on a bench share.
+The order of a pour's steps is in `actors.bench.pour_procedure`.
 """
 
 from __future__ import annotations
@@ -23,12 +25,12 @@ from actors.runtime.remote_object import DeviceLostError
 
 
 def grams(mass: float) -> str:
-    """'12.34 g'."""
+    """Format a mass [kg] as '12.34 g'."""
     return f"{1e3 * mass:.2f} g"
 
 
 def start_question(spec: ArmSpec, path: PlannedPour) -> OperatorQuestion:
-    """Whether a whole pour may begin."""
+    """Ask whether the whole pour may begin."""
     report = path.report
     return OperatorQuestion(
         f"Hands out of the cell. The arm will pour: {report.duration:.1f} s, tilting the pourer to "
@@ -48,12 +50,12 @@ def start_question(spec: ArmSpec, path: PlannedPour) -> OperatorQuestion:
 
 
 def stopped_question(error: Exception, problem: str, *, begun: bool) -> OperatorQuestion:
-    """Whether the cause of a stop was seen to.
+    """Ask whether the cause of a stop has been fixed.
 
     Args:
-        error: that told of the stop.
-        problem: why it is asked, or asked again.
-        begun: whether anything may have been poured.
+        error: the error that reported the stop.
+        problem: reason of the question, or of its repetition.
+        begun: whether liquid may have been poured.
     """
     details: dict[str, float | str] = {}
     tilt, phase = getattr(error, "tilt", None), getattr(error, "phase", None)
@@ -75,7 +77,7 @@ def stopped_question(error: Exception, problem: str, *, begun: bool) -> Operator
 
 
 def unsafe_question(problem: str) -> OperatorQuestion:
-    """Whether to look again if the arm keeps still."""
+    """Ask whether to check again that the arm stands still."""
     return OperatorQuestion(
         "Keep hands out of the cell, or press the emergency stop first: it can't be seen that the arm keeps still. "
         "Mend that. Shall it be looked at again?",
@@ -87,7 +89,7 @@ def unsafe_question(problem: str) -> OperatorQuestion:
 
 
 def upright_question(spec: ArmSpec) -> OperatorQuestion:
-    """Whether a stopped arm may bring the pourer upright."""
+    """Ask whether a stopped arm may bring the pourer upright."""
     return OperatorQuestion(
         f"Hands out of the cell. The arm will bring the pourer upright at {math.degrees(spec.untilt_speed):.0f}°/s, "
         f"wait, and go home. It moves {spec.announcement:g} s after you say so. May it?",
@@ -98,7 +100,7 @@ def upright_question(spec: ArmSpec) -> OperatorQuestion:
 
 
 def way_home_question(spec: ArmSpec) -> OperatorQuestion:
-    """Whether a stopped arm may go home."""
+    """Ask whether a stopped arm may go home."""
     return OperatorQuestion(
         f"Hands out of the cell. The arm will go home, the pourer upright. It moves {spec.announcement:g} s after you "
         "say so. May it?",
@@ -109,16 +111,16 @@ def way_home_question(spec: ArmSpec) -> OperatorQuestion:
 
 
 STUCK = (ArmError, DeviceLostError)
-"""What leaves an arm where a person has to see to it."""
+"""Errors after which the operator has to check the arm."""
 
 
 class ConsentRefusedError(LaboratoryError):
-    """The operator said no."""
+    """The operator refused."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What all pours on a bench share; see `pouring_bench.PouringBench`."""
+    """The parts of a bench that all its pours share; see `actors.bench.bench_factory.PouringBench`."""
 
     mode: str
     spec: ArmSpec
@@ -132,27 +134,27 @@ class Setup:
 
 
 class Consent:
-    """Asks people, and moves the arm only as far as they have agreed to.
+    """Asks the operator, and moves the arm only as far as the operator has agreed.
 
     Args:
-        setup: of the bench.
-        path: of the pour.
+        setup: parts of the bench.
+        path: planned path of the pour.
     """
 
     def __init__(self, setup: Setup, path: PlannedPour) -> None:
         self._setup, self._path = setup, path
 
     async def ask(self, question: OperatorQuestion) -> str:
-        """Put a question; one that invites hands into the cell only while nothing can move."""
+        """Ask a question. If it invites hands into the cell, make sure first that nothing can move."""
         if question.hands:
             await self.make_safe()
         return await self._setup.questions.ask(question)
 
     async def make_safe(self) -> None:
-        """See that nothing moves and nothing can; where that can't be seen, nobody is invited into the cell.
+        """Make sure that nothing moves and nothing can move. The operator is invited into the cell only after that.
 
         Raises:
-            RefusedError: it can't, and the operator leaves it at that.
+            ConsentRefusedError: this cannot be verified, and the operator ends the attempts.
         """
         problem = ""
         while True:
@@ -165,7 +167,7 @@ class Consent:
                 raise
             except STUCK as error:
                 if not problem:
-                    problem = str(error)  # the connection may be made anew without anybody's help
+                    problem = str(error)  # the connection may recover without the operator
                     continue
                 problem = str(error)
             if not await self._agreed(unsafe_question(problem)):
@@ -175,23 +177,23 @@ class Consent:
         return (await self.ask(question)).strip().lower() in ("yes", "y")
 
     async def given(self, question: OperatorQuestion) -> None:
-        """Have somebody say that the arm may move, announce it, and release it.
+        """Ask for consent to a motion, announce the motion, and release the arm.
 
         Raises:
-            RefusedError: they said no.
+            ConsentRefusedError: the operator refused.
         """
         if not await self._agreed(question):
             raise ConsentRefusedError("the operator did not let the arm move")
         spec = self._setup.spec
         text = f"The arm moves in {spec.announcement:g} s. Keep out of its way."
-        # The driver waits for as long from the release to the first movement.
+        # The driver waits for the same time between the release and the first movement.
         await self._setup.questions.announce(text, spec.on_clock(spec.announcement))
         await self._setup.arm.release()
 
-    # ---- the way back from a stop
+    # ---- recovery after a stop
 
     async def bring_upright(self, error: Exception) -> None:
-        """After a stop with the pourer tilted: nothing moves before somebody has looked at it and said so, twice."""
+        """Bring the pourer upright after a stop in which it was tilted. Two confirmations precede the motion."""
         while True:
             await self._recover(error, begun=True)
             await self.given(upright_question(self._setup.spec))
@@ -202,7 +204,7 @@ class Consent:
                 error = again
 
     async def bring_home(self, error: Exception, *, begun: bool) -> None:
-        """After a stop on the way to the pour, or from it once the pour has begun."""
+        """Bring the arm home after a stop on the way to the pour, or on the way back from it."""
         while True:
             await self._recover(error, begun=begun)
             await self.given(way_home_question(self._setup.spec))
@@ -213,13 +215,13 @@ class Consent:
                 error = again
 
     async def _recover(self, error: Exception, *, begun: bool) -> None:
-        """Make the robot ready again, once somebody has seen to the cause; nothing moves yet.
+        """Make the robot ready again after the operator has fixed the cause; nothing moves yet.
 
         Raises:
-            RefusedError: they would rather leave it as it is.
+            ConsentRefusedError: the operator leaves the arm as it is.
         """
         if isinstance(error, BenchLostError):
-            raise error  # nobody can mend it from here
+            raise error  # cannot be recovered from here
         problem = str(error)
         while await self._agreed(stopped_question(error, problem, begun=begun)):
             try:
@@ -234,7 +236,7 @@ class Consent:
         raise ConsentRefusedError(f"{error}; the operator leaves the arm as it stands")
 
     async def leave_safe(self) -> None:
-        """Stop what moves, whatever has failed: also when this task itself is being cancelled."""
+        """Stop arm and balance after any failure, also while this task is being cancelled."""
         setup = self._setup
 
         async def stop() -> None:

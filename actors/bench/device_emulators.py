@@ -1,9 +1,8 @@
-"""What a virtual bench has in place of hardware: what stands in for its arm, a balance on a pseudo-terminal.
+"""The emulators of a virtual bench: one for the arm, and a balance on a pseudo-terminal.
 
-Plain and blocking; `actors.runtime.remote_object` puts it on the machine that the bench is on, beside the drivers
-that talk to it.
-
-The stand-ins of a virtual bench from the event loop: the same calls, awaited.
+`BenchEmulators` starts and holds them; it blocks. `actors.runtime.remote_object` places it on the bench's machine, next
+to the drivers that connect to it. `DeviceEmulators` offers the same calls to the event loop. The emulators themselves
+are in `actors.emulators`.
 """
 
 from __future__ import annotations
@@ -22,12 +21,12 @@ from actors.runtime.remote_object import Device
 
 @dataclass(frozen=True)
 class Found:
-    """Where drivers find what was started.
+    """The addresses at which drivers find the emulators.
 
     Attributes:
-        arm: the arm's settings, with the address of what stands in for it.
-        balance: the balance's settings likewise; None where weights are typed.
-        follows: whether `history` can be asked for.
+        arm: the arm's settings with the address of its emulator.
+        balance: the balance's settings with the address of its emulator; None if weights are typed.
+        follows: whether `history` is available.
     """
 
     arm: ArmSpec
@@ -37,12 +36,12 @@ class Found:
 
 @dataclass(frozen=True)
 class History:
-    """What the controller's joints did.
+    """Recorded joint motion of the controller.
 
     Attributes:
-        times: of the controller [s], increasing.
-        joints: six at each of these [rad].
-        now: when it was asked [s].
+        times: controller times [s], increasing.
+        joints: six joint angles at each time [rad].
+        now: controller time of the request [s].
     """
 
     times: tuple[float, ...]
@@ -51,32 +50,32 @@ class History:
 
 
 class ArmEmulator(Protocol):
-    """What an arm's driver talks to on a virtual bench; made of an `ArmSpec`, named by its `stand_in`."""
+    """The emulator that an arm's driver connects to; created from an `ArmSpec`, which names it in `stand_in`."""
 
     @property
     def arm(self) -> ArmSpec:
-        """The settings, with its address filled in."""
+        """The settings, with the emulator's address."""
         ...
 
     def install(self) -> None:
-        """Set what a person would have set on a real one, once and for all."""
+        """Configure the emulator once, as a person would configure a real controller."""
         ...
 
     def history(self, since: float) -> History:
-        """What the joints did since a time of its own [s]."""
+        """Joint motion since a controller time [s]."""
         ...
 
     def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
-        """Have something go wrong, or ask what it knows of itself."""
+        """Inject a fault, or read the emulator's internal state."""
         ...
 
     def close(self) -> None:
-        """End it. May be called again."""
+        """End the emulator. May be called again."""
         ...
 
 
 def emulator_of(arm: ArmSpec) -> ArmEmulator | None:
-    """Start what stands in for an arm; None where its driver moves nothing but numbers itself."""
+    """Start the emulator of an arm; None if the arm's driver is a simulation itself."""
     if not arm.stand_in:
         return None
     module, _, name = arm.stand_in.partition(":")
@@ -84,11 +83,11 @@ def emulator_of(arm: ArmSpec) -> ArmEmulator | None:
 
 
 class BenchEmulators:
-    """For arm and balance, in processes of their own, which end with this one.
+    """The emulators of arm and balance, in child processes that end with this process.
 
     Args:
-        arm: which arm.
-        balance: which balance; None for weights that are typed.
+        arm: settings of the arm.
+        balance: settings of the balance; None if weights are typed.
     """
 
     def __init__(self, arm: ArmSpec, balance: BalanceDevice | None) -> None:
@@ -103,7 +102,7 @@ class BenchEmulators:
             raise
 
     def found(self) -> Found:
-        """Where they are."""
+        """Return the addresses of the emulators."""
         arm = self._spec if self._arm is None else self._arm.arm
         return Found(arm, self._weighs if self._balance is None else self._balance.device, self._arm is not None)
 
@@ -113,37 +112,37 @@ class BenchEmulators:
             self._arm.install()
 
     def prepare(self, seed: tuple[int, ...]) -> None:
-        """A new pour: the balance's chance begins anew, and it is empty."""
+        """Prepare a new pour: reseed the balance's random numbers and empty the balance."""
         if self._balance is not None:
             self._balance.prepare(seed)
 
     def put(self, mass: float) -> None:
-        """What stands on the balance from now on [kg]."""
+        """Set the mass on the balance from now on [kg]."""
         if self._balance is not None:
             self._balance.put(mass)
 
     def history(self, since: float) -> History:
         """See `ArmEmulator.history`."""
-        return self._of_the_arm.history(since)
+        return self._arm_emulator.history(since)
 
     def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """See `ArmEmulator.fault`."""
-        return self._of_the_arm.fault(name, arguments)
+        return self._arm_emulator.fault(name, arguments)
 
     @property
-    def _of_the_arm(self) -> ArmEmulator:
+    def _arm_emulator(self) -> ArmEmulator:
         if self._arm is None:
             raise LaboratoryError("nothing stands in for the arm here")
         return self._arm
 
     def order(self, what: str, values: dict[str, Any]) -> dict[str, Any]:
-        """Have something done to the balance: 'unplug', 'plug', 'faults' …, see what stands in for it."""
+        """Send a command to the balance emulator: 'unplug', 'plug', 'faults' …; see its `order`."""
         if self._balance is None:
             raise LaboratoryError("there is no virtual balance here")
         return self._balance.order(what, values)
 
     def close(self) -> None:
-        """End both. May be called again."""
+        """End both emulators. May be called again."""
         if self._arm is not None:
             self._arm.close()
         if self._balance is not None:
@@ -151,17 +150,17 @@ class BenchEmulators:
 
 
 DEADLINE = 30.0
-"""Longest wait for any answer [s]; its process may still be starting."""
+"""Longest wait for any reply [s]; the process may still be starting."""
 
 
 class DeviceEmulators:
-    """`actors.bench.device_emulators.StandIns` over a `Device`.
+    """`BenchEmulators` over a `Device`, for the event loop.
 
     Args:
-        device: that holds it.
+        device: holds the `BenchEmulators`.
 
     Attributes:
-        told: a balance whose driver is itself told what stands on it; None where something stands in for it.
+        told: a balance whose driver receives the load directly; None if an emulator carries the load.
     """
 
     def __init__(self, device: Device) -> None:
@@ -169,38 +168,38 @@ class DeviceEmulators:
         self.told: DeviceBalance | None = None
 
     async def found(self) -> Found:
-        """Where they are."""
+        """Return the addresses of the emulators."""
         found: Found = await self.device.call("found", deadline=4.0 * DEADLINE)
         return found
 
     async def prepare(self, seed: tuple[int, ...]) -> None:
-        """A new pour."""
+        """Prepare a new pour."""
         await self.device.call("prepare", seed, deadline=DEADLINE)
         if self.told is not None:
             await self.told.prepare(seed)
 
     async def put(self, mass: float) -> None:
-        """What stands on the balance from now on [kg]."""
+        """Set the mass on the balance from now on [kg]."""
         if self.told is not None:
             await self.told.put(Load((0.0,), (mass,)))
         else:
             await self.device.call("put", mass, deadline=DEADLINE)
 
     async def history(self, since: float) -> History:
-        """What the joints did since a controller time [s]; nothing, for a time to come."""
+        """Joint motion since a controller time [s]; empty for a time in the future."""
         history: History = await self.device.call("history", min(since, 1e12), deadline=DEADLINE)
         return history
 
     async def fault(self, name: str, **arguments: Any) -> dict[str, Any]:
-        """Ask the controller for a fault."""
+        """Request a fault from the controller's emulator."""
         answer: dict[str, Any] = await self.device.call("fault", name, arguments, deadline=DEADLINE, urgent=True)
         return answer
 
     async def order(self, what: str, **values: Any) -> dict[str, Any]:
-        """Have something done to the balance."""
+        """Send a command to the balance emulator."""
         answer: dict[str, Any] = await self.device.call("order", what, values, deadline=DEADLINE, urgent=True)
         return answer
 
     async def close(self) -> None:
-        """End controller and balance."""
+        """End both emulators."""
         await self.device.call("close", deadline=DEADLINE)

@@ -1,7 +1,8 @@
-"""The virtual bench's reality: a 'real' liquid with hidden parameters, poured with hidden errors.
+"""The ground truth of a virtual bench: a 'real' liquid with hidden parameters, poured with hidden pose errors.
 
-It runs on a simulator of its own, so that it never takes one from the pool, and calibration sees of it what a balance
-shows, nothing else.
+`hidden_pour` and `hidden_spill` simulate one pour of that liquid; `Spill` holds the resulting masses. The simulations
+run in a simulator pool of their own, so that they never occupy a simulator of the calibration. Calibration only sees
+the balance's readings.
 """
 
 from __future__ import annotations
@@ -18,24 +19,24 @@ from sim_engine.outcome import PourOutcome, RecordedFrames, SimulatedPour
 from sim_engine.scene import PoseError, PourTask, Scene
 
 ATTEMPTS = 3
-"""Initial positions that are tried before the liquid is given up."""
+"""Number of initial particle positions to try before the simulation of the liquid fails."""
 
 Stream = Literal["pose", "liquid", "balance", "arm"]
 _STREAMS: tuple[Stream, ...] = ("pose", "liquid", "balance", "arm")
 
 
 def stream(seed: int, name: Stream) -> tuple[int, ...]:
-    """Seed of one source of chance in one pour; the sources don't disturb each other.
+    """Return the seed of one source of randomness in one pour; the sources are independent.
 
     Args:
-        seed: of the pour, any whole number.
+        seed: of the pour, any integer.
         name: of the source.
     """
     return (seed % 2**64, _STREAMS.index(name))
 
 
 def draw_pose_error(spec: VirtualBenchSpec, seed: int) -> PoseError:
-    """Grip and placement of one pour: the systematic error and this pour's share of chance.
+    """Draw the grip and placement errors of one pour: systematic error plus random error.
 
     Args:
         spec: mean errors and standard deviations.
@@ -49,7 +50,8 @@ def draw_pose_error(spec: VirtualBenchSpec, seed: int) -> PoseError:
         y=float(mean.y + deviation.y * noise[1]),
         z=float(mean.z + deviation.z * noise[4]),
         tilt=float(mean.tilt + deviation.tilt * noise[2]),
-        # A standard deviation is not a bound; an arm that stands still or runs away is not an error of execution.
+        # A standard deviation sets no bound, and a speed factor near 0 or far above 1 is not a plausible execution
+        # error.
         speed_factor=float(np.clip(factor, 0.5, 1.5)),
     )
 
@@ -60,14 +62,14 @@ class TouchingError(LaboratoryError):
 
 @dataclass(frozen=True)
 class Spill:
-    """What truly became of the liquid.
+    """The true masses of one pour.
 
     Attributes:
-        times: since the motion's begin [s].
-        spilled_curve: mass beside the receiver at those times [kg].
-        spilled: at last [kg].
-        retained: left in the pourer [kg].
-        frames: particles, where somebody watches.
+        times: since the start of the motion [s].
+        spilled_curve: spilled mass at those times [kg].
+        spilled: final spilled mass [kg].
+        retained: mass left in the pourer [kg].
+        frames: recorded particles, if a live view needs them.
     """
 
     times: tuple[float, ...]
@@ -78,16 +80,16 @@ class Spill:
 
 
 async def hidden_pour(spec: VirtualBenchSpec, simulators: SimulatorPool, task: PourTask, seed: int) -> SimulatedPour:
-    """What becomes of the 'real' liquid in one pour; same seed, same answer.
+    """Simulate the 'real' liquid in one pour; the same seed gives the same result.
 
     Args:
-        spec: of the bench: the hidden θ.
-        simulators: a pool of its own.
-        task: what is poured and how; θ and seed are filled in here.
+        spec: of the bench, with the hidden θ.
+        simulators: a separate pool for the hidden liquid.
+        task: scene and motion of the pour; θ and seed are filled in here.
         seed: of the pour.
 
     Raises:
-        TouchingError: with these errors of placement the vessels would touch.
+        TouchingError: with these placement errors the vessels would touch.
         LaboratoryError: the liquid could not be simulated.
     """
     reason = None
@@ -110,15 +112,16 @@ async def hidden_spill(
     seed: int,
     record_rate: float = 0.0,
 ) -> Spill:
-    """What becomes of the liquid if the arm does what it is told, with this pour's errors; raises as `hidden_pour`.
+    """Simulate the liquid for an arm that executes the commanded action with this pour's errors; raises like
+    `hidden_pour`.
 
     Args:
-        spec: of the bench: the hidden θ and errors.
-        simulators: a pool of its own.
-        scene: as intended.
-        action: as commanded.
+        spec: of the bench, with the hidden θ and errors.
+        simulators: a separate pool for the hidden liquid.
+        scene: the intended scene.
+        action: the commanded action.
         seed: of the pour.
-        record_rate: of the particles that are kept for those who watch [1/s].
+        record_rate: rate of the recorded particle frames for the live view [1/s].
     """
     task = PourTask(scene, action, spec.liquid, 0, record_rate=record_rate, pose_error=draw_pose_error(spec, seed))
     simulated = await hidden_pour(spec, simulators, task, seed)
@@ -126,10 +129,10 @@ async def hidden_spill(
 
 
 def spill_of(outcome: PourOutcome, mass: float) -> Spill:
-    """Masses of a simulated pour.
+    """Return the masses of a simulated pour.
 
-    Drops that still fall at the end land where the others did: they are shared between receiver and tray in the
-    proportion of those. What escaped through a wall (at most `ESCAPED_LIMIT`) is missing from both.
+    Drops that still fall at the end are shared between receiver and tray in the proportion of the landed drops. Mass
+    that escaped through a wall (at most `ESCAPED_LIMIT`) is counted in neither.
 
     Args:
         outcome: of the liquid's simulation.

@@ -1,4 +1,8 @@
-"""Questions to the operator: reminders while nobody answers, a deadline, and a record of everything said."""
+"""Questions to the operator, with reminders, a deadline and a log.
+
+`OperatorQuestions` forwards questions to one operator and records each answer as an `AnsweredQuestion`. The wording of
+the questions belongs to `consent` and `weighing_plan`.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +21,13 @@ class NoAnswerError(LaboratoryError):
 
 @dataclass(frozen=True)
 class AnsweredQuestion:
-    """A question and what came of it.
+    """A question and its answer.
 
     Attributes:
-        about: of the question.
+        about: subject of the question.
         answer: as given; '' if none was.
-        after: how long it took [s of the clock].
-        problem: why it was asked again; '' the first time.
+        after: time until the answer [s of the clock].
+        problem: why the question was repeated; '' the first time.
     """
 
     about: str
@@ -36,31 +40,31 @@ class OperatorQuestions:
     """Asks one operator.
 
     Args:
-        operator: who answers.
+        operator: answers the questions.
         spec: reminder and deadline.
-        tell: takes notices: what is asked, answered and not answered, for the journal; problems as warnings. The
+        tell: receives notices for the journal: questions, answers, missing answers, and problems as warnings. The
             operator's own screen shows questions with their problems, and reminders.
-        time_scale: bench seconds per second of the clock; times of `spec` run so much faster for a virtual operator.
+        time_scale: bench seconds per second of the clock; for a virtual operator the times of `spec` are divided by it.
     """
 
     def __init__(
         self, operator: Operator, spec: OperatorSpec, tell: Callable[[Notice], None], time_scale: float = 1.0
     ) -> None:
-        self._operator, self._tell = operator, tell
+        self._operator, self._notify = operator, tell
         self._on_screen = spec.answers == "person"
         pace = time_scale if spec.answers == "virtual" else 1.0
         self._reminder, self._deadline = spec.reminder / pace, spec.deadline / pace
         self.log: list[AnsweredQuestion] = []
 
     async def ask(self, question: OperatorQuestion) -> str:
-        """Put a question and await the answer.
+        """Ask a question and wait for the answer.
 
         Raises:
-            NobodyAnsweredError: none came in time.
-            LaboratoryError: the operator gave it up.
+            NoAnswerError: no answer came before the deadline.
+            LaboratoryError: the operator gave up.
         """
         if question.problem:
-            self._tell(Notice("warning", question.problem, asked=self._on_screen))
+            self._notify(Notice("warning", question.problem, asked=self._on_screen))
         begun, answer = time.monotonic(), ""
         answering = asyncio.ensure_future(self._operator.ask(question))
         try:
@@ -73,16 +77,16 @@ class OperatorQuestions:
                 answering.exception()
             after = time.monotonic() - begun
             self.log.append(AnsweredQuestion(question.about, answer, after, question.problem))
-            said = f"'{answer}' after {after:.1f} s" if answer else f"no answer within {after:.1f} s"
-            self._tell(Notice("note", f"operator ({question.about}): {question.text} → {said}"))
+            reply = f"'{answer}' after {after:.1f} s" if answer else f"no answer within {after:.1f} s"
+            self._notify(Notice("note", f"operator ({question.about}): {question.text} → {reply}"))
 
     async def announce(self, text: str, seconds: float) -> None:
-        """Say that something moves in so many seconds [s of the clock]."""
-        self._tell(Notice("note", f"operator told: {text}"))
+        """Announce that something moves after the given time [s of the clock]."""
+        self._notify(Notice("note", f"operator told: {text}"))
         await self._operator.announce(text, seconds)
 
     def take_log(self) -> list[dict[str, Any]]:
-        """What was asked and answered since this was called last, JSON-ready."""
+        """Return the questions and answers since the last call, JSON-ready."""
         log, self.log = self.log, []
         return [
             {k: round(v, 3) if isinstance(v, float) else v for k, v in asdict(one).items() if v != ""} for one in log
@@ -98,4 +102,4 @@ class OperatorQuestions:
             if waited >= self._deadline:
                 raise NoAnswerError(f"nobody answered within {self._deadline:g} s: '{question.text}'")
             unseen: Literal["note", "warning"] = "note" if self._on_screen else "warning"
-            self._tell(Notice(unseen, f"still waiting, for {waited:.0f} s now: {question.text}"))
+            self._notify(Notice(unseen, f"still waiting, for {waited:.0f} s now: {question.text}"))

@@ -1,4 +1,4 @@
-"""Is a pour possible at all? Answered before anything moves."""
+"""Checks before any motion whether a pour is feasible."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from sim_engine.vessel.vessel import Vessel, build_vessel, check_holds
 
 @functools.lru_cache(maxsize=16)
 def vessel(spec: VesselSpec) -> Vessel:
-    """Built once: a mesh's distance grid takes seconds."""
+    """Build a vessel once per specification: the distance grid of a mesh takes seconds."""
     return build_vessel(spec)
 
 
 def plan_pour(scene: Scene, action: Action) -> PourMotion:
-    """The motion that the arm will make, by the same definitions as the simulator's.
+    """Plan the motion of the pourer with the same definitions as the simulator.
 
     Args:
         scene: vessels and liquid.
         action: how to pour.
 
     Raises:
-        InvalidActionError: the vessels would touch, the pourer can't hold the load, or the motion can't be made.
+        InvalidActionError: the vessels would touch, the pourer cannot hold the load, or the motion cannot be executed.
     """
     try:
         pourer, receiver = vessel(scene.pourer), vessel(scene.receiver)

@@ -1,9 +1,11 @@
-"""One pour: the operator's steps, consent, the arm's ways and the weighings, in their order.
+"""One pour: the operator's steps, the consent, the arm's motions and the weighings, in order.
 
-Two rules hold throughout. While somebody is asked to put hands into the cell, no program runs on the controller, which
-is read back first. And nothing moves unless somebody has just said that it may, and been told how long they have.
+Two rules always hold. While a question invites hands into the cell, no program runs on the controller; this is read
+back first. The arm moves only after the operator has confirmed the motion and has been informed of the time until it
+starts.
 
-Tells who watches where a pour stands.
+`PourProcedure` runs the steps; `PourReport` reports the progress of the pour to a callback. Questions are in
+`actors.bench.consent`, weighings in `actors.balance.weighing`.
 """
 
 from __future__ import annotations
@@ -45,10 +47,10 @@ from sim_engine.scene import SampledMotion, Scene
 
 
 class PourReport:
-    """In bench time done of bench time expected; never runs backwards.
+    """Progress of a pour as elapsed bench time over expected bench time; it never decreases.
 
     Args:
-        progress: told; what it raises is its own affair.
+        progress: receives the progress; its exceptions are suppressed.
         parts: expected time of each checkpoint, in order [s].
         motion_time: of tilt, hold and return together [s].
     """
@@ -64,7 +66,7 @@ class PourReport:
         self._pourer: tuple[float, ...] = ()
 
     def enter(self, checkpoint: str, done: float = 0.0) -> None:
-        """A checkpoint is reached, or `done` (0 … 1) of it."""
+        """Report that a checkpoint is reached, or that the fraction `done` (0 … 1) of it is."""
         self._checkpoint = checkpoint
         before = 0.0
         for name, duration in self._parts.items():
@@ -73,16 +75,16 @@ class PourReport:
                 break
             before += duration
         self._fraction = max(self._fraction, before / sum(self._parts.values()))
-        self._tell()
+        self._publish()
 
     def move(self, phase: str, fraction: float, tilt: float | None, *, moving: bool = True) -> None:
-        """Where the arm is during the pour itself.
+        """Report the arm's progress during the pour itself.
 
         Args:
             phase: 'tilt', 'hold' or 'return'.
             fraction: of the pour's motion, 0 … 1.
             tilt: of the pourer [rad].
-            moving: whether it is on its way; else only the tilt is noted.
+            moving: whether the arm is moving; otherwise only the tilt is stored.
         """
         self._tilt = tilt
         if not moving:
@@ -90,30 +92,30 @@ class PourReport:
         start = sum(duration for name, duration in self._parts.items() if name in ("operator", "tare", "approach"))
         self._checkpoint = phase if phase in self._parts else self._checkpoint
         self._fraction = max(self._fraction, (start + fraction * self._motion_time) / sum(self._parts.values()))
-        self._tell()
+        self._publish()
 
     def stand(self, joints: tuple[float, ...], pourer: tuple[float, ...]) -> None:
-        """Where the arm is, see `PourProgress`; as far as it tells."""
+        """Report the arm's joints and the pourer's pose, as far as available; see `PourProgress`."""
         self._joints, self._pourer = joints or self._joints, pourer or self._pourer
-        self._tell()
+        self._publish()
 
     def show(self, balance: float, stable: bool | None = None) -> None:
-        """The balance's display [kg], and whether it says that it is at rest."""
+        """Report the balance's display [kg] and its stability flag."""
         self._balance, self._stable = balance, stable
-        self._tell()
+        self._publish()
 
     @property
     def watched(self) -> bool:
-        """Whether anybody gets it."""
+        """Whether a progress callback is set."""
         return self._progress is not None
 
     def pour(self, liquid: RecordedFrames) -> None:
-        """What the liquid of a virtual bench does in this pour."""
-        self._tell(liquid)
+        """Report the frames of the liquid of a virtual bench."""
+        self._publish(liquid)
 
-    def _tell(self, liquid: RecordedFrames | None = None) -> None:
+    def _publish(self, liquid: RecordedFrames | None = None) -> None:
         if self._progress is not None:
-            told = PourProgress(
+            state = PourProgress(
                 self._checkpoint,
                 self._fraction,
                 self._tilt,
@@ -124,17 +126,17 @@ class PourReport:
                 liquid,
             )
             with contextlib.suppress(Exception):
-                self._progress(told)
+                self._progress(state)
 
 
 WEIGHING_TIME = 3.0
-"""Bench time that a weight usually takes, for the progress bar [s]."""
+"""Typical bench time until a weight is stable, for the progress bar [s]."""
 
 SETTLING_TIME = 2.0
 """From the arm's return home to the first weighing [s of bench time]: the last drops fall."""
 
 LOOK_INTERVAL = 0.1
-"""Between two looks at the balance's display [s of the clock]."""
+"""Time between two readings of the balance's display [s of the clock]."""
 
 _BROKEN_OFF = (ArmStoppedError, ArmLostError, DeviceLostError)
 
@@ -143,12 +145,12 @@ class PourProcedure:
     """One pour, from the first question to the last weight.
 
     Args:
-        setup: of the bench.
+        setup: parts of the bench.
         scene, action: what to pour.
-        path: checked.
-        seed: of a virtual bench's chance.
-        known: weighings of this pourer that still hold.
-        progress: told where it stands.
+        path: checked path of the arm.
+        seed: of a virtual bench's randomness.
+        known: weighings of this pourer that are still valid.
+        progress: receives the progress.
     """
 
     def __init__(
@@ -175,15 +177,15 @@ class PourProcedure:
 
     @property
     def lasting(self) -> dict[str, PourMasses]:
-        """Weighings that hold for later pours with this pourer."""
+        """Weighings that remain valid for later pours with this pourer."""
         return self._weighings.lasting
 
     async def run(self) -> PourMeasurement:
-        """All of it.
+        """Run the whole pour.
 
         Raises:
             NotPouredError: nothing was poured.
-            UnknownPourError: something may have been.
+            UnknownPourError: some liquid may have been poured.
         """
         self._setup.questions.take_log()
         watching = asyncio.create_task(self._watch())
@@ -203,15 +205,15 @@ class PourProcedure:
             raise
         except LaboratoryError as error:
             if self._begun and not isinstance(error, BalanceError):
-                await self._keep_what_shows()
+                await self._weigh_remaining()
             await self._consent.leave_safe()
-            raise self._said(error) from error
+            raise self._pour_error(error) from error
         finally:
             watching.cancel()
             await asyncio.gather(watching, return_exceptions=True)
             await self._setup.nature.end()
 
-    # ---- in order
+    # ---- steps in order
 
     async def _before(self) -> None:
         setup = self._setup
@@ -226,7 +228,7 @@ class PourProcedure:
         await self._weighings.before()
 
     async def _move(self) -> None:
-        """Out, pour, home: all of it after one consent, unless something stops it."""
+        """Approach, pour and return home after one consent, unless a stop interrupts the motion."""
         setup, path = self._setup, self._path
         await self._consent.given(start_question(setup.spec, path))
         async with self._setup.nature.followed():
@@ -246,7 +248,7 @@ class PourProcedure:
         self._begun = True
         try:
             self._executed = await setup.nature.lasting(setup.arm.execute(path, self._follow), path.pour_time)
-        except ArmRefusedError as error:  # before anything moved
+        except ArmRefusedError as error:  # before any movement
             self._begun = False
             await self._consent.bring_home(error, begun=self._begun)
             raise
@@ -256,7 +258,7 @@ class PourProcedure:
         await setup.nature.note()
         try:
             if self._broken is not None:
-                await setup.arm.release()  # agreed to with the un-tilting
+                await setup.arm.release()  # consented to with the return to upright
             await setup.arm.retreat(path, self._seen)
         except STUCK as error:
             await self._consent.bring_home(error, begun=self._begun)
@@ -277,24 +279,24 @@ class PourProcedure:
     # ---- the liquid
 
     async def _let_it_land(self) -> None:
-        """What was executed is over: the liquid does what it does, and lies on the balance."""
+        """The motion is over: let the ground truth pour the liquid and load the balance."""
         await self._setup.nature.lands(self._executed, self._broken)
 
-    async def _keep_what_shows(self) -> None:
-        """Weigh whatever can be weighed of a pour that was broken off without touching anything."""
+    async def _weigh_remaining(self) -> None:
+        """After an aborted pour, weigh whatever can be weighed without touching anything."""
         with contextlib.suppress(LaboratoryError):
             await self._let_it_land()
             await self._setup.nature.settle(SETTLING_TIME)
             await self._weighings.at_once()
 
-    # ---- what is kept
+    # ---- records
 
     def _note_weight(self, key: str, weighed: PourMasses) -> None:
-        """Into the journal at once: no weight is lost, whatever happens next."""
+        """Write a weight to the journal at once, so that no later failure can lose it."""
         self._setup.tell(Notice("note", f"weighed, {key}: {grams(weighed.mass)} ± {1e3 * weighed.uncertainty:.2f} g"))
 
-    def _said(self, error: Exception) -> LaboratoryError:
-        """The error for those above, with what is known of the liquid."""
+    def _pour_error(self, error: Exception) -> LaboratoryError:
+        """Return the error for the caller, with the known facts about the liquid."""
         if not self._begun:
             return NotPouredError(f"{error}. Nothing was poured")
         text = f"{error}. What was poured is unknown"
@@ -315,14 +317,14 @@ class PourProcedure:
         return {
             "mode": self._setup.mode,
             **measured.notes,
-            "arm": _who(self._facts),
+            "arm": _arm_identity(self._facts),
             "executed_s": float(executed.times[-1]),
             "largest_tilt_deg": _largest_tilt(executed),
             "executed": executed.record(),
             "operator": self._setup.questions.take_log(),
         }
 
-    # ---- screens
+    # ---- progress
 
     def _follow(self, state: ArmState) -> None:
         self._report.move(state.phase, state.fraction, state.tilt, moving=state.moving)
@@ -332,7 +334,7 @@ class PourProcedure:
         self._report.stand(state.joints, state.pourer)
 
     async def _watch(self) -> None:
-        """Give the balance's display to those who watch; it can't hold the pour up."""
+        """Report the balance's display to the progress callback; it cannot delay the pour."""
         balance = self._setup.balance
         if balance is None:
             return
@@ -345,7 +347,7 @@ class PourProcedure:
 
 
 def _expected(setup: Setup, path: PlannedPour) -> dict[str, float]:
-    """Time of each checkpoint [s of bench time]."""
+    """Expected time of each checkpoint [s of bench time]."""
     return {
         "operator": setup.operator_time + 4.0 * WEIGHING_TIME,
         "approach": setup.spec.announcement + path.approach_time,
@@ -357,15 +359,15 @@ def _expected(setup: Setup, path: PlannedPour) -> dict[str, float]:
 
 
 def _largest_tilt(executed: Executed) -> float:
-    """As read back [deg]."""
+    """Largest tilt as read back [deg]."""
     if len(executed.times) < 2:
         return 0.0
     return math.degrees(float(SampledMotion(executed.times, executed.poses).tilt(executed.times).max()))
 
 
-def _who(facts: ArmFacts | None) -> dict[str, Any]:
-    """What a later reader will ask about the robot."""
+def _arm_identity(facts: ArmFacts | None) -> dict[str, Any]:
+    """Identification of the robot for the record: model, serial number, version, checksum."""
     if facts is None:
         return {}
-    told = {name: getattr(facts, name) for name in ("model", "serial", "version", "checksum")}
-    return {name: text for name, text in told.items() if text}
+    values = {name: getattr(facts, name) for name in ("model", "serial", "version", "checksum")}
+    return {name: text for name, text in values.items() if text}

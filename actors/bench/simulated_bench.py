@@ -1,7 +1,8 @@
-"""The bench of numbers: neither arm nor balance has wires, and the hidden liquid is poured before the arm has moved.
+"""The simulated bench: arm and balance are simulated in the driver, and the hidden liquid is poured before the arm
+moves.
 
-Same seed and action → same measurement, bit for bit, whatever happened before and however the clock runs: time passes
-on the balance, and only there.
+The same seed and action give the same measurement bit for bit, independent of earlier pours and of the clock: bench
+time passes only on the balance. `SimulatedBench` holds the ground truth, and `SimulatedOperator` answers all questions.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from actors.interfaces import LaboratoryError, OperatorQuestion, OperatorSpec, P
 from actors.laboratory_settings import VirtualBenchSpec
 
 CARRYING_TIME = 2.0
-"""Bench time to put something on the balance or take it off [s]."""
+"""Bench time to put an object on the balance or to remove it [s]."""
 
 T = TypeVar("T")
 
@@ -32,7 +33,7 @@ _NOTHING = Load((0.0,), (0.0,))
 
 
 def simulated_balance(spec: VirtualBenchSpec) -> BalanceSpec:
-    """The balance of a bench of numbers: the dry pourer is tared away, and no load is ever wrong."""
+    """Balance settings of a simulated bench: the dry pourer is tared, and no load is out of tolerance."""
     settings = BalanceSettings(
         resolution=spec.balance_resolution,
         noise=spec.balance_noise,
@@ -44,13 +45,13 @@ def simulated_balance(spec: VirtualBenchSpec) -> BalanceSpec:
 
 
 class SimulatedBench(GroundTruth):
-    """What is hidden on a bench of numbers.
+    """The ground truth of a simulated bench.
 
     Args:
-        spec: hidden liquid, errors, pace.
-        simulators: a pool of its own for the hidden liquid.
-        arm: of numbers.
-        balance: of numbers; bench time passes on it.
+        spec: hidden liquid, errors, time scale.
+        simulators: a separate pool for the hidden liquid.
+        arm: the simulated arm.
+        balance: the simulated balance; bench time passes on it.
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class SimulatedBench(GroundTruth):
         self._liquid: asyncio.Task[Spill] | None = None
 
     async def prepare(self, pour: PourAsk) -> None:
-        """See `GroundTruth.prepare`: the liquid is poured from here on."""
+        """See `GroundTruth.prepare`; starts the simulation of the liquid."""
         self._pour = pour
         self._liquid = asyncio.create_task(
             hidden_spill(self._spec, self._simulators, pour.scene, pour.action, pour.seed, pour.record_rate)
@@ -72,10 +73,10 @@ class SimulatedBench(GroundTruth):
         await self._arm.device.call("grip", Grip(error.speed_factor, stream(pour.seed, "arm")), deadline=30.0)
 
     async def tilts(self) -> None:
-        """See `GroundTruth.tilts`: the tray must know what falls on it while the arm moves.
+        """See `GroundTruth.tilts`; puts the spilled mass over time on the balance before the arm moves.
 
         Raises:
-            PourFailedError: the vessels would touch as they truly stand.
+            PourFailedError: at their true poses the vessels would touch.
         """
         try:
             spill = await self._spill()
@@ -86,12 +87,12 @@ class SimulatedBench(GroundTruth):
         await self._balance.put(Load(spill.times, spill.spilled_curve))
 
     async def lands(self, executed: Executed | None, broken: Exception | None) -> None:
-        """See `GroundTruth.lands`; what a broken motion poured is not what was foretold."""
+        """See `GroundTruth.lands`; raises for an aborted motion, because the simulated liquid does not apply to it."""
         if broken is not None or executed is None or not executed.completed:
             raise LaboratoryError(f"{broken or 'the arm did not complete the pour'}")
 
     async def lasting(self, doing: Awaitable[T], seconds: float) -> T:
-        """See `GroundTruth.lasting`: time passes on the balance meanwhile."""
+        """See `GroundTruth.lasting`; bench time passes on the balance meanwhile."""
         return (await _together(doing, self._balance.pass_time(seconds)))[0]
 
     async def wait(self, seconds: float) -> None:
@@ -99,8 +100,9 @@ class SimulatedBench(GroundTruth):
         await self._balance.pass_time(seconds)
 
     async def settle(self, seconds: float) -> None:
-        """See `GroundTruth.settle`: drops may fall for longer than the arm moves; a settled tray carries all of
-        them."""
+        """See `GroundTruth.settle`; waits for the last drop, which may fall after the arm has stopped, and for the
+        balance to settle.
+        """
         assert self._pour is not None
         last = (await self._spill()).times[-1]
         await self.wait(max(last - self._pour.path.pour_time, 0.0) + self._spec.settling_time)
@@ -111,7 +113,7 @@ class SimulatedBench(GroundTruth):
             await _end(self._liquid)
 
     async def content(self, about: str) -> Load | None:
-        """What is on the balance after a question was answered, net of what is dry; None: as it was."""
+        """Load on the balance after a question was answered, net of the dry mass; None if it is unchanged."""
         assert self._pour is not None
         match about:
             case "pourer_full":
@@ -128,14 +130,14 @@ class SimulatedBench(GroundTruth):
 
 
 class SimulatedOperator(OperatorQuestions):
-    """The person at the bench of numbers: refills, wipes, carries things to the balance, and always says yes.
+    """The operator of a simulated bench: refills, wipes, moves vessels to the balance, and confirms every question.
 
-    Nothing of it is written down: it happens in no time, and is the same in every pour.
+    It writes no log: its answers take no time and are the same in every pour.
 
     Args:
-        bench: that they stand beside.
-        balance: that they put things on.
-        preparation_time: refilling, placing, wiping [s of bench time].
+        bench: the ground truth, which supplies the loads.
+        balance: receives the loads.
+        preparation_time: for refilling, placing and wiping [s of bench time].
     """
 
     def __init__(self, bench: SimulatedBench, balance: DeviceBalance, preparation_time: float) -> None:
@@ -151,7 +153,7 @@ class SimulatedOperator(OperatorQuestions):
             await self._balance.put(load)
             await self._balance.pass_time(CARRYING_TIME)
         if question.problem and question.wants == "done":
-            raise LaboratoryError(question.problem)  # nobody can mend numbers
+            raise LaboratoryError(question.problem)  # a simulation has no problem that an operator could fix
         return "done" if question.wants == "done" else "no" if question.about in ("balance", "unsafe") else "yes"
 
     async def announce(self, text: str, seconds: float) -> None:
@@ -159,7 +161,7 @@ class SimulatedOperator(OperatorQuestions):
 
 
 async def _together(first: Awaitable[T], second: Awaitable[Any]) -> tuple[T, Any]:
-    """Both; if one fails, the other is awaited no longer and the error is raised."""
+    """Await both; if one fails, cancel the other and raise the error."""
     tasks: list[asyncio.Future[Any]] = [asyncio.ensure_future(first), asyncio.ensure_future(second)]
     try:
         await asyncio.gather(*tasks)
@@ -170,7 +172,7 @@ async def _together(first: Awaitable[T], second: Awaitable[Any]) -> tuple[T, Any
 
 
 async def _end(task: asyncio.Future[Any]) -> None:
-    """Cancel a task unless it is done, wait for it, and take note of its error."""
+    """Cancel a task unless it is done, wait for it, and retrieve its exception."""
     task.cancel()
     await asyncio.wait({task})
     if not task.cancelled():

@@ -1,10 +1,12 @@
-"""The virtual bench: what truly becomes of the liquid, when something that isn't there stands in for arm and balance.
+"""The ground truth of a virtual bench: the hidden liquid follows the motion that the arm really executed.
 
-Nothing of it is known to those who learn but what the balance shows. What the arm executed counts, and neither what was
-planned nor what the driver believes: a motion that was broken off leaves liquid in the pourer, or lets it run on while
-the pourer stands tilted. Where part of a motion is not known, nobody says what became of the liquid.
+Calibration only sees the balance's readings. The executed motion counts, not the planned motion and not the driver's
+view. An aborted motion leaves liquid in the pourer, or lets it run out while the pourer stays tilted. If part of the
+motion is missing, the masses are reported as unknown.
 
-Which part of what an arm did is the pour, and what a pourer did that sits askew in the fingers.
+`GroundTruth` is the interface and does nothing on hardware. `VirtualBench` simulates the liquid from the poses that the
+arm read back, `FollowedBench` from the joint history of the arm's emulator. `executed_pour` cuts the pour out of that
+history; `slipped` applies a grip error.
 """
 
 from __future__ import annotations
@@ -34,17 +36,17 @@ from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
 FloatArray = NDArray[np.float64]
 
 AT_START = 2e-3
-"""How near the pour's first pose the arm stands when it begins [rad]."""
+"""Largest joint distance from the pour's first pose at which the arm counts as standing there [rad]."""
 
 AT_REST = 1e-6
-"""Joints that change by less from sample to sample stand still [rad]."""
+"""Joints that change by less between two samples stand still [rad]."""
 
 LONGEST_REST = 6.0
-"""Rest in the middle of a motion is simulated for so long [s]: what runs out meanwhile has run out by then."""
+"""Longest simulated rest in the middle of a motion [s]; by then, everything that can run out has run out."""
 
 
 def slipped(motion: SampledMotion, grip_tilt: float) -> SampledMotion:
-    """The motion of a pourer that sits in the fingers turned by so much [rad] about the y axis of its underside."""
+    """The motion of a pourer that is rotated in the grip by `grip_tilt` [rad] about the y axis of its underside."""
     c, s = math.cos(0.5 * grip_tilt), math.sin(0.5 * grip_tilt)
     w, x, y, z = (motion.poses[:, k] for k in range(3, 7))
     turned = np.stack([c * w - s * y, c * x - s * z, c * y + s * w, c * z + s * x], axis=-1)
@@ -52,10 +54,11 @@ def slipped(motion: SampledMotion, grip_tilt: float) -> SampledMotion:
 
 
 def executed_pour(times: FloatArray, joints: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """The part of a history that is the pour: from the first movement away from its first pose to the last movement.
+    """Return the part of a history that is the pour: from the first movement away from its first pose to the last
+    movement.
 
-    The clock plays no part in where it begins or ends, and long rests are shortened, so that the same motion is cut the
-    same however long anybody took over it.
+    Start and end do not depend on the clock, and long rests are shortened. The same motion is therefore cut in the same
+    way, independent of the operator's response times.
 
     Args:
         times: shape (T,), increasing [s].
@@ -63,7 +66,7 @@ def executed_pour(times: FloatArray, joints: FloatArray, start: FloatArray) -> t
         start: the pour's first joints, shape (6,) [rad].
 
     Returns:
-        Times from 0, and joints; None if nothing moved after the arm had stood there.
+        Times from 0, and joints; None if the arm did not move after standing at the start.
     """
     away = np.max(np.abs(joints - start), axis=1) >= AT_START
     moves = np.max(np.abs(np.diff(joints, axis=0)), axis=1) > AT_REST
@@ -84,7 +87,7 @@ def executed_pour(times: FloatArray, joints: FloatArray, start: FloatArray) -> t
 def _without_long_rests(
     gaps: FloatArray, moved: NDArray[np.bool_], joints: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Times from 0; of a rest only its beginning is kept."""
+    """Return times from 0 and joints; only the first `LONGEST_REST` seconds of each rest are kept."""
     kept, now, rest = [(0.0, 0)], 0.0, 0.0
     for i, (gap, moves) in enumerate(zip(gaps, moved, strict=True), start=1):
         allowed = float(gap) if moves else min(float(gap), LONGEST_REST - rest)
@@ -98,24 +101,25 @@ def _without_long_rests(
 T = TypeVar("T")
 
 UPRIGHT = math.radians(0.5)
-"""Below this tilt [rad] a pourer is upright; ways to and from a pour keep it so."""
+"""Below this tilt [rad] a pourer is upright; the motions to and from a pour keep it below."""
 
 NOTING_INTERVAL = 40.0
-"""Between two looks at what the arm did [s of its time]; a virtual controller remembers two minutes."""
+"""Interval between two reads of the arm's history [s of controller time]; a virtual controller keeps two minutes."""
 
 WATCHED_RATE = 10.0
-"""Looks at the hidden liquid's particles per second of its time, for those who watch [1/s]."""
+"""Frame rate of the hidden liquid's particles for the live view [1/s]."""
 
 LONGEST_GAP = 0.1
-"""Between two samples of a history without a gap [s of controller time]; it is sampled at 125 Hz."""
+"""Largest distance between two samples of a history without a gap [s of controller time]; the sampling rate is 125 Hz.
+"""
 
 
 @dataclass(frozen=True)
 class PourAsk:
-    """The pour that is under way; `seed` is that of all its chance.
+    """The current pour; `seed` is the seed of all its randomness.
 
     Attributes:
-        show: takes what its liquid does, where anybody watches.
+        show: receives the liquid's frames if a live view needs them.
     """
 
     scene: Scene
@@ -126,17 +130,17 @@ class PourAsk:
 
     @property
     def record_rate(self) -> float:
-        """Frames of the hidden liquid's particles [1/s]; 0 where nobody watches. It changes nothing of their ways."""
+        """Frame rate of the hidden liquid's particles [1/s]; 0 without a live view. The simulation is unaffected."""
         return 0.0 if self.show is None else WATCHED_RATE
 
     def shown(self, frames: RecordedFrames | None) -> None:
-        """What its liquid does is known."""
+        """Pass the liquid's frames to `show`."""
         if self.show is not None and frames is not None:
             self.show(frames)
 
 
 class GroundTruth:
-    """What happens around arm and balance during a pour. On hardware nobody here has to do anything about it.
+    """Hooks around arm and balance during a pour. On hardware they do nothing.
 
     Args:
         time_scale: bench seconds per second of the clock.
@@ -146,55 +150,55 @@ class GroundTruth:
         self._time_scale = time_scale
 
     async def prepare(self, pour: PourAsk) -> None:
-        """A pour is about to be prepared by the operator."""
+        """Called before the operator prepares the pour."""
 
     @contextlib.asynccontextmanager
     async def followed(self) -> AsyncIterator[None]:
-        """Entered before the arm leaves home, left when it is back."""
+        """Context from before the arm leaves home until it is back."""
         yield
 
     async def note(self) -> None:
-        """The arm has come to the end of a way."""
+        """Called at the end of each transfer motion of the arm."""
 
     async def tilts(self) -> None:
-        """The arm stands at the pour's first pose, and is about to tilt."""
+        """Called when the arm stands at the pour's first pose and is about to tilt."""
 
     async def lands(self, executed: Executed | None, broken: Exception | None) -> None:
-        """What was executed is over: the liquid does what it does.
+        """Called after the executed motion; determines the liquid's masses.
 
         Args:
-            executed: as the arm read it back, if it did.
-            broken: why the pour was broken off, if it was.
+            executed: poses as read back from the arm, if available.
+            broken: why the pour was aborted, if it was.
 
         Raises:
-            LaboratoryError: nobody can say what became of it.
+            LaboratoryError: the masses are unknown.
         """
 
     async def lasting(self, doing: Awaitable[T], seconds: float) -> T:
-        """Something that takes the arm so long [s of bench time]."""
+        """Await an operation of the arm that takes `seconds` of bench time."""
         return await doing
 
     async def wait(self, seconds: float) -> None:
-        """Bench time passes [s]."""
+        """Let bench time pass [s]."""
         await asyncio.sleep(seconds / self._time_scale)
 
     async def settle(self, seconds: float) -> None:
-        """The last drops fall, for so long at least [s of bench time]."""
+        """Wait at least `seconds` of bench time, so that the last drops fall."""
         await self.wait(seconds)
 
     async def end(self) -> None:
-        """The pour is over, however."""
+        """Called when the pour is over, in every case."""
 
 
 class VirtualBench(GroundTruth):
-    """A bench without hardware, whose liquid follows what the arm read back.
+    """A bench without hardware whose liquid follows the poses that the arm read back.
 
     Args:
-        spec: what is hidden.
+        spec: the hidden liquid and errors.
         time_scale: bench seconds per second of the clock.
-        stand_ins: of arm and balance.
-        hands: that fill the pourer, and know what stands where.
-        simulators: a pool of its own for the hidden liquid.
+        stand_ins: the emulators of arm and balance.
+        hands: fill the pourer and hold the bench contents.
+        simulators: a separate pool for the hidden liquid.
     """
 
     def __init__(
@@ -225,11 +229,11 @@ class VirtualBench(GroundTruth):
         yield
 
     async def lands(self, executed: Executed | None, broken: Exception | None) -> None:
-        """See `GroundTruth.lands`: the liquid follows, once, and the balance carries what became of it.
+        """See `GroundTruth.lands`; simulates the liquid once and puts the resulting mass on the balance.
 
         Raises:
-            LaboratoryError: with the errors of this pour's placement the vessels would touch, the liquid could not be
-                simulated, or part of the motion is not known.
+            LaboratoryError: with the placement errors of this pour the vessels would touch, the liquid could not be
+                simulated, or part of the motion is unknown.
         """
         assert self._pour is not None
         if self._landed:
@@ -243,7 +247,7 @@ class VirtualBench(GroundTruth):
         await self.stand_ins.put(self.things.carried)
 
     def _motion(self, executed: Executed | None, grip_tilt: float) -> SampledMotion | None:
-        """What the pourer truly did; None if nothing left it."""
+        """The true motion of the pourer; None if nothing left it."""
         if executed is None or not executed.completed or len(executed.times) < 2:
             raise LaboratoryError(
                 "the virtual bench can't tell what became of the liquid: its arm only tells of pours that it completed"
@@ -251,7 +255,7 @@ class VirtualBench(GroundTruth):
         return slipped(SampledMotion(executed.times, executed.poses), grip_tilt)
 
     async def _simulate(self, pour: PourAsk, motion: SampledMotion, error: PoseError) -> tuple[float, float]:
-        """Masses spilled and retained [kg]; same motion, same seed, same masses."""
+        """Masses spilled and retained [kg]; the same motion and seed give the same masses."""
         mass = self.things.in_pourer
         scene = replace(pour.scene, liquid=pour.scene.liquid.model_copy(update={"mass": mass}))
         shift = PoseError(x=error.x, y=error.y, z=error.z)
@@ -264,11 +268,11 @@ class VirtualBench(GroundTruth):
 
 
 class FollowedBench(VirtualBench):
-    """A virtual bench whose arm has a history of its own: what its stand-in did counts, also of a broken motion.
+    """A virtual bench that uses the joint history of the arm's emulator, also after an aborted motion.
 
     Args:
         spec, stand_ins, hands, simulators: as for `VirtualBench`.
-        arm: the cell as everybody believes it to be.
+        arm: the cell as configured; it may differ from the ground truth.
     """
 
     def __init__(
@@ -289,7 +293,7 @@ class FollowedBench(VirtualBench):
 
     @contextlib.asynccontextmanager
     async def followed(self) -> AsyncIterator[None]:
-        """See `GroundTruth.followed`: what the arm does is noted again and again, however long anybody needs."""
+        """See `GroundTruth.followed`; reads the arm's history at regular intervals, however long the operator takes."""
         self._times, self._joints, self._landed, self._gap = [], [], False, ""
         self._earlier, self._since = 0.0, (await self.stand_ins.history(math.inf)).now
         following = asyncio.create_task(self._follow())
@@ -302,18 +306,18 @@ class FollowedBench(VirtualBench):
     async def _follow(self) -> None:
         while True:
             await asyncio.sleep(NOTING_INTERVAL / self._arm.time_scale)
-            with contextlib.suppress(LaboratoryError):  # what matters is noted once more at the end
+            with contextlib.suppress(LaboratoryError):  # the history is read once more at the end
                 await self.note()
 
     async def note(self) -> None:
-        """Take down what the arm did since.
+        """Read the arm's motion since the last call.
 
-        The controller remembers two minutes of its time: whoever comes later, because its process was held up, misses
-        part of the motion. That is kept in mind, and then nobody says what became of the liquid.
+        The controller keeps two minutes of its time. If a delayed process reads later, part of the motion is lost. The
+        gap is recorded, and the masses of the pour are then unknown.
         """
         async with self._noting:
             history = await self.stand_ins.history(self._since)
-            if history.now < self._since:  # the controller was switched off, and its clock begins anew
+            if history.now < self._since:  # the controller was switched off; its clock restarts at 0
                 self._gap = self._gap or "the controller was switched off, and forgot what its arm had done before"
                 self._earlier += self._since
                 self._since = 0.0
@@ -338,7 +342,7 @@ class FollowedBench(VirtualBench):
         self._times, self._joints = [], []
 
     def _motion(self, executed: Executed | None, grip_tilt: float) -> SampledMotion | None:
-        """What the pourer truly did, from the pour's first pose on; None if it never left it."""
+        """The true motion of the pourer from the pour's first pose on; None if the pourer never left it."""
         from actors.arm.planning.frames import pourer_motion
 
         if self._gap:
@@ -357,10 +361,10 @@ class FollowedBench(VirtualBench):
         tilted = np.flatnonzero(pourer_motion(joints, times, self._arm).tilt(times) > UPRIGHT)
         if len(tilted) == 0:
             return None
-        end = min(int(tilted[-1]) + 2, len(times))  # what follows is the way home
+        end = min(int(tilted[-1]) + 2, len(times))  # the rest is the return path
         return pourer_motion(joints[:end], times[:end], self._arm, grip_tilt=grip_tilt)
 
 
 def _missed(history: History, since: float) -> float:
-    """How long nothing is known of the motion, from a time on that was asked for until what was kept of it [s]."""
+    """Length of the missing motion between the requested time and the first sample of the history [s]."""
     return max((history.times[0] if history.times else history.now) - since, 0.0)

@@ -1,6 +1,8 @@
-"""The person at a virtual bench: does what questions ask, takes a person's time for it, and answers.
+"""The operator of a virtual bench: carries out the requested steps, takes a person's time for them, and answers.
 
-What stands where on a virtual bench, and what is in it: what its balance carries follows from that. Pure.
+`BenchContents` holds the objects and the liquid on the bench; the load on the balance follows from it. `Hands` changes
+it on request. `VirtualOperator` answers by itself; `PlayedOperator` passes the questions to a person. `BenchContents`
+has no side effects outside itself.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from actors.balance.weighing_plan import Placement
 from actors.interfaces import LaboratoryError, Operator, OperatorQuestion
 
 POURER, RECEIVER, TRAY = 0.312, 0.186, 0.428
-"""Dry masses [kg]: of glass beakers and a steel tray, so that nothing cancels by chance."""
+"""Dry masses [kg] of glass beakers and a steel tray; all differ, so that no error cancels by chance."""
 
 
 @dataclass
@@ -25,7 +27,7 @@ class BenchContents:
 
     Attributes:
         placement: where the balance stands.
-        on_balance: what of 'pourer', 'receiver', 'tray' stands on it.
+        on_balance: those of 'pourer', 'receiver', 'tray' that stand on it.
         in_pourer, in_receiver, on_tray: liquid [kg].
     """
 
@@ -36,32 +38,32 @@ class BenchContents:
     on_tray: float = 0.0
 
     def mass(self, name: str) -> float:
-        """Mass of a thing with what is in it [kg]."""
+        """Mass of an object with its contents [kg]."""
         dry = {"dry pourer": POURER, "pourer": POURER, "receiver": RECEIVER, "tray": TRAY}[name]
         return dry + {"pourer": self.in_pourer, "receiver": self.in_receiver, "tray": self.on_tray}.get(name, 0.0)
 
     @property
     def carried(self) -> float:
-        """By the balance [kg]."""
+        """Mass on the balance [kg]."""
         return sum(self.mass(name) for name in self.on_balance)
 
     def receive(self, spilled: float, retained: float) -> None:
-        """A pour is over, or was broken off.
+        """Apply the masses of a pour that is over or was aborted.
 
         Args:
-            spilled: beside the receiver [kg].
-            retained: still in the pourer [kg].
+            spilled: mass outside the receiver [kg].
+            retained: mass left in the pourer [kg].
         """
         self.in_receiver += self.in_pourer - spilled - retained
         self.on_tray += spilled
         self.in_pourer = retained
 
     def do(self, about: str, fill: float) -> None:
-        """What a question of a pour's weighings asks for; anything else changes nothing.
+        """Carry out the step of a weighing question; other questions change nothing.
 
         Args:
             about: of the question, see `actors.balance.weighing_plan`.
-            fill: what the pourer is filled with, if it is to be filled [kg].
+            fill: mass that the pourer is filled with, if the step fills it [kg].
         """
         under = {"tray"} if self.placement in (Placement.TRAY, Placement.EVERYTHING) else set()
         alone = self.placement in (Placement.TRAY, Placement.TARED)
@@ -89,7 +91,7 @@ class BenchContents:
                 self.on_balance = under | {"pourer"}
 
     def typed(self, about: str, step: float) -> str:
-        """What somebody reads off another scale and types.
+        """The weight that a person reads from another scale and types.
 
         Args:
             about: a weighing's key.
@@ -103,7 +105,7 @@ SCATTER = 1e-3
 """Standard deviation of a filling by hand [kg]."""
 
 TYPED_STEP = 1e-4
-"""Step of the scale that typed weights are read from [kg]."""
+"""Step of the scale for typed weights [kg]."""
 
 SHARES = {
     "pourer_full": 4.0,
@@ -117,24 +119,25 @@ SHARES = {
     "receiver_gone": 1.0,
     "tray_after": 1.0,
 }
-"""Shares of the time for one pour, by what is to be done; answering alone takes `GLANCE`."""
+"""Relative time of each step within one pour; an answer without a step takes `GLANCE`."""
 
 GLANCE = 0.02
 """Share of the time for one pour that an answer without work takes."""
 
 PERSISTENCE = 12
-"""After so many questions in a row about problems it says no: nobody would watch it say yes."""
+"""Limit of consecutive questions about problems. After that the answer is no, because endless confirmations would hide
+the problem."""
 
 Put = Callable[[float], Awaitable[None]]
-"""Puts a mass [kg] on the virtual balance, in place of what was there."""
+"""Replaces the mass on the virtual balance [kg]."""
 
 
 class Hands:
-    """Move things about on a virtual bench.
+    """Moves objects on a virtual bench.
 
     Args:
-        things: what stands where.
-        put: changes what is on the balance; None where there is none.
+        things: the bench contents.
+        put: changes the mass on the balance; None without a balance.
     """
 
     def __init__(self, things: BenchContents, put: Put | None) -> None:
@@ -143,27 +146,27 @@ class Hands:
         self._load = 0.0
 
     def prepare(self, load: float, seed: tuple[int, ...]) -> None:
-        """The next pour begins.
+        """Prepare the next pour.
 
         Args:
-            load: to refill to [kg].
-            seed: of their unsteadiness.
+            load: mass to refill to [kg].
+            seed: of the random fill error.
         """
         self._load, self._rng = load, np.random.default_rng(seed)
 
     async def do(self, question: OperatorQuestion) -> None:
-        """What a question asks for."""
+        """Carry out the step of a question."""
         self.things.do(question.about, self._load + float(self._rng.normal(0.0, SCATTER)))
         if self._put is not None and question.wants == "done":
             await self._put(self.things.carried)
 
 
 class VirtualOperator:
-    """See `actors.interfaces.Operator`. Mends what it is told of, but not for ever: see `PERSISTENCE`.
+    """See `actors.interfaces.Operator`. Confirms that reported problems are fixed, up to `PERSISTENCE` times in a row.
 
     Args:
-        hands: that it works with.
-        time: for all of one pour [s of the clock].
+        hands: carry out the steps.
+        time: for all steps of one pour [s of the clock].
     """
 
     def __init__(self, hands: Hands, time: float) -> None:
@@ -175,11 +178,12 @@ class VirtualOperator:
         self.announced: list[tuple[str, float]] = []
 
     def script(self, answers: Mapping[str, Sequence[str]], late: Mapping[str, float]) -> None:
-        """Be as people are, for tests.
+        """Set scripted answers and delays, for tests.
 
         Args:
-            answers: given in place of its own, first to last, to questions about something; nothing is done then.
-            late: extra time for the next question about something [s of the clock]; inf: it is never answered.
+            answers: replace the operator's own answers to questions about a subject, first to last; no step is carried
+                out.
+            late: extra time for the next question about a subject [s of the clock]; with inf, it is never answered.
         """
         self._answers = {about: list(given) for about, given in answers.items()}
         self._late = dict(late)
@@ -215,11 +219,11 @@ class VirtualOperator:
 
 
 class PlayedOperator:
-    """A person who tries the procedure out on a virtual bench: answers, and invisible hands do it.
+    """A person who tries the procedure on a virtual bench: the person answers, and virtual hands carry out the steps.
 
     Args:
-        person: who is asked.
-        hands: that do what was asked.
+        person: answers the questions.
+        hands: carry out the steps.
     """
 
     def __init__(self, person: Operator, hands: Hands) -> None:
@@ -227,7 +231,7 @@ class PlayedOperator:
 
     async def ask(self, question: OperatorQuestion) -> str:
         """See `Operator.ask`."""
-        if question.wants == "weight":  # there is no scale to look at
+        if question.wants == "weight":  # the person has no scale to read
             await self._hands.do(question)
             shown = self._hands.things.typed(question.about, TYPED_STEP)
             question = replace(question, text=f"{question.text} (The virtual scale shows {shown}.)")

@@ -1,4 +1,4 @@
-"""What every arm has to do, as tests. A driver's author derives a class from `ArmContract` and runs pytest::
+"""The contract of arm drivers, as tests. The author of a driver derives a class from `ArmContract` and runs pytest::
 
     class TestMyArm(ArmContract):
         @pytest.fixture
@@ -8,13 +8,13 @@
             yield ArmBench(arm, spec.plan(SCENE, ACTION), time_scale=10.0, true_poses=camera.poses, cut=line.unplug)
             arm.close()
 
-The arm stands at home, holds an empty pourer, and has not been connected. It moves in most of these tests: try an
-emulator first, and stand next to a real one with a finger on the emergency stop.
+The arm stands at home, holds an empty pourer, and is not connected yet. It moves in most of these tests: use an
+emulator first, and stand next to a real arm with a finger on the emergency stop.
 
-What a bench lacks is skipped, and pytest shows it. Without `true_poses` the contract reads the driver's own reports
-only. It then cannot check that the arm moves at all, that it moves as it reports, that it gets home, or that it stands
-still after a stop or a lost connection. Without `disturb` it cannot check that reported poses are measured, and without
-`cut` it cannot check a lost connection.
+Tests for features that a bench lacks are skipped, and pytest shows them. Without `true_poses` the contract reads the
+driver's own reports only. It then cannot check that the arm moves at all, that it moves as it reports, that it returns
+home, or that it stands still after a stop or a lost connection. Without `disturb` it cannot check that reported poses
+are measured, and without `cut` it cannot check a lost connection.
 """
 
 from __future__ import annotations
@@ -49,22 +49,22 @@ from sim_engine.scene import SampledMotion
 FloatArray = NDArray[np.float64]
 
 AT_ONCE = 2.0
-"""Longest time that an answer may take which should come at once [s]; a starved machine needs a part of it."""
+"""Time limit for calls that return immediately [s]; a fully loaded machine stays well below it."""
 
 CLOSE = math.radians(3.0)
-"""How far a tilt may be from the one that was planned or measured independently [rad]."""
+"""Largest difference of a tilt from the planned or independently measured one [rad]."""
 
 NEAR = 5e-3
-"""How far a position may be from the one that was measured independently [m]."""
+"""Largest difference of a position from the independently measured one [m]."""
 
 SPEED_MARGIN = 1.25
-"""A step between two poses may be so much longer than the stated speed allows in its time."""
+"""Factor by which a step between two poses may exceed the distance at the stated speed."""
 
 STEP_NOISE, TURN_NOISE = 2e-3, math.radians(1.0)
 """Added to the longest step between two poses, for noise of both readings [m], [rad]."""
 
 REST_TIME = 0.2
-"""An arm stands once its true pose has not changed for so long [s of bench time]."""
+"""An arm stands once its true pose has not changed for this time [s of bench time]."""
 
 REST_MOVE, REST_TURN = 5e-4, math.radians(0.3)
 """Changes of a true pose that count as none [m], [rad]."""
@@ -72,26 +72,27 @@ REST_MOVE, REST_TURN = 5e-4, math.radians(0.3)
 
 @dataclass(frozen=True)
 class ArmBench:
-    """An arm to be tried.
+    """An arm under test.
 
     Attributes:
         arm: the driver, not yet connected.
-        path: a pour that its settings have planned; its tilt lasts a second of the clock or more.
+        path: a pour planned from its settings; its tilt takes at least a second of the clock.
         time_scale: bench seconds per second of the clock.
-        jog: axis, amount and speed of a step that it may make; None: not to be tried.
-        trip: has something stop the arm that nobody ordered, as a protective stop would; None: not to be tried.
-        mend: puts right what `trip` did, as far as a person has to.
-        true_poses: the independent witness: poses of the pourer that something else than the driver has measured, as
-            the joints of an emulator or a camera. Takes a time of its own clock [s of bench time]; returns the times
-            after it, shape (T,), increasing up to now, and poses in the world, shape (T, 7): x y z [m] qw qx qy qz.
-            None: there is no witness.
+        jog: axis, amount and speed of a permitted step; None: not tested.
+        trip: stops the arm from outside, as a protective stop does; None: not tested.
+        mend: fixes the effect of `trip`, as far as a person has to.
+        true_poses: the independent witness: poses of the pourer measured by another source than the driver, such as the
+            joints of an emulator or a camera. Takes a time of its own clock [s of bench time]; returns the times after
+            it, shape (T,), increasing up to now, and poses in the world, shape (T, 7): x y z [m] qw qx qy qz. None:
+            there is no witness.
         tool_speed: largest speed of the pourer that the arm's settings allow [m/s]; None: that of the path's report.
         tilt_speed: largest angular velocity of the pourer likewise [rad/s].
-        disturb: called before a pour's first movement. The arm executes that pour otherwise than commanded: by a brake,
-            another speed or a slipping belt, by more than 5 mm or 3°, and still completes it. None: not to be tried.
-        cut: cuts the connection to the arm, by closing its socket or killing the far process; None: not to be tried.
-        restore: makes connections possible again after `cut`; None: coming home after a loss is not tried.
-        lost_within: the longest time from `cut` to the `ArmLostError` of the call under way [s of the clock].
+        disturb: called before a pour's first movement. The arm then executes that pour differently from the command (by
+            a brake, another speed or a slipping belt), by more than 5 mm or 3°, and still completes it. None: not
+            tested.
+        cut: cuts the connection to the arm, by closing its socket or killing the remote process; None: not tested.
+        restore: makes connections possible again after `cut`; None: returning home after a loss is not tested.
+        lost_within: the longest time from `cut` to the `ArmLostError` of the running call [s of the clock].
     """
 
     arm: Arm
@@ -110,22 +111,23 @@ class ArmBench:
 
 
 class ArmContract:
-    """Derive from this, in a class whose name begins with Test, with a fixture `bench`."""
+    """Derive a test class from this, with a name that begins with Test and a fixture `bench`."""
 
-    # Tests are skipped for what a bench can't do, never for what a driver can't: beside a real one nobody may be there
-    # who trips it or pulls its plug, and its author is to see what was not tried. Ours leave out as little as they can.
+    # Tests are skipped if the bench lacks a feature, never if the driver does. With a real arm there may be no one to
+    # trip it or to pull its plug, and the author must see which tests were skipped. The project's own benches skip as
+    # few tests as possible.
 
-    # ---- nothing moves without consent
+    # ---- no motion without consent
 
     def test_it_says_who_it_is(self, bench: ArmBench) -> None:
-        """People read it in records, and before they arm it."""
+        """Records and operators need the identification before the arm may move."""
         facts = bench.arm.connect()
         assert facts.model.strip()
         assert facts.problem == ""
         assert bench.arm.facts().model == facts.model
 
     def test_nothing_moves_before_somebody_has_released_it(self, bench: ArmBench) -> None:
-        """Neither after connecting nor after hands were invited in."""
+        """Not after connecting, and not after hands were invited into the cell."""
         bench.arm.connect()
         self._refuses_everything(bench)
         bench.arm.release()
@@ -134,7 +136,7 @@ class ArmContract:
         assert not bench.arm.state().moving
 
     def test_a_stop_takes_consent_back_also_where_nothing_moves(self, bench: ArmBench) -> None:
-        """And says that there was nothing to stop."""
+        """The stop reports that there was nothing to stop."""
         bench.arm.connect()
         bench.arm.release()
         assert bench.arm.stop() == 0.0
@@ -144,7 +146,7 @@ class ArmContract:
     # ---- a pour
 
     def test_a_whole_pour_is_made_as_planned_and_ends_consent(self, bench: ArmBench) -> None:
-        """Out, pour, home; what the arm read back is the motion that was planned."""
+        """Approach, pour, return home; the motion as read back is the planned one."""
         executed = self._poured(bench)
         path = bench.path
         assert executed.completed, "execute returned an incomplete pour; a motion that was broken off raises an error"
@@ -168,7 +170,7 @@ class ArmContract:
         self._refuses_everything(bench)
 
     def test_it_moves_as_it_reports_and_goes_home(self, bench: ArmBench) -> None:
-        """What an independent witness saw of a whole cycle is what the arm reports, without a jump."""
+        """The arm's reports agree with an independent witness during a whole cycle, and contain no jumps."""
         self._needs_witness(bench, "whether the arm moves as it reports, without jumps, and gets home")
         bench.arm.connect()
         bench.arm.hands_in()
@@ -186,7 +188,7 @@ class ArmContract:
         self._same(back, home, "after retreat the pourer", "home, where it was before move_to_start")
 
     def test_the_poses_it_reports_are_measured(self, bench: ArmBench) -> None:
-        """A pour that is executed otherwise than commanded is reported as it was executed."""
+        """A pour that is executed differently from the command is reported as executed."""
         if bench.disturb is None:
             pytest.skip("ArmBench.disturb is missing: not checked is whether reported poses are measured or commanded")
         before = self._poured(bench)
@@ -209,17 +211,17 @@ class ArmContract:
         )
 
     def test_the_record_of_a_pour_is_small_and_can_be_written_down(self, bench: ArmBench) -> None:
-        """It goes into the journal."""
+        """The record goes into the journal."""
         assert len(json.dumps(self._poured(bench).record())) < 100_000
 
     def test_it_pours_again(self, bench: ArmBench) -> None:
-        """From home to home, as often as somebody lets it."""
+        """From home to home, each time after a release."""
         self._poured(bench)
         bench.arm.hands_in()
         self._cycle(bench)
 
     def test_it_tells_where_it_is_while_it_pours(self, bench: ArmBench) -> None:
-        """At once, in the plan's own words."""
+        """The state is available at once, with the phase names of the plan."""
         self._to_start(bench)
         pouring = Call(bench.arm.execute, bench.path)
         self._await(bench, lambda: bench.arm.state().moving, "it never moves")
@@ -243,7 +245,7 @@ class ArmContract:
         self._states_keep_to_speeds(bench, moving)
 
     def test_it_does_one_thing_at_a_time(self, bench: ArmBench) -> None:
-        """A second motion is refused, and the first one goes on."""
+        """A second motion is refused, and the first one continues."""
         self._to_start(bench)
         pouring = Call(bench.arm.execute, bench.path)
         self._await(bench, lambda: bench.arm.state().moving, "it never moves")
@@ -254,7 +256,7 @@ class ArmContract:
     # ---- stops
 
     def test_a_stop_breaks_the_pour_off_and_tells_how_far_it_came(self, bench: ArmBench) -> None:
-        """The pourer stays where it is until somebody has it brought upright."""
+        """The pourer keeps its pose until the operator releases the motion back to upright."""
         self._to_start(bench)
         began = self._true_time(bench)
         error = self._stopped_by(bench, bench.arm.stop)
@@ -280,7 +282,7 @@ class ArmContract:
                 self._reports_what_was_seen(error.executed, self._seen(bench, began))
 
     def test_it_stands_soon_after_a_stop(self, bench: ArmBench) -> None:
-        """The call comes back when the arm stands."""
+        """The call returns when the arm stands."""
         self._tilting(bench)
         asked = time.monotonic()
         assert bench.arm.stop() < AT_ONCE
@@ -288,7 +290,7 @@ class ArmContract:
         assert not bench.arm.state().moving
 
     def test_after_a_stop_it_comes_upright_goes_home_and_pours_again(self, bench: ArmBench) -> None:
-        """Each of it after somebody's word."""
+        """Each motion needs a release."""
         home = self._home(bench)
         self._broken_off(bench, bench.arm.stop)
         self._brought_home(bench, home)
@@ -296,7 +298,7 @@ class ArmContract:
         self._cycle(bench)
 
     def test_what_stops_it_from_outside_is_told_and_mended(self, bench: ArmBench) -> None:
-        """Nobody here ordered it; the arm recovers when its cause was seen to."""
+        """The stop was not ordered; the arm recovers after its cause is fixed."""
         if bench.trip is None:
             pytest.skip("nothing stops this arm from outside")
         home = self._home(bench)
@@ -308,7 +310,7 @@ class ArmContract:
     # ---- a lost connection
 
     def test_a_connection_lost_during_a_pour_is_an_error_and_the_arm_stands(self, bench: ArmBench) -> None:
-        """The call under way ends in a stated time; consent has ended; the arm comes home after it is connected."""
+        """The running call ends within the stated time; consent ends; after a new connection the arm returns home."""
         if bench.cut is None:
             pytest.skip("ArmBench.cut is missing: not checked is what happens when the connection is lost")
         home = self._home(bench)
@@ -326,13 +328,13 @@ class ArmContract:
         self._lost(bench, Call(bench.arm.untilt, bench.path), "untilt, after release() without a connection,")
         if bench.restore is not None:
             bench.restore()
-            self._refuses_everything(bench, ArmError)  # consent has ended with the loss, not with `connect`
+            self._refuses_everything(bench, ArmError)  # the loss ended the consent, not `connect`
             bench.arm.connect()
             self._refuses_everything(bench)
             self._brought_home(bench, home)
 
     def test_a_connection_lost_at_rest_is_an_error_of_the_next_call(self, bench: ArmBench) -> None:
-        """Nothing is reported as done over a line that is cut."""
+        """No call reports success over a cut connection."""
         if bench.cut is None:
             pytest.skip("ArmBench.cut is missing: not checked is what happens when the connection is lost")
         bench.arm.connect()
@@ -345,17 +347,17 @@ class ArmContract:
         bench.arm.close()
 
     def test_errors_and_answers_travel_between_processes(self, bench: ArmBench) -> None:
-        """The driver's process is not the campaign's."""
+        """The driver runs in another process than the campaign."""
         error = self._broken_off(bench, bench.arm.stop)
         again = pickle.loads(pickle.dumps(error))
         assert (str(again), again.kind, again.phase, again.tilt) == (str(error), error.kind, error.phase, error.tilt)
         for value in (bench.path, bench.arm.state()):
             pickle.loads(pickle.dumps(value))
 
-    # ---- by hand, and the end
+    # ---- jogging, and the end
 
     def test_a_step_by_hand_needs_a_word_each(self, bench: ArmBench) -> None:
-        """And the arm says where it stands."""
+        """Each step needs a release, and the arm reports its pose."""
         if bench.jog is None:
             pytest.skip("this arm makes no steps")
         bench.arm.connect()
@@ -374,12 +376,12 @@ class ArmContract:
             bench.arm.jog(axis, 1e3, speed)
 
     def test_it_is_let_go_of_twice_without_harm(self, bench: ArmBench) -> None:
-        """Whoever ends a bench closes everything."""
+        """Several parts of a bench may close the arm."""
         bench.arm.connect()
         bench.arm.close()
         bench.arm.close()
 
-    # ---- how
+    # ---- helpers
 
     def _refuses_everything(self, bench: ArmBench, with_error: type[Exception] = ArmNotReleasedError) -> None:
         for motion in (bench.arm.move_to_start, bench.arm.execute, bench.arm.retreat):
@@ -473,7 +475,7 @@ class ArmContract:
             )
 
     def _watched(self, bench: ArmBench, motion: Callable[[Any], object]) -> list[ArmState]:
-        """Make a motion; the states that showed it moving."""
+        """Run a motion; return the states during it."""
         going, seen = Call(motion, bench.path), []
         while going.is_alive():
             state = bench.arm.state()
@@ -493,7 +495,7 @@ class ArmContract:
             pytest.skip(f"ArmBench.true_poses is missing: not checked is {unchecked}")
 
     def _home(self, bench: ArmBench) -> FloatArray | None:
-        """Where the pourer truly is before the first motion, shape (7,); None without a witness."""
+        """True pose of the pourer before the first motion, shape (7,); None without a witness."""
         return None if bench.true_poses is None else self._rest(bench)
 
     @staticmethod
@@ -514,7 +516,7 @@ class ArmContract:
         return float(times[-1])
 
     def _rest(self, bench: ArmBench) -> FloatArray:
-        """Wait until the arm truly stands; the pose of the pourer, shape (7,)."""
+        """Wait until the arm truly stands; return the pose of the pourer, shape (7,)."""
         assert bench.true_poses is not None
         since, end = self._true_time(bench), time.monotonic() + PATIENCE
         while True:
@@ -558,7 +560,7 @@ class ArmContract:
         )
 
     def _keeps_to_its_speeds(self, bench: ArmBench, times: FloatArray, poses: FloatArray, source: str) -> None:
-        """No step between two poses is longer than the stated speeds allow in the time between them."""
+        """Check that no step between two poses is longer than the stated speeds allow."""
         tool_speed, tilt_speed = self._limits(bench)
         ways, turns = _differences(poses[1:], poses[:-1])
         took = np.diff(times)
@@ -610,10 +612,10 @@ def _differences(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _apart(
     times: FloatArray, poses: FloatArray, other_times: FloatArray, other_poses: FloatArray
 ) -> tuple[float, float, float]:
-    """How far a motion is from another one whose clock is shifted by an unknown time.
+    """Largest difference between two motions whose clocks differ by an unknown shift.
 
     Returns:
-        Distance [m], angle [rad] and time [s] where both differ most, for the shift at which they differ least.
+        Distance [m], angle [rad] and time [s] of the largest difference, for the shift with the smallest differences.
     """
     other = SampledMotion(other_times, other_poses)
 

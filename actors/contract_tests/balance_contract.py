@@ -1,4 +1,5 @@
-"""What every balance has to do, as tests. A driver's author derives a class from `BalanceContract` and runs pytest::
+"""The contract of balance drivers, as tests. The author of a driver derives a class from `BalanceContract` and runs
+pytest::
 
     class TestMyBalance(BalanceContract):
         @pytest.fixture
@@ -7,9 +8,10 @@
             yield BalanceBench(driver, put=ask_somebody_to_put, tolerance=0.2e-3)
             driver.close()
 
-`put` changes what stands on the balance; before a real one it asks the operator. What a bench lacks is skipped, and
-pytest shows it. Without `restless` the contract cannot check that a moving value is never taken for a weight, without
-`unplug` and `plug` not that a lost connection is an error, without `ignore_tare` not that a tare without effect is one.
+`put` changes the load on the balance; with a real one it asks the operator. Tests for features that a bench lacks are
+skipped, and pytest shows them. Without `restless` the contract cannot check that a moving value is never taken for a
+weight. Without `unplug` and `plug` it cannot check that a lost connection is an error, and without `ignore_tare` that a
+tare without effect is one.
 """
 
 from __future__ import annotations
@@ -27,27 +29,28 @@ from actors.contract_tests.contract_calls import PATIENCE, Call
 from actors.interfaces import LaboratoryError
 
 AT_ONCE = 2.0
-"""Longest time that an answer may take which should come at once [s]; a starved machine needs a part of it."""
+"""Time limit for calls that return immediately [s]; a fully loaded machine stays well below it."""
 
 READINGS = 10
-"""Readings of a moving display, none of which may be stable."""
+"""Number of readings of a moving display, none of which may be stable."""
 
 
 @dataclass(frozen=True)
 class BalanceBench:
-    """A balance to be tried, empty, and hands beside it.
+    """A balance under test, without a load.
 
     Attributes:
         driver: the driver, not yet connected.
-        put: puts so much on it, in place of what was there [kg].
-        tolerance: how far a weight may be off: step and scatter of the balance [kg].
-        load: something that it weighs well [kg].
-        capacity: more than it weighs [kg]; None: not to be tried.
-        unplug, plug: pull the plug of its line, and put it in again; None: not to be tried.
-        restless: has the load move from now on, or come to rest again; None: not to be tried.
-        ignore_tare: has the balance take tare and do nothing from now on, or obey again; None: not to be tried.
-        lost_within: the longest time from `unplug` to the error of a call under way [s of the clock].
-        make: class and arguments that the driver was made of, to be made in another process.
+        put: replaces the load on the balance [kg].
+        tolerance: largest error of a weight: step and scatter of the balance [kg].
+        load: a load within its range [kg].
+        capacity: a load above its range [kg]; None: not tested.
+        unplug, plug: unplug its line and plug it in again; None: not tested.
+        restless: makes the load move from now on, or rest again; None: not tested.
+        ignore_tare: makes the balance accept a tare without executing it from now on, or execute it again; None: not
+            tested.
+        lost_within: the longest time from `unplug` to the error of a running call [s of the clock].
+        make: class and arguments of the driver, to create it in another process.
     """
 
     driver: BalanceDriver
@@ -64,17 +67,18 @@ class BalanceBench:
 
 
 class BalanceContract:
-    """Derive from this, in a class whose name begins with Test, with a fixture `bench`."""
+    """Derive a test class from this, with a name that begins with Test and a fixture `bench`."""
 
-    # Tests are skipped for what a bench can't do, never for what a driver can't: beside a real one nobody may be there
-    # who trips it or pulls its plug, and its author is to see what was not tried. Ours leave out as little as they can.
+    # Tests are skipped if the bench lacks a feature, never if the driver does. With a real balance there may be no one
+    # to pull its plug, and the author must see which tests were skipped. The project's own benches skip as few tests as
+    # possible.
 
     def test_it_says_who_it_is(self, bench: BalanceBench) -> None:
-        """People read it in `decant doctor`."""
+        """`decant doctor` shows the identification."""
         assert bench.driver.connect().strip()
 
     def test_it_weighs_what_is_put_on_it(self, bench: BalanceBench) -> None:
-        """In kilograms, and only what has settled counts."""
+        """In kilograms, and only settled weights count."""
         bench.driver.tare()
         for mass in (bench.load, 0.5 * bench.load, bench.load):
             before = bench.driver.read()
@@ -88,7 +92,7 @@ class BalanceContract:
             )
 
     def test_the_display_follows_what_is_put_on_it(self, bench: BalanceBench) -> None:
-        """An old reading is not shown as a new one."""
+        """An old reading is not reported as a new one."""
         bench.driver.tare()
         before = bench.driver.read()
         for mass in (bench.load, 0.5 * bench.load):
@@ -103,14 +107,14 @@ class BalanceContract:
         self._shows(bench, 0.0)
 
     def test_times_of_weights_go_forwards(self, bench: BalanceBench) -> None:
-        """They are matched with what the arm did."""
+        """Times relate weights to the motion of the arm."""
         first, second = bench.driver.weigh(), bench.driver.weigh()
         assert second.time > first.time, (
             f"weigh() returns a weight of the time {second.time:.3f} s, after one of the time {first.time:.3f} s"
         )
 
     def test_a_tare_counts_what_is_there_as_nothing(self, bench: BalanceBench) -> None:
-        """What is taken away afterwards reads below zero."""
+        """A load that is removed after the tare gives a negative weight."""
         bench.put(bench.load)
         bench.driver.tare()
         self._is(bench, bench.driver.weigh(), 0.0, "after tare weigh()")
@@ -120,7 +124,7 @@ class BalanceContract:
         self._is(bench, bench.driver.weigh(), -bench.load, "after tare of a load that was taken away weigh()")
 
     def test_a_tare_without_effect_is_an_error(self, bench: BalanceBench) -> None:
-        """Balances acknowledge commands that they do not execute; a pour would start from a wrong zero."""
+        """Balances may acknowledge commands without executing them; a pour would start from a wrong zero."""
         if bench.ignore_tare is None:
             pytest.skip("BalanceBench.ignore_tare is missing: not checked is whether a tare without effect is an error")
         bench.put(bench.load)
@@ -143,7 +147,7 @@ class BalanceContract:
             bench.restless(False)
 
     def test_a_moving_display_is_not_called_stable(self, bench: BalanceBench) -> None:
-        """People read it during a pour, and records keep it."""
+        """The operator reads the display during a pour, and records keep it."""
         if bench.restless is None:
             pytest.skip("BalanceBench.restless is missing: not checked is whether a moving display is called stable")
         bench.driver.weigh()
@@ -167,7 +171,7 @@ class BalanceContract:
         )
 
     def test_looking_changes_no_weight_and_takes_no_time(self, bench: BalanceBench) -> None:
-        """The display is watched during a pour."""
+        """The display is read during a pour."""
         bench.driver.tare()
         bench.put(bench.load)
         bench.driver.weigh()
@@ -216,7 +220,7 @@ class BalanceContract:
             bench.restless(False)
 
     def test_more_than_it_carries_is_an_error_and_not_a_weight(self, bench: BalanceBench) -> None:
-        """And it weighs again once it is relieved."""
+        """The balance weighs again after the overload is removed."""
         if bench.capacity is None:
             pytest.skip("this balance is not to be overloaded")
         bench.driver.tare()
@@ -227,13 +231,13 @@ class BalanceContract:
         self._is(bench, bench.driver.weigh(), bench.load, "after an overload was taken away weigh()")
 
     def test_a_lost_connection_puts_the_tare_in_doubt(self, bench: BalanceBench) -> None:
-        """A balance that was off begins at a new zero: no weight until a person has said that the tare holds."""
+        """A balance that was off has a new zero: no weight is returned until the operator confirms the tare."""
         if bench.unplug is None or bench.plug is None:
             pytest.skip("this balance has no plug to pull")
         bench.driver.tare()
         bench.put(bench.load)
         bench.unplug()
-        bench.driver.read()  # watching never fails
+        bench.driver.read()  # read() never fails
         bench.plug()
         with pytest.raises(ReferenceLostError):
             bench.driver.weigh()
@@ -241,7 +245,7 @@ class BalanceContract:
         self._is(bench, bench.driver.weigh(), bench.load, "after keep_reference weigh()")
 
     def test_a_lost_connection_is_an_error_and_no_weight(self, bench: BalanceBench) -> None:
-        """Calls end in a stated time, the call under way too; what is shown is not the last weight."""
+        """Calls end within the stated time, including the running one; the display does not keep the last weight."""
         if bench.unplug is None or bench.plug is None:
             pytest.skip("BalanceBench.unplug or plug is missing: not checked is what a lost connection comes to")
         bench.driver.tare()
@@ -268,18 +272,18 @@ class BalanceContract:
                 bench.restless(False)
 
     def test_it_can_be_made_where_the_bench_is(self, bench: BalanceBench) -> None:
-        """Class and settings travel to another process."""
+        """Class and settings can be sent to another process."""
         if not bench.make:
             pytest.skip("it was not said what the driver is made of")
         assert pickle.loads(pickle.dumps(bench.make)) is not None
 
     def test_closing_twice_does_no_harm(self, bench: BalanceBench) -> None:
-        """Ends overlap."""
+        """Several parts of a bench may close the driver."""
         bench.driver.connect()
         bench.driver.close()
         bench.driver.close()
 
-    # ---- how
+    # ---- helpers
 
     @staticmethod
     def _is(bench: BalanceBench, weight: Weight, mass: float, call: str) -> None:

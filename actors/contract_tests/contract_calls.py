@@ -1,4 +1,4 @@
-"""What the contracts share: a call in a thread of its own, and how long a result may take."""
+"""Shared by the contracts: a call in a thread of its own, and the time limit for results."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Callable
 from typing import Any
 
 PATIENCE = 60.0
-"""After which something that should have happened has not [s]."""
+"""Time after which an expected event counts as missing [s]."""
 
 
 class Call(threading.Thread):
-    """A blocking call that goes on in a thread."""
+    """A blocking call that runs in a thread."""
 
     def __init__(self, call: Callable[..., Any], *arguments: Any) -> None:
         super().__init__(daemon=True)
@@ -28,7 +28,7 @@ class Call(threading.Thread):
             self.error = error
 
     def ended(self) -> Exception | None:
-        """Wait for its end; what it raised."""
+        """Wait for the end of the call; return the exception that it raised, or None."""
         self.join(PATIENCE)
         assert not self.is_alive(), f"the call has not come back after {PATIENCE:g} s"
         return self.error

@@ -1,1 +1,1 @@
-"""Emulated devices that speak the real protocols."""
+"""Emulated devices that use the protocols of the real ones."""

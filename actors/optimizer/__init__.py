@@ -1,1 +1,1 @@
-"""The Bayesian optimiser: linear algebra, and one actor around it."""
+"""The Bayesian optimiser: numerical code, and the actor that runs it."""

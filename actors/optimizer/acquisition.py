@@ -1,4 +1,4 @@
-"""Where to look next: lower confidence bound, local penalisation of busy places, and the search for its minimum."""
+"""Acquisition functions: lower confidence bound, local penalisation of pending points, search for the minimum."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ def lower_confidence_bound(surrogate: Surrogate, kappa: float) -> Score:
 def penalised(
     score: Score, surrogate: Surrogate, busy: Array, candidates: Array, feasibility: Feasibility | None = None
 ) -> Score:
-    """A score that also stays away from points whose answers are still out, and from likely refusals and failures.
+    """Return a score that also avoids pending points, and likely refusals and failures.
 
-    Around each busy point lies a ball in which, judging by the surrogate's steepest slope, the minimum can't be; the
-    score is divided by the probability of being outside it, and by that of not being refused. No cost has to be
-    invented for the busy points, nor for the refused ones.
+    Each pending point has a ball that cannot contain the minimum, according to the surrogate's steepest slope. The
+    score is divided by the probability of being outside all balls, and by the probability of not being refused. Pending
+    and refused points therefore need no invented cost.
 
     Args:
         score: to be minimised.
         surrogate: of the cost.
-        busy: (b, dimension).
-        candidates: (m, dimension), from which slope, lowest mean and the score's range are estimated.
-        feasibility: of requests; None while nothing was refused.
+        busy: pending points (b, dimension).
+        candidates: (m, dimension), for the estimates of slope, lowest mean and the score's range.
+        feasibility: of requests; None if no request was refused.
 
     Returns:
         A new score to be minimised: −log(softplus(−score)) − Σ log φ_j − log P, score in units of its spread.
@@ -75,7 +75,7 @@ def _outside(surrogate: Surrogate, busy: Array, candidates: Array) -> Score:
     slope = _steepest_slope(surrogate, candidates[:: max(1, len(candidates) // 64)])
     relief = float(all_means.max()) - lowest
     slope = max(slope, relief / np.sqrt(candidates.shape[1]), 1e-9)
-    # where the surrogate is sure of itself the ball would vanish, and two identical trials be asked for
+    # if the surrogate's deviation is near 0, the ball would vanish and two identical trials would be proposed
     deviation = np.maximum(deviation, max(0.05 * relief, 1e-9))
 
     def log_probability(points: Array) -> Array:
@@ -88,9 +88,9 @@ def _outside(surrogate: Surrogate, busy: Array, candidates: Array) -> Score:
 def spread_out(
     count: int, taken: Array, region: Region, rng: np.random.Generator, feasibility: Feasibility | None = None
 ) -> Array:
-    """(count, dimension) Sobol points; where points are taken already (k, dimension), those farthest from them.
+    """(count, dimension) Sobol points; given taken points (k, dimension), the points farthest from them.
 
-    With refusals the distance counts by the probability of not being refused.
+    With refusals, the distance is weighted by the probability of not being refused.
     """
     if len(taken) == 0:
         return region.draw(count, rng, even=True)
@@ -106,20 +106,20 @@ def spread_out(
 
 
 def _round_the_cube(points: Array, others: Array) -> Array:
-    """(m, k) distances where opposite faces of the cube touch: else the farthest points would all be corners."""
+    """(m, k) distances on a torus, where opposite faces touch; otherwise the farthest points would all be corners."""
     gap = np.abs(points[:, None, :] - others[None, :, :])
     return np.asarray(np.linalg.norm(np.minimum(gap, 1.0 - gap), axis=2))
 
 
 def search_candidates(region: Region, dimension: int, around: Sequence[Array], rng: np.random.Generator) -> Array:
-    """Places to score first: a Sobol cover of the region, and clouds around known good points. (m, dimension)."""
+    """Candidates to score first: Sobol points over the region, and clouds around known good points. (m, dimension)."""
     cover = region.draw(512 if dimension <= 2 else 1024, rng, even=True)
     clouds = [_cloud(region, point, spread, 16, rng) for point in around for spread in (0.1, 0.02)]
     return np.concatenate([cover, *clouds])
 
 
 def minimise(score: Score, candidates: Array, region: Region, rng: np.random.Generator) -> Array:
-    """Minimiser of a score over the region: the best candidates, then shrinking clouds around them. (dimension,)."""
+    """Minimise a score over the region: the best candidates, then shrinking clouds around them. (dimension,)."""
     values = score(candidates)
     leaders = candidates[np.argsort(values, kind="stable")[:3]]
     best, lowest = leaders[0], float(values.min())
@@ -135,7 +135,7 @@ def minimise(score: Score, candidates: Array, region: Region, rng: np.random.Gen
 
 
 def _cloud(region: Region, point: Array, spread: float, count: int, rng: np.random.Generator) -> Array:
-    """At most `count` allowed points around one."""
+    """At most `count` allowed points around a point."""
     cloud = region.snap(np.clip(point + spread * rng.standard_normal((count, len(point))), 0.0, 1.0))
     return cloud[region.allows(cloud)]
 

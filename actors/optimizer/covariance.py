@@ -1,11 +1,11 @@
-"""Prior covariance of what was observed, really and in simulation, with the gradients that a fit needs.
+"""Prior covariance of real and simulated observations, with the gradients that a fit needs.
 
     f_s ~ GP(0, σ² M_ℓ)                     the simulated cost
     f_r = ρ f_s + β + δ                     the real one: β ~ N(0, τ²), δ ~ GP(0, σ_δ² M_ℓδ)
-    y_i = f + ε_i,  ε_i ~ N(0, n_i²)        n_i: the source's own, and it may depend on the action
+    y_i = f + ε_i,  ε_i ~ N(0, n_i²)        n_i: one per source, and it may depend on the action
 
-M is the Matérn 5/2 correlation. Without simulations only σ, ℓ and n are left: ordinary regression. Pooling has ρ = 1
-and δ = 0, and lets the simulations' n say how far they may be from the truth.
+M is the Matérn 5/2 correlation. Without simulations only σ, ℓ and n are left: ordinary regression. The pooled model has
+ρ = 1 and δ = 0; the simulations' n then includes their discrepancy.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ Pullback = Callable[[Array], Array]
 class HyperPrior:
     """Priors over the hyperparameters, in units of the cube (lengths) and of the cost's scale (the others).
 
-    Each pair is (median, standard deviation of the logarithm), but for ρ and the noise's growth (mean, standard
-    deviation). With few observations the maximum of the likelihood alone is unreliable: on a plateau its lengthscales
-    grow without bound and the model claims to know everything.
+    Each pair is (median, standard deviation of the logarithm), except for ρ and the noise's growth (mean, standard
+    deviation). With few observations the maximum of the likelihood alone is unreliable: on a plateau the lengthscales
+    grow without bound, and the model becomes overconfident.
 
     Attributes:
         length: of each axis' lengthscale.
         signal: of the signal's standard deviation.
         noise: of the observations' standard deviation.
-        simulated_noise: of the simulations', discrepancy included.
+        simulated_noise: of the simulations' standard deviation, discrepancy included.
         offset: of the standard deviation of a constant between simulated and real cost.
         rho: of the scale between simulated and real cost.
-        delta_signal: of the standard deviation of what the simulation lacks.
-        delta_length: of its lengthscale, one for all axes.
+        delta_signal: of the standard deviation of the simulation's discrepancy δ.
+        delta_length: of the discrepancy's lengthscale, one for all axes.
         noise_growth: of the coefficients of the noise's logarithm.
     """
 
@@ -75,10 +75,10 @@ class PriorCovariance(Protocol):
 
 
 def matern(first: Array, second: Array, lengths: Array) -> tuple[Array, Array]:
-    """Matérn 5/2 correlation (m, k) between points (m, d) and (k, d), and −∂/∂(r²/2) of it, r in lengthscales.
+    """Matérn 5/2 correlation (m, k) between points (m, d) and (k, d), and its −∂/∂(r²/2), r in lengthscales.
 
-    The correlation is scikit-learn's. Its gradients there are arrays (m, k, d), one slice for each lengthscale; the
-    factor that all of them share makes a fit three times as fast.
+    The correlation is that of scikit-learn. Its gradients there are arrays (m, k, d), one slice per lengthscale. The
+    common factor of all slices makes a fit three times as fast.
 
     Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, equation 4.17.
     """
@@ -93,13 +93,13 @@ def matern_correlation(first: Array, second: Array, lengths: Array) -> Array:
 
 
 def _distances(first: Array, second: Array, lengths: Array) -> tuple[Array, Array]:
-    """√5 r and its falling exponential, r being the distance in lengthscales."""
+    """√5 r and exp(−√5 r), r being the distance in lengthscales."""
     s = cdist(first / lengths, second / lengths) * np.sqrt(5.0)
     return s, np.exp(-s)
 
 
 class Covariance:
-    """See the module. Hyperparameters θ are logarithms, but for ρ and the noise's growth.
+    """The covariance of the module docstring. Hyperparameters θ are logarithms, except for ρ and the noise's growth.
 
     Attributes:
         points: (n, dimension) of all observations.
@@ -120,16 +120,16 @@ class Covariance:
         known: PriorCovariance | None = None,
         unit: float = 1.0,
     ) -> None:
-        """Which terms there are.
+        """Select the terms of the model.
 
         Args:
             points: (n, dimension).
             prior: over the hyperparameters.
-            real: (n,), which observations are real; None: all, and there is no simulation in the model.
-            scaled: ρ and δ are fitted; else ρ = 1 and δ = 0.
-            growth: (n, q): log n_i grows with these features; None: it does not.
+            real: (n,), which observations are real; None: all, and the model has no simulation.
+            scaled: whether ρ and δ are fitted; otherwise ρ = 1 and δ = 0.
+            growth: (n, q): log n_i grows with these features; None: constant noise.
             known: further covariance of the real cost.
-            unit: in which costs are measured here, for `known`.
+            unit: of the costs here, for `known`.
         """
         self.points = points
         self._real = real
@@ -162,7 +162,7 @@ class Covariance:
         self.bounds: Array = np.array([np.log(limits) if log else limits for _, _, limits, log in rows])
 
     def value(self, theta: Array, name: str) -> float:
-        """One hyperparameter as it enters the model (not its logarithm); those that are left out change nothing."""
+        """One hyperparameter as it enters the model (not its logarithm); for an absent one, its neutral value."""
         if name not in self.names:
             return {"rho": 1.0}.get(name, 0.0)
         found = float(theta[self.names.index(name)])
@@ -184,7 +184,7 @@ class Covariance:
         return noise if self._growth is None else noise * np.exp(self._growth @ self.growth(theta))
 
     def observed(self, theta: Array) -> tuple[Array, Pullback]:
-        """Covariance of the observations (n, n), and the way back: symmetric W (n, n) → Σ W_ij ∂K_ij/∂θ (p,)."""
+        """Covariance of the observations (n, n), and its pullback: symmetric W (n, n) → Σ W_ij ∂K_ij/∂θ (p,)."""
         d, mask, real = self.points.shape[1], self._mask, self._loads
         lengths, rho = self.lengths(theta), self.value(theta, "rho")
         correlation, slope = matern(self.points, self.points, lengths)

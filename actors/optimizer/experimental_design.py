@@ -1,4 +1,4 @@
-"""Which pour to weigh next: the one that would tell most about those that are to be predicted."""
+"""Experimental design for calibration: the pour that reduces the uncertainty of predictions most."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class WeighedDesign:
-    """Pours that have been made.
+    """Weighed pours.
 
     Attributes:
         contexts: (n, c).
-        offsets: (n,) weighed spillage minus what the differences of the surrogate were formed with.
-        noise: standard deviation of a weighed pour around what it is on average.
+        offsets: (n,) weighed spillage minus the spillage with which the surrogate's differences were formed.
+        noise: standard deviation of a weighed pour around its mean.
     """
 
     contexts: Array
@@ -32,31 +32,33 @@ class WeighedDesign:
 def expected_reductions(
     process: GaussianProcess, thetas: Array, lacks: Array, weighed: WeighedDesign, candidates: Array, targets: Array
 ) -> tuple[Array, float]:
-    """By how much weighing a pour is expected to lower the variance of predictions.
+    """Expected reductions of the variance of predictions by weighing one more pour.
 
-    Given θ, weighed less simulated spillage at a context is Gaussian: e ~ N(0, S + σ_δ² M) as in the posterior, and the
-    pours made so far say what it is near them: its mean and variance v(c) there are conditional on them. Over equally
-    likely θ what is expected at c, so corrected, and what is simulated at t have the covariance C(c, t). To second
-    order in these moments weighing c takes from the variance at t, whatever comes of it,
+    Given θ, weighed minus simulated spillage at a context is Gaussian: e ~ N(0, S + σ_δ² M), as in the posterior. Its
+    mean and variance v(c) near the earlier pours are conditional on them. Over equally likely θ, the expected value at
+    c (corrected by this mean) and the simulated value at t have the covariance C(c, t). To second order in these
+    moments, weighing c reduces the variance at t, independent of the outcome, by
 
         C(c, t)² / (C(c, c) + v(c) + n²).
 
-    So a pour counts for little where all θ agree, where one was made already, where the surrogate is vague, or where
-    what it tells concerns no target. The surrogate's own doubt at targets is left out: they can be simulated.
+    A pour therefore has a low value if all θ agree on it, if it was already made, if the surrogate is uncertain there,
+    or if it is unrelated to the targets. The surrogate's own uncertainty at targets is left out, because targets can be
+    simulated.
 
     Args:
-        process: of signed differences (to nothing: minus the simulated spillage) over (θ, context).
+        process: of signed differences (to zero: minus the simulated spillage) over (θ, context).
         thetas: (J, dimension) draws, in the unit cube.
         lacks: (J,) σ_δ of each.
+        weighed: the pours made so far.
         candidates: (M, c) contexts at which a pour could be weighed.
         targets: (T, c) contexts that are to be predicted.
 
     Returns:
-        (M,) mean reductions over the targets, and the mean variance over them as it is: of θ alone.
+        (M,) reductions, averaged over the targets, and the current variance due to θ, averaged over the targets.
 
     Source: Cohn, Neural network exploration using optimal experiment design, 1996 (expected reduction of variance);
-        linear Bayes: Goldstein & Wooff, Bayes Linear Statistics, 2007.
-    Limitations: Gaussian to second order: what a pour tells about a bend of the response is seen only in the mean.
+    linear Bayes: Goldstein & Wooff, Bayes Linear Statistics, 2007.
+    Limitations: Gaussian to second order; the effect of a pour on a bend of the response enters only through the mean.
     """
     n, m = len(weighed.contexts), len(candidates)
     poured = np.concatenate([weighed.contexts, candidates])

@@ -1,4 +1,7 @@
-"""Where proposals may lie: whole numbers, linear constraints, and places that were refused."""
+"""The feasible region of proposals: integer axes, linear constraints, and a model of refused requests.
+
+`Region` contains the allowed points; `Feasibility` estimates the probability that a request is not refused.
+"""
 
 from __future__ import annotations
 
@@ -28,12 +31,12 @@ _MOST_DRAWN = 2**15
 
 
 class Region:
-    """The part of the unit cube that proposals may lie in.
+    """The part of the unit cube that may contain proposals.
 
-    Integer axes have as many places as values: what is rounded later is rounded before the surrogate sees it.
+    An integer axis has as many places as values: values are rounded before they enter the surrogate.
 
     Source: Garrido-Merchán & Hernández-Lobato, Dealing with categorical and integer-valued variables in Bayesian
-        optimization with Gaussian processes, Neurocomputing 2020.
+    optimization with Gaussian processes, Neurocomputing 2020.
     """
 
     def __init__(self, space: Space, constraints: Sequence[Linear]) -> None:
@@ -43,7 +46,7 @@ class Region:
         self._rows = [([(index[name], weight) for name, weight in c.weights], c.upper) for c in constraints]
 
     def snap(self, points: Array) -> Array:
-        """Points (m, ≥ dimension) with integer axes at whole numbers; further coordinates are left alone."""
+        """Points (m, ≥ dimension) with integer axes rounded; further coordinates are unchanged."""
         if not self._integers:
             return points
         snapped = points.copy()
@@ -52,7 +55,7 @@ class Region:
         return snapped
 
     def allows(self, points: Array) -> Mask:
-        """Which points (m, dimension) meet all constraints: (m,)."""
+        """Which points (m, dimension) satisfy all constraints: (m,)."""
         allowed = np.ones(len(points), dtype=np.bool_)
         for weights, upper in self._rows:
             parts = [weight * self._decoded(i, points[:, i]) for i, weight in weights]
@@ -63,13 +66,16 @@ class Region:
     def draw(
         self, count: int, rng: np.random.Generator, *, even: bool, law: Callable[[Array], Array] | None = None
     ) -> Array:
-        """(count, dimension) allowed points: of a scrambled Sobol sequence if `even`, else independent ones.
+        """(count, dimension) allowed points: of a scrambled Sobol sequence if `even`, otherwise independent ones.
 
         Args:
-            law: makes points of another distribution of uniform ones (m, dimension).
+            count: number of points.
+            rng: random number generator.
+            even: whether to use a Sobol sequence.
+            law: transforms uniform points (m, dimension) to another distribution.
 
         Raises:
-            ValueError: the constraints leave next to nothing.
+            ValueError: too few points of the space satisfy all constraints.
         """
         d = self._space.dimension
         sequence = qmc.Sobol(d, scramble=True, rng=rng) if even else None
@@ -98,8 +104,8 @@ class Kind:
 
     Attributes:
         fulfilled: places (n, dimension).
-        refused: places (k ≥ 1, dimension); what is among both counts as refused.
-        by_chance: the same request may be fulfilled one time and fail the next.
+        refused: places (k ≥ 1, dimension); a place in both counts as refused.
+        by_chance: whether the same request may succeed one time and fail the next.
     """
 
     fulfilled: Array
@@ -108,14 +114,14 @@ class Kind:
 
 
 class Feasibility:
-    """How likely a request at a place is not refused, from where some were and where others were not.
+    """Probability that a request is not refused, estimated from fulfilled and refused requests.
 
-    A GP of the label (1 fulfilled, −1 refused) with prior mean 1: what nobody asked for is taken to be allowed. The
-    probability is that of a positive latent label; of several kinds of request, which may be refused for other reasons,
-    the product.
+    The model is a GP of the label (1 fulfilled, −1 refused) with prior mean 1: unexplored places count as allowed. The
+    probability is that of a positive latent label. Several kinds of requests may be refused for different reasons;
+    their probabilities are multiplied.
 
-    Source: least-squares classification, Rasmussen & Williams, chapter 6.5; weighing an acquisition by it: Gardner et
-        al., Bayesian optimization with inequality constraints, ICML 2014.
+    Source: least-squares classification, Rasmussen & Williams, chapter 6.5; as a weight of an acquisition: Gardner et
+    al., Bayesian optimization with inequality constraints, ICML 2014.
     """
 
     def __init__(self, *kinds: Kind) -> None:
@@ -129,13 +135,13 @@ class Feasibility:
         return _log_positive(self._processes, points)
 
     def made(self, points: Array) -> Array:
-        """Probabilities (m,) at points (m, dimension) that what may fail by chance doesn't; 1 where nothing may."""
+        """Probabilities (m,) at points (m, dimension) that no random failure occurs; 1 without random failures."""
         return np.exp(_log_positive(self._chancy, points))
 
     def likely(self, points: Array) -> Mask:
-        """Which points (m, dimension) were not refused and more likely than not are not: (m,).
+        """Which points (m, dimension) were not refused and have a probability above 0.5 of not being refused: (m,).
 
-        If that leaves none, all that were not refused; if that leaves none either, all.
+        If there is none, all points that were not refused; if there is none either, all points.
         """
         other = cdist(points, self._refused).min(axis=1) > _SAME
         likely = other & (self.log_probability(points) > -math.log(2.0))
@@ -163,7 +169,7 @@ def _labelled(kind: Kind) -> GaussianProcess:
 
 
 def _values(axis: Axis, units: Array) -> Array:
-    """`Axis.decode` of many, not rounded."""
+    """Vectorised `Axis.decode` without rounding."""
     u = np.clip(units, 0.0, 1.0)
     if axis.scale == "log":
         return np.asarray(np.exp(math.log(axis.lower) + u * (math.log(axis.upper) - math.log(axis.lower))))
@@ -171,7 +177,7 @@ def _values(axis: Axis, units: Array) -> Array:
 
 
 def _units(axis: Axis, values: Array) -> Array:
-    """`Axis.encode` of many."""
+    """Vectorised `Axis.encode`."""
     if axis.scale == "log":
         values = np.maximum(values, 1e-300)
         return np.asarray((np.log(values) - math.log(axis.lower)) / (math.log(axis.upper) - math.log(axis.lower)))

@@ -1,8 +1,9 @@
 """Gaussian-process surrogates of a noisy cost on the unit cube: fitted by MAP, bounded, always finite.
 
-Hyperparameters by maximum a posteriori: likelihood, log-priors, their gradient, and a bounded search.
-
-The band of a single observation: the shortest interval that holds it with a given probability.
+`GaussianProcess` is the fitted model. `maximum_a_posteriori` fits its hyperparameters: likelihood, log-priors, their
+gradient, and a bounded search. The functions `..._process` build the surrogates for the different prior means.
+`highest_density_intervals` returns the shortest interval that contains a single observation with a given probability.
+Kernels are in `covariance`.
 """
 
 from __future__ import annotations
@@ -46,13 +47,13 @@ class Fitted:
 def maximum_a_posteriori(
     covariance: Covariance, residuals: Array, starts: Sequence[Array], iterations: int = ITERATIONS
 ) -> Fitted:
-    """Fit.
+    """Fit the hyperparameters.
 
     Args:
         covariance: of the observations.
         residuals: (n,), costs less their prior mean, in units of the scale.
         starts: of the search, (p,) each, at least one.
-        iterations: of the search from each; 0 takes the first start as it is.
+        iterations: of the search from each; 0 uses the first start unchanged.
 
     Raises:
         ValueError: no start gave a covariance that can be factorised.
@@ -109,7 +110,7 @@ Mean = Callable[[Array], Array]
 
 
 class Surrogate(Protocol):
-    """What an acquisition needs to know of a model of the cost."""
+    """The interface of a cost model that acquisition functions use."""
 
     def predict(self, points: Array) -> tuple[Array, Array]:
         """Posterior mean and standard deviation of the noise-free cost.
@@ -125,19 +126,19 @@ class Surrogate(Protocol):
 
 CONSTANT_PRIOR = HyperPrior()
 RESIDUAL_PRIOR = HyperPrior(signal=(0.4, 0.7), noise=(0.07, 1.0))
-"""Prior of what reality adds to the simulation: smaller than the cost itself, but free to be as large."""
+"""Prior of the difference between reality and simulation: smaller than the cost itself, but free to be as large."""
 
 POOLED_PRIOR = HyperPrior(noise=(0.05, 0.4), simulated_noise=(0.3, 1.0))
-"""Pours have little noise, simulations much: where they contradict each other the simulations must give way."""
+"""Pours have little noise, simulations much: if they contradict each other, the pours dominate."""
 
 SCALED_PRIOR = HyperPrior(rho=(1.0, 1.0), delta_signal=(0.6, 0.7))
-"""Wide, so that a simulation that is the wrong way round can be found out."""
+"""Wide, so that a simulation with the opposite trend can be detected."""
 
 SMALLEST_SCALE = 1e-60
 """Smallest unit of costs; fourth powers of a smaller one (products of covariances) leave the range of floats."""
 
 VARYING_FROM = 20
-"""Observations below which the noise is taken for constant: fewer can't tell."""
+"""Number of observations below which the noise is taken as constant: fewer cannot determine its variation."""
 
 
 class GaussianProcess:
@@ -147,11 +148,11 @@ class GaussianProcess:
         points: (n, dimension) of the observations.
         lengths: (dimension,) fitted lengthscales.
         signal: fitted standard deviation of the signal, in the cost's unit.
-        noise: fitted standard deviation of the real observations, in the cost's unit; where it varies, its
-            geometric mean over them.
-        simulated_noise: the same of simulations; where there is only one kind of observation, that one's.
-        evidence: by how much the log-likelihood is above that of noise around the prior mean and nothing else.
-        hyperparameters: what else was fitted, by name.
+        noise: fitted standard deviation of the real observations, in the cost's unit; if it varies, its value at zero
+            growth features.
+        simulated_noise: the same for simulations; with one kind of observation only, equal to `noise`.
+        evidence: difference of the log-likelihood to that of pure noise around the prior mean.
+        hyperparameters: the other fitted values, by name.
 
     Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, chapters 2 and 5.
     """
@@ -173,9 +174,10 @@ class GaussianProcess:
             costs: (n,), finite, n ≥ 1.
             covariance: of the observations, in units of scale².
             mean: prior mean of the cost at points (m, dimension) → (m,).
-            scale: unit in which the priors are meant, in the cost's unit.
-            growth: what the covariance's noise grows with.
-            start: hyperparameters to start from; None: their priors' centre, and more noise than that.
+            scale: unit of the priors, in the cost's unit.
+            growth: features of the covariance's varying noise.
+            start: initial hyperparameters; None: the centre of their priors, and a second start with longer
+                lengthscales and more noise.
             iterations: of the search for better ones.
 
         Raises:
@@ -210,7 +212,7 @@ class GaussianProcess:
         }
 
     def predict(self, points: Array) -> tuple[Array, Array]:
-        """See `Surrogate.predict`. The deviation leaves the observations' noise out."""
+        """See `Surrogate.predict`. The deviation excludes the observations' noise."""
         K = self._covariance.cross(self._fitted.theta, points)
         V = solve_triangular(self._fitted.L, K.T, lower=True, check_finite=False)
         prior = self._covariance.variance(self._fitted.theta, points)
@@ -219,8 +221,9 @@ class GaussianProcess:
         return mean, self.scale * np.sqrt(np.maximum(variance, 1e-12))
 
     def projected(self, points: Array) -> tuple[Array, Array]:
-        """What posterior moments at points (m, d) are made of: means (m,), and V (n, m); the posterior covariance
-        is `prior_covariance` − Vᵀ V, in the cost's unit (squared)."""
+        """Parts of the posterior moments at points (m, d): means (m,), and V (n, m). The posterior covariance is
+        `prior_covariance` − Vᵀ V, in the cost's unit (squared).
+        """
         K = self.cross(points)
         return self.expected(points, K), self.explained(K)
 
@@ -234,7 +237,8 @@ class GaussianProcess:
 
     def explained(self, cross: Array) -> Array:
         """V (n, m) of rows of `cross`, or of weighted sums of them (m, n): VᵀV is the covariance that the observations
-        explain, in the cost's unit squared."""
+        explain, in the cost's unit squared.
+        """
         return np.asarray(self.scale * solve_triangular(self._fitted.L, cross.T, lower=True, check_finite=False))
 
     def prior_covariance(self, points: Array) -> Array:
@@ -242,8 +246,9 @@ class GaussianProcess:
         return np.asarray(self.scale**2 * self._covariance.between(self._fitted.theta, points, points))
 
     def joint_covariance(self, simulated: Array, real: Array) -> Array:
-        """Posterior covariance of the noise-free simulated cost at points (a, d) and the real one at points (m, d):
-        (a + m, a + m), in the cost's unit squared."""
+        """Posterior covariance of the noise-free simulated cost at points (a, d) and the real one at points (m, d): (a
+        + m, a + m), in the cost's unit squared.
+        """
         theta, covariance = self._fitted.theta, self._covariance
         K = np.concatenate([covariance.cross_simulated(theta, simulated), covariance.cross(theta, real)])
         V = solve_triangular(self._fitted.L, K.T, lower=True, check_finite=False)
@@ -270,10 +275,10 @@ class GaussianProcess:
 
 @dataclass(frozen=True)
 class NoiseGrowth:
-    """What the logarithm of the noise may grow with: the expected cost, linearly, and its nearness to the middle.
+    """Features of the noise's logarithm: the expected cost, linearly, and its nearness to the middle of its range.
 
-    A pour that surely spills nothing scatters least, and one that surely spills all less than one on the brink. The
-    coefficients can't be negative: noise that is larger in the valley was only ever seen to stand for a wall too steep
+    A pour that certainly spills nothing scatters least, and one that certainly spills all scatters less than one at the
+    threshold. The coefficients cannot be negative: so far, larger noise in the valley always stood for a wall too steep
     for the kernel.
 
     Attributes:
@@ -293,10 +298,10 @@ class NoiseGrowth:
 
 
 def with_varying_noise(process: GaussianProcess, costs: Array, prior: HyperPrior, **terms: Any) -> GaussianProcess:
-    """The same model with a noise that depends on the action, if the observations speak for it; else `process`.
+    """Return the same model with an action-dependent noise if the observations support it; otherwise `process`.
 
-    The noise grows with the mean of `process`, as a plug-in: the first step of Kersting et al. with a parametric
-    noise. Evidence: the likelihood must gain more than what Schwarz' criterion charges for the coefficients.
+    The noise grows with the mean of `process`, as a plug-in: the first step of Kersting et al. with a parametric noise.
+    Criterion: the log-likelihood must increase by more than the penalty of Schwarz' criterion for the coefficients.
 
     Args:
         process: fitted with constant noise.
@@ -304,8 +309,8 @@ def with_varying_noise(process: GaussianProcess, costs: Array, prior: HyperPrior
         prior: over the hyperparameters.
         terms: of `Covariance`, those of `process`.
 
-    Source: Kersting et al., Most likely heteroscedastic Gaussian process regression, ICML 2007; Schwarz, Estimating
-        the dimension of a model, 1978.
+    Source: Kersting et al., Most likely heteroscedastic Gaussian process regression, ICML 2007; Schwarz, Estimating the
+    dimension of a model, 1978.
     """
     real = terms.get("real")
     mask = np.ones(len(costs), dtype=np.bool_) if real is None else real
@@ -325,7 +330,7 @@ def with_varying_noise(process: GaussianProcess, costs: Array, prior: HyperPrior
 
 @dataclass(frozen=True)
 class HyperparameterSearch:
-    """How hyperparameters are looked for; see `GaussianProcess`."""
+    """Start and length of the hyperparameter search; see `GaussianProcess`."""
 
     start: Array | None = None
     iterations: int = ITERATIONS
@@ -345,10 +350,10 @@ def constant_mean_process(
 def zero_mean_process(
     points: Array, costs: Array, *, varying: bool = False, search: HyperparameterSearch = AFRESH
 ) -> GaussianProcess:
-    """GP with prior mean zero, as in the paper: unexplored means 'spills nothing'.
+    """GP with prior mean zero, as in the paper: unexplored regions are expected to spill nothing.
 
-    Limitations: on a cost in [0, 1] that is minimised by a lower confidence bound, it explores corners for ever and
-    loses to random search. For replication.
+    Limitations: for a cost in [0, 1] that is minimised by a lower confidence bound, it explores corners indefinitely
+    and is worse than random search. For replication.
     """
     return _fitted(points, costs, _constant(0.0), _scale(costs, costs), varying, search=search)
 
@@ -363,8 +368,8 @@ def simulated_mean_process(
 ) -> GaussianProcess:
     """GP of the real cost around a surrogate of the simulated one: f_r = f_s + δ, f_s ~ `simulated`'s posterior.
 
-    The prior mean is the simulated surrogate's posterior mean, the prior covariance its posterior covariance plus that
-    of δ, so that a pour also corrects the surrogate where too few simulations were run.
+    The prior mean is the simulated surrogate's posterior mean. The prior covariance is its posterior covariance plus
+    that of δ, so that a pour also corrects the surrogate where too few simulations were run.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D3); Kennedy & O'Hagan 2000 with ρ = 1.
     """
@@ -386,21 +391,21 @@ def joint_process(
     widening: float = 1.0,
     search: HyperparameterSearch = AFRESH,
 ) -> GaussianProcess:
-    """GP of the real cost from simulations and real observations at once.
+    """GP of the real cost from simulations and real observations together.
 
-    Pooled, simulations are observations of the same cost but for a constant, with a noise of their own that also holds
+    Pooled, simulations are observations of the same cost except for a constant, with a separate noise that includes
     their discrepancy: f_r = f_s + β. Scaled, f_r = ρ f_s + β + δ, with ρ and δ fitted. See `covariance.py`.
 
     Args:
         simulated: (k, dimension), k ≥ 1, and their costs (k,).
         points: (n, dimension), n ≥ 0, and their costs (n,).
-        scaled: which of the two.
+        scaled: whether to use the scaled model.
         varying: whether the noise of real observations may vary.
         widening: factor on the median of the prior of the simulations' noise.
         search: for the hyperparameters.
 
     Source: Kennedy & O'Hagan, Predicting the output from a complex computer code when fast approximations are
-        available, Biometrika 2000.
+    available, Biometrika 2000.
     """
     both, values = np.concatenate([simulated, points]), np.concatenate([simulated_costs, costs])
     centre = float(simulated_costs.mean())
@@ -431,7 +436,7 @@ def _fitted(
 
 
 def _of_noise_alone(residuals: Array) -> float:
-    """Log-likelihood of residuals (n,) as independent normal noise of the deviation that suits them best."""
+    """Log-likelihood of residuals (n,) as independent normal noise with the best-fitting deviation."""
     variance = max(float(np.mean(residuals**2)), 1e-12)
     return -0.5 * len(residuals) * (math.log(2 * math.pi * variance) + 1.0)
 
@@ -441,7 +446,8 @@ def _constant(value: float) -> Mean:
 
 
 def _scale(residuals: Array, costs: Array) -> float:
-    """Unit of the priors: the residuals' size, but on a plateau a tenth of the costs', so that doubt remains.
+    """Unit of the priors: the residuals' root mean square, but at least a tenth of the largest cost, so that
+    uncertainty remains on a plateau.
 
     Costs below `SMALLEST_SCALE` count as zero, and zero costs have the unit 1.
     """
@@ -452,16 +458,16 @@ def _scale(residuals: Array, costs: Array) -> float:
 
 
 ENDS = 64
-"""Lower ends that are tried, evenly by the probability below them."""
+"""Number of lower ends that are tried, evenly spaced in the probability below them."""
 
 HALVINGS = 50
 
 
 def highest_density_intervals(weights: Array, means: Array, deviations: Array, level: float) -> Array:
-    """Bands (m, 2) of y = clip(z, 0, 1), z of a mixture of normal distributions.
+    """Shortest intervals (m, 2) of y = clip(z, 0, 1), z of a mixture of normal distributions.
 
-    Where y may well be 0 the band begins there, and holds no more for that: an interval between two quantiles would
-    leave out the least likely end only.
+    If y is likely to be 0, the interval begins at 0 and contains no more probability for that. An interval between two
+    fixed quantiles would exclude the least likely end only.
 
     Args:
         weights: (J,), sum 1.
@@ -477,7 +483,7 @@ def highest_density_intervals(weights: Array, means: Array, deviations: Array, l
 
 
 def _quantiles(weights: Array, means: Array, deviations: Array, shares: Array) -> Array:
-    """(k, m) for shares (k,), by bisection."""
+    """Quantiles (k, m) for probabilities (k,), by bisection."""
     low, high = np.zeros((len(shares), means.shape[1])), np.ones((len(shares), means.shape[1]))
     none = weights @ ndtr(-means / deviations) >= shares[:, None]
     all_of_it = weights @ ndtr((1.0 - means) / deviations) <= shares[:, None]

@@ -1,64 +1,66 @@
-"""What one more simulation would teach about where the real cost is least.
+"""The value of the next simulation or pour: knowledge gradient, and decisions with a fixed budget of pours.
 
-Let x̂ be the minimiser of the posterior mean m of the real cost f_r, and x another place that may be better. To know the
-difference of the two would be worth the expected improvement
+`most_instructive` chooses simulations for a Gaussian process. `proposals` chooses the next pour and simulations for a
+`ModelAveragedProcess`, with `least_loss`, `looked_ahead` and `instructive`; `found` describes the result.
+
+**Value of a simulation** (`most_instructive`). Let x̂ be the minimiser of the posterior mean m of the real cost f_r,
+and x another place that may be better. Perfect knowledge of their difference is worth the expected improvement
 
     EI(x) = E max(f_r(x̂) − f_r(x), 0) = s φ(u) + (m(x̂) − m(x)) Φ(u)
     s² = Var(f_r(x) − f_r(x̂)),    u = (m(x̂) − m(x)) / s
 
-A simulation at a, with noise n_s, leaves of that doubt
+A simulation at a, with noise n_s, reduces this variance, independent of its outcome, to
 
     s′² = s² − Cov(f_s(a), f_r(x) − f_r(x̂))² / (Var f_s(a) + n_s²)
 
-whatever it comes to, and is worth the share that it removes of the improvement most at stake:
+Its value is the largest part of an improvement that it removes:
 
     v(a) = max_x EI(x) (1 − s′/s)        0 ≤ v ≤ max EI, in the cost's unit
 
-A real observation is worth the same expression with f_r and n_r in place of f_s and n_s. Doubt that would change no
-decision counts for nothing; nor does doubt about what simulations lack: it is of no use to them, and only pours tell.
-
-Observations that are under way are taken into account by what they will do to the covariance; the mean is left as it
-is.
+The value of a real observation is the same expression with f_r and n_r instead of f_s and n_s. Uncertainty that cannot
+change the decision has no value. Uncertainty about the simulator's discrepancy has no value for simulations either,
+because only pours reduce it. Pending observations enter through their effect on the covariance; the mean is unchanged.
 
 Source: expected improvement, Jones, Schonlau & Welch, Efficient global optimization of expensive black-box functions,
-    J. Global Optim. 1998; several sources by value over price, Poloczek, Wang & Frazier, NeurIPS 2017. Their knowledge
-    gradient asks whether *one* observation changes the decision, and is nothing where it takes two: with a tight valley
-    and a doubtful corner it ended simulations after 27, and a real pour went to see what was in that corner.
-Limitations: alternatives are looked at one by one, each against x̂.
+    J. Global Optim. 1998; several sources by value over cost, Poloczek, Wang & Frazier, NeurIPS 2017. Their knowledge
+    gradient measures whether *one* observation changes the decision, and is zero if two are needed. With a narrow
+    valley and an uncertain corner it ended simulations after 27, and a real pour explored that corner.
+Limitations: alternatives are compared with x̂ one by one.
 
-What a pour is worth by what it will tell: the least loss that may be expected once it has been weighed.
-
-A pour on the slope of the valley tells which hypothesis is right, one on a plateau hardly anything, whatever either
-loses. With H pours to follow (4 at most) the next one minimises
-
-    E c(x) − H (min_x′ E c(x′) − E_y min_x′ E[c(x′) | y at x]),    c = clip(f, 0, 1)
-
-What y may be is dealt to a few values; each reweighs the hypotheses and moves what each of them expects elsewhere. The
-minimum over x′ is one over places: what was poured, the best of each hypothesis, and some all over the region.
-
-Source: knowledge gradient, Frazier et al. 2009; over hypotheses, ours.
-Limitations: one pour ahead; the places are not polished, so the best one by `least_loss` is among them.
-
-Where to pour when every pour counts, and where to simulate for it.
-
-With H pours to follow (4 at most), b the least expected cost of an action that was poured, and f the cost by
-`ModelAveragedProcess`, the next pour minimises what it loses less what it may save in all that follow:
+**Loss of a pour** (`least_loss`). Let H be the number of pours to follow (4 at most), b the least expected cost of a
+poured action, and f the cost by `ModelAveragedProcess`. The next pour minimises its expected loss minus the expected
+savings in the following pours:
 
     E clip(f(x), 0, 1) − H E (b − f(x)⁺)⁺
 
-so that a corner that would spill the load is looked at only where it may be better by more than the spill, and with
-nothing in hand much is tried. Its place competes with those that tell of others, too (`lookahead.py`). With a limit
-only actions count whose probability of exceeding it is small enough; where there is none, the one with the smallest.
+A corner that may spill the whole load is therefore tried only if its possible advantage exceeds the spill. While no
+poured action is good (b is large), much is tried. Before the first pour, H counts as 0. With a limit, only actions
+count whose probability of exceeding it is small enough; if there is none, the action with the smallest probability
+counts.
 
-What one more pour at x would be worth looks at differences to the best poured action x̂, for knowing both better helps
-only where it changes which is better, and no cost is below 0:
+**Lookahead** (`looked_ahead`). The place found by `least_loss` competes with places that are informative about other
+places: a pour on the slope of the valley distinguishes the hypotheses, one on a plateau hardly does, whatever their
+losses. With H pours to follow (4 at most), the next pour minimises
+
+    E c(x) − H (min_x′ E c(x′) − E_y min_x′ E[c(x′) | y at x]),    c = clip(f, 0, 1)
+
+The outcome y is discretised to a few values. Each value reweights the hypotheses and shifts their expectations at other
+places. The minimum over x′ is taken over poured places, the best place of each hypothesis, and places all over the
+region.
+
+Source: knowledge gradient, Frazier et al. 2009; the extension to hypotheses is this project's own.
+Limitations: looks one pour ahead; the places are not refined, so the best one by `least_loss` is included.
+
+**Gain of one more pour** (`worth`). It considers differences to the best poured action x̂, because better knowledge of
+both helps only if it changes their order, and no cost is below 0:
 
     g(x) = Σ_j w_j min(E d⁺, E (b_j − f_j(x)⁺)⁺),    d ~ N(m_j(x̂)⁺ − m_j(x)⁺, s⁴ / (s² + n²))
 
 s² = Var(f_j(x̂) − f_j(x)), n is a pour's noise, w_j the weight of hypothesis j.
 
-A simulation is made where it takes most doubt from what the heavy hypotheses say of the poured places, by which they
-are told apart, and of the best of those to come: each sees them at another place of the simulator.
+**Simulations next to pours** (`instructive`). A simulation is made where it reduces the uncertainty of the heaviest
+hypotheses most, at the poured places, which distinguish the hypotheses, and at the best places for the next pours. Each
+hypothesis maps these places to other places of the simulator.
 """
 
 from __future__ import annotations
@@ -81,19 +83,19 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int_]
 
 LEADERS = 32
-"""Places that may be the minimiser: so many with the lowest bounds, and as many with the lowest means."""
+"""Number of places that may be the minimiser: this many with the lowest bounds, and as many with the lowest means."""
 ELSEWHERE = 96
-"""Further places at which a simulation is considered."""
+"""Number of further places at which a simulation is considered."""
 
 
 @dataclass(frozen=True)
 class KnowledgeGradient:
-    """What simulations are worth.
+    """Values of simulations.
 
     Attributes:
-        points: (count, dimension), where the next ones pay most, each given those before it.
-        values: (count,), what each of them is worth, ≥ 0.
-        pour_value: what the real observation that pays most is worth, ≥ 0.
+        points: (count, dimension), the most valuable next ones, each given those before it.
+        values: (count,), value of each of them, ≥ 0.
+        pour_value: value of the most valuable real observation, ≥ 0.
     """
 
     points: Array
@@ -114,52 +116,52 @@ def most_instructive(
     Args:
         problem: for its count and κ.
         process: of the real cost, from simulations.
-        candidates: (m, dimension), m ≥ 1, places to think about.
-        busy: (b, dimension), simulations under way.
-        pouring: (p, dimension), real observations under way.
-        feasibility: of requests; a place is worth less where a refusal is likely.
+        candidates: (m, dimension), m ≥ 1, places to consider.
+        busy: (b, dimension), pending simulations.
+        pouring: (p, dimension), pending real observations.
+        feasibility: of requests; it reduces the value of places with likely refusals.
     """
     mean, deviation = process.predict(candidates)
     by_bound = np.argsort(mean - problem.kappa * deviation, kind="stable")
     leaders = np.array(list(dict.fromkeys([*by_bound[:LEADERS], *np.argsort(mean, kind="stable")[:LEADERS]])))
     others = by_bound[LEADERS : LEADERS + ELSEWHERE]
     places = candidates[np.concatenate([leaders, others])]
-    belief = _Belief(process, np.concatenate([places, busy]), np.concatenate([candidates[leaders], pouring]))
+    joint = _JointCovariance(process, np.concatenate([places, busy]), np.concatenate([candidates[leaders], pouring]))
     reals = len(places) + len(busy)
     here, targets = np.arange(len(places)), reals + np.arange(len(leaders))
     for index in range(len(places), reals):
-        belief.observe(index, process.simulated_noise)
+        joint.observe(index, process.simulated_noise)
     for index in range(reals + len(leaders), reals + len(leaders) + len(pouring)):
-        belief.observe(index, process.noise)
+        joint.observe(index, process.noise)
 
     m = mean[leaders]
-    pours = belief.values(targets, targets, m, process.noise)
+    pours = joint.values(targets, targets, m, process.noise)
     allowed = np.ones(len(places)) if feasibility is None else np.exp(feasibility.log_probability(places))
     chosen, values = [], []
     for _ in range(problem.count):
-        worth = belief.values(here, targets, m, process.simulated_noise) * allowed
+        worth = joint.values(here, targets, m, process.simulated_noise) * allowed
         best = int(np.argmax(worth))
         chosen.append(places[best])
         values.append(float(worth[best]))
-        belief.observe(best, process.simulated_noise)
+        joint.observe(best, process.simulated_noise)
     points = np.array(chosen).reshape(problem.count, candidates.shape[1])
     return KnowledgeGradient(points, np.array(values), float(pours.max()))
 
 
-class _Belief:
-    """Joint covariance of the simulated cost at some places and the real one at others, as observations come in."""
+class _JointCovariance:
+    """Joint covariance of the simulated cost at some places and the real one at others, updated by observations."""
 
     def __init__(self, process: GaussianProcess, simulated: Array, real: Array) -> None:
         self._covariance = process.joint_covariance(simulated, real)
         self._least = (1e-6 * process.scale) ** 2
 
     def observe(self, index: int, noise: float) -> None:
-        """Take an observation of one of the quantities into account, whatever it comes to."""
+        """Condition on an observation of one of the quantities, independent of its value."""
         column = self._covariance[:, index].copy()
         self._covariance -= np.outer(column, column) / self._variance(np.array([index]), noise)[0]
 
     def values(self, observed: Indices, targets: Indices, mean: Array, noise: float) -> Array:
-        """What observing each of some quantities (k,) is worth where targets (m,) with means (m,) compete: (k,)."""
+        """Value of observing each of some quantities (k,), for competing targets (m,) with means (m,): (k,)."""
         G, best = self._covariance, int(targets[np.argmin(mean)])
         doubt = G[targets, targets] + G[best, best] - 2.0 * G[targets, best]
         doubt = np.sqrt(np.maximum(doubt, self._least))
@@ -167,26 +169,27 @@ class _Belief:
         u = gain / doubt
         improvement = np.maximum(doubt * np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi) + gain * ndtr(u), 0.0)
         improvement[targets == best] = 0.0
-        told = G[np.ix_(observed, targets)] - G[observed, best][:, None]
-        removed = np.minimum(told**2 / self._variance(observed, noise)[:, None] / doubt**2, 1.0)
+        covariances = G[np.ix_(observed, targets)] - G[observed, best][:, None]
+        removed = np.minimum(covariances**2 / self._variance(observed, noise)[:, None] / doubt**2, 1.0)
         return np.asarray((improvement * (1.0 - np.sqrt(1.0 - removed))).max(axis=1))
 
     def _variance(self, indices: Indices, noise: float) -> Array:
-        """Variance of an observation; bounded below, since rounding may leave less than nothing."""
+        """Variance of an observation; bounded below, because rounding may make it negative."""
         return np.maximum(self._covariance[indices, indices], 0.0) + noise**2 + self._least
 
 
 SHOWN = np.array([0.0, 0.02, 0.06, 0.14, 0.28, 0.46, 0.66, 0.84, 1.0])
-"""What a pour may show, in units of the largest cost: closer where little is lost, for there decisions are made."""
+"""Discretised outcomes of a pour, in units of the largest cost: denser at small losses, where decisions are made."""
 
 SOME = 8
-"""Places that are thought about because little is expected to be lost there, and as many that are disputed most."""
+"""Number of places considered for their low expected loss, and of those considered for their disputed cost."""
 
 HEAVIEST, EVEN = 16, 16
-"""Heavy hypotheses whose best places are thought about; places all over the region."""
+"""Number of heaviest hypotheses whose best places are considered; number of places all over the region."""
 
 TARGETS = 64
-"""Places all over the region at which the least loss afterwards is looked for, beside the best of each hypothesis."""
+"""Number of places all over the region at which the least loss afterwards is searched, in addition to the best of each
+hypothesis."""
 
 
 def looked_ahead(
@@ -198,16 +201,16 @@ def looked_ahead(
     allowed: Callable[[Array, Array], Array],
     feasibility: Feasibility | None,
 ) -> Array:
-    """The place (dimension,) of the next pour.
+    """Return the place (dimension,) of the next pour.
 
     Args:
         process: of the cost.
-        pour: (dimension,), the best by what it loses and saves itself.
+        pour: (dimension,), the best by its own loss and savings.
         candidates: (m, dimension), the first of them all over the region.
         known: (k, dimension), poured actions that may be poured again; k ≥ 0.
         left: H.
-        allowed: what values (p,) of pours at places (p, dimension) become by limits and refusals.
-        feasibility: of requests; None while nothing was refused.
+        allowed: applies limits and refusals to values (p,) of pours at places (p, dimension).
+        feasibility: of requests; None if no request was refused.
     """
     if left == 0:
         return pour
@@ -253,31 +256,31 @@ def foreseen(process: ModelAveragedProcess, places: Array, targets: Array) -> Ar
 Score = Callable[[Array], Array]
 
 LATEST = 8
-"""Poured places, and as many to come, that simulations are made for."""
+"""Number of poured places, and of places for the next pours, that simulations are made for."""
 
 FORESIGHT = 4
-"""Most pours whose savings count: what is found later could be found otherwise."""
+"""Largest number of pours whose savings count: later pours could find the same otherwise."""
 
 WORTH_AT = 256
-"""Places all over the region at which the worth of one more pour is looked at."""
+"""Number of places all over the region at which the gain of one more pour is computed."""
 
 DRAWN = 64
-"""Displacements that are handed on to another receiver."""
+"""Number of bench offsets that are passed on to another receiver."""
 
 FORBIDDEN = 1e3
-"""Added for each per cent by which a limit is exceeded, in units of the largest cost."""
+"""Penalty per unit of probability above a limit's, in units of the largest cost."""
 
 
 def least_loss(
     process: ModelAveragedProcess, mismatch: ModelDiscrepancy, known: Array, feasibility: Feasibility | None = None
 ) -> Score:
-    """The score of a pour, to be minimised.
+    """Return the score of a pour, to be minimised.
 
     Args:
         process: of the cost.
         mismatch: for H and the limit.
         known: (k, dimension), poured actions that may be poured again; k ≥ 0.
-        feasibility: of requests; None while nothing was refused. What can't be made is as bad as the worst.
+        feasibility: of requests; None if no request was refused. An infeasible pour counts as the worst cost.
     """
     best = float(process.predict(known)[0].min()) / process.worst if len(known) else 0.0
     left = min(mismatch.left, FORESIGHT) if len(known) else 0
@@ -294,7 +297,7 @@ def least_loss(
 def _allowed(
     process: ModelAveragedProcess, mismatch: ModelDiscrepancy, feasibility: Feasibility | None
 ) -> Callable[[Array, Array], Array]:
-    """What values (m,) of pours at points (m, dimension) become by the limit and by what may be refused."""
+    """Return a function that applies the limit and the feasibility to values (m,) of pours at points (m, dimension)."""
 
     def changed(value: Array, points: Array) -> Array:
         if mismatch.limit is not None:
@@ -309,7 +312,7 @@ def _allowed(
 
 
 def worth(process: ModelAveragedProcess, points: Array, known: Array) -> Array:
-    """g (m,) of one more pour at points (m, dimension), poured ones being known (k ≥ 1, dimension); the cost's unit."""
+    """Gain g (m,) of one more pour at points (m, dimension), given poured ones (k ≥ 1, dimension), in cost units."""
     place = known[int(np.argmin(process.predict(known)[0]))]
     means, deviations, noises = process.components(points)
     at_best, its_deviation, _ = (part[:, 0] for part in process.components(place[None, :]))
@@ -333,16 +336,16 @@ def instructive(
     pending: Array,
     region: Region,
 ) -> Array:
-    """Places (count, dimension) for simulations.
+    """Choose places (count, dimension) for simulations.
 
     Args:
         process: of the real cost.
-        count: how many.
-        candidates: (m, dimension), where pours may come to lie.
+        count: number of places.
+        candidates: (m, dimension), possible places of pours.
         score: of pours.
-        pour: (dimension,), the one that comes next.
-        pending: (b, dimension), simulations under way.
-        region: that they have to lie in.
+        pour: (dimension,), the next one.
+        pending: (b, dimension), pending simulations.
+        region: of the simulations.
     """
     if count == 0:
         return np.empty((0, len(pour)))
@@ -384,7 +387,7 @@ def proposals(
     feasibility: Feasibility | None,
     rng: np.random.Generator,
 ) -> Array:
-    """(count, dimension): the next pour, then simulations beside it. Candidates (m, dimension), m ≥ 1."""
+    """(count, dimension): the next pour, followed by simulations. Candidates (m, dimension), m ≥ 1."""
     if problem.count == 0:
         return np.empty((0, problem.space.dimension))
     assert problem.mismatch is not None
@@ -413,7 +416,7 @@ def found(
     feasibility: Feasibility | None,
     rng: np.random.Generator,
 ) -> DiscrepancyFound:
-    """What the observations say about the simulator, and what one more pour would be worth."""
+    """Return the conclusions about the simulator, and the gain of one more pour."""
     assert problem.mismatch is not None
     limit, known = problem.mismatch.limit, pourable(asked, feasibility)
     candidates = asked.region.draw(WORTH_AT, rng, even=True)
@@ -442,6 +445,6 @@ def found(
 
 
 def _near(point: Array, region: Region, rng: np.random.Generator) -> Array:
-    """Allowed places around one: where the cost may be least is often beside the next pour."""
+    """Allowed places around a point: the minimum is often close to the next pour."""
     cloud = region.snap(np.clip(point + 0.05 * rng.standard_normal((64, len(point))), 0.0, 1.0))
     return cloud[region.allows(cloud)]

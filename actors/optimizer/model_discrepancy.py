@@ -1,22 +1,25 @@
-"""Averaging over the ways in which a simulator can be wrong, each weighed by the observations.
+"""Bayesian model averaging over the ways in which a simulator can be wrong.
 
-Hypothesis j says that the bench does at action x what the simulator does at a displaced one, nearer to or farther from
-its best action x̂, more or less of it, and something more that nobody simulated:
+Hypothesis j states that the bench at action x behaves like the simulator at a displaced action, nearer to or farther
+from the simulator's best action x̂, with a scaled cost, plus a discrepancy δ that is not simulated:
 
     f(x) = μ_j(x) + δ(x),    μ_j(x) = clip(e^{g_j} f̂_s(z_j(x)), 0, 1),    δ ~ GP(0, v_j(x) v_j(x′) M_{ℓ_j}(x, x′))
     z_j(x) = x̂ + e^{h_j} (A_j x + s_j − x̂),    v_j² = σ_j² + e^{2 g_j} s_s²(z_j(x))
     y = f(x) + ε,    ε ~ N(0, (n_j + 0.15 μ_j(x))²)
 
-f̂_s and s_s are posterior mean and deviation of a GP of the simulations, costs in units of the largest one. h makes the
-valley wider or narrower than it was simulated, as walls and lips do that are not the simulator's. n, by which pours of
-one action differ, belongs to the hypothesis, too: a few pours nearby tell it. Two last ones, of equal prior weight, do
-not trust the simulator: it says the contrary, μ_j = clip(e^{g_j} (1 − f̂_s(z_j(x))), 0, 1); or it says nothing of this
-bench, and f is a GP around 0.6, more towards corners. The posterior weights are prior times marginal likelihood of the
-observations. So nothing is forgotten: a hypothesis that fails fades, and the weight of these two, ignorance, says how
-far the simulator is to be trusted.
+f̂_s and s_s are posterior mean and deviation of a GP of the simulations, with costs in units of the largest one. h
+makes the valley wider or narrower than simulated, as deviating walls and lips do. n, the scatter of pours of one
+action, belongs to the hypothesis, too: a few pours close together determine it.
+
+Two further groups of hypotheses, of equal prior weight, do not rely on the simulator. In the contrary group it predicts
+the opposite, μ_j = clip(e^{g_j} (1 − f̂_s(z_j(x))), 0, 1). In the ignorant group it contains no information about this
+bench, and f is a GP around 0.6, more towards corners.
+
+The posterior weights are prior times marginal likelihood of the observations. No hypothesis is removed: the weight of a
+failing one decreases. The weight of the two further groups, called ignorance, measures how unreliable the simulator is.
 
 Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001.
-Limitations: the hypotheses are a fixed set; predictions come from at most 32 draws of them, and ignorance.
+Limitations: the set of hypotheses is fixed; predictions use at most 32 draws of them, and ignorance.
 """
 
 from __future__ import annotations
@@ -37,33 +40,32 @@ Array = NDArray[np.float64]
 
 HYPOTHESES = 2048
 KEPT = 32
-"""Draws from the posterior weights that predictions are made from, evenly by weight: at most as many hypotheses."""
+"""Number of draws from the posterior weights for predictions, evenly by weight: at most as many hypotheses."""
 GAIN = 0.3
 """Standard deviation of g."""
 WIDTH = 0.25
 """Standard deviation of h."""
 RESTS = (0.02, 0.3)
-"""Smallest and largest σ, in units of the largest cost; evenly by its logarithm, as ℓ."""
+"""Smallest and largest σ, in units of the largest cost; log-uniform, like ℓ."""
 LENGTHS = (0.15, 0.6)
 FARTHER = (0.4, 3.0)
-"""Factors on a displacement's deviations, evenly by their logarithm: tails for a bench that is far off."""
+"""Range of factors on the standard deviations of an offset, log-uniform: tails for a bench that deviates far."""
 NOISES, NOISE_GROWTH = (0.002, 0.05), 0.15
-"""Smallest and largest deviation of one observation where nothing is lost, evenly by its logarithm; and what it grows
-by where everything is lost."""
+"""Smallest and largest standard deviation of one observation at zero cost, log-uniform; and its increase at the largest
+cost."""
 IGNORANT_MEAN, IGNORANT_SIGNAL = 0.6, 0.4
 IGNORANT_EDGE = 0.3
-"""How much more ignorance expects in the corners than in the middle: a box is drawn around what may be good."""
+"""Difference of ignorance's expected cost between corners and middle: search boxes are drawn around good actions."""
 IGNORANT_LENGTHS = np.repeat((0.15, 0.3, 0.6), 3)
 IGNORANT_NOISES = np.tile((0.003, 0.01, 0.03), 3)
-"""ℓ and n of what ignorance consists of: were its scatter fixed, pours that hardly scatter would speak against it."""
+"""ℓ and n of the components of ignorance. With a fixed scatter, pours that hardly scatter would count against it."""
 CONTRARY, CONTRARY_REST = 128, 0.15
-"""How many hypotheses take the simulator for the wrong way round, half of the ignorance beforehand being theirs; and
-their smallest σ: were they sure that all is lost where nothing was simulated to be, any pour that went wrong would
-speak for them."""
+"""Number of contrary hypotheses, which hold half of the prior ignorance; and their smallest σ. If they were certain of
+a total loss where the simulation has none, any failed pour would count for them."""
 KNOWN_SHARE = 0.75
-"""Share of the hypotheses around displacements that were found before, where some were."""
+"""Fraction of the hypotheses around earlier bench offsets, if there are any."""
 KNOWN_SPREAD = 0.25
-"""Deviation of what is added to those, in that of the play."""
+"""Standard deviation that is added to those, relative to the prior's."""
 
 
 @dataclass(frozen=True)
@@ -71,13 +73,13 @@ class Hypotheses:
     """Ways in which the simulator can be wrong.
 
     Attributes:
-        scales, shifts: (J, dimension) of the displacements.
+        scales, shifts: (J, dimension) of the bench offsets.
         widths: (J,), logarithms of the factors on distances to the centre.
         gains: (J,), logarithms.
         rests: (J,), σ.
         lengths: (J,), ℓ.
         noises: (J,), n.
-        contrary: (J,), whether it takes the simulator for the wrong way round.
+        contrary: (J,), whether the hypothesis reverses the simulator.
         centre: (dimension,), the simulated best.
     """
 
@@ -93,7 +95,7 @@ class Hypotheses:
 
     @classmethod
     def of(cls, mismatch: ModelDiscrepancy, centre: Array) -> Hypotheses:
-        """Draw, the same for the same question: quasi-random, so that few cover much."""
+        """Draw the hypotheses, the same for the same question: quasi-random, for even coverage by few draws."""
         dimension = len(mismatch.play)
         rows = qmc.Sobol(2 * dimension + 7, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES)
         rows = np.clip(np.concatenate([rows, rows[:CONTRARY]]), 1e-6, 1.0 - 1e-6)
@@ -125,19 +127,19 @@ class Hypotheses:
         )
 
     def only(self, kept: NDArray[np.int_]) -> Hypotheses:
-        """Some of them."""
+        """Return a subset."""
         names = "scales", "shifts", "widths", "gains", "rests", "lengths", "noises", "contrary"
         return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
     def moved(self, points: Array) -> Array:
-        """(J, m, dimension): where each puts points (m, dimension) in the simulator."""
+        """(J, m, dimension): the simulator's points that each hypothesis assigns to points (m, dimension)."""
         there = self.scales[:, None, :] * points[None, :, :] + self.shifts[:, None, :]
         return np.asarray(self.centre + np.exp(self.widths)[:, None, None] * (there - self.centre))
 
 
 @dataclass(frozen=True)
 class _Prior:
-    """What hypotheses (J) say of points (m) before any observation: means, deviations of δ, noises; (J, m) each."""
+    """Prior moments of hypotheses (J) at points (m): means, deviations of δ, noises; (J, m) each."""
 
     means: Array
     spreads: Array
@@ -145,16 +147,17 @@ class _Prior:
 
 
 class ModelAveragedProcess:
-    """The real cost, averaged over hypotheses; see the module. Its `predict` is a `Surrogate`'s.
+    """The real cost, averaged over hypotheses; see the module docstring. Its `predict` is a `Surrogate`'s.
 
     Attributes:
         simulated: surrogate of the simulations.
-        weights: posterior weights (J + ignorant ones,); of the last `len(IGNORANT_LENGTHS)` the simulator says nothing.
-        ignorance: their sum and that of the contrary ones.
+        weights: posterior weights (J + ignorant ones,); the last `len(IGNORANT_LENGTHS)` are those of the ignorant
+            group.
+        ignorance: the sum of these and of the contrary ones.
     """
 
     def __init__(self, simulated: GaussianProcess, points: Array, costs: Array, mismatch: ModelDiscrepancy) -> None:
-        """Weigh the hypotheses.
+        """Compute the posterior weights of the hypotheses.
 
         Args:
             simulated: of the same cost.
@@ -172,18 +175,18 @@ class ModelAveragedProcess:
         logs = np.concatenate([informed + np.log(prior), ignorant + np.log(half / len(ignorant))])
         weights = np.exp(logs - logs.max())
         self.weights = weights / weights.sum()
-        told, alone = self.weights[: len(informed)], self.weights[len(informed) :]
-        self._trusting = np.where(self._all.contrary, 0.0, told)
-        self.ignorance = float(told[self._all.contrary].sum() + alone.sum())
-        kept, times = np.unique(_evenly_drawn(told, KEPT), return_counts=True)
+        informed_weights, ignorant_weights = self.weights[: len(informed)], self.weights[len(informed) :]
+        self._trusting = np.where(self._all.contrary, 0.0, informed_weights)
+        self.ignorance = float(informed_weights[self._all.contrary].sum() + ignorant_weights.sum())
+        kept, times = np.unique(_evenly_drawn(informed_weights, KEPT), return_counts=True)
         self._kept = self._all.only(kept)
-        self.mixture = np.concatenate([times / KEPT * told.sum(), alone])
+        self.mixture = np.concatenate([times / KEPT * informed_weights.sum(), ignorant_weights])
         self._lengths = np.concatenate([self._kept.lengths, IGNORANT_LENGTHS])
         self._least_noises = np.concatenate([self._kept.noises, IGNORANT_NOISES])
         self._at_data = self._prior(points, self._costs)
         self._factors = self._factorised(self._at_data, self._lengths, points)
 
-    # -- what the hypotheses say before any observation ------------------------------------------------------------
+    # -- prior moments ---------------------------------------------------------------------------------------------
 
     def _informed(self, hypotheses: Hypotheses, points: Array) -> _Prior:
         J, m = len(hypotheses.gains), len(points)
@@ -201,14 +204,14 @@ class ModelAveragedProcess:
         shape = len(IGNORANT_LENGTHS), len(points)
         edge = ((2.0 * points - 1.0) ** 2).mean(axis=1)
         means = np.broadcast_to(IGNORANT_MEAN + IGNORANT_EDGE * np.clip(edge, 0.0, 1.0), shape)
-        noises = IGNORANT_NOISES[:, None] + NOISE_GROWTH * np.broadcast_to(seen, shape)  # by what was seen, if anything
+        noises = IGNORANT_NOISES[:, None] + NOISE_GROWTH * np.broadcast_to(seen, shape)  # from observed costs, if any
         return _Prior(means, np.full(shape, IGNORANT_SIGNAL), noises)
 
     def _prior(self, points: Array, seen: Array | float = IGNORANT_MEAN) -> _Prior:
         parts = self._informed(self._kept, points), self._ignorant(points, seen)
         return _Prior(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("means", "spreads", "noises")))
 
-    # -- what the observations say ---------------------------------------------------------------------------------
+    # -- posterior moments -----------------------------------------------------------------------------------------
 
     def _evidences(self, prior: _Prior, lengths: Array) -> Array:
         """Log marginal likelihoods (J,)."""
@@ -267,7 +270,7 @@ class ModelAveragedProcess:
         correlation = _correlation(points, self.points, self._lengths)
         return np.asarray(correlation * prior.spreads[:, :, None] * self._at_data.spreads[:, None, :])
 
-    # -- what follows for the cost ---------------------------------------------------------------------------------
+    # -- moments of the cost ---------------------------------------------------------------------------------------
 
     def predict(self, points: Array) -> tuple[Array, Array]:
         """See `Surrogate.predict`: moments of the cost, which is between 0 and the worst."""
@@ -288,15 +291,15 @@ class ModelAveragedProcess:
         return np.asarray(self.mixture @ ndtr((means - loss / self.worst) / np.hypot(deviations, noises)))
 
     def bands(self, points: Array, level: float) -> Array:
-        """Shortest intervals (m, 2), in the cost's unit, that hold single observations at points (m, dimension)."""
+        """Shortest intervals (m, 2), in the cost's unit, that contain single observations at points (m, dimension)."""
         means, deviations, noises = self.components(points)
         return self.worst * highest_density_intervals(self.mixture, means, np.hypot(deviations, noises), level)
 
-    # -- for people and pictures -----------------------------------------------------------------------------------
+    # -- summaries -------------------------------------------------------------------------------------------------
 
     @property
     def hyperparameters(self) -> dict[str, float]:
-        """What the hypotheses are, by name."""
+        """Parameters of the hypotheses, by name."""
         noise = self.worst * float(self.mixture @ self._least_noises)
         return {"noise": noise, "simulated_noise": self.simulated.noise, "ignorance": self.ignorance}
 
@@ -311,18 +314,18 @@ class ModelAveragedProcess:
         return np.asarray(mean), np.asarray(deviation), float(np.exp(self._all.gains[median]))
 
     def drawn(self, count: int) -> tuple[Array, Array]:
-        """Scales and shifts (count, dimension) of displacements drawn from the posterior, evenly by their weight."""
+        """Scales and shifts (count, dimension) of bench offsets drawn from the posterior, evenly by their weight."""
         chosen = _evenly_drawn(self._trusting, count)
         return self._all.scales[chosen], self._all.shifts[chosen]
 
     @property
     def heaviest(self) -> tuple[Hypotheses, Array]:
-        """The hypotheses that predictions come from, and their weights."""
+        """The hypotheses used for predictions, and their weights."""
         return self._kept, self.mixture[: len(self._kept.gains)]
 
 
 def _least(simulated: GaussianProcess) -> Array:
-    """The simulated place (dimension,) that is expected to cost least."""
+    """The simulated place (dimension,) with the least expected cost."""
     return np.asarray(simulated.points[int(np.argmin(simulated.predict(simulated.points)[0]))])
 
 

@@ -1,4 +1,7 @@
-"""The optimiser in a process of its own (its linear algebra would hold the event loop up), and its twin in a thread."""
+"""The optimiser in a process of its own, because its linear algebra would block the event loop.
+
+`Proposer` runs in the process (or in a thread); `DeviceOptimizer` awaits it. The numerical code is in `suggest`.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ DEADLINE = 600.0
 
 
 class Proposer:
-    """What runs inside the actor. It keeps nothing from one question to the next."""
+    """The object inside the actor. It keeps no state between questions."""
 
     def suggest(self, problem: SuggestProblem) -> Suggestion:
         """See `actors.optimizer.suggest.propose`."""
@@ -21,7 +24,8 @@ class Proposer:
 
 
 class DeviceOptimizer:
-    """`Optimizer` over a `Device` that holds a `Proposer`. A process that dies is replaced; whoever asked asks again.
+    """`Optimizer` over a `Device` that holds a `Proposer`. A process that dies is replaced; the caller repeats the
+    question.
 
     Args:
         device: of the proposer.
@@ -34,9 +38,9 @@ class DeviceOptimizer:
         """See `Optimizer.suggest`.
 
         Raises:
-            DeviceLostError: it died over the question, or took too long; a new process is there to be asked again.
+            DeviceLostError: the process died, or took too long; a new process is ready for the repeated question.
             MachineLostError: its machine is gone.
-            LaboratoryError: it can't answer the question.
+            LaboratoryError: it cannot answer the question.
         """
         try:
             suggestion: Suggestion = await self.device.call("suggest", problem, deadline=DEADLINE)

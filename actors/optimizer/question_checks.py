@@ -1,6 +1,6 @@
-"""What a question must be like to be answered.
+"""Checks of a question to the optimiser, and its conversion to arrays.
 
-A question as arrays, and arrays as parts of an answer.
+`check` rejects invalid questions; `Asked` holds a question as arrays. `array` and `tuples` convert points.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ MAX_DISTURBANCES = 512
 
 
 def check(problem: SuggestProblem) -> None:
-    """Refuse what would end in NaN or never end.
+    """Reject questions that would lead to NaN or an endless computation.
 
     Raises:
-        ValueError: which number is wrong, and what would be right.
+        ValueError: names the invalid number and the valid range.
     """
     dimension = problem.space.dimension
     contexts = {len(point) for point in problem.context}
@@ -167,16 +167,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Asked:
-    """A problem as arrays, in an order that doesn't depend on who answered first, integer axes at whole numbers.
+    """A problem as arrays. Their order does not depend on the order of the answers; integer axes are rounded.
 
     Attributes:
         points: (n, dimension and context) of the observations, with their costs (n,).
         known: (n, dimension), the same without context.
         simulated: (k, dimension), with their costs (k,).
-        busy: (b, dimension).
-        infeasible: (i, dimension), refused of any kind of request.
-        really_refused: (r, dimension), of real ones.
-        failed: (f, dimension), real ones that went wrong under way.
+        busy: (b, dimension), pending.
+        infeasible: (i, dimension), refused for any kind of request.
+        really_refused: (r, dimension), refused real requests.
+        failed: (f, dimension), real requests that failed during execution.
         pouring: (p, dimension).
     """
 
@@ -194,7 +194,7 @@ class Asked:
 
     @classmethod
     def of(cls, problem: SuggestProblem) -> Asked:
-        """Read a problem."""
+        """Convert a problem."""
         dimension = problem.space.dimension
         contextual = dimension + problem.beside
         region = Region(problem.space, problem.constraints)
@@ -217,16 +217,16 @@ class Asked:
 
     @property
     def seen(self) -> Array:
-        """Where the cost was observed: really or in simulation; (n + k, dimension)."""
+        """Places where the cost was observed, really or in simulation; (n + k, dimension)."""
         return np.concatenate([self.known, self.simulated])
 
     @property
     def refused(self) -> Array:
-        """Where anything was refused: (i + r, dimension)."""
+        """Places of all refusals: (i + r, dimension)."""
         return np.concatenate([self.infeasible, self.really_refused])
 
     def feasibility(self) -> Feasibility | None:
-        """How likely requests are not refused and don't fail; None while none was or did."""
+        """Model of refusals and failures; None if there were none."""
         kinds = [
             Kind(self.seen, self.infeasible),
             Kind(self.known, self.really_refused),
@@ -237,16 +237,16 @@ class Asked:
 
 
 def _sorted(data: Data, dimension: int) -> tuple[Array, Array]:
-    """Points (n, dimension) and costs (n,), by their numbers."""
+    """Points (n, dimension) and costs (n,), sorted by their numbers."""
     pairs = sorted(zip(data.points, data.costs, strict=True))
     return array([point for point, _ in pairs], dimension), np.array([cost for _, cost in pairs], dtype=np.float64)
 
 
 def array(points: Sequence[Point], dimension: int) -> Array:
-    """(n, dimension), also of no points."""
+    """Points as an array (n, dimension), also for n = 0."""
     return np.array(points, dtype=np.float64).reshape(len(points), dimension)
 
 
 def tuples(rows: Array | Sequence[Array]) -> tuple[tuple[float, ...], ...]:
-    """Rows as plain numbers, for a message."""
+    """Rows as tuples of plain floats, for a message."""
     return tuple(tuple(map(float, row)) for row in rows)

@@ -1,6 +1,8 @@
-"""Questions to the optimiser and its answers: plain values that travel, are journalled and replayed.
+"""Questions to the optimiser and its answers: plain values that are sent between processes, journalled and replayed.
 
-How a bench may differ from its simulator, as a question says it and an answer tells it: plain values.
+`SuggestProblem` is a question and `Suggestion` its answer. `ModelDiscrepancy` and `DiscrepancyFound` describe how a
+bench may differ from its simulator, `Risk` the disturbances of execution, `PosteriorQuestion` and `DesignQuestion` the
+calibration by weighed pours.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ Numbers = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Play:
-    """How far one axis may be off, as standard deviations.
+    """Prior of the bench offset along one axis, as standard deviations.
 
     Attributes:
         shift: of an offset, in units of the axis' unit interval.
@@ -30,7 +32,7 @@ class Play:
 
 @dataclass(frozen=True)
 class BenchOffset:
-    """The simulator's action scales · u + shifts does what u does on the bench; in units of the cube."""
+    """The simulator's action scales · u + shifts corresponds to the bench's action u; in units of the cube."""
 
     scales: Numbers
     shifts: Numbers
@@ -38,7 +40,7 @@ class BenchOffset:
 
 @dataclass(frozen=True)
 class Limit:
-    """No pour whose loss is above `loss` (in the cost's unit) with more than `probability`."""
+    """Exclude pours whose loss exceeds `loss` (in the cost's unit) with more than `probability`."""
 
     loss: float
     probability: float
@@ -46,17 +48,17 @@ class Limit:
 
 @dataclass(frozen=True)
 class ModelDiscrepancy:
-    """For `mean='adaptive'`: the ways in which the simulator may be wrong, and what a pour is worth.
+    """For `mean='adaptive'`: the ways in which the simulator may be wrong, and the budget of pours.
 
     Attributes:
-        play: of each axis.
-        drawn: displacements that are likelier than others, equally likely: what a calibration, or pours into another
-            receiver, said about the bench.
-        ignorance: prior probability that the simulator says nothing of this bench.
+        play: prior of the bench offset along each axis.
+        drawn: bench offsets that are more likely than others, equally likely among themselves: from a calibration, or
+            from pours into another receiver.
+        ignorance: prior probability that the simulator contains no information about this bench.
         worst: largest cost.
-        left: real observations that follow the one that is proposed.
-        limit: that proposals keep, if any action does.
-        looks_ahead: whether the next observation may be made for what it tells of other places.
+        left: number of real observations after the proposed one.
+        limit: kept by proposals, if any action keeps it.
+        looks_ahead: whether the next observation may be chosen for its information about other places.
     """
 
     play: tuple[Play, ...]
@@ -70,18 +72,18 @@ class ModelDiscrepancy:
 
 @dataclass(frozen=True)
 class DiscrepancyFound:
-    """What the observations say about the simulator.
+    """Conclusions about the simulator.
 
     Attributes:
-        ignorance: probability that the simulator says nothing of this bench.
-        shifts: of the cube's centre, by which the simulator's action differs; mean over all other hypotheses.
+        ignorance: probability that the simulator contains no information about this bench.
+        shifts: difference of the simulator's action at the cube's centre; mean over all other hypotheses.
         deviations: of these shifts.
         factor: real over simulated cost, the median of those hypotheses.
-        gain: by how much one more observation is expected to lower the least expected cost; None before any was made,
-            and where no action keeps the limit.
+        gain: expected decrease of the least expected cost by one more observation; None before any observation, and if
+            no action keeps the limit.
         exceedances: at the proposals: probabilities that an observation is above the limit; empty without one.
-        least_exceedance: the smallest that any action has; None without a limit.
-        drawn: displacements drawn from the posterior, for another receiver; only with `count=0`.
+        least_exceedance: smallest probability over all actions; None without a limit.
+        drawn: bench offsets drawn from the posterior, for another receiver; only with `count=0`.
     """
 
     ignorance: float
@@ -108,7 +110,7 @@ class Data:
 
     Attributes:
         points: in the unit cube, one tuple of `Space.dimension` numbers each.
-        costs: one number each; failed trials are left out by the strategy or penalised by it.
+        costs: one number each; the strategy leaves failed trials out or penalises them.
     """
 
     points: tuple[Point, ...] = ()
@@ -122,7 +124,7 @@ class Data:
         return len(self.points)
 
     def added(self, point: Point, cost: float) -> Data:
-        """A copy with one more observation."""
+        """Return a copy with one more observation."""
         return Data((*self.points, tuple(float(u) for u in point)), (*self.costs, float(cost)))
 
 
@@ -132,7 +134,7 @@ class Linear:
 
     Attributes:
         weights: pairs of an axis' name and its weight.
-        upper: largest allowed sum, in the unit that weights and values [SI] give.
+        upper: largest allowed sum, in the unit that results from weights and values [SI].
     """
 
     weights: tuple[tuple[str, float], ...]
@@ -141,15 +143,15 @@ class Linear:
 
 @dataclass(frozen=True)
 class PosteriorQuestion:
-    """Weighed pours, for what they say about θ.
+    """Weighed pours, for the posterior of θ.
 
     Attributes:
         contexts: actions of the pours, in the context's unit cube.
-        offsets: weighed minus regressed spillage at each; the regressed one is in the differences that were observed.
+        offsets: weighed minus regressed spillage at each; the regressed one is part of the observed differences.
         noise: standard deviation of a weighed pour.
-        count: of draws wanted.
-        prior: centre and standard deviation along every axis of the unit cube, of normals that its faces cut off; where
-            a deviation is 0, all values are alike. Empty: they are along all axes.
+        count: number of requested draws.
+        prior: centre and standard deviation of a normal along every axis of the unit cube, truncated at its faces; with
+            a deviation of 0 the axis is uniform. Empty: all axes are uniform.
     """
 
     contexts: tuple[Point, ...]
@@ -161,7 +163,8 @@ class PosteriorQuestion:
 
 @dataclass(frozen=True)
 class DesignQuestion:
-    """Which pour would tell most about others; asked beside a `PosteriorQuestion`, which may then have no pours yet.
+    """Which pour would be most informative about others; in addition to a `PosteriorQuestion`, which may have no pours
+    yet.
 
     Attributes:
         candidates: contexts at which a pour could be weighed.
@@ -178,8 +181,8 @@ class Posterior:
 
     Attributes:
         points: in the unit cube.
-        discrepancies: of each, the standard deviation of what it still lacks.
-        effective: how many independent draws the chain was worth.
+        discrepancies: standard deviation of the remaining discrepancy of each draw.
+        effective: effective number of independent draws of the chain.
     """
 
     points: tuple[Point, ...]
@@ -189,11 +192,11 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One way in which requests are executed: x becomes scales · x + shifts, beside coordinates that no request has.
+    """One disturbance of execution: x becomes scales · x + shifts, extended by coordinates that requests do not have.
 
     Attributes:
         scales, shifts: one number for each axis of the space.
-        context: errors of execution that are not a change of an axis.
+        context: errors of execution that do not change an axis.
     """
 
     scales: Point
@@ -203,7 +206,7 @@ class Disturbance:
 
 @dataclass(frozen=True)
 class Risk:
-    """What is minimised over disturbances: the mean, or the CVaR, which is the mean of the worst share 1 − level.
+    """The risk measure over disturbances: the mean, or the CVaR, which is the mean of the worst fraction 1 − level.
 
     Attributes:
         disturbances: equally likely.
@@ -216,7 +219,7 @@ class Risk:
 
 @dataclass(frozen=True)
 class RiskAnswer:
-    """What the surrogate says over the disturbances, at each of `SuggestProblem.predict_at`.
+    """Results over the disturbances, at each of `SuggestProblem.predict_at`.
 
     Attributes:
         expected: means over the disturbances.
@@ -231,12 +234,12 @@ class RiskAnswer:
 
 @dataclass(frozen=True)
 class SearchEffort:
-    """How much a fit may cost. Without one it starts afresh and takes the time it needs.
+    """Limit of the effort of a fit. Without it, a fit starts from its priors and takes the time it needs.
 
     Attributes:
-        start: hyperparameters to begin with, of each process in the order of fitting: `Suggestion.fitted` of an
-            earlier answer. A process without an entry is fitted afresh.
-        iterations: of the search for better ones, for processes that have a start; 0 takes them as they are.
+        start: initial hyperparameters of each process in the order of fitting: `Suggestion.fitted` of an earlier
+            answer. A process without an entry starts from its priors.
+        iterations: of the search for better ones, for processes with a start; 0 uses them unchanged.
     """
 
     start: tuple[tuple[float, ...], ...] = ()
@@ -245,52 +248,51 @@ class SearchEffort:
 
 @dataclass(frozen=True)
 class SuggestProblem:
-    """Everything that a proposal depends on; the optimiser actor keeps no state that matters.
+    """A question with everything that a proposal depends on; the optimiser actor keeps no relevant state.
 
     Attributes:
         space: searched box.
-        data: what was observed of the cost.
-        pending: points asked for and not answered yet.
-        count: how many points are wanted; 0 asks for `best_point`, map and predictions only.
+        data: observations of the cost.
+        pending: requested points without an answer yet.
+        count: number of requested points; 0 requests only `best_point`, map and predictions.
         seed: of every random choice in the answer.
-        mean: prior mean of the surrogate: 'constant' (fitted), 'zero' (the paper's), 'simulated' (posterior mean of a
-            GP over `simulated`, the paper's D3), 'pooled' (`simulated` and `data` in one GP, simulations with a noise
-            and an offset of their own), 'scaled' (real cost = ρ · simulated cost + remainder, fitted at once),
-            'adaptive' (an average over the ways in which the simulator may be wrong, see `mismatch`).
+        mean: prior mean of the surrogate. 'constant' is fitted; 'zero' is the paper's. 'simulated' is the posterior
+            mean of a GP over `simulated`, the paper's D3. 'pooled' has `simulated` and `data` in one GP, with a
+            separate noise and an offset for simulations. 'scaled' has real cost = ρ · simulated cost + remainder,
+            fitted together. 'adaptive' averages over the ways in which the simulator may be wrong, see `mismatch`.
         simulated: cheap observations of the same cost, for the last four.
-        acquisition: 'lcb' minimises m(x) − κ s(x); 'posterior_minimum' minimises m(x) (further points of the same
-            answer the penalised 'lcb'); 'random' and 'sobol' only draw. 'knowledge' looks for *simulations*: where one
-            more of them would teach most about which action is best (a mean that knows simulations is needed).
-            'least_loss' (for 'adaptive'): the first point is a pour that loses little on the way to a good action, the
-            others are simulations that tell in which way the simulator is wrong.
+        acquisition: 'lcb' minimises m(x) − κ s(x). 'posterior_minimum' minimises m(x); further points of the same
+            answer use the penalised 'lcb'. 'random' and 'sobol' only draw. 'knowledge' chooses *simulations*: those
+            most informative about the best action (needs a mean with simulations). 'least_loss' (for 'adaptive'): the
+            first point is a pour with a small loss on the way to a good action, the others are simulations that show in
+            which way the simulator is wrong.
         kappa: κ of the lower confidence bound, constant as in the paper.
-        map_resolution: if > 0 and the space has at least two dimensions, the answer carries the surrogate on a square
-            grid over the two axes that matter most.
-        map_at: place of the unit cube that the grid goes through; without one it is the least that is known, see
-            `SurrogateMap.at`.
-        predict_at: further points at which the posterior is wanted (a regression, with `count=0`).
-        context: if given, the observations are signed differences that also depend on coordinates which nobody chooses
-            (in calibration: c_r − c_s, and the action that was simulated), and what is minimised is the mean of their
-            absolute values over these places of the context's unit cube. The points of `data` then have
-            `space.dimension` coordinates followed by those of the context.
-        infeasible: places where a request was refused. They say nothing about the cost; proposals keep away from places
-            where another refusal is likely.
-        refused: the same of real requests: what was only simulated does not say that a place can really be had.
-        failed: places of real requests that went wrong under way, where the vessels touched after all, say. They are
-            among `data` too, at what that costs. Proposals keep away from where that is likely again, and the best
-            point is one that is likely to be made.
-        constraints: that every proposal meets.
-        noise: of real observations: 'constant', or 'varying' with the expected cost where the observations show it.
-        widening: 'pooled': factor on what the simulations' noise, which holds their discrepancy, is expected to be.
+        map_resolution: if > 0 and the space has at least two dimensions, the answer includes the surrogate on a square
+            grid over the two most important axes.
+        map_at: point of the unit cube through which the grid passes; by default the minimum, see `SurrogateMap.at`.
+        predict_at: further points for posterior predictions (a regression, with `count=0`).
+        context: if given, the observations are signed differences that also depend on coordinates that are not searched
+            (in calibration: c_r − c_s, and the simulated action). The minimised quantity is the mean of their absolute
+            values over these points of the context's unit cube. The points of `data` then have `space.dimension`
+            coordinates followed by those of the context.
+        infeasible: places where a request was refused. They contain no information about the cost; proposals avoid
+            places with a likely refusal.
+        refused: the same for real requests: a simulation does not show that a place can be executed.
+        failed: places of real requests that failed during execution, for example because the vessels touched. They are
+            among `data` too, with the cost of the failure. Proposals avoid places with a likely failure, and the best
+            point is one that is likely to succeed.
+        constraints: kept by every proposal.
+        noise: of real observations: 'constant', or 'varying' with the expected cost if the observations support it.
+        widening: 'pooled': factor on the expected noise of simulations, which includes their discrepancy.
         posterior: with a context: weighed pours, for draws of the searched parameters given them.
         design: with a posterior: which pour to weigh next.
-        risk: if given, the observations are of requests as they were executed, disturbances included: points of `data`
-            have `space.dimension` coordinates (which may leave the cube) followed by the disturbances' context. What is
-            minimised, predicted and mapped is the measure over the disturbances of a request.
-        pouring: 'knowledge': places of real observations whose outcome is out; `pending` are simulations then.
-        effort: limits the fit, and has the answer carry what was fitted.
+        risk: if given, the observations are of requests as executed, disturbances included: points of `data` have
+            `space.dimension` coordinates (which may leave the cube) followed by the disturbances' context. The
+            minimised, predicted and mapped quantity is the measure over the disturbances of a request.
+        pouring: 'knowledge': places of pending real observations; `pending` are simulations then.
+        effort: limits the fit, and includes the fitted hyperparameters in the answer.
         mismatch: 'adaptive': how the simulator may be wrong, and how many pours follow.
-        plain: 'lcb' as it stands in the paper: κ is kept, and no point only fills space on a plateau.
+        plain: 'lcb' as in the paper: κ is constant, and no point only fills space on a plateau.
     """
 
     space: Space
@@ -322,7 +324,7 @@ class SuggestProblem:
 
     @property
     def beside(self) -> int:
-        """Coordinates of an observation that are none of the space's."""
+        """Number of coordinates of an observation in addition to the space's."""
         if self.risk is not None and self.risk.disturbances:
             return len(self.risk.disturbances[0].context)
         return len(self.context[0]) if self.context else 0
@@ -330,16 +332,16 @@ class SuggestProblem:
 
 @dataclass(frozen=True)
 class SurrogateMap:
-    """The surrogate on a square grid over two axes of the space, for pictures.
+    """The surrogate on a square grid over two axes of the space, for plots.
 
     Attributes:
         mean: posterior means, row i at the second axis' i-th place in 0 … 1.
         deviation: their standard deviations.
         axes: names of the two axes, in the space's order: those with the shortest fitted lengthscales. Empty for a
-            space that has no others.
-        at: point of the unit cube that the grid goes through: every other axis is held at its value there. It is
-            `SuggestProblem.map_at`, or where the posterior mean is least: the minimiser that 'posterior_minimum' found,
-            else `Suggestion.best_point`.
+            space with two axes only.
+        at: point of the unit cube through which the grid passes: every other axis is held at its value there. It is
+            `SuggestProblem.map_at`, or the minimum of the posterior mean: the minimiser that 'posterior_minimum' found,
+            otherwise `Suggestion.best_point`.
     """
 
     mean: tuple[tuple[float, ...], ...]
@@ -348,7 +350,7 @@ class SurrogateMap:
     at: Point = ()
 
     def plane(self, space: Space) -> Space:
-        """The two axes of the grid, out of those that were searched: the first across, the second up."""
+        """The two axes of the grid as a space: the first is horizontal, the second vertical."""
         return Space(tuple(axis for axis in space.axes if not self.axes or axis.name in self.axes))
 
     def held(self, space: Space) -> dict[str, float]:
@@ -363,32 +365,33 @@ class Suggestion:
 
     Attributes:
         points: `count` proposals in the unit cube.
-        means: posterior means there; NaN-free; empty if no surrogate was fitted (too few data, or only drawn).
+        means: posterior means there; NaN-free; empty if no surrogate was fitted (too few data, or drawn points only).
         deviations: posterior standard deviations of the noise-free cost there.
-        best_point: minimiser of the posterior mean over the observed points (the simulated ones while nothing else was
-            observed) that were not refused, nor probably are; where requests failed, of what is expected when each
-            fails again as likely as it seems, at the cost of the dearest observation; with a risk: over `predict_at`,
-            for requests are not what was observed; None without a surrogate.
+        best_point: minimiser of the posterior mean over the observed points (the simulated ones if there are no
+            others), except those that were refused or probably are. After failures, the minimised quantity is the
+            expectation with a failure of the estimated probability, at the largest observed cost. With a risk: the
+            minimiser over `predict_at`, because requests differ from the observed points. None without a surrogate.
         best_mean: posterior mean there.
         best_deviation: its standard deviation.
-        hyperparameters: fitted values by name (for people and plots); 'noise' and 'signal' in the cost's unit.
+        hyperparameters: fitted values by name (for reports and plots); 'noise' and 'signal' in the cost's unit.
         surrogate: see `SuggestProblem.map_resolution`.
         predictions: posterior means at `SuggestProblem.predict_at`; empty without a surrogate.
         prediction_deviations: their standard deviations.
-        seconds: CPU seconds it took.
+        seconds: CPU seconds used.
         noises: standard deviations of single real observations at the proposals; empty without a surrogate.
-        bands: 'adaptive': shortest intervals that hold single real observations at the proposals with a probability of
-            `sim_engine.prediction_band.LEVEL`.
-        feasibilities: probabilities that the proposals are not refused and don't fail; empty while nothing was or did.
-        posterior: what was asked for with `SuggestProblem.posterior`; None without a surrogate.
+        bands: 'adaptive': shortest intervals that contain single real observations at the proposals with a probability
+            of `sim_engine.prediction_band.LEVEL`.
+        feasibilities: probabilities that the proposals are neither refused nor fail; empty without any refusal or
+            failure.
+        posterior: answer to `SuggestProblem.posterior`; None without a surrogate.
         best_noise: standard deviation of a single real observation at `best_point`; None without a surrogate.
-        risk: with a risk: what else is known at `SuggestProblem.predict_at`.
-        values: 'knowledge': what a simulation at each point is worth, those before it given; in the cost's unit, ≥ 0.
-        pour_value: 'knowledge': the same of the one real observation that is worth most.
-        gains: 'design': by how much weighing a pour at each candidate is expected to lower the variance of predictions,
-            in the mean over the targets; in the cost's unit, squared.
-        uncertainty: 'design': that variance as it is, the mean over the targets.
-        mismatch: 'adaptive': what the observations say about the simulator.
+        risk: with a risk: further results at `SuggestProblem.predict_at`.
+        values: 'knowledge': value of a simulation at each point, given those before it; in the cost's unit, ≥ 0.
+        pour_value: 'knowledge': the same for the most valuable real observation.
+        gains: 'design': expected reduction of the variance of predictions by weighing a pour at each candidate,
+            averaged over the targets; in the cost's unit, squared.
+        uncertainty: 'design': the current variance, averaged over the targets.
+        mismatch: 'adaptive': the conclusions about the simulator.
         fitted: with `SuggestProblem.effort`: hyperparameters of each process, to start the next fit with.
     """
 

@@ -1,4 +1,7 @@
-"""What an action is worth when it is never executed exactly: mean or CVaR of a surrogate over disturbances."""
+"""Risk measures for actions with execution errors: mean or CVaR of a surrogate over disturbances.
+
+`RiskProcess` is a surrogate of the measure; `conditional_value_at_risk` computes the CVaR of losses.
+"""
 
 from __future__ import annotations
 
@@ -16,29 +19,29 @@ from actors.optimizer.questions import Disturbance, Risk, RiskAnswer
 Array = NDArray[np.float64]
 
 _AT_ONCE = 2**16
-"""Predictions in one piece: the memory that they need stays below 100 MB."""
+"""Number of predictions per batch: the memory for them stays below 100 MB."""
 
 
 def tail_weights(losses: Array, level: float) -> Array:
-    """Weights with which equally likely losses make up their CVaR: 1 / ((1 − β) J) for the worst (1 − β) J of them.
+    """Weights of equally likely losses in their CVaR: 1 / ((1 − β) J) for the worst (1 − β) J of them.
 
-    CVaR_β is the mean of the worst share 1 − β. Where (1 − β) J is not a whole number, the last one counts in part, so
-    that this is the minimum over c of c + mean(max(loss − c, 0)) / (1 − β).
+    CVaR_β is the mean of the worst fraction 1 − β. If (1 − β) J is not an integer, the last loss counts partially, so
+    that the result is the minimum over c of c + mean(max(loss − c, 0)) / (1 − β).
 
     Args:
         losses: (m, J).
-        level: β, 0 ≤ β < 1; 0 weighs all alike.
+        level: β, 0 ≤ β < 1; 0 weights all equally.
 
     Returns:
         (m, J), each row's sum is 1.
 
-    Source: Rockafellar & Uryasev, Optimization of conditional value-at-risk, Journal of Risk 2000; of scenarios with
-        atoms: the same, Conditional value-at-risk for general loss distributions, 2002.
+    Source: Rockafellar & Uryasev, Optimization of conditional value-at-risk, Journal of Risk 2000; for scenarios with
+    atoms: the same, Conditional value-at-risk for general loss distributions, 2002.
     """
     count = losses.shape[1]
     mass = max((1.0 - level) * count, 1e-12)
     by_rank = np.clip(mass - np.arange(count), 0.0, 1.0) / mass
-    by_rank /= by_rank.sum()  # below one loss' share the worst alone
+    by_rank /= by_rank.sum()  # below the fraction of one loss, only the worst counts
     weights = np.empty_like(losses)
     np.put_along_axis(weights, np.argsort(-losses, axis=1, kind="stable"), by_rank[None, :], axis=1)
     return weights
@@ -47,7 +50,7 @@ def tail_weights(losses: Array, level: float) -> Array:
 def conditional_value_at_risk(losses: Sequence[float] | Array, level: float) -> float:
     """CVaR of equally likely losses; see `tail_weights`. Raises ValueError without any, or for a level outside [0, 1).
 
-    Limitations: of a few draws it is biased low and scatters; a surrogate's many are what it is meant for.
+    Limitations: for a few draws it is biased low and scatters; it is meant for the many draws of a surrogate.
     """
     row = np.asarray(losses, dtype=np.float64)[None, :]
     if row.size == 0 or not 0.0 <= level < 1.0:
@@ -59,9 +62,10 @@ def conditional_value_at_risk(losses: Sequence[float] | Array, level: float) -> 
 class RiskProcess:
     """A surrogate of a measure over disturbances: M(x) = mean or CVaR over j of f(D_j(x), z_j).
 
-    f is a GP over what was executed: coordinates of the action as disturbed, then those of errors that no action has.
-    The same disturbances for every x (common random numbers): differences between actions are not their luck. The mean
-    is the measure of the posterior means, the deviation that of Σ w_j f_j with the weights of the tail there.
+    f is a GP over executed requests: coordinates of the disturbed action, then those of errors that no action has. The
+    same disturbances are used for every x (common random numbers), so that differences between actions contain no
+    sampling noise of them. The mean is the measure of the posterior means, the deviation that of Σ w_j f_j with the
+    weights of the tail there.
 
     Attributes:
         process: of single observations, (n, dimension + c).
@@ -69,10 +73,10 @@ class RiskProcess:
         level: β of CVaR; 0: the mean.
 
     Source: Cakmak, Astudillo, Frazier & Zhou, Bayesian optimization of risk measures, NeurIPS 2020; for the mean:
-        Toscano-Palmerin & Frazier, Bayesian optimization with expensive integrands, 2018.
-    Limitations: CVaR of a mean function is below the mean of CVaR where the surrogate knows little, and scatter from
-        seed to seed is averaged out. The prior covariance between disturbances is that in the cube's middle: exact
-        for shifts, a few per cent off for the scaling of an axis.
+    Toscano-Palmerin & Frazier, Bayesian optimization with expensive integrands, 2018.
+    Limitations: CVaR of a mean function is below the mean of CVaR where the surrogate is uncertain, and scatter between
+    seeds is averaged out. The prior covariance between disturbances is computed in the cube's middle: exact for shifts,
+    a few per cent off for the scaling of an axis.
     """
 
     process: GaussianProcess
@@ -81,11 +85,11 @@ class RiskProcess:
 
     @classmethod
     def of(cls, process: GaussianProcess, risk: Risk) -> RiskProcess:
-        """As a question asks for."""
+        """Create it from a question's risk."""
         return cls(process, risk.disturbances, risk.level)
 
     def predict(self, points: Array) -> tuple[Array, Array]:
-        """See `Surrogate.predict`: of the measure at points (m, dimension)."""
+        """See `Surrogate.predict`; of the measure at points (m, dimension)."""
         pieces = [self._moments(piece) for piece in self._pieces(points)]
         if not pieces:
             return np.empty(0), np.empty(0)
@@ -96,8 +100,8 @@ class RiskProcess:
         """Mean and standard deviation over the disturbances at points (m, dimension), and the worst ones.
 
         Args:
-            points: where.
-            count: how many of the worst are wanted for each, by index, the worst first; with level 0: none.
+            points: (m, dimension).
+            count: number of the worst disturbances for each point, by index, the worst first; with level 0: none.
         """
         losses = [self._losses(piece)[0] for piece in self._pieces(points)]
         every = np.concatenate(losses) if losses else np.empty((0, len(self.disturbances)))
@@ -113,7 +117,7 @@ class RiskProcess:
         losses, cross = self._losses(points)
         weights = tail_weights(losses, self.level)
         mean = (weights * losses).sum(axis=1)
-        # Weighted before it is solved for: one right-hand side for each point, not J.
+        # The weights are applied before solving: one right-hand side per point instead of J.
         known = self.process.explained(np.einsum("mj,mjn->mn", weights, cross))
         prior = np.einsum("mj,mj->m", weights @ self._prior, weights)
         variance = prior - (known**2).sum(axis=0)
@@ -127,7 +131,7 @@ class RiskProcess:
         return self.process.expected(executed, cross).reshape(m, J), cross.reshape(m, J, -1)
 
     def _executed(self, points: Array) -> Array:
-        """What comes of points (m, dimension) under every disturbance: (m · J, dimension + c)."""
+        """Points (m, dimension) as executed under every disturbance: (m · J, dimension + c)."""
         scales, shifts, context = self._maps
         moved = points[:, None, :] * scales + shifts
         beside = np.broadcast_to(context, (len(points), *context.shape))

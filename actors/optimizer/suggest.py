@@ -1,8 +1,7 @@
 """`propose`: from a question to an answer. Pure: the same question gets the same answer on the same machine.
 
-What a fitted surrogate says, for the answer: predictions, the best observation, a map, draws of θ.
-
-A surrogate cut through every two of its axes, for pictures of spaces with more than two.
+`describe`, `posterior_of` and `design_of` compute the parts of an answer: predictions, best observation, map, draws of
+θ. `slices` returns the surrogate over every pair of its axes, for plots of spaces with more than two.
 """
 
 from __future__ import annotations
@@ -38,20 +37,20 @@ from sim_engine.prediction_band import LEVEL
 Array = NDArray[np.float64]
 
 WORST = 8
-"""Disturbances that an answer names as the worst of a request."""
+"""Number of worst disturbances of a request in an answer."""
 
 
 def describe(
     problem: SuggestProblem, asked: Asked, model: Model, points: Array, feasibility: Feasibility | None
 ) -> dict[str, object]:
-    """What the surrogate says about the proposals, the observations and the rest."""
+    """Return the surrogate's results about the proposals, the observations and further points."""
     known = asked.known if len(asked.known) else asked.simulated
     if problem.risk is not None:
         known = asked.region.snap(array(problem.predict_at, problem.space.dimension))
     elif feasibility is not None:
         known = known[feasibility.likely(known)]
     if problem.risk is None and (allowed := asked.region.allows(known)).any():
-        known = known[allowed]  # former data may lie beside what is allowed today
+        known = known[allowed]  # prior data may lie outside the current constraints
     means, deviations = model.surrogate.predict(points) if len(points) else (np.empty(0), np.empty(0))
     at_known, known_deviations = model.surrogate.predict(known)
     expected = at_known
@@ -97,7 +96,7 @@ def describe(
 def posterior_of(
     problem: SuggestProblem, question: PosteriorQuestion, region: Region, model: Model, rng: np.random.Generator
 ) -> Posterior:
-    """Draws of θ given weighed pours."""
+    """Return draws of θ given weighed pours."""
     contexts = array(question.contexts, model.process.points.shape[1] - problem.space.dimension)
     if not len(contexts):
         drawn = drawn_beforehand(question.count, problem.space.dimension, array(question.prior, 2), rng)
@@ -119,7 +118,7 @@ def posterior_of(
 def design_of(
     problem: SuggestProblem, question: DesignQuestion, made: PosteriorQuestion, model: Model, posterior: Posterior
 ) -> dict[str, object]:
-    """What weighing a pour at each candidate would tell, beside those made."""
+    """Return the expected information of weighing a pour at each candidate, in addition to those made."""
     beside = model.process.points.shape[1] - problem.space.dimension
     gains, variance = expected_reductions(
         model.process,
@@ -154,30 +153,29 @@ def mapped(
 
 
 FILL_EVERY = 3
-"""While the costs could as well be noise, one proposal of this many only fills space."""
+"""One proposal in this many only fills space while the costs may be pure noise."""
 
 STRUCTURE = 2.0
-"""Gain of the log-likelihood from which the costs are more than noise."""
+"""Gain of the log-likelihood above which the costs are more than noise."""
 
 SETTLED = 0.5
-"""Share of κ that is left once the costs are more than noise."""
+"""Factor on κ once the costs are more than noise."""
 
 
 def propose(problem: SuggestProblem) -> Suggestion:
     """Answer a `SuggestProblem`.
 
-    With fewer than two observations there is no surrogate and the points are Sobol points, far from those known.
-    Points asked for and not answered yet are avoided by local penalisation, as are the other points of the same
-    answer.
+    With fewer than two observations there is no surrogate, and the points are Sobol points far from the known ones.
+    Local penalisation avoids pending points and the other points of the same answer.
 
     Raises:
-        ValueError: the question can't be answered: numbers that are not finite, wrong dimensions, sizes beyond what
-            a dense GP is for.
+        ValueError: the question cannot be answered: numbers that are not finite, wrong dimensions, sizes too large for
+            a dense GP.
 
-    Limitations: linear algebra differs between machines in the last bits, so proposals do too: journal the answer.
+    Limitations: linear algebra differs between machines in the last bits, and so do proposals: journal the answer.
     """
     check(problem)
-    with threadpool_limits(1):  # matrices this small only lose by threads, and sums in a fixed order are repeatable
+    with threadpool_limits(1):  # threads only slow down matrices this small, and sums in a fixed order are repeatable
         return _answer(problem)
 
 
@@ -227,10 +225,10 @@ def _answer(problem: SuggestProblem) -> Suggestion:
 
 
 def _candidates(problem: SuggestProblem, asked: Asked, model: Model, rng: np.random.Generator) -> Array:
-    """Places to think about: all over the region, and around the best of those observed."""
+    """Candidates for the search: all over the region, and around the best observations."""
     seen = asked.seen if problem.mean in ("simulated", "pooled", "scaled", "adaptive") else asked.known
     if problem.risk is not None:
-        seen = np.clip(seen, 0.0, 1.0)  # what was executed may lie beside the box
+        seen = np.clip(seen, 0.0, 1.0)  # executed points may lie outside the box
     means = model.surrogate.predict(seen)[0]
     around = [seen[i] for i in np.argsort(means, kind="stable")[:4]]
     return acquisition.search_candidates(asked.region, problem.space.dimension, around, rng)
@@ -243,14 +241,14 @@ def _search(
     feasibility: Feasibility | None,
     rng: np.random.Generator,
 ) -> Array:
-    """`count` minimisers of the acquisition, each keeping away from the busy points and its forerunners."""
+    """`count` minimisers of the acquisition, each avoiding the pending points and the ones before it."""
     chosen: list[Array] = []
     surrogate = model.surrogate
     if problem.count:
         candidates = _candidates(problem, asked, model, rng)
     for index in range(problem.count):
         taken = np.concatenate([asked.busy, np.array(chosen).reshape(-1, problem.space.dimension)])
-        if _looks_round(problem, asked, model, index):
+        if _fills_space(problem, asked, model, index):
             avoided = np.concatenate([asked.known, taken, asked.refused])
             chosen.append(acquisition.spread_out(1, avoided, asked.region, rng, feasibility)[0])
             continue
@@ -261,13 +259,13 @@ def _search(
     return np.array(chosen).reshape(problem.count, problem.space.dimension)
 
 
-def _looks_round(problem: SuggestProblem, asked: Asked, model: Model, index: int) -> bool:
-    """Whether the next point only fills space: every third one, while the costs could as well be noise.
+def _fills_space(problem: SuggestProblem, asked: Asked, model: Model, index: int) -> bool:
+    """Whether the next point only fills space: every third one, while the costs may be pure noise.
 
-    On a plateau the luckiest pours look like a slope, and following them, mostly along the faces of the cube, would
-    take the whole budget. The same holds where every pour came to more than half of all simulations did, and pours
-    alone show no structure: what simulation promised isn't there. The paper's ways (`plain`, 'zero', 'simulated'),
-    contexts and risks are left alone.
+    On a plateau the best pours look like a slope by chance. Following them, mostly along the faces of the cube, would
+    use up the whole budget. The same holds if every pour costs more than `_expected_cost`, and the pours alone show no
+    structure: the simulated optimum is not confirmed. The paper's methods (`plain`, 'zero', 'simulated'), contexts and
+    risks are excluded.
     """
     if problem.plain:
         return False
@@ -278,7 +276,7 @@ def _looks_round(problem: SuggestProblem, asked: Asked, model: Model, index: int
         return model.process.evidence < STRUCTURE
     if problem.mean not in ("pooled", "scaled") or len(asked.known) < 2 or len(asked.simulated) < 2:
         return False
-    if asked.costs.min() <= _promised(problem, asked):
+    if asked.costs.min() <= _expected_cost(problem, asked):
         return False
     return constant_mean_process(asked.points, asked.costs).evidence < STRUCTURE
 
@@ -286,19 +284,20 @@ def _looks_round(problem: SuggestProblem, asked: Asked, model: Model, index: int
 def _kappa(problem: SuggestProblem, model: Model) -> float:
     """κ of the next point: half of it once the costs show structure.
 
-    A constant κ goes on visiting what is merely unknown when the valley has long been found, and a budget of twenty
-    ends before its bottom is reached. The paper's ways (`plain`, 'zero', 'simulated'), and contexts, are left alone.
+    A constant κ continues to explore unknown regions long after the valley has been found, and a budget of twenty ends
+    before its bottom is reached. The paper's methods (`plain`, 'zero', 'simulated'), and contexts, are excluded.
     """
     adapts = problem.mean == "constant" and not problem.context and not problem.plain
     settled = adapts and model.process.evidence >= STRUCTURE
     return problem.kappa * (SETTLED if settled else 1.0)
 
 
-def _promised(problem: SuggestProblem, asked: Asked) -> float:
-    """What pours should at least come to, by the simulations.
+def _expected_cost(problem: SuggestProblem, asked: Asked) -> float:
+    """Cost that pours should at least reach according to the simulations.
 
-    That is their median. Where they are made by what they are worth (`effort`), most of them lie in the valley: there
-    each counts for the part of the region that it is nearest to, and it is half-way from the least to the median.
+    It is the median of the simulated costs. If simulations are chosen by their value (`effort`), most of them lie in
+    the valley. Each then counts for the part of the region to which it is nearest, and the result is half-way between
+    minimum and median.
     """
     if problem.effort is None:
         return float(np.median(asked.simulated_costs))
@@ -311,20 +310,20 @@ MOST_AXES = 4
 
 
 def slices(problem: SuggestProblem, suggestion: Suggestion, resolution: int = 15) -> tuple[SurrogateMap, ...]:
-    """The surrogate over every two of its axes, the others held where `suggestion.surrogate` holds them.
+    """The surrogate over every pair of its axes, the others held as in `suggestion.surrogate`.
 
-    Of more than `MOST_AXES` axes those with the shortest lengthscales are taken.
+    Of more than `MOST_AXES` axes, those with the shortest lengthscales are used.
 
     Args:
-        problem: that was put to the optimiser.
+        problem: the question to the optimiser.
         suggestion: its answer, with a surrogate.
-        resolution: places along an axis.
+        resolution: number of places along an axis.
 
     Returns:
         Pairs in the space's order: (0, 1), (0, 2) … ; empty for a space of two axes.
 
-    Limitations: answers carry one map only, since they are journalled; here the surrogate is fitted once more, which
-    costs what it cost the first time, and gives the same but for the last bits on another machine.
+    Limitations: answers contain one map only, because they are journalled. The surrogate is fitted again here, which
+    takes as long as the first fit, and is identical except for the last bits on another machine.
     """
     if suggestion.surrogate is None or problem.space.dimension <= 2:
         return ()

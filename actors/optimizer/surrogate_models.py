@@ -1,6 +1,6 @@
-"""Which surrogate a question asks for.
+"""The surrogate models of the questions: `fit` returns the fitted `Model` of a question.
 
-The mean absolute value of a signed surrogate over places that nobody chooses.
+`AbsoluteProcess` is the mean absolute value of a signed surrogate over a context that is not searched.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ class Model:
     """A fitted surrogate.
 
     Attributes:
-        surrogate: of what is minimised.
-        process: with the observations in it; where hypotheses are averaged over, of the simulations alone.
-        lengths: (dimension,) lengthscales of the searched axes. Around a simulated mean they are the simulations':
-            a handful of pours says little about what the pours' remainder depends on.
-        fitted: all processes that were fitted, in order.
+        surrogate: of the minimised quantity.
+        process: with the observations in it; for an average over hypotheses, of the simulations only.
+        lengths: (dimension,) lengthscales of the searched axes. Around a simulated mean they are the simulations',
+            because a few pours do not determine those of the remainder.
+        fitted: all fitted processes, in order.
     """
 
     surrogate: Surrogate
@@ -78,7 +78,7 @@ class Model:
 
 
 def fit(problem: SuggestProblem, asked: Asked) -> Model | None:
-    """The surrogate that the problem asks for; None with too few observations."""
+    """Fit the surrogate of the problem; None with too few observations."""
     points, costs = asked.points, asked.costs
     informed = problem.mean in ("simulated", "pooled", "scaled", "adaptive") and len(asked.simulated) >= 2
     varying = problem.noise == "varying"
@@ -120,7 +120,7 @@ def fit(problem: SuggestProblem, asked: Asked) -> Model | None:
 
 
 def _search_for(problem: SuggestProblem, number: int) -> HyperparameterSearch:
-    """How the `number`-th process looks for its hyperparameters."""
+    """Hyperparameter search of the `number`-th process."""
     effort = problem.effort
     if effort is None or number >= len(effort.start):
         return AFRESH

@@ -1,4 +1,4 @@
-"""What weighed pours say about θ: a region of the unit cube and not a point. Sampled on a surrogate; numpy only."""
+"""The posterior of θ given weighed pours: a distribution over the unit cube, sampled on a surrogate with numpy only."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from actors.optimizer.gaussian_process import GaussianProcess
 Array = NDArray[np.float64]
 
 WALKERS = 32
-"""At least; a stretch move needs more than twice as many as there are dimensions."""
+"""Smallest number of walkers; a stretch move needs more than twice the number of dimensions."""
 STEPS, BURN_IN = 300, 100
 STRETCH = 2.0
 STARTS = 256
-"""Even places of which the walkers begin at the likeliest, drawn by their likelihood."""
+"""Number of Sobol points; the walkers start at the likeliest of them, and at others drawn by their likelihood."""
 
 DISCREPANCY_PRIOR = (0.02, 1.0)
-"""Median and sd of the logarithm of what the best θ still lacks, in the cost's unit: 2 % of what is poured."""
+"""Median and standard deviation of the logarithm of the best θ's remaining discrepancy, in the cost's unit: 2 % of the
+poured mass."""
 DISCREPANCY_LENGTH = 0.4
-"""Lengthscale over actions of what the best θ lacks, in the unit cube: without it a bias that all pours share would
-count as many independent errors, and θ would seem far better known than it is."""
+"""Lengthscale of the best θ's remaining discrepancy over actions, in the unit cube. Without it, a bias common to all
+pours would count as many independent errors, and the posterior of θ would be far too narrow."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,8 @@ class Sampled:
 
     Attributes:
         points: (count, dimension), in the unit cube.
-        discrepancies: (count,) sampled standard deviations of what θ still lacks, in the cost's unit.
-        effective: how many independent draws the chain is worth.
+        discrepancies: (count,) sampled standard deviations of the remaining discrepancy, in the cost's unit.
+        effective: effective number of independent draws of the chain.
     """
 
     points: Array
@@ -58,24 +59,26 @@ def sample_posterior(
 ) -> Sampled:
     """Draw θ from p(θ | pours) ∝ p(θ) N(e(θ); 0, S(θ) + n² I + σ_δ² M), θ in the cube.
 
-    e_i(θ) = m(θ, a_i) + o_i is weighed minus simulated spillage of pour i; S(θ) the surrogate's posterior covariance
-    over the pours; n² the variances of a weighing and of simulations around the surrogate, which hold what it can't
-    follow (a kink); σ_δ² M what even the best θ lacks, a Matérn 5/2 over actions. σ_δ is sampled with θ. The
-    chain is an affine-invariant ensemble, at home on the long narrow ridges along which θ make up for each other.
+    e_i(θ) = m(θ, a_i) + o_i is weighed minus simulated spillage of pour i. S(θ) is the surrogate's posterior covariance
+    over the pours. n² contains the variances of a weighing and of simulations around the surrogate, including features
+    that it cannot represent (a kink). σ_δ² M is the discrepancy that remains at the best θ, a Matérn 5/2 over actions;
+    σ_δ is sampled with θ. The chain is an affine-invariant ensemble, which suits the long narrow ridges along which
+    parameters compensate each other.
 
     Args:
         process: of signed differences c_r − c_s over (θ, a).
         contexts: (n, c) actions of the pours, in their unit cube.
-        offsets: (n,) weighed spillage minus the regressed one that the differences were formed with.
+        offsets: (n,) weighed spillage minus the regressed one in the differences.
         noise: standard deviation of a weighed pour.
-        count: of draws to return.
+        count: number of returned draws.
         snap: rounds integer axes of points (m, dimension).
-        prior: p(θ), (dimension, 2) centres and deviations of normals in the cube; along axes with a deviation of 0, and
-            along all of them without any row, it is uniform.
+        rng: random number generator.
+        prior: p(θ), (dimension, 2) centres and deviations of normals in the cube; uniform along axes with a deviation
+            of 0, and along all axes without any row.
 
     Source: Kennedy & O'Hagan, Bayesian calibration of computer models, 2001; Goodman & Weare, Ensemble samplers with
-        affine invariance, 2010.
-    Limitations: the surrogate's hyperparameters and M's lengthscale are taken for known.
+    affine invariance, 2010.
+    Limitations: the surrogate's hyperparameters and M's lengthscale are taken as known.
     """
     n, dimension = len(contexts), process.points.shape[1] - contexts.shape[1]
     likelihood = _Likelihood(process, contexts, offsets, noise, dimension, snap)
@@ -99,7 +102,8 @@ def sample_posterior(
     starts[:, dimension] = math.log(median) + width * (2.0 * starts[:, dimension] - 1.0)
     at_starts = density(starts)
     weights = np.exp(at_starts - at_starts.max())
-    # At least as many different ones as walkers span all directions: an ensemble never leaves the plane it begins in.
+    # As many different starts as walkers / 2 span all directions: an ensemble never leaves the subspace in which it
+    # starts.
     best = np.argsort(-at_starts, kind="stable")[: walkers // 2]
     drawn = rng.choice(STARTS, walkers - len(best), p=weights / weights.sum())
     x = starts[np.concatenate([best, drawn])]
@@ -113,7 +117,7 @@ def sample_posterior(
 
 
 def drawn_beforehand(count: int, dimension: int, prior: Array, rng: np.random.Generator) -> Array:
-    """Draws (count, dimension) of θ before anything is weighed: even in the cube, along the axes of `prior` normal."""
+    """Draws (count, dimension) of θ from its prior: uniform in the cube, normal along the axes of `prior`."""
     points = qmc.Sobol(dimension, rng=rng).random(2 ** math.ceil(math.log2(max(count, 2))))[:count]
     for i, (centre, deviation) in enumerate(prior):
         if deviation > 0.0:
@@ -136,7 +140,7 @@ class _Likelihood:
     ) -> None:
         self._process, self._contexts, self._offsets, self._snap = process, contexts, offsets, snap
         n = len(contexts)
-        # Within one θ the prior covariance of a stationary process depends on the actions alone.
+        # Within one θ, the prior covariance of a stationary process depends on the actions only.
         at_one = np.concatenate([np.full((n, dimension), 0.5), contexts], axis=1)
         self._prior = process.prior_covariance(at_one)
         self._scatter = (noise**2 + process.noise**2 + 1e-10) * np.eye(n)
@@ -178,7 +182,7 @@ def _stretched(x: Array, density: Callable[[Array], Array], rng: np.random.Gener
 
 
 def _effective(chain: Array) -> float:
-    """Independent draws that a chain (steps, walkers, d) is worth: of its slowest coordinate.
+    """Effective number of independent draws of a chain (steps, walkers, d), for its slowest coordinate.
 
     Source: Geyer's initial positive sequence on the walkers' mean autocovariance.
     """

@@ -1,2 +1,3 @@
-"""How balances talk: bytes to readings and back, one dialect a file, no ports. `actors.balance.dialect_registry`
-finds them."""
+"""Dialects of serial balances: bytes to readings and back, one dialect per file, without ports.
+`actors.balance.dialect_registry` lists them.
+"""

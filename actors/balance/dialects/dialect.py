@@ -1,4 +1,4 @@
-"""What the driver needs to know of a dialect. Bytes and values only; nothing here opens a port."""
+"""The interface of a dialect: `Dialect` and its `LineSettings`. Only bytes and values; this module opens no port."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from actors.balance.dialects.protocol_encoder import PlainEncoder, ProtocolEncod
 from actors.balance.readings import Reading, Reply
 
 NUMBER = re.compile(r"[+-]?[0-9]{1,10}(?:\.[0-9]{1,9})?")
-"""A weight in digits; no exponents, no commas, and a digit on both sides of the point."""
+"""A weight in digits: no exponent, no comma, and a digit on both sides of the point."""
 
 
 @dataclass(frozen=True)
 class LineSettings:
-    """How characters travel.
+    """Settings of a serial line.
 
     Attributes:
         baud: bits per second.
@@ -33,7 +33,7 @@ class LineSettings:
 
     @property
     def format(self) -> str:
-        """'8N1'."""
+        """Character format, e.g. '8N1'."""
         return f"{self.bits}{self.parity}{self.stop}"
 
     def __str__(self) -> str:
@@ -41,28 +41,28 @@ class LineSettings:
 
     @property
     def character_time(self) -> float:
-        """Time that one character takes on the line [s]."""
+        """Transmission time of one character [s]."""
         return (1 + self.bits + (self.parity != "N") + self.stop) / self.baud
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dialect(ABC):
-    """One way of talking: a class without state in a file of its own, whose one instance is registered at the door
+    """A dialect: a class without state in a file of its own. Its one instance is registered in the plug-in registry
     `decant.balances` under its `name`.
 
     Attributes:
         name: in files: 'kcp'.
-        title: for people: 'Kern KCP'.
-        lines: line settings that such balances come with, the likeliest first.
-        gap: shortest time from one question to the next [s].
-        query: asks for what the display shows now.
-        tare: counts what is on the balance as nothing.
-        zero: sets the empty balance's zero; None where only a key does.
-        cancel: ends repeated output and commands that wait; None where there is no such command.
-        acknowledged: whether tare and zero are answered by a line.
-        turn: when this is asked, as long as it isn't known who is there: a question that means nothing to other
-            balances comes first, one that they may take for a command last.
-        identity: questions that make it say who it is, without ends of lines.
+        title: for messages: 'Kern KCP'.
+        lines: usual line settings of such balances, the most likely first.
+        gap: shortest time between two queries [s].
+        query: requests the display's current weight.
+        tare: tares the balance.
+        zero: sets the empty balance's zero; None if only a key does.
+        cancel: ends repeated output and waiting commands; None if there is no such command.
+        acknowledged: whether the balance replies to tare and zero with a line.
+        turn: order of the query during detection. A query without meaning to other balances comes first, one that they
+            may take for a command comes last.
+        identity: queries that return the balance's identification, without line ends.
     """
 
     name: str
@@ -79,44 +79,46 @@ class Dialect(ABC):
 
     @abstractmethod
     def decode(self, line: bytes) -> Reply:
-        """Understand one line.
+        """Decode one line.
 
         Args:
             line: without its CR LF.
 
         Raises:
-            LineError: it is none of this dialect's.
+            LineError: it is not a line of this dialect.
         """
 
     @abstractmethod
     def encode(self, reading: Reading) -> bytes:
-        """The line that a balance of this dialect would send for a reading, CR LF included.
+        """Return the line that a balance of this dialect sends for a reading, CR LF included.
 
         Raises:
-            ValueError: the dialect can't say it.
+            ValueError: the dialect has no line for it.
         """
 
     def likeness(self, said: Mapping[str, str]) -> int:
-        """How much a balance that knew the query is one of this dialect; of those that ask alike the largest wins.
+        """Score how well a balance that answered the query fits this dialect; among dialects with the same query the
+        largest wins.
 
         Args:
-            said: what it answered to the questions of `identity`, '' for nothing.
+            said: its replies to the queries of `identity`, '' for none.
         """
         return 0
 
     def voices(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
-        """Its side at the far end of the line, for virtual balances: by the dialect's name, and by others for what else
-        such balances may be set to."""
+        """Protocol encoders for emulated balances: one under the dialect's name, and one per further mode of such
+        balances.
+        """
         return {self.name: lambda: PlainEncoder(self, self.query, self.tare, self.zero)}
 
 
 def text_of(line: bytes) -> str | None:
-    """A line as text; None where it holds anything but printable ASCII."""
+    """Return a line as text; None if it contains anything but printable ASCII."""
     if any(not 0x20 <= byte < 0x7F for byte in line):
         return None
     return line.decode("ascii")
 
 
 def number_in(text: str) -> Decimal | None:
-    """The number that a text consists of; None where it is anything else."""
+    """Return the number that makes up the whole text; None for any other text."""
     return Decimal(text) if NUMBER.fullmatch(text) else None

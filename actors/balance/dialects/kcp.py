@@ -1,8 +1,9 @@
 """Kern Communications Protocol: `SI` is answered by `S S     12.34 g`.
 
-It must be switched on in the balance's menu. Sources: Kern KIB-TM-ZB-e-1913 (commands; no question sooner than 100 ms
-after the last), CKE-BA-e-2132 (`S I`, `S +`, `S -`). 9600 baud 8N1 is what such balances are usually met with.
-Limitations: `TA` reads the tare in some manuals and `MM` in others, so neither is used.
+It must be switched on in the balance's menu. Sources: Kern KIB-TM-ZB-e-1913 (commands; at least 100 ms between two
+queries), CKE-BA-e-2132 (`S I`, `S +`, `S -`). 9600 baud 8N1 is the most common setting of such balances.
+
+Limitations: `TA` reads the tare in some manuals and `MM` does in others, so the driver uses neither.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from actors.balance.dialects.protocol_encoder import ProtocolEncoder
 
 @dataclass(frozen=True, kw_only=True)
 class Kcp(status_lines.StatusLines):
-    """See the module's text."""
+    """The KCP dialect; see the module docstring."""
 
     name: str = "kcp"
     title: str = "Kern KCP"
 
     def likeness(self, said: Mapping[str, str]) -> int:
         """See `Dialect.likeness`."""
-        return 3 if status_lines.is_kern(said) else 1  # whose pace suits both, where nothing else is known
+        return 3 if status_lines.is_kern(said) else 1  # default of the two: its query interval suits both dialects
 
     def voices(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
         """See `Dialect.voices`."""

@@ -6,11 +6,12 @@
 | unstable                | 18 bytes, the unit blank               | 15, the unit left out                         |
 | fault                   | 18 bytes: 11 blanks, `Error`           | 14: 7 blanks, `Error`                         |
 
-CR LF are counted in. The drawings of the second column can be read as one byte more (19 and 16), so these widths are
-understood too. A line of any other width has lost characters, and a lost digit would be a wrong weight: it is refused.
-A stable line has a unit, an unstable one has none; that is how they are told apart. `=Overload=` is met in place of a
-value. Such balances must be set to remote control ('rE Cr').
-Limitations: there is no command for zero, and taring is not answered.
+The widths include CR LF. The drawings of the second column can also be read as one byte more (19 and 16), so these
+widths are accepted too. A line of any other width has lost characters, and a lost digit would give a wrong weight; such
+a line is invalid. A stable line has a unit and an unstable one has none; the unit is the only difference. `=Overload=`
+may appear instead of a value. Such balances must be set to remote control ('rE Cr').
+
+Limitations: there is no command for zero, and a tare is not acknowledged.
 """
 
 from __future__ import annotations
@@ -32,23 +33,23 @@ from actors.balance.dialects.protocol_encoder import (
 from actors.balance.readings import LineError, Reading, ReadingStatus, Reply
 
 STABLE_WIDTHS = (16, 17)
-"""Characters of a stable line without CR LF."""
+"""Widths of a stable line without CR LF."""
 
 UNSTABLE_WIDTHS = (13, 14, 16, 17)
-"""… of an unstable one."""
+"""Widths of an unstable line without CR LF."""
 
 FAULT_WIDTHS = (12, 16)
-"""… of a fault."""
+"""Widths of a fault line without CR LF."""
 
 _LINE = re.compile(r"[ M]?(?P<sign>[ -]?) *(?P<value>[0-9.]+) (?P<unit>[A-Za-z%]{0,4}) *")
 
 
 @dataclass(frozen=True, kw_only=True)
 class KernSwt(Dialect):
-    """The dialect; both layouts are understood, whichever is set.
+    """The dialect; it decodes both layouts.
 
     Attributes:
-        short: lines of the shorter layout, for `encode`.
+        short: whether `encode` uses the shorter layout.
     """
 
     short: bool = False
@@ -98,10 +99,10 @@ class KernSwt(Dialect):
 
 
 class KernSwtEncoder:
-    """Older Kern balances.
+    """Protocol encoder of older Kern balances.
 
     Args:
-        short: lines of 15 and 14 bytes where the other layout has 18.
+        short: send lines of 15 and 14 bytes instead of 18.
     """
 
     def __init__(self, *, short: bool = False) -> None:

@@ -1,12 +1,13 @@
 """Mettler-Toledo's Standard Interface Command Set, levels 0 and 1.
 
-A command sent before the last one is answered may be confused with it, so the driver never has two under way. Sources:
-Mettler-Toledo AL/AB operating instructions (commands, `S` replies); AT operating instructions (upper case, CR LF).
-9600 baud 8N1 is the factory setting of many; some come with Xon/Xoff (setting `handshake`).
+The reply to a command that is sent before the last reply may be confused with it, so the driver keeps at most one
+command pending. Sources: Mettler-Toledo AL/AB operating instructions (commands, `S` replies); AT operating instructions
+(upper case, CR LF). 9600 baud 8N1 is the factory setting of many; some are delivered with Xon/Xoff (setting
+`handshake`).
 
-A virtual balance answers all commands of levels 0 and 1 as the reference manual for weigh modules lists them
-(11781363), and `M21` of level 2, by which clients choose the unit. Assumed, as no balance was at hand: `M21` without
-parameters lists host and display unit in two lines, and `ZC` answers as `ZI` does.
+An emulated balance answers all commands of levels 0 and 1 as listed in the reference manual for weigh modules
+(11781363), and `M21` of level 2, which selects the unit. Two replies are assumed, not verified on a balance: `M21`
+without parameters lists host and display unit in two lines, and `ZC` answers like `ZI`.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from actors.balance.readings import KILOGRAMS, Reading, ReadingStatus
 
 @dataclass(frozen=True, kw_only=True)
 class MtSics(status_lines.StatusLines):
-    """See the module's text."""
+    """The MT-SICS dialect; see the module docstring."""
 
     name: str = "mt-sics"
     title: str = "Mettler-Toledo MT-SICS"
@@ -48,17 +49,19 @@ class MtSics(status_lines.StatusLines):
 
 
 HOST, DISPLAY = 0, 1
-"""Kinds of unit that M21 sets: of weights on the line, and of those that SIRU and SRU send."""
+"""Kinds of unit that M21 sets: the unit of weights on the line, and the unit in the replies to SIRU and SRU."""
 
 UNITS = {"0": "g", "1": "kg", "3": "mg", "5": "ct"}
-"""Numbers of the units; pounds and ounces, which are no whole number of digits, are refused."""
+"""Numbers of the units. Pounds and ounces are refused because their conversion is not a power of ten."""
 
 LONGEST_WAIT = 65_535
-"""What SC, TC and ZC may be told to wait [ms]."""
+"""Longest wait that SC, TC and ZC accept [ms]."""
 
 
 class MtSicsVoice(status_lines.StatusLineEncoder):
-    """What MT-SICS has and KCP has not: units, commands with a time limit, repeated output of the display's unit."""
+    """The commands that MT-SICS has in addition to KCP: units, commands with a time limit, repeated output in the
+    display's unit.
+    """
 
     LEVELS: Mapping[str, int] = {
         **status_lines.StatusLineEncoder.LEVELS,
@@ -116,7 +119,7 @@ class MtSicsVoice(status_lines.StatusLineEncoder):
         return f"{tare.value!s:>10} {tare.unit}"
 
     def _limited(self, word: str, parameters: str, display: EncoderDisplay) -> Said:
-        """Wait for rest for a time, then do it all the same."""
+        """Wait up to a time limit for a stable weight, then execute the command in any case."""
         if not parameters.isdecimal() or int(parameters) > LONGEST_WAIT:
             return line_of(f"{word} L")
 
@@ -130,7 +133,7 @@ class MtSicsVoice(status_lines.StatusLineEncoder):
         return next((number for number, name in UNITS.items() if name == unit), "0")
 
     def _in_unit(self, reading: Reading, kind: int) -> Reading:
-        """A reading in the host's unit or the display's; as it is where it has no mass."""
+        """Convert a reading to the host's or the display's unit; a reading without a mass is returned unchanged."""
         unit = self._units.get(kind, reading.unit)
         if reading.value is None or unit == reading.unit or reading.unit not in KILOGRAMS:
             return reading

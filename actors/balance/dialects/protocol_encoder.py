@@ -1,4 +1,8 @@
-"""The balance's side of a dialect: from bytes that it hears to what it says. No clock, no ports."""
+"""The balance's side of a dialect, for emulated balances: received bytes to replies. No clock, no ports.
+
+`ProtocolEncoder` is the interface and `PlainEncoder` its simplest implementation. A reply is either bytes or one of
+`PendingReply`, `Repeat`, `Follow` and `Cancel`, which the emulator carries out.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +16,18 @@ from actors.balance.readings import Reading, ReadingStatus
 from actors.balance.simulated_balance import EmulatedScale
 
 END = b"\r\n"
-"""Ends every line of every dialect here."""
+"""Ends every line of the dialects in this package."""
 
 
 @dataclass(frozen=True)
 class PendingReply:
-    """Said once the display stands.
+    """A reply that is sent once the display is stable.
 
     Attributes:
-        done: carries the command out and gives the line.
-        expired: line if it does not come to rest in time, or what carries the command out all the same and gives it;
-            None: waits for ever.
-        patience: how long it waits [s of bench time]; None: as long as the balance waits for every command.
+        done: executes the command and returns the line.
+        expired: line if the display does not become stable in time, or a function that executes the command in any case
+            and returns the line; None: wait without limit.
+        patience: longest wait [s of bench time]; None: the balance's limit for every command.
     """
 
     done: Callable[[], bytes]
@@ -36,7 +40,7 @@ class Repeat:
     """Readings from now on, until the next command.
 
     Attributes:
-        line: gives the line for a reading; None: the dialect's.
+        line: returns the line for a reading; None: the dialect's line.
     """
 
     line: Callable[[Reading], bytes] | None = None
@@ -44,12 +48,12 @@ class Repeat:
 
 @dataclass(frozen=True)
 class Follow:
-    """The weight once it stands, and again whenever it has changed and stands again, until the next command.
+    """The weight once it is stable, and again after every change once it is stable, until the next command.
 
     Attributes:
-        line: gives the line for a reading.
-        step: change that counts, as a function of the last stable value, in the display's unit.
-        moving: the change itself is reported, too, while the display moves.
+        line: returns the line for a reading.
+        step: smallest change that counts, as a function of the last stable value, in the display's unit.
+        moving: whether the change itself is reported, too, while the display moves.
     """
 
     line: Callable[[Reading], bytes]
@@ -59,10 +63,10 @@ class Follow:
 
 @dataclass(frozen=True)
 class Cancel:
-    """Ends what waits and what is repeated.
+    """Ends pending replies and repeated output.
 
     Attributes:
-        line: the answer.
+        line: the reply.
     """
 
     line: bytes
@@ -72,7 +76,7 @@ Said = bytes | PendingReply | Repeat | Follow | Cancel
 
 
 class EncoderDisplay(Protocol):
-    """What a voice speaks of: a scale, or one with a fault."""
+    """The display that an encoder reads: a scale, or a scale with an injected fault."""
 
     @property
     def scale(self) -> EmulatedScale:
@@ -80,32 +84,32 @@ class EncoderDisplay(Protocol):
         ...
 
     def reading(self) -> Reading:
-        """What the display shows."""
+        """The display's current reading."""
         ...
 
     def tare(self) -> ReadingStatus:
-        """Carry out a tare."""
+        """Execute a tare."""
         ...
 
     def zero(self) -> ReadingStatus:
-        """Carry out a zero."""
+        """Execute a zero."""
         ...
 
 
 class Lines(Protocol):
-    """Puts readings into lines: a dialect."""
+    """Encodes readings as lines; a dialect does."""
 
     def encode(self, reading: Reading) -> bytes:
-        """The line for a reading.
+        """Return the line for a reading.
 
         Raises:
-            ValueError: there is none for it.
+            ValueError: there is no line for it.
         """
         ...
 
 
 class ProtocolEncoder(Protocol):
-    """One dialect, spoken by a balance."""
+    """The balance's side of one dialect."""
 
     @property
     def dialect(self) -> Lines:
@@ -113,16 +117,18 @@ class ProtocolEncoder(Protocol):
         ...
 
     def commands(self, heard: bytearray) -> list[bytes]:
-        """Take whole commands out of what was received."""
+        """Remove complete commands from the receive buffer and return them."""
         ...
 
     def answer(self, command: bytes, display: EncoderDisplay) -> Said:
-        """What it says to a command; empty for nothing."""
+        """Return the reply to a command; empty for no reply."""
         ...
 
 
 def weight_line(dialect: Lines, reading: Reading) -> bytes:
-    """The line for a reading; a dialect that can't say it reports a fault instead, or has no words for that either."""
+    """Return the line for a reading. If the dialect has none, return its fault line, or nothing if it has no fault
+    line.
+    """
     for said in (reading, Reading(ReadingStatus.ERROR)):
         with contextlib.suppress(ValueError):
             return dialect.encode(said)
@@ -130,11 +136,11 @@ def weight_line(dialect: Lines, reading: Reading) -> bytes:
 
 
 class PlainEncoder:
-    """A balance that answers its question at once, and tares and zeroes in silence once it rests.
+    """A balance that answers its query at once, and tares and zeroes without a reply once it is stable.
 
     Args:
-        dialect: whose lines it sends.
-        query, tare, zero: what it understands, each byte for byte.
+        dialect: encodes its lines.
+        query, tare, zero: the accepted commands, byte for byte.
     """
 
     def __init__(self, dialect: Lines, query: bytes, tare: bytes, zero: bytes | None) -> None:
@@ -151,7 +157,7 @@ class PlainEncoder:
                 found.append(command)
                 del heard[: len(command)]
             elif any(c.startswith(heard) for c in self._known):
-                break  # the rest is still to come
+                break  # incomplete command
             else:
                 del heard[0]
         return found
@@ -165,11 +171,11 @@ class PlainEncoder:
 
 
 def silently(act: Callable[[], ReadingStatus]) -> bytes:
-    """Do it and say nothing."""
+    """Execute a command without a reply."""
     act()
     return b""
 
 
 def line_of(text: str) -> bytes:
-    """A text as a line."""
+    """Encode a text as a line."""
     return text.encode("ascii", "replace") + END

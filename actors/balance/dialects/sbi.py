@@ -4,14 +4,17 @@
 +    123.45 g  CR LF          sign, 9 of value, blank, 3 of unit
 N     +    123.45 g  CR LF    the same after 6 of identification
 ```
-The unit is blank while the balance is not at rest. In place of a value stand `High`, `Low`, `H`, `L`, `--`, `Cal.Int.`,
-`Cal.Ext.`, `C`, and `Err 123`; a 22-character line then begins with `Stat`. Digits that the law does not vouch for may
-stand in brackets. A line of another width has lost characters: it is refused.
+
+The unit is blank while the weight is unstable. Instead of a value, a line may contain `High`, `Low`, `H`, `L`, `--`,
+`Cal.Int.`, `Cal.Ext.`, `C`, or `Err 123`; a 22-character line then begins with `Stat`. Digits outside the verified
+(legal-for-trade) range may be in brackets. A line of another width has lost characters and is invalid.
 
 Sources: Sartorius Quintix manual p. 87, Entris II interface description p. 3 and 4, LE2202S p. 51, CP operating
 instructions p. 55 (1200 baud 7O1 and printing 'at stability' as factory setting of that series).
-Limitations: commands are not answered. Set 'print: manual, without stability' and no automatic printing in the menu: at
-stability, the question is answered only once the balance is at rest; with automatic printing `ESC P` switches that.
+
+Limitations: commands are not acknowledged. Set 'print: manual, without stability' and no automatic printing in the
+menu: with 'at stability', the query is answered only once the weight is stable; with automatic printing, `ESC P`
+toggles it.
 """
 
 from __future__ import annotations
@@ -52,10 +55,10 @@ _BRACKETS = re.compile(r"\[([0-9]+)\]")
 
 @dataclass(frozen=True, kw_only=True)
 class Sbi(Dialect):
-    """The dialect; both layouts are understood, whichever is set.
+    """The dialect; it decodes both layouts.
 
     Attributes:
-        identified: lines of 22 characters, for `encode`.
+        identified: whether `encode` sends lines of 22 characters.
     """
 
     identified: bool = False
@@ -117,11 +120,11 @@ _SAID = {ReadingStatus.OVER: "High", ReadingStatus.UNDER: "Low", ReadingStatus.B
 
 
 def _weight(text: str) -> Reading:
-    """From the 14 characters of a weight."""
+    """Decode the 14 characters of a weight."""
     sign, digits, unit = text[0], _BRACKETS.sub(r"\1", text[1:11]).strip(), text[11:]
     if sign not in "+- " or not unit.isascii():
         raise LineError("not a weight")
-    if "[" in text:  # brackets take the blank's place before the unit
+    if "[" in text:  # a bracket replaces the blank before the unit
         digits = digits.strip()
     number = number_in(digits)
     name = unit.strip()
@@ -133,11 +136,11 @@ def _weight(text: str) -> Reading:
 
 
 class SbiEncoder:
-    """Sartorius SBI.
+    """Protocol encoder of Sartorius SBI.
 
     Args:
-        identified: lines of 22 characters.
-        at_stability: answers ESC P only once it is at rest.
+        identified: send lines of 22 characters.
+        at_stability: answer ESC P only once the weight is stable.
     """
 
     def __init__(self, *, identified: bool = False, at_stability: bool = False) -> None:

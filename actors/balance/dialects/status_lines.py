@@ -1,9 +1,10 @@
 """Lines of the form `command status value unit`, which KCP and MT-SICS share.
 
+`StatusLines` is the base class of both dialects and `StatusLineEncoder` that of their encoders.
+
 Sources: Mettler-Toledo AL/AB and AT operating instructions (`S S`, `S I`, `S +`, `S -`, commands I0 … TAC); Kern
-CKE-BA-e-2132 and KIB-TM-ZB-e-1913 for the same of KCP; `S D`, `T S`, `Z A`, `TAC A` as drivers for such balances meet
-them. Whether every KCP balance answers `T` with a weight (`T S`) or with `T A` could not be found out: both are
-understood.
+CKE-BA-e-2132 and KIB-TM-ZB-e-1913 for the same of KCP; `S D`, `T S`, `Z A`, `TAC A` from existing drivers for such
+balances. No source states whether every KCP balance answers `T` with a weight (`T S`) or with `T A`; both are accepted.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ COMMAND = re.compile(r"(?:T|TI|TA|TAC|Z|ZI|I[0-9]{1,2}|@|MM|U)")
 
 
 def decode(line: bytes) -> Reply:
-    """Understand one line.
+    """Decode one line.
 
     Args:
         line: without its CR LF.
@@ -105,7 +106,7 @@ def _weight(words: list[str]) -> Reading:
 
 
 def encode(reading: Reading) -> bytes:
-    """The line for a reading; the value right-aligned in ten characters.
+    """Return the line for a reading; the value is right-aligned in ten characters.
 
     Raises:
         ValueError: these dialects have no such line.
@@ -120,14 +121,14 @@ def encode(reading: Reading) -> bytes:
 
 
 IDENTITY = ("I1", "I2")
-"""Ask for the levels of commands, and for the model."""
+"""Queries for the command levels and for the model."""
 
 _SIGNS = {ReadingStatus.OVER: "+", ReadingStatus.UNDER: "-"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class StatusLines(Dialect):
-    """What the dialects of such lines have in common."""
+    """The common base of the dialects with such lines."""
 
     query: bytes = b"SI\r\n"
     tare: bytes = b"T\r\n"
@@ -147,12 +148,12 @@ class StatusLines(Dialect):
 
 
 class StatusLineEncoder:
-    """The commands that KCP and MT-SICS share: MT-SICS's levels 0 and 1, as most balances have them.
+    """The commands that KCP and MT-SICS share: MT-SICS's levels 0 and 1, as implemented by most balances.
 
     Args:
-        dialect: one of the two.
-        levels: answer to I1.
-        model: answer to I2.
+        dialect: KCP or MT-SICS.
+        levels: reply to I1.
+        model: reply to I2.
     """
 
     LEVELS: Mapping[str, int] = {
@@ -189,7 +190,7 @@ class StatusLineEncoder:
         return self.answer_bare(word, display)
 
     def answer_bare(self, word: str, display: EncoderDisplay) -> Said:
-        """The answer to a known command without parameters."""
+        """Return the reply to a known command without parameters."""
         match word:
             case "I0":
                 return self._list()
@@ -217,7 +218,7 @@ class StatusLineEncoder:
         return line_of(f"{word} A {self._identity[word]}" if word in self._identity else f"{word} L")
 
     def answer_with(self, word: str, parameters: str, display: EncoderDisplay) -> Said:
-        """The answer to a known command with parameters; 'L' where these are not as they should be."""
+        """Return the reply to a known command with parameters; 'L' if they are invalid."""
         match word:
             case "D" if re.fullmatch(r'"[^"]*"', parameters):
                 return line_of("D A")
@@ -232,25 +233,25 @@ class StatusLineEncoder:
         return line_of("ES")
 
     def line(self, reading: Reading) -> bytes:
-        """The line for a reading."""
+        """Return the line for a reading."""
         return weight_line(self.dialect, reading)
 
     def weight(self, display: EncoderDisplay) -> bytes:
-        """The line for what is shown now."""
+        """Return the line for the display's current reading."""
         return self.line(display.reading())
 
     def tared(self, display: EncoderDisplay) -> str:
-        """The tare with its unit, as it stands in a line."""
+        """The tare with its unit, formatted for a line."""
         return f"{display.scale.tared!s:>10} {display.scale.settings.unit}"
 
     def mass_in(self, parameters: str) -> float | None:
-        """The mass in 'value unit' [kg]; None where it is none."""
+        """Parse the mass in 'value unit' [kg]; None if it is invalid."""
         value, _, unit = parameters.partition(" ")
         number, factor = number_in(value), kilograms(unit.strip())
         return None if number is None or factor is None else float(number) * factor
 
     def follow(self, display: EncoderDisplay, mass: float | None = None, *, moving: bool = True) -> Follow:
-        """Report changes: of a mass [kg], or by default of an eighth of the weight and at least 30 digits."""
+        """Report changes of at least `mass` [kg]; by default, an eighth of the weight and at least 30 display steps."""
         scale = display.scale
         if mass is None:
             return Follow(self.line, lambda stood: max(abs(stood) / 8, 30 * scale.step), moving)
@@ -258,7 +259,7 @@ class StatusLineEncoder:
         return Follow(self.line, lambda stood: step, moving)
 
     def act(self, word: str, display: EncoderDisplay) -> bytes:
-        """Tare (T …) or zero (Z …) now, and the line that reports it."""
+        """Tare (T …) or zero (Z …) now, and return the reply."""
         status = display.tare() if word.startswith("T") else display.zero()
         if status in _SIGNS:
             return line_of(f"{word} {_SIGNS[status]}")
@@ -276,15 +277,15 @@ class StatusLineEncoder:
 
 
 def levels_of_sics(said: Mapping[str, str]) -> bool:
-    """Whether the answer to I1 looks like MT-SICS's: its levels, and one version of two numbers for each.
+    """Whether the reply to I1 has the form of MT-SICS: its levels, and one version of two numbers for each.
 
-    KCP borrowed its questions and answers from MT-SICS; all that the driver does is the same but for the pace. MT-SICS
-    says its levels and versions as "0123" "2.30" "2.22" …; KCP's versions have three numbers (1.1.2). How it prints
-    them could not be found out.
+    KCP took its queries and replies from MT-SICS; for this driver only the query interval differs. MT-SICS reports its
+    levels and versions as "0123" "2.30" "2.22" …; KCP's versions have three numbers (1.1.2). The print format of KCP is
+    not documented.
     """
     return re.fullmatch(r'"[0-9]{1,4}"( "[0-9]+\.[0-9]+[A-Z]?")+', said.get("I1", "")) is not None
 
 
 def is_kern(said: Mapping[str, str]) -> bool:
-    """Whether it calls itself one of Kern's."""
+    """Whether the balance identifies itself as one of Kern's."""
     return any("KERN" in text.upper() for text in said.values())

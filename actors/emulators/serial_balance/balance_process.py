@@ -1,6 +1,8 @@
-"""The strings of a virtual balance on a serial line: it runs in a process of its own and dies with this one.
+"""Starts an emulated serial balance in a child process, which ends with this process.
 
-What stands in for a balance on a serial line on a virtual bench: one at the far end of a pseudo-terminal.
+`VirtualSerialBalance` starts an emulated balance and controls it; `RecordedBalance` replays a recording.
+`SerialBalanceEmulator` is the balance of a virtual bench. The emulation itself is in `emulated_balance`, the process in
+`pty_server`.
 """
 
 from __future__ import annotations
@@ -22,28 +24,28 @@ from actors.runtime.child_process import ChildProcess, python_module
 from actors.runtime.ray_cleanup import MARK
 
 PATIENCE = 40.0
-"""How long its process may take to start, or to answer [s]."""
+"""Longest wait for the process to start, or to reply [s]."""
 
 GRACE = 10.0
-"""How long it has to end by itself [s]."""
+"""Longest wait for the process to end by itself [s]."""
 
 
 class FarProcess:
-    """A process at the far end of a pseudo-terminal.
+    """A child process that serves a pseudo-terminal.
 
     Args:
-        settings: for `server.make_character`.
-        baud: speed of the line; 0: any, and characters take no time.
+        settings: for `pty_server.make_character`.
+        baud: speed of the line; 0: any speed, and characters take no time.
 
     Raises:
-        LaboratoryError: it did not start.
+        LaboratoryError: the process did not start.
     """
 
     def __init__(self, settings: dict[str, Any], baud: int) -> None:
-        # In a Ray of our own: in its folder, which is removed even behind a program that was killed.
+        # With a Ray cluster of its own, in that cluster's folder, which is removed even after the program was killed.
         folder = Path(tempfile.mkdtemp(prefix="decant-balance-", dir=os.environ.get(MARK)))
         self.port = str(folder / "balance")
-        """Path of the line, which keeps its name when the plug is pulled and put in again."""
+        """Path of the line; it stays the same when the line is unplugged and plugged in again."""
         self._lock = threading.Lock()
         text = json.dumps({**settings, "link": self.port, "baud": baud})
         self._process = ChildProcess(python_module("actors.emulators.serial_balance.pty_server", text))
@@ -55,22 +57,22 @@ class FarProcess:
 
     @property
     def pid(self) -> int:
-        """Id of its process."""
+        """Process id."""
         return self._process.pid
 
     def unplug(self) -> None:
-        """Pull the plug: the port is gone."""
+        """Unplug the line: the port vanishes."""
         self.order("unplug")
 
     def plug(self) -> None:
-        """Put it in again: another device under the same name."""
+        """Plug the line in again: another device under the same path."""
         self.order("plug")
 
     def order(self, what: str, **values: Any) -> dict[str, Any]:
-        """Have something done, and wait until it is.
+        """Send a command and wait until it is executed.
 
         Raises:
-            LaboratoryError: it can't, or its process is gone.
+            LaboratoryError: the command failed, or the process has ended.
         """
         with self._lock:
             try:
@@ -80,7 +82,7 @@ class FarProcess:
             return self._answer()
 
     def close(self) -> None:
-        """End it. May be called again."""
+        """End the process. May be called again."""
         self._process.close(GRACE)
         with contextlib.suppress(OSError):
             Path(self.port).unlink(missing_ok=True)
@@ -98,16 +100,16 @@ class FarProcess:
         return answer
 
     def _end(self) -> str:
-        """How its process ended, for an error message."""
+        """Describe how the process ended, for an error message."""
         self._process.wait(1.0)
         said = f": {self._process.last_error}" if self._process.last_error else ""
         return f" (status {self._process.status}{said})"
 
 
 class VirtualSerialBalance(FarProcess):
-    """A virtual balance, started.
+    """A running emulated balance.
 
-    Use `start`; its `port` is what a driver opens.
+    Create it with `start`; a driver opens its `port`.
     """
 
     @classmethod
@@ -121,14 +123,14 @@ class VirtualSerialBalance(FarProcess):
         latency: float = 0.01,
         seed: tuple[int, ...] = (0,),
     ) -> VirtualSerialBalance:
-        """Start one, empty.
+        """Start an emulated balance without a load.
 
         Args:
-            dialect: one of `doors.voices`.
-            baud: speed of the line; 0: any, and characters take no time.
-            scale: what a data sheet says.
+            dialect: one of `actors.balance.dialect_registry.voices`.
+            baud: speed of the line; 0: any speed, and characters take no time.
+            scale: data sheet of the scale.
             time_scale: bench seconds per second of the clock; 0: bench time passes by `advance` only.
-            latency: from question to answer [s of the clock].
+            latency: time between query and reply [s of the clock].
             seed: of noise and of faults.
 
         Raises:
@@ -146,7 +148,7 @@ class VirtualSerialBalance(FarProcess):
         return cls(settings, baud)
 
     def put(self, load: Load | float) -> None:
-        """What is on it from now on.
+        """Set the load from now on.
 
         Args:
             load: a mass [kg], or masses over bench time.
@@ -155,36 +157,36 @@ class VirtualSerialBalance(FarProcess):
         self.order("put", times=list(load.times), masses=list(load.masses))
 
     def prepare(self, seed: tuple[int, ...]) -> None:
-        """Empty, bench time 0, no tare, noise of a new pour."""
+        """Empty the scale, set bench time to 0, clear the tare, and reseed the noise."""
         self.order("prepare", seed=list(seed))
 
     def faults(self, **changes: Any) -> None:
-        """Change faults (see `faults.Faults`); others stay as they are."""
+        """Change faults (see `emulated_balance.BalanceFaults`); others stay as they are."""
         self.order("faults", **changes)
 
     def advance(self, seconds: float) -> None:
-        """Bench time passes, whatever the clock says [s]."""
+        """Let bench time pass, independent of the clock [s]."""
         self.order("advance", seconds=seconds)
 
     def power_cycle(self) -> None:
-        """Switch it off and on: tare gone, what is on it is its new zero. The port stays."""
+        """Switch the balance off and on: the tare is cleared, and the current load becomes the zero. The port stays."""
         self.order("power cycle")
 
     def state(self) -> dict[str, Any]:
-        """What is on it truly [kg], what it shows, bench time [s], commands heard."""
+        """Return the true load [kg], the display, bench time [s] and the number of received commands."""
         return self.order("state")
 
 
 class RecordedBalance(FarProcess):
-    """Plays a recording to a client that asks."""
+    """Replays a recording to a client that sends queries."""
 
     @classmethod
     def start(cls, recording: Path, *, speed: float = 1.0) -> RecordedBalance:
-        """Start playing; unasked bytes come at their times, answers after their questions.
+        """Start the replay; unsolicited bytes arrive at their times, replies after their queries.
 
         Args:
             recording: file made by `python -m actors.balance.record_line`.
-            speed: so much faster than it was.
+            speed: replay speed relative to the recording.
 
         Raises:
             LaboratoryError: it did not start.
@@ -193,15 +195,15 @@ class RecordedBalance(FarProcess):
 
 
 USUAL_DIALECT = "kcp"
-"""Spoken unless another dialect is named."""
+"""Dialect of the emulated balance if the settings name none."""
 
 
 class SerialBalanceEmulator:
-    """See `actors.balance.balance_settings.BalanceStandIn`.
+    """See `actors.balance.balance_settings.BalanceEmulator`.
 
     Args:
-        spec: which dialect at which pace.
-        scale: what its data sheet says.
+        spec: dialect and time scale.
+        scale: data sheet of the scale.
 
     Raises:
         LaboratoryError: it did not start.
@@ -209,7 +211,7 @@ class SerialBalanceEmulator:
 
     def __init__(self, spec: SerialBalanceSpec, scale: ScaleSettings) -> None:
         dialect = USUAL_DIALECT if spec.dialect == AUTO else spec.dialect
-        # A line that takes no time: in scaled time its characters would be the slowest thing on the bench.
+        # baud=0: in scaled time, the transmission of characters would limit the speed of the bench.
         self._balance = VirtualSerialBalance.start(
             dialect, baud=0, scale=scale, time_scale=spec.time_scale, latency=0.002
         )
@@ -229,7 +231,7 @@ class SerialBalanceEmulator:
         self._balance.put(mass)
 
     def order(self, what: str, values: dict[str, Any]) -> dict[str, Any]:
-        """'unplug', 'plug', 'faults' …, see `VirtualSerialBalance`."""
+        """Send a command: 'unplug', 'plug', 'faults' …; see `VirtualSerialBalance`."""
         return self._balance.order(what, **values)
 
     def close(self) -> None:

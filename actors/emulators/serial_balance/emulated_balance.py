@@ -1,6 +1,7 @@
-"""Who sits at the far end of a virtual line: an emulated balance.
+"""An emulated balance with injectable faults, as bytes in and bytes out.
 
-What may go wrong with a virtual balance, and how it then shows on display and line.
+`EmulatedBalance` is the interface that the pty server serves. `Emulation` implements it with a dialect and a scale;
+`FaultyDisplay` and `spoil` apply the `BalanceFaults` to display and line. The module opens no port.
 """
 
 from __future__ import annotations
@@ -20,21 +21,21 @@ from actors.balance.simulated_balance import EmulatedScale, Load, ScaleSettings
 
 @dataclass(frozen=True)
 class BalanceFaults:
-    """Faults in force; all off at first.
+    """Active faults; all are off at first.
 
     Attributes:
-        silent: says nothing and hears nothing.
-        frozen: the display stands as it was when this began, load and tare notwithstanding.
+        silent: sends nothing and ignores all input.
+        frozen: the display keeps its reading from the start of the fault, independent of load and tare.
         restless: never stable.
-        powerless: acknowledges tare and zero, and does nothing.
+        powerless: acknowledges tare and zero, but does nothing.
         fault: reports this error instead of weights.
-        stranger: understands no question, and says so where its dialect has words for it.
+        stranger: recognises no query, and sends an error if its dialect has one.
         unit: shown instead of its own, e.g. 'pcs'.
-        garbage: share of lines that noise is mixed into.
-        halved: share of lines that lose their first half.
-        unasked: prints by itself every so many seconds of the clock; 0: never.
-        interleaved: unasked lines may cut answers in two.
-        delay: answers come so much later [s of the clock].
+        garbage: fraction of lines with random bytes inserted.
+        halved: fraction of lines that lose their first half.
+        unasked: interval of unsolicited lines [s of the clock]; 0: none.
+        interleaved: unsolicited lines may split replies.
+        delay: additional delay of replies [s of the clock].
     """
 
     silent: bool = False
@@ -52,7 +53,7 @@ class BalanceFaults:
 
 
 class FaultyDisplay:
-    """A scale's display with faults. See `voice.Display`."""
+    """A scale's display with faults. See `protocol_encoder.EncoderDisplay`."""
 
     def __init__(self, scale: EmulatedScale) -> None:
         self.scale = scale
@@ -65,7 +66,7 @@ class FaultyDisplay:
         self._frozen = (self._frozen or self.reading()) if self.faults.frozen else None
 
     def reading(self) -> Reading:
-        """What the display shows."""
+        """Return the display's reading."""
         if self._frozen is not None:
             return self._frozen
         if self.faults.fault:
@@ -85,12 +86,12 @@ class FaultyDisplay:
 
 
 def spoil(line: bytes, faults: BalanceFaults, rng: np.random.Generator) -> bytes:
-    """A line as it comes off a bad cable.
+    """Apply the line faults to a line.
 
     Args:
-        line: as said.
-        faults: in force.
-        rng: of chance.
+        line: as sent.
+        faults: the active faults.
+        rng: random number generator.
     """
     if rng.random() < faults.halved:
         line = line[len(line) // 2 :]
@@ -101,62 +102,62 @@ def spoil(line: bytes, faults: BalanceFaults, rng: np.random.Generator) -> bytes
 
 
 REPEAT_INTERVAL = 0.2
-"""From one repeated reading to the next [s of bench time]."""
+"""Interval of repeated readings [s of bench time]."""
 
 COMMAND_PATIENCE = 5.0
-"""How long a command waits for rest before the balance gives it up [s of bench time]."""
+"""Longest time that a command waits for a stable display [s of bench time]."""
 
 
 class EmulatedBalance(Protocol):
-    """Hears and speaks; knows no ports."""
+    """Receives and returns bytes; does not depend on a port."""
 
     def hear(self, data: bytes, now: float) -> None:
-        """Take in what a client sent."""
+        """Process bytes from a client."""
         ...
 
     def speak(self, now: float) -> bytes:
-        """What is to be sent by now."""
+        """Return the bytes that are due now."""
         ...
 
     def due(self, now: float) -> float | None:
-        """When to ask again though nothing was received; None: not before."""
+        """Return the next time at which `speak` must be called without new input; None: not before new input."""
         ...
 
     def control(self, order: dict[str, Any], now: float) -> dict[str, Any]:
-        """Carry out what the one who holds the strings wants; an answer, JSON-ready.
+        """Execute a control command; return the result, JSON-ready.
 
         Raises:
-            KeyError, TypeError, ValueError: an order that isn't known.
+            KeyError, TypeError, ValueError: unknown command.
         """
         ...
 
 
 class Emulation:
-    """A balance that speaks a dialect.
+    """A balance with a dialect.
 
     Args:
-        dialect: one of `doors.voices`.
+        dialect: one of `actors.balance.dialect_registry.voices`.
         settings: of its scale.
-        time_scale: bench seconds per second of the clock; 0: bench time passes by order only.
-        latency: from question to answer [s of the clock].
-        seed: of its chance.
+        time_scale: bench seconds per second of the clock; 0: bench time passes by command only.
+        latency: time between query and reply [s of the clock].
+        seed: of its random numbers.
     """
 
     def __init__(
         self, dialect: str, settings: ScaleSettings, time_scale: float, latency: float, seed: tuple[int, ...]
     ) -> None:
-        self._voice = voices()[dialect]()
+        self._encoder = voices()[dialect]()
         self._scale = EmulatedScale(settings, seed)
         self._display = FaultyDisplay(self._scale)
         self._time_scale, self._latency = time_scale, latency
         self._rng = np.random.default_rng((*seed, 7))
-        self._heard = bytearray()
+        self._received = bytearray()
         self._questions = 0
         self._waiting: tuple[PendingReply, float] | None = None
         self._repeat = Repeat()
         self._repeat_at: float | None = None
         self._following: Follow | None = None
-        self._stood_at: Decimal | None = None
+        self._stable_value: Decimal | None = None
         self._unasked_at: float | None = None
         self._answers: list[tuple[float, bytes]] = []
         self._now: float | None = None
@@ -166,8 +167,8 @@ class Emulation:
         self._advance(now)
         if self._display.faults.silent:
             return
-        self._heard += data
-        for command in self._voice.commands(self._heard):
+        self._received += data
+        for command in self._encoder.commands(self._received):
             self._questions += 1
             self._repeat_at = self._following = None
             self._carry_out(command, now)
@@ -236,48 +237,48 @@ class Emulation:
         self._now = now
 
     def _carry_out(self, command: bytes, now: float) -> None:
-        said = self._voice.answer(b"?" if self._display.faults.stranger else command, self._display)
-        if isinstance(said, Repeat):
-            self._repeat, self._repeat_at = said, now
-        elif isinstance(said, Follow):
-            self._following, self._stood_at = said, None
-        elif isinstance(said, Cancel):
+        reply = self._encoder.answer(b"?" if self._display.faults.stranger else command, self._display)
+        if isinstance(reply, Repeat):
+            self._repeat, self._repeat_at = reply, now
+        elif isinstance(reply, Follow):
+            self._following, self._stable_value = reply, None
+        elif isinstance(reply, Cancel):
             self._waiting = None
-            self._say(said.line, now)
-        elif isinstance(said, PendingReply):
-            patience = COMMAND_PATIENCE if said.patience is None else said.patience
-            self._waiting = (said, now + (patience / self._time_scale if self._time_scale > 0.0 else math.inf))
+            self._reply(reply.line, now)
+        elif isinstance(reply, PendingReply):
+            patience = COMMAND_PATIENCE if reply.patience is None else reply.patience
+            self._waiting = (reply, now + (patience / self._time_scale if self._time_scale > 0.0 else math.inf))
             self._wait_on(now)
         else:
-            self._say(said, now)
+            self._reply(reply, now)
 
     def _wait_on(self, now: float) -> None:
-        """Carry out the command that waits for rest, or give it up."""
+        """Execute the pending command if the display is stable, or end it after its time limit."""
         assert self._waiting is not None
         waiting, until = self._waiting
         if self._scale.stable and not self._display.faults.restless:
             self._waiting = None
-            self._say(waiting.done(), now)
+            self._reply(waiting.done(), now)
         elif now > until and waiting.expired is not None:
             self._waiting = None
-            self._say(waiting.expired if isinstance(waiting.expired, bytes) else waiting.expired(), now)
+            self._reply(waiting.expired if isinstance(waiting.expired, bytes) else waiting.expired(), now)
 
     def _follow(self, following: Follow, now: float) -> None:
-        """Report the weight once it stands, and its changes."""
+        """Report the weight once it is stable, and its changes."""
         reading = self._display.reading()
-        if self._stood_at is None:
+        if self._stable_value is None:
             if reading.status is ReadingStatus.STABLE and reading.value is not None:
-                self._stood_at = reading.value
+                self._stable_value = reading.value
                 self._answers.append((now, following.line(reading)))
-        elif reading.value is None or abs(reading.value - self._stood_at) >= following.step(self._stood_at):
-            self._stood_at = None
+        elif reading.value is None or abs(reading.value - self._stable_value) >= following.step(self._stable_value):
+            self._stable_value = None
             if following.moving and reading.status is not ReadingStatus.STABLE:
                 self._answers.append((now, following.line(reading)))
 
-    def _say(self, line: bytes, now: float) -> None:
+    def _reply(self, line: bytes, now: float) -> None:
         if line:
             faults = self._display.faults
             self._answers.append((now + self._latency + faults.delay, spoil(line, faults, self._rng)))
 
     def _weight(self) -> bytes:
-        return weight_line(self._voice.dialect, self._display.reading())
+        return weight_line(self._encoder.dialect, self._display.reading())

@@ -1,6 +1,7 @@
-"""The far end of a pseudo-terminal: paced characters, another speed is gibberish, and a plug that can be pulled.
+"""The balance's end of a pseudo-terminal, and the replay of a recording on it.
 
-A recording at the far end of a line: each question gets the answer that it got then.
+`PtyEnd` sends characters at the line's speed, garbles them for a client with another speed, and can be unplugged.
+`Replay` is an `EmulatedBalance` that gives each query the recorded reply.
 """
 
 from __future__ import annotations
@@ -17,13 +18,15 @@ from actors.balance.line_recording import LineEvent, LineRecording
 
 
 class PtyEnd:
-    """A serial line as the balance has it.
+    """The balance's end of a serial line.
 
     Args:
-        link: path that leads to the line while it is plugged in, like those under /dev/serial/by-id.
-        baud: its speed; a client with another one gets gibberish. 0: any speed, and no time for characters.
+        link: path of the line while it is plugged in, like those under /dev/serial/by-id.
+        baud: its speed; a client with another speed receives garbled characters. 0: any speed, and characters take no
+            time.
 
-    Limitations: Linux keeps neither parity nor character length of a pseudo-terminal, so these can't be wrong.
+    Limitations: Linux keeps neither parity nor character length of a pseudo-terminal, so their settings are not
+    checked.
     """
 
     def __init__(self, link: Path, baud: int) -> None:
@@ -36,11 +39,11 @@ class PtyEnd:
 
     @property
     def descriptor(self) -> int | None:
-        """To wait for; None while unplugged."""
+        """File descriptor to wait for; None while unplugged."""
         return self._master if self._master >= 0 else None
 
     def plug(self) -> None:
-        """Plug it in: a new device under the same name."""
+        """Plug the line in: a new device under the same path."""
         if self._master >= 0:
             return
         self._master, self._slave = os.openpty()
@@ -50,7 +53,7 @@ class PtyEnd:
         self.link.symlink_to(os.ttyname(self._slave))
 
     def unplug(self) -> None:
-        """Pull it out; what was under way is lost."""
+        """Unplug the line; unsent characters are lost."""
         self.link.unlink(missing_ok=True)
         for descriptor in (self._master, self._slave):
             with contextlib.suppress(OSError):
@@ -59,17 +62,17 @@ class PtyEnd:
         self._queue.clear()
 
     def receive(self) -> bytes:
-        """What came from the client; nothing if it talks at another speed."""
+        """Return the bytes from the client; none if it uses another speed."""
         with contextlib.suppress(OSError):
             data = os.read(self._master, 4096)
-            return data if self._understands() else b""
+            return data if self._speed_matches() else b""
         return b""
 
     def send(self, data: bytes, now: float) -> None:
-        """Say something; it leaves character by character.
+        """Queue bytes; they are sent character by character.
 
         Args:
-            data: what.
+            data: the bytes.
             now: time of the clock [s].
         """
         if self._master < 0:
@@ -82,21 +85,21 @@ class PtyEnd:
         self._free_at = at
 
     def pump(self, now: float) -> float | None:
-        """Let characters go whose time has come.
+        """Send the characters that are due.
 
         Returns:
-            When the next one is due; None if none is left.
+            Time of the next character; None if none is left.
         """
         due = bytearray()
         while self._queue and self._queue[0][0] <= now:
             due.append(self._queue.popleft()[1])
         if due:
-            data = bytes(due) if self._understands() else bytes((37 * byte + 91) & 0xFF for byte in due)
-            with contextlib.suppress(OSError):  # a client that reads nothing loses what doesn't fit
+            data = bytes(due) if self._speed_matches() else bytes((37 * byte + 91) & 0xFF for byte in due)
+            with contextlib.suppress(OSError):  # if the client does not read, bytes beyond the buffer are lost
                 os.write(self._master, data)
         return self._queue[0][0] if self._queue else None
 
-    def _understands(self) -> bool:
+    def _speed_matches(self) -> bool:
         if self._speed is None:
             return True
         with contextlib.suppress(termios.error):
@@ -105,35 +108,35 @@ class PtyEnd:
 
 
 class Replay:
-    """See `character.Character`.
+    """See `emulated_balance.EmulatedBalance`.
 
-    What came before the first question comes by itself. A question is looked for among those recorded, from where the
-    last one was found, once around; then follows what followed it then, at its pace. A question that was never asked
-    gets no answer.
+    Bytes before the first recorded query are sent without a query. A query is searched among the recorded ones,
+    starting at the last match and wrapping around once. The bytes recorded after it are then sent at their recorded
+    pace. An unrecorded query gets no reply.
 
     Args:
-        recording: to play.
-        speed: so much faster than it was.
+        recording: the recording.
+        speed: replay speed relative to the recording.
     """
 
     def __init__(self, recording: LineRecording, speed: float = 1.0) -> None:
         self._events, self._speed = recording.events, speed
         self._at = 0
-        self._heard = b""
+        self._received = b""
         self._queue: list[tuple[float, bytes]] = []
         self._begun = False
 
     def hear(self, data: bytes, now: float) -> None:
         """See `EmulatedBalance.hear`."""
         self._begin(now)
-        self._heard += data
+        self._received += data
         while (found := self._find()) is not None:
-            self._heard = self._heard[len(self._events[found].data) :]
+            self._received = self._received[len(self._events[found].data) :]
             self._at = found + 1
             self._play(found, now)
         longest = max((len(e.data) for e in self._events if e.direction == "out"), default=0)
-        if len(self._heard) >= longest:
-            self._heard = b""
+        if len(self._received) >= longest:
+            self._received = b""
 
     def speak(self, now: float) -> bytes:
         """See `EmulatedBalance.speak`."""
@@ -147,7 +150,7 @@ class Replay:
         return min((at for at, _ in self._queue), default=None if self._begun else now)
 
     def control(self, order: dict[str, Any], now: float) -> dict[str, Any]:
-        """See `EmulatedBalance.control`: a recording takes no orders but to tell where it is."""
+        """See `EmulatedBalance.control`; a recording only supports the command 'state'."""
         if order.get("do") == "state":
             return {"played": self._at, "of": len(self._events)}
         raise ValueError(f"a recording can't do {order.get('do')!r}")
@@ -158,17 +161,17 @@ class Replay:
             self._play(-1, now)
 
     def _find(self) -> int | None:
-        """The next recorded question that was just heard."""
+        """Return the index of the next recorded query that matches the input."""
         count = len(self._events)
         for step in range(count):
             index = (self._at + step) % count
             event = self._events[index]
-            if event.direction == "out" and event.data and self._heard.startswith(event.data):
+            if event.direction == "out" and event.data and self._received.startswith(event.data):
                 return index
         return None
 
     def _play(self, question: int, now: float) -> None:
-        """Queue what came after a question until the next one."""
+        """Queue the bytes recorded between a query and the next one."""
         start = self._events[question].time if question >= 0 else 0.0
         following: list[LineEvent] = []
         for event in self._events[question + 1 :]:

@@ -1,7 +1,7 @@
-"""The process of a virtual balance: orders on standard input, characters on a pseudo-terminal.
+"""The process of an emulated balance: commands on standard input, characters on a pseudo-terminal.
 
-It ends when its standard input ends or its parent is gone, whichever comes first: nobody needs to clean up behind a
-killed test.
+It ends when its standard input ends or its parent ends, whichever comes first. A killed test therefore leaves no
+process behind.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from actors.emulators.serial_balance.emulated_balance import EmulatedBalance, Em
 from actors.emulators.serial_balance.pty_end import PtyEnd
 
 _PARENT_CHECK = 1.0
-"""How often it is seen whether the parent still lives [s]."""
+"""Interval of the check whether the parent is alive [s]."""
 
 
 class Server:
-    """One line, one character, one stream of orders.
+    """Serves one line and one stream of commands for one emulated balance.
 
     Args:
-        line: the far end.
-        character: who sits there.
+        line: the balance's end of the line.
+        character: the emulated balance.
     """
 
     def __init__(self, line: PtyEnd, character: EmulatedBalance) -> None:
-        self._line, self._character = line, character
+        self._line, self._balance = line, character
         self._orders = bytearray()
         self._parent = os.getppid()
 
     def run(self) -> None:
-        """Until the parent is gone or closes its end."""
+        """Run until the parent ends or closes its end."""
         wake: float | None = None
         while os.getppid() == self._parent:
             now = time.monotonic()
@@ -49,13 +49,13 @@ class Server:
             if 0 in ready and not self._take_orders(now):
                 return
             if self._line.descriptor is not None and self._line.descriptor in ready:
-                self._character.hear(self._line.receive(), now)
-            self._line.send(self._character.speak(now), now)
-            times = [self._line.pump(now), self._character.due(now)]
+                self._balance.hear(self._line.receive(), now)
+            self._line.send(self._balance.speak(now), now)
+            times = [self._line.pump(now), self._balance.due(now)]
             wake = min((moment for moment in times if moment is not None), default=None)
 
     def _take_orders(self, now: float) -> bool:
-        """Carry out what came on standard input; False at its end."""
+        """Execute the commands from standard input; return False at its end."""
         data = os.read(0, 65536)
         self._orders += data
         *whole, rest = self._orders.split(b"\n")
@@ -75,18 +75,18 @@ class Server:
             case "plug":
                 self._line.plug()
             case _:
-                return self._character.control(order, now)
+                return self._balance.control(order, now)
         return {}
 
 
 def tell(answer: dict[str, Any]) -> None:
-    """Answer on standard output; nobody may be listening any more."""
+    """Write a reply to standard output; a reader that has gone is ignored."""
     with contextlib.suppress(BrokenPipeError):
         os.write(1, json.dumps(answer).encode("ascii") + b"\n")
 
 
 def make_character(settings: dict[str, Any]) -> EmulatedBalance:
-    """The one who sits at the far end.
+    """Create the emulated balance.
 
     Args:
         settings: as `VirtualSerialBalance` or `RecordedBalance` writes them.
@@ -106,8 +106,8 @@ def make_character(settings: dict[str, Any]) -> EmulatedBalance:
 
 
 def main() -> None:
-    """Serve with the settings of the first argument, JSON, until the parent is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C goes to the whole group; the parent decides
+    """Serve with the settings of the first argument, JSON, until the parent ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C reaches the whole group; the parent decides
     settings = json.loads(sys.argv[1])
     line = PtyEnd(Path(settings["link"]), settings["baud"])
     try:

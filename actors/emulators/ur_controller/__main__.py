@@ -18,7 +18,7 @@ _STATES = {"running": RobotMode.RUNNING, "idle": RobotMode.IDLE, "off": RobotMod
 
 
 def arguments(given: list[str] | None = None) -> argparse.Namespace:
-    """The command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(prog="python -m actors.emulators.ur_controller", description=__doc__)
     parser.add_argument("--address", default="127.0.0.2", help="loopback address of all ports (default %(default)s)")
     parser.add_argument("--model", choices=sorted(MODELS), default="ur10e")
@@ -56,7 +56,7 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
 
 
 async def serve(chosen: argparse.Namespace) -> None:
-    """Open everything, say so in one line of JSON, and go on until the end."""
+    """Open all ports, print one line of JSON when ready, and run until the end."""
     controller = Controller(
         MODELS[chosen.model],
         frequency=chosen.frequency,

@@ -1,4 +1,8 @@
-"""The process around a controller: its clock, its ports, and its end."""
+"""The process around a controller: its clock, its ports, and its end.
+
+`Host` opens the ports and runs the control cycles in wall time; `Timing` records how punctual they are.
+`until_orphaned` waits for the end of the parent process.
+"""
 
 from __future__ import annotations
 
@@ -22,28 +26,28 @@ from actors.emulators.ur_controller.servers.primary_server import PrimaryConnect
 from actors.emulators.ur_controller.servers.rtde_server import RtdeConnection, RtdeServer
 
 SLOWEST_WAKE = 0.002
-"""Wall time between two wake-ups of the clock at most rate [s]; where time is scaled up each does several ticks."""
+"""Shortest wall time between two wake-ups of the clock [s]; in scaled time, each wake-up runs several ticks."""
 
 MOST_BEHIND = 0.1
-"""Wall time that the clock may fall behind before it lets the rest go [s]: a controller never catches up in a rush."""
+"""Longest lag of the clock in wall time [s]; more is dropped, because a controller never runs faster to catch up."""
 
 LONGEST_WAKE = 0.05
-"""Wall time after which a wake-up with more cycles to do serves the ports first [s]."""
+"""Wall time after which a wake-up with more pending cycles serves the ports first [s]."""
 
 REAL_TIME = 1
 """Real-time priority of the clock's thread: the lowest one, which is above all work that is not real-time."""
 
 NICENESS = -10
-"""Of the clock's thread where it may not be real-time [nice]."""
+"""Niceness of the clock's thread if real-time priority is not permitted."""
 
 
 def raise_priority() -> str:
-    """Let the calling thread run before other work on the machine, as far as the system permits.
+    """Raise the priority of the calling thread above other work on the machine, as far as the system permits.
 
-    Neither the process's other threads nor its children get the real-time priority.
+    The process's other threads and its children do not get the real-time priority.
 
     Returns:
-        What was granted: 'real-time', 'nice -10' or 'normal'.
+        The granted priority: 'real-time', 'nice -10' or 'normal'.
     """
     with contextlib.suppress(OSError, AttributeError):  # macOS has no such call
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(REAL_TIME))
@@ -55,7 +59,7 @@ def raise_priority() -> str:
 
 
 def lower_priority() -> str:
-    """Give back what `raise_priority` got. Returns 'normal'."""
+    """Revert `raise_priority`. Returns 'normal'."""
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     with contextlib.suppress(OSError):
@@ -66,14 +70,15 @@ def lower_priority() -> str:
 
 @dataclass
 class Timing:
-    """How well the clock kept time.
+    """Statistics of the clock's punctuality.
 
     Attributes:
-        ticks: done.
+        ticks: executed control cycles.
         late: wake-ups later than two periods.
-        worst: latest wake-up [s].
-        dropped: wall time that was let go because the process was too far behind [s].
-        busy: processor time used by this process [s]; `since` the start of the clock [s of wall time].
+        worst: delay of the latest wake-up [s].
+        dropped: wall time that was dropped because the process was too far behind [s].
+        started: start of the clock [s of `time.monotonic`].
+        busy_at_start: processor time of this process at that moment [s].
         priority: of the clock's thread; see `raise_priority`.
     """
 
@@ -86,7 +91,7 @@ class Timing:
     priority: str = "normal"
 
     def report(self) -> dict[str, float | str]:
-        """For people and tests."""
+        """Return the statistics for logs and tests."""
         wall = max(time.monotonic() - self.started, 1e-9)
         return {
             "ticks": self.ticks,
@@ -103,10 +108,10 @@ class Host:
     """Ports and clock of one controller.
 
     Args:
-        controller: what is hosted.
+        controller: the hosted controller.
         address: of all ports.
-        prioritised: its clock goes before other work on the machine, where the system permits it. Not in time that is
-            scaled up: there the clock takes much of a core.
+        prioritised: run the clock with raised priority if the system permits it. Not in time that is scaled up: there
+            the clock takes much of a core.
     """
 
     def __init__(self, controller: Controller, address: str, *, prioritised: bool = False) -> None:
@@ -129,15 +134,15 @@ class Host:
 
     # ---- ports
 
-    def _doors(self) -> list[tuple[int, Callable[[], asyncio.Protocol]]]:
-        def primary_door(messages: bool, writable: bool) -> Callable[[], asyncio.Protocol]:
+    def _port_factories(self) -> list[tuple[int, Callable[[], asyncio.Protocol]]]:
+        def primary_factory(messages: bool, writable: bool) -> Callable[[], asyncio.Protocol]:
             return lambda: PrimaryConnection(self.primary, messages=messages, writable=writable)
 
         return [
             (rtde_server.PORT, lambda: RtdeConnection(self.rtde)),
             (script_server.PORT, lambda: ScriptConnection(self.connections)),
             (dashboard_server.PORT, lambda: DashboardConnection(self.connections, self.dashboard)),
-            *((port, primary_door(*kind)) for port, kind in primary_server.PORTS.items()),
+            *((port, primary_factory(*kind)) for port, kind in primary_server.PORTS.items()),
         ]
 
     async def open(self) -> None:
@@ -147,27 +152,29 @@ class Host:
             OSError: a port is taken.
         """
         loop = asyncio.get_running_loop()
-        for port, factory in self._doors():
+        for port, factory in self._port_factories():
             self._servers.append(await loop.create_server(factory, self.address, port))
 
     def close(self) -> None:
-        """Listen no more; connections stay."""
+        """Stop listening; connections stay."""
         for server in self._servers:
             server.close()
         self._servers.clear()
 
     def reopen(self) -> None:
-        """Listen again, if that had ended."""
+        """Listen again, after `close`."""
         if not self._servers and (self._opening is None or self._opening.done()):
             self._opening = asyncio.get_running_loop().create_task(self.open())
 
     def stall(self, active: bool, *, motion: bool = True) -> None:
-        """Keep connections but say nothing; without `motion` the controller itself hangs too."""
+        """Keep connections but send nothing; without `motion` the controller itself stops, too."""
         self.connections.silence(active)
         self.halted = active and not motion
 
     def set_remote(self, active: bool) -> None:
-        """Switch between remote and local control. Into local control, connections that take programs are cut off."""
+        """Switch between remote and local control. On the switch to local control, connections that accept programs are
+        closed.
+        """
         self.controller.set_remote(active)
         if self.controller.local:
             self.connections.drop(ScriptConnection)
@@ -175,7 +182,7 @@ class Host:
     # ---- clock
 
     def start(self) -> None:
-        """Let time pass."""
+        """Start the clock."""
         if self._prioritised:
             self.timing.priority = raise_priority()
         self.timing.started, self.timing.busy_at_start = time.monotonic(), time.process_time()
@@ -196,7 +203,7 @@ class Host:
             self.timing.dropped += behind - MOST_BEHIND
             self._next = now - MOST_BEHIND
             if self.timing.priority != "normal" and worked - self._worked > 0.5 * (now - self._woke):
-                # It is late by its own work, a program's, say: others would get no processor time at all.
+                # Its own work, for example a program's, causes the delay; other processes would get no processor time.
                 self.timing.priority = lower_priority()
         self._worked, self._woke = worked, now
         try:
@@ -211,27 +218,27 @@ class Host:
                 self.rtde.publish(clock)
                 self.primary.publish(clock)
         except Exception:
-            # A defect of this program: a clock that silently stood still would be worse than an end.
+            # A defect in this program: ending is better than a clock that silently stands still.
             traceback.print_exc()
             raise SystemExit(1) from None
         self._clock = loop.call_at(max(self._next, now + min(period, SLOWEST_WAKE)), self._wake)
 
 
 HUNG = 20.0
-"""Wall time after which a process whose interpreter doesn't get on is ended [s]."""
+"""Wall time after which a process with a blocked interpreter is ended [s]."""
 
 
 async def until_orphaned(parent: int, interval: float = 0.5, hung: float = HUNG) -> None:
-    """Wait for a parent process to end: by its standard input, which ends with it, and by its number.
+    """Wait for the parent process to end: by the end of standard input, and by a change of the parent's id.
 
-    The pipe alone isn't enough: a grandchild that was forked may hold its other end open. Neither is noticed by an
-    interpreter that hangs; so an alarm signal, which needs no Python, ends the process with a traceback unless it is
-    put off again and again. A thread that does the same would have to be waited for each time, and has no priority.
+    The pipe alone is not enough, because a forked grandchild may hold its other end open. A blocked interpreter notices
+    neither. An alarm signal, which needs no Python, therefore ends the process with a traceback unless it is postponed
+    in every interval. A thread for the same purpose would have to be joined each time, and has no priority.
 
     Args:
-        parent: its number.
-        interval: between two looks [s].
-        hung: longest time that the interpreter may hang [s].
+        parent: its process id.
+        interval: between two checks [s].
+        hung: longest time that the interpreter may be blocked [s].
     """
     loop = asyncio.get_running_loop()
     gone = asyncio.Event()
@@ -241,9 +248,9 @@ async def until_orphaned(parent: int, interval: float = 0.5, hung: float = HUNG)
             loop.remove_reader(0)
             gone.set()
 
-    with contextlib.suppress(OSError):  # not every standard input can be waited for: /dev/null can't
+    with contextlib.suppress(OSError):  # not every standard input can be polled; /dev/null cannot
         loop.add_reader(0, readable)
-    faulthandler.register(signal.SIGALRM, chain=True)  # the traceback, and then what ends a process by default
+    faulthandler.register(signal.SIGALRM, chain=True)  # prints the traceback, then ends the process by default
     while not gone.is_set() and os.getppid() == parent:
         signal.setitimer(signal.ITIMER_REAL, hung)
         try:

@@ -1,4 +1,8 @@
-"""The controller: one tick per control cycle runs the program, moves the arm and watches over both."""
+"""The controller: each control cycle runs the program, moves the arm and monitors both.
+
+`Controller` combines robot, power, safety system, registers and programs. It opens no socket; the servers read and
+write it between ticks.
+"""
 
 from __future__ import annotations
 
@@ -33,28 +37,28 @@ _POWERLESS = (SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.SYSTEM_EMERGENCY_STOP,
 """Modes in which the arm has no power."""
 
 MOST_SECONDARY = 10
-"""Secondary programs beside the main one."""
+"""Largest number of secondary programs that run in addition to the main one."""
 
 Watcher = Callable[[], bool]
 """Called each cycle until it returns True."""
 
 
 class Controller:
-    """One robot with its controller. Knows no sockets; servers read and write it between ticks.
+    """One robot with its controller. It uses no sockets; servers read and write it between ticks.
 
     Args:
-        model: which robot.
+        model: robot model.
         frequency: control cycles per second of controller time [Hz].
-        time_scale: controller seconds per wall second; only watchdogs care.
-        mode: of power, to begin with.
+        time_scale: controller seconds per wall second; only watchdogs use it.
+        mode: initial power mode.
         remote: remote control is on.
-        joints: where the arm stands [rad].
+        joints: initial joint positions [rad].
         configuration: safety limits; the model's own by default.
 
     Attributes:
         now: controller time [s].
-        known_commands: what the translator has to know of the commands that programs may call.
-        switches: how often somebody switched between remote and local control.
+        known_commands: the translator's view of the commands that programs may call.
+        switches: number of switches between remote and local control.
     """
 
     def __init__(
@@ -95,10 +99,10 @@ class Controller:
         self._commands = commands_of(self)
         self.known_commands = waiting(self._commands)
 
-    # ---- telling
+    # ---- messages
 
     def tell(self, kind: str, text: str, line: int = 0) -> None:
-        """Give a message to all who listen."""
+        """Send a message to all listeners."""
         message = ControllerMessage(kind, text.encode("utf-8", "replace").decode("utf-8"), line, self.now)
         for listener in self.listeners:
             listener(message)
@@ -111,7 +115,9 @@ class Controller:
         return self.runtime is RuntimeState.PLAYING
 
     def upload(self, text: str) -> None:
-        """Run a program; one that runs is ended. What can't be run is refused with a message, whatever is wrong."""
+        """Run a program and end the current one. A program that cannot be run is refused with a message, whatever the
+        error.
+        """
         try:
             translated = translate(text, self.known_commands)
         except Exception as error:
@@ -120,14 +126,16 @@ class Controller:
             self.begin(translated)
 
     def refuse(self, error: Exception) -> None:
-        """Report why a program can't be run; what is not a `ScriptError` is a defect here, and is logged as one."""
+        """Report why a program cannot be run. An error other than `ScriptError` is a defect of the emulator, and is
+        logged as one.
+        """
         if not isinstance(error, ScriptError):
             traceback.print_exception(error)
             error = ScriptError(f"internal error of the controller: {error}")
         self.tell("exception", f"compile error: {error.text}", error.line)
 
     def begin(self, translated: Translated) -> None:
-        """Run a program that has been translated; see `upload`."""
+        """Run a translated program; see `upload`."""
         try:
             program = Program(translated, self._commands)
         except Exception as error:
@@ -143,7 +151,7 @@ class Controller:
             self.tell("key", f"program {program.name} not started: the robot is not ready")
             return
         if self.runtime in (RuntimeState.PAUSED, RuntimeState.PAUSING):
-            # Seen with the manufacturer's simulator: the first upload only ends the program that is held.
+            # Observed with the manufacturer's simulator: the first upload only ends the paused program.
             self.tell("key", f"program {program.name} not started: a paused program was stopped instead")
             self.stop()
             return
@@ -161,17 +169,17 @@ class Controller:
 
     @property
     def local(self) -> bool:
-        """Whether commands over the network are refused. CB3 controllers know no such thing."""
+        """Whether commands over the network are refused. CB3 controllers have no local mode."""
         return self.model.remote_control and not self.remote
 
     def stop(self) -> None:
-        """End the program; the arm comes to rest."""
+        """End the program; the arm stops."""
         if self.program is not None:
             self.tell("key", f"program {self.program.name} stopped")
         self._drop_program()
 
     def pause(self) -> bool:
-        """Hold program and arm. Returns whether there was anything to hold."""
+        """Pause program and arm. Returns whether a program was running."""
         if not self.playing:
             return False
         self.runtime = RuntimeState.PAUSING
@@ -179,7 +187,7 @@ class Controller:
         return True
 
     def play(self) -> bool:
-        """Go on with a program that is held. Returns whether that is possible."""
+        """Resume a paused program. Returns whether that is possible."""
         held = self.program is not None and self.runtime in (RuntimeState.PAUSED, RuntimeState.PAUSING)
         if not held or not self.safety.may_move or not self.power.running:
             return False
@@ -198,7 +206,7 @@ class Controller:
     # ---- safety
 
     def protective_stop(self, reason: str) -> None:
-        """Stop the arm, hold the program; to be unlocked by a person."""
+        """Stop the arm and pause the program; a person has to unlock the stop."""
         self.safety.protective_stop(self.now)
         self.safety_popup = True
         self._hold()
@@ -206,39 +214,39 @@ class Controller:
         self.tell("safety", f"protective stop: {reason}")
 
     def emergency_stop(self, *, system: bool = False) -> None:
-        """Stop the arm, end the program, switch off."""
+        """Stop the arm, end the program, and switch the power off."""
         self.safety.emergency_stop(system=system)
         self._drop_program()
         self.robot.mover.freeze()
         self.tell("safety", "emergency stop")
 
     def release_emergency_stop(self) -> None:
-        """The button is pulled out; power stays off."""
+        """Release the emergency stop button; power stays off."""
         self.safety.release_emergency_stop()
         self.tell("safety", "emergency stop released")
 
     def safety_fault(self) -> None:
-        """The safety system fails: stop, off, and only a restart helps."""
+        """Fail the safety system: stop and switch off; only a restart helps."""
         self.safety.fault = True
         self._drop_program()
         self.robot.mover.freeze()
         self.tell("safety", "fault")
 
     def configure_safety(self, configuration: SafetyConfiguration) -> None:
-        """Other limits, with another checksum."""
+        """Apply other limits, with another checksum."""
         self.safety.configuration = configuration
         self.robot.configure(configuration)
         self.tell("key", f"safety checksum changed to {configuration.checksum}")
 
     def set_remote(self, active: bool) -> None:
-        """Somebody switches between remote and local control; a program that came over the network ends."""
+        """Switch between remote and local control; the running program ends."""
         if self.remote != active:
             self.stop()
             self.remote = active
             self.switches += 1
 
     def reboot(self) -> None:
-        """As after a power cut: everything but the safety configuration and the remote switch is forgotten."""
+        """Reset as after a power cut: only the safety configuration and the remote switch are kept."""
         self.power_off()
         self.runtime = RuntimeState.STOPPED
         self.now = 0.0
@@ -255,7 +263,7 @@ class Controller:
         self.signals.digital_out = 0
 
     def set_safeguard(self, active: bool) -> None:
-        """Someone enters or leaves the guarded area. Without a reset button, as here, the program goes on by itself."""
+        """Apply or release the safeguard stop. There is no reset button here, so the program resumes on release."""
         was = self.safety.safeguard
         self.safety.safeguard = active
         if active and not was:
@@ -272,7 +280,7 @@ class Controller:
             self.runtime = RuntimeState.PAUSING
 
     def unlock_protective_stop(self) -> str | None:
-        """A person has seen to the cause. Returns why it can't be unlocked yet, or None."""
+        """Unlock a protective stop. Returns why that is not possible yet, or None."""
         refusal = self.safety.unlock(self.now)
         if refusal is None:
             self.safety_popup = False
@@ -280,7 +288,7 @@ class Controller:
         return refusal
 
     def power_on(self) -> str | None:
-        """Switch on. Returns why not, or None."""
+        """Switch the power on. Returns why not, or None."""
         if self.safety.mode in _POWERLESS:
             return "Failed to execute: power on"
         self.power.on(self.now)
@@ -294,36 +302,36 @@ class Controller:
         return None
 
     def restart_safety(self) -> None:
-        """After a fault: everything off."""
+        """Restart the safety system after a fault; the power is switched off."""
         self.power_off()
         self.safety.restart()
 
     def power_off(self) -> None:
-        """Brakes close, the program ends."""
+        """Close the brakes and end the program."""
         self._drop_program()
         self.power.off()
 
     # ---- time
 
     def tick(self) -> None:
-        """One control cycle."""
+        """Run one control cycle."""
         self.ticks += 1
         self.now += self.dt
         self.power.step(self.now)
         for watcher in list(self.watchers):
-            if watcher() and watcher in self.watchers:  # what it does may have cleared the list
+            if watcher() and watcher in self.watchers:  # its call may have cleared the list
                 self.watchers.remove(watcher)
         if self.runtime is RuntimeState.PLAYING:
             due = self.watchdogs.step(self.dt / self.time_scale)
             if due is not None:
-                self._bite(*due)
+                self._trigger_watchdog(*due)
             else:
                 self._run()
-        self.secondary = [program for program in self.secondary if self._goes_on(program)]
+        self.secondary = [program for program in self.secondary if self._continues(program)]
         try:
             self.robot.step(self.now, self.dt)
         except (ViolationError, ValueError, ArithmeticError) as violation:
-            # Whatever can't be computed must not move: the mover keeps its last targets and brakes.
+            # A state that cannot be computed must not cause motion: the mover keeps its last targets and brakes.
             self.robot.mover.freeze()
             if self.safety.may_move:
                 self.protective_stop(str(violation))
@@ -332,7 +340,7 @@ class Controller:
         if self.safety.mode in _POWERLESS and self.power.powered and not self._in_motion():
             self.power.off()
 
-    def _bite(self, action: str, why: str) -> None:
+    def _trigger_watchdog(self, action: str, why: str) -> None:
         self.tell("key", why)
         if action == "pause":
             self.pause()
@@ -344,11 +352,11 @@ class Controller:
 
     def _run(self) -> None:
         program = self.program
-        if program is not None and not self._goes_on(program) and self.program is program:
+        if program is not None and not self._continues(program) and self.program is program:
             self.stop()
 
-    def _goes_on(self, program: Program) -> bool:
-        """One cycle of a program: whether it wants another."""
+    def _continues(self, program: Program) -> bool:
+        """Run one cycle of a program; return whether it continues."""
         self.running = program
         try:
             return program.tick()

@@ -1,6 +1,7 @@
-"""Starting a virtual controller from Python, talking to its fault port, and making sure that it ends.
+"""Starts a virtual controller as a child process, sends it faults, and ends it.
 
-The virtual controller as what stands in for a UR arm on a virtual bench; see `actors.bench.device_emulators.StandIn`.
+`VirtualController` is the process; `UrEmulator` is the emulator of a UR arm on a virtual bench (see
+`actors.bench.device_emulators.ArmEmulator`).
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ChildProcess, python_module
 
 START_TIME = 40.0
-"""Longest wait for the process to be ready [s]."""
+"""Longest wait until the process is ready [s]."""
 
 
 class VirtualControllerError(Exception):
-    """The process doesn't start, or doesn't understand a fault; the text says why."""
+    """The process does not start, or refuses a fault; the text gives the reason."""
 
 
 class VirtualController:
-    """A controller in a process of its own. Made by `start`; a context manager that closes.
+    """A controller in a process of its own. Create it with `start`; as a context manager it closes itself.
 
     Attributes:
         address: of its ports 30001 … 30004 and 29999.
-        fault_port: where faults are asked for, at the same address.
+        fault_port: port for fault requests, at the same address.
         pid: of its process.
     """
 
@@ -65,14 +66,14 @@ class VirtualController:
             model: 'ur10' or 'ur10e'.
             time_scale: controller seconds per wall second.
             frequency: control cycles per controller second [Hz]; the model's by default.
-            state: of power, 'running', 'idle' or 'off'.
-            local: begin in local control.
-            joints: six positions to begin with [rad]; a pose in the middle of its reach by default.
-            prioritised: its clock goes before other work on the machine; see docs/virtual-ur.md, "Control period".
+            state: initial power mode, 'running', 'idle' or 'off'.
+            local: start in local control.
+            joints: six initial positions [rad]; a pose in the middle of its workspace by default.
+            prioritised: raise the priority of its clock; see docs/virtual-ur.md, "Control period".
             patience: longest wait [s].
 
         Raises:
-            VirtualControllerError: it did not get ready, with what it said.
+            VirtualControllerError: it did not get ready; the text includes its error output.
         """
         command = python_module("actors.emulators.ur_controller", "--address", address, "--model", model)
         command += ["--time-scale", repr(float(time_scale)), "--state", state, "--parent", str(os.getpid())]
@@ -86,27 +87,27 @@ class VirtualController:
             return cls(process, address, int(ready["fault_port"]))
         except BaseException as error:
             process.kill()
-            said = process.last_error or str(error)
+            reason = process.last_error or str(error)
             process.release()
             if not isinstance(error, Exception):
                 raise
             raise VirtualControllerError(
-                f"virtual controller at {address}: not ready within {patience:g} s: {said}"
+                f"virtual controller at {address}: not ready within {patience:g} s: {reason}"
             ) from error
 
     def fault(self, name: str, *, patience: float = 5.0, **arguments: Any) -> dict[str, Any]:
-        """Ask for a fault, or for what the controller knows of itself; see docs/virtual-ur.md for names.
+        """Inject a fault, or read the controller's internal state; see docs/virtual-ur.md for names.
 
         Args:
             name: of the fault.
-            patience: longest wait for the answer [s].
+            patience: longest wait for the reply [s].
             arguments: of the fault.
 
         Returns:
-            What it answers; {'ok': True} at least.
+            The reply; {'ok': True} at least.
 
         Raises:
-            VirtualControllerError: it doesn't know such a fault, or its arguments are wrong, or it doesn't answer.
+            VirtualControllerError: the fault is unknown, its arguments are wrong, or no reply came.
         """
         try:
             with socket.create_connection((self.address, self.fault_port), timeout=patience) as connection:
@@ -144,17 +145,17 @@ PORTS = (29999, 30001, 30002, 30003, 30004, 30011, 30012)
 ATTEMPTS = 20
 
 FREQUENCY = 125.0
-"""Control cycles per controller second [Hz]; in scaled time more cost much and change nothing that is weighed."""
+"""Control cycles per controller second [Hz]; in scaled time, more cost much and do not change the weighed masses."""
 
 
 SCRIPTS = 30003
 
 
 class UrEmulator:
-    """A controller in a process of its own, which ends with this one.
+    """A controller in a process of its own, which ends with this process.
 
     Args:
-        spec: which model stands where.
+        spec: settings of the arm.
     """
 
     def __init__(self, spec: UrArmSpec) -> None:
@@ -167,7 +168,7 @@ class UrEmulator:
         return replace(self._spec, address=self._controller.address)
 
     def install(self) -> None:
-        """See `ArmEmulator.install`: on a real controller somebody has set TCP and payload in the installation."""
+        """See `ArmEmulator.install`; sets gravity, TCP and payload, which a real controller has in its installation."""
         arm = self._spec
         tool = ", ".join(f"{value!r}" for value in arm.tool.as_list)
         centre = ", ".join(f"{value!r}" for value in arm.payload_centre)
@@ -179,10 +180,10 @@ class UrEmulator:
             time.sleep(0.3)
 
     def history(self, since: float) -> History:
-        """See `ArmEmulator.history`; it is kept for two minutes.
+        """See `ArmEmulator.history`; two minutes of it are kept.
 
         Raises:
-            LaboratoryError: the controller doesn't say.
+            LaboratoryError: the controller does not reply.
         """
         try:
             now = float(self._controller.fault("state")["time"])
@@ -204,8 +205,8 @@ class UrEmulator:
 
 
 def _start_controller(arm: UrArmSpec) -> VirtualController:
-    """At a loopback address that nobody uses: campaigns and tests run side by side."""
-    chance, said = random.SystemRandom(), ""
+    """Start a controller at a free random loopback address, because campaigns and tests run in parallel."""
+    chance, reason = random.SystemRandom(), ""
     for _ in range(ATTEMPTS):
         address = f"127.{chance.randint(1, 254)}.{chance.randint(0, 254)}.{chance.randint(1, 254)}"
         if not _is_free(address):
@@ -215,8 +216,8 @@ def _start_controller(arm: UrArmSpec) -> VirtualController:
                 address, arm.model, arm.time_scale, FREQUENCY if arm.time_scale > 1.0 else None, joints=arm.home
             )
         except VirtualControllerError as error:
-            said = str(error)
-    raise LaboratoryError(f"no virtual controller could be started: {said or 'no free loopback address was found'}")
+            reason = str(error)
+    raise LaboratoryError(f"no virtual controller could be started: {reason or 'no free loopback address was found'}")
 
 
 def _is_free(address: str) -> bool:

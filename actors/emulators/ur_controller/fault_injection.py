@@ -1,4 +1,7 @@
-"""What may go wrong, on request: one TCP port with a line of JSON in and a line of JSON out. For tests only."""
+"""Fault injection for tests: a TCP port with one line of JSON per request and one per reply.
+
+`ControllerFaults` implements the faults, `FaultServer` the port.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +20,14 @@ LONGEST_LINE = 100_000
 
 
 class FaultError(Exception):
-    """There is no such fault, or not with these arguments."""
+    """The fault is unknown, or its arguments are invalid."""
 
 
 class ControllerFaults:
-    """All faults of one host, by name. Times are of the controller [s] unless they say wall.
+    """All faults of one host, by name. Times are controller times [s] unless wall time is named.
 
     Args:
-        host: what they happen to.
+        host: the host that the faults act on.
     """
 
     def __init__(self, host: Host) -> None:
@@ -55,10 +58,10 @@ class ControllerFaults:
         }
 
     def call(self, request: Any) -> dict[str, Any]:
-        """Do what a request asks.
+        """Execute a request.
 
         Raises:
-            FaultError: it can't be done as asked.
+            FaultError: the request is invalid.
         """
         if not isinstance(request, dict) or not isinstance(request.get("fault"), str):
             raise FaultError('a request is an object with "fault" and its arguments')
@@ -71,7 +74,7 @@ class ControllerFaults:
         except (TypeError, ValueError, LookupError, ArithmeticError) as error:
             raise FaultError(f"{name}: {error!r} with {arguments}"[:500]) from error
 
-    # ---- when
+    # ---- conditions
 
     def _when(
         self,
@@ -81,7 +84,7 @@ class ControllerFaults:
         above: float | None = None,
         below: float | None = None,
     ) -> None:
-        """Now, after a time, or once a joint's measured position passes a value [rad]."""
+        """Execute now, after a time, or once a joint's measured position passes a value [rad]."""
         if after is None and joint is None:
             do()
             return
@@ -105,19 +108,19 @@ class ControllerFaults:
     # ---- safety
 
     def protective_stop(self, reason: str = "fault port", **when: Any) -> None:
-        """A protective stop."""
+        """Trigger a protective stop."""
         self._when(lambda: self._controller.protective_stop(str(reason)), **when)
 
     def emergency_stop(self, system: bool = False, **when: Any) -> None:
-        """The emergency stop button is pressed."""
+        """Press the emergency stop button."""
         self._when(lambda: self._controller.emergency_stop(system=bool(system)), **when)
 
     def release_emergency_stop(self, **when: Any) -> None:
-        """The button is pulled out."""
+        """Release the emergency stop button."""
         self._when(self._controller.release_emergency_stop, **when)
 
     def reduced(self, active: bool = True, **when: Any) -> None:
-        """An input or a plane sets the reduced mode; its lower limits are not modelled."""
+        """Switch the reduced mode, as an input or a plane does; its lower limits are not modelled."""
 
         def apply() -> None:
             self._controller.safety.reduced = bool(active)
@@ -125,15 +128,15 @@ class ControllerFaults:
         self._when(apply, **when)
 
     def safeguard(self, active: bool = True, **when: Any) -> None:
-        """Someone enters the guarded area, or leaves it."""
+        """Apply the safeguard stop (a person enters the guarded area), or release it."""
         self._when(lambda: self._controller.set_safeguard(bool(active)), **when)
 
     def safety_fault(self, **when: Any) -> None:
-        """The safety system itself fails: only a restart helps."""
+        """Fail the safety system itself: only a restart helps."""
         self._when(self._controller.safety_fault, **when)
 
     def checksum(self, value: str | None = None) -> None:
-        """Report another safety checksum, up to eight hexadecimal digits; none for the true one."""
+        """Report another safety checksum, up to eight hexadecimal digits; None restores the true one."""
         self._controller.safety.reported_checksum = None if value is None else f"{int(value, 16) & 0xFFFFFFFF:08X}"
 
     def limits(
@@ -143,7 +146,7 @@ class ControllerFaults:
         tool_speed: float | None = None,
         planes: list[dict[str, Any]] | None = None,
     ) -> dict[str, Any]:
-        """Narrow the safety configuration; what isn't named becomes the model's own."""
+        """Narrow the safety configuration; limits that are not given become the model's own."""
         own = SafetyConfiguration.of(self._controller.model)
         ranges, speeds = own.joint_ranges, own.joint_speeds
         if joint_ranges is not None:
@@ -166,9 +169,9 @@ class ControllerFaults:
     # ---- connections
 
     def stall(self, seconds: float | None = None, motion: bool = True, **when: Any) -> None:
-        """Connections stay but nothing is answered, for some wall seconds or until 'clear'.
+        """Keep connections but send no replies, for some wall seconds or until 'clear'.
 
-        With `motion` False the whole controller hangs: the arm keeps still where it is.
+        With `motion` False the whole controller hangs: the arm stands still.
         """
 
         def begin() -> None:
@@ -182,11 +185,11 @@ class ControllerFaults:
         self._host.stall(False)
 
     def drop(self, **when: Any) -> None:
-        """Cut all connections off; new ones are welcome."""
+        """Close all connections; new ones are accepted."""
         self._when(self._host.connections.drop, **when)
 
     def refuse(self, seconds: float | None = None, **when: Any) -> None:
-        """Cut all connections off and accept none, for some wall seconds or until 'clear'."""
+        """Close all connections and accept none, for some wall seconds or until 'clear'."""
 
         def begin() -> None:
             self._host.close()
@@ -197,7 +200,7 @@ class ControllerFaults:
         self._when(begin, **when)
 
     def reboot(self, seconds: float = 10.0, **when: Any) -> None:
-        """Gone for some wall seconds, then switched off as after a power cut."""
+        """Disappear for some wall seconds, then be switched off as after a power cut."""
 
         def begin() -> None:
             self._controller.reboot()
@@ -212,21 +215,23 @@ class ControllerFaults:
     def _reopen(self) -> None:
         self._host.reopen()
 
-    # ---- the arm and its panel
+    # ---- arm and panel
 
     def noise(self, sigma: float = 0.0) -> None:
-        """Measured joint positions get noise [rad]."""
+        """Add noise to the measured joint positions [rad]."""
         self._controller.robot.noise = max(0.0, _finite(sigma))
 
     def lag(self, seconds: float = TRACKING_LAG) -> None:
-        """The joints follow their targets with this time constant [s], as weak ones do; healthy ones by default."""
+        """Set the time constant with which joints follow their targets [s]; weak joints have a larger one than the
+        default.
+        """
         value = _finite(seconds)
         if value <= 0.0:
             raise ValueError("a time constant is above 0 s")
         self._controller.robot.lag = value
 
     def slider(self, fraction: float, **when: Any) -> None:
-        """Someone moves the speed slider."""
+        """Move the speed slider."""
         value = _finite(fraction)
         if not 0.0 <= value <= 1.0:
             raise ValueError("the slider goes from 0 to 1")
@@ -237,11 +242,11 @@ class ControllerFaults:
         self._when(move, **when)
 
     def remote(self, active: bool, **when: Any) -> None:
-        """Someone switches remote control on or off."""
+        """Switch remote control on or off."""
         self._when(lambda: self._host.set_remote(bool(active)), **when)
 
     def inputs(self, digital: dict[str, bool] | None = None, analog: list[float] | None = None) -> None:
-        """What is wired to the inputs: levels by number, 0–7 standard, 8–15 configurable, 16–17 tool."""
+        """Set the input levels: digital by number (0–7 standard, 8–15 configurable, 16–17 tool), and analogue."""
         for number, level in (digital or {}).items():
             if not 0 <= int(number) <= 17:
                 raise ValueError("digital inputs are 0 … 17")
@@ -250,16 +255,16 @@ class ControllerFaults:
             self._controller.signals.analog_in[at] = _finite(value)
 
     def power(self, mode: str) -> None:
-        """Be in a power mode at once: 'running', 'idle', 'off'."""
+        """Set the power mode at once: 'running', 'idle', 'off'."""
         modes = {"running": RobotMode.RUNNING, "idle": RobotMode.IDLE, "off": RobotMode.POWER_OFF}
         if mode == "off":
             self._controller.power_off()
         self._controller.power.mode = modes[mode]
 
-    # ---- questions
+    # ---- queries
 
     def state(self) -> dict[str, Any]:
-        """What the controller knows of itself, and how its clock kept time."""
+        """Return the controller's state and the statistics of its clock."""
         c = self._controller
         return {
             "time": c.now,
@@ -283,13 +288,13 @@ class ControllerFaults:
         }
 
     def history(self, since: float = 0.0) -> dict[str, Any]:
-        """Joint positions as executed since a controller time, without noise."""
+        """Return the executed joint positions since a controller time, without noise."""
         start = _finite(since)
         kept = [(t, q) for t, q in self._controller.robot.history if t >= start]
         return {"times": [t for t, _ in kept], "joints": [list(q) for _, q in kept]}
 
     def clear(self) -> None:
-        """End stalls and refusals, forget what was to happen."""
+        """End stalls and refusals, and cancel pending faults."""
         self._controller.watchers.clear()
         self._resume()
         self._reopen()
@@ -313,10 +318,10 @@ def _once(condition: Callable[[], bool], do: Callable[[], None]) -> Watcher:
 
 
 class FaultServer:
-    """The port.
+    """The TCP port for faults.
 
     Args:
-        host: what faults happen to.
+        host: the host that the faults act on.
     """
 
     def __init__(self, host: Host) -> None:
@@ -325,7 +330,7 @@ class FaultServer:
         self._server: asyncio.Server | None = None
 
     async def open(self, port: int) -> int:
-        """Listen; returns the port, which is any free one for 0."""
+        """Listen; returns the port number. With 0, the system chooses a free port."""
         self._server = await asyncio.start_server(self._serve, self._host.address, port, limit=LONGEST_LINE)
         number: int = self._server.sockets[0].getsockname()[1]
         return number
@@ -340,6 +345,6 @@ class FaultServer:
                 writer.write(json.dumps(answer).encode() + b"\n")
                 await writer.drain()
         except (ConnectionError, ValueError):
-            pass  # gone, or a line without an end
+            pass  # closed, or a line without an end
         finally:
             writer.close()

@@ -1,6 +1,7 @@
-"""Poses as a robot controller writes them: x, y, z [m] and a rotation vector [rad]. Scalars only: they run at 500 Hz.
+"""Poses in a robot controller's format: x, y, z [m] and a rotation vector [rad].
 
-A rotation matrix is a tuple of its nine entries, row by row; a vector a tuple of three.
+The functions use plain scalars because they run at 500 Hz. A rotation matrix is a tuple of its nine entries, row by
+row; a vector is a tuple of three.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from math import atan2, cos, pi, sin, sqrt
 Vector = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 Transform = tuple[Matrix, Vector]
-"""A rotation and a position: what a pose means."""
+"""A rotation and a position."""
 
 IDENTITY: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -53,7 +54,7 @@ def rotation_vector(m: Matrix) -> Vector:
 
 
 def _half_turn(m: Matrix) -> Vector:
-    # At an angle of π the antisymmetric part vanishes; the axis stands in the symmetric one: m = 2·n·nᵀ − 1.
+    # At an angle of π the antisymmetric part vanishes; the symmetric part contains the axis: m = 2·n·nᵀ − 1.
     i = max(range(3), key=lambda k: m[4 * k])
     length = sqrt(max(0.5 * (m[4 * i] + 1.0), 0.0))
     axis = [0.0, 0.0, 0.0]
@@ -92,14 +93,14 @@ def rotate(m: Matrix, v: Sequence[float]) -> Vector:
 
 
 def compose(a: Transform, b: Transform) -> Transform:
-    """b, given in a, seen from where a is given."""
+    """Compose two transforms: b, given in the frame a, in the frame in which a is given."""
     m, p = a
     x, y, z = rotate(m, b[1])
     return multiply(m, b[0]), (p[0] + x, p[1] + y, p[2] + z)
 
 
 def invert(a: Transform) -> Transform:
-    """The frame that undoes `a`."""
+    """Inverse of a transform."""
     back = transpose(a[0])
     x, y, z = rotate(back, a[1])
     return back, (-x, -y, -z)
@@ -111,7 +112,7 @@ def transform_of(pose: Sequence[float]) -> Transform:
 
 
 def pose_of(frame: Transform) -> tuple[float, float, float, float, float, float]:
-    """Pose of a frame."""
+    """Pose of a transform."""
     return (*frame[1], *rotation_vector(frame[0]))
 
 
@@ -121,7 +122,7 @@ def norm3(v: Sequence[float]) -> float:
 
 
 def distance(a: Sequence[float], b: Sequence[float]) -> float:
-    """Distance of two points or poses, rotations aside [m]."""
+    """Distance of two points, or of the positions of two poses [m]."""
     return sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 

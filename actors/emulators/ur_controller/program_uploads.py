@@ -1,4 +1,4 @@
-"""Programs on their way to the controller: one after the other, while its clock goes on."""
+"""The queue of uploaded programs: they run one after the other while the controller's clock continues."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from actors.emulators.ur_controller.urscript.translator import LONGEST_HERE, Tra
 from actors.runtime.child_process import python_module, run_async
 
 MOST_WAITING = 100
-"""Programs that may wait before no more is read from those who send them."""
+"""Number of waiting programs above which their senders are no longer read."""
 
 PATIENCE = 60.0
-"""Longest wait for a translation apart [s of wall time]."""
+"""Longest wait for a translation in a separate process [s of wall time]."""
 
 
 class Sender(Protocol):
-    """Whom a program came from."""
+    """The connection that a program came from."""
 
     @property
     def privileged(self) -> bool:
-        """Whether it may command now."""
+        """Whether it may send commands now."""
 
     def refuse(self) -> None:
-        """Say that it may not."""
+        """Report that it may not send commands."""
 
     def wait(self, active: bool) -> None:
-        """Send no more for now, or again."""
+        """Stop reading from it, or resume."""
 
 
 class Uploads:
     """The queue. Short programs are translated between two cycles of the clock, long ones in a process of their own.
 
-    The clock calls `work`; so a flood of programs can't take it its time.
+    The clock calls `work` with a time limit, so a flood of programs cannot delay it.
 
     Args:
         controller: runs them.
@@ -46,38 +46,38 @@ class Uploads:
         self._controller = controller
         self._waiting: deque[tuple[str, Sender]] = deque()
         self._held: set[Sender] = set()
-        self._apart: asyncio.Task[None] | None = None
+        self._translation: asyncio.Task[None] | None = None
 
     def put(self, text: str, sender: Sender) -> None:
-        """Run a program when its turn comes; whether the sender may command is asked then."""
+        """Queue a program; the sender's privilege is checked when its turn comes."""
         self._waiting.append((text, sender))
         if len(self._waiting) > MOST_WAITING and sender not in self._held:
             self._held.add(sender)
             sender.wait(True)
 
     def forget(self) -> None:
-        """Drop what waits, as at a power cut."""
+        """Drop the queue, as at a power cut."""
         self._waiting.clear()
 
     def work(self, seconds: float = 0.0) -> None:
-        """Run the next program, and further ones for a time [s]; one that is translated apart is waited for."""
+        """Run the next program, and further ones for a time [s]; none while a separate translation is pending."""
         end = time.monotonic() + seconds
-        while self._waiting and (self._apart is None or self._apart.done()):
+        while self._waiting and (self._translation is None or self._translation.done()):
             text, sender = self._waiting.popleft()
             if not sender.privileged:
                 sender.refuse()
             elif len(text) <= LONGEST_HERE:
                 self._controller.upload(text)
             else:
-                self._apart = asyncio.get_running_loop().create_task(self._upload_apart(text, sender))
+                self._translation = asyncio.get_running_loop().create_task(self._upload_translated(text, sender))
             if time.monotonic() >= end:
                 break
         while self._held and len(self._waiting) < MOST_WAITING:
             self._held.pop().wait(False)
 
-    async def _upload_apart(self, text: str, sender: Sender) -> None:
+    async def _upload_translated(self, text: str, sender: Sender) -> None:
         try:
-            translated = await self._translate_apart(text)
+            translated = await self._translate_in_process(text)
         except Exception as error:
             self._controller.refuse(error)
             return
@@ -86,7 +86,7 @@ class Uploads:
         else:
             sender.refuse()
 
-    async def _translate_apart(self, text: str) -> Translated:
+    async def _translate_in_process(self, text: str) -> Translated:
         asked = question(text, self._controller.known_commands)
         try:
             answer = await run_async(python_module("actors.emulators.ur_controller.urscript"), asked, timeout=PATIENCE)

@@ -1,6 +1,7 @@
-"""What programs, clients and wires share: registers and inputs and outputs.
+"""Data that programs, clients and wires share: registers, inputs and outputs, and watchdogs on inputs.
 
-Inputs that a client has to write often enough, or its program is paused or stopped.
+`Registers` and `Signals` hold the values. `Watchdogs` pause or stop a program if a client does not write an input often
+enough.
 """
 
 from __future__ import annotations
@@ -8,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 REGISTERS = 48
-"""Integer and double registers of each direction."""
+"""Number of integer and of double registers in each direction."""
 
 
 @dataclass
 class Registers:
-    """General-purpose registers. Programs write outputs and read inputs, clients the other way round."""
+    """General-purpose registers. Programs write outputs and read inputs; clients do the opposite."""
 
     input_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
     input_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
@@ -31,7 +32,7 @@ class Signals:
         digital_in, digital_out: bits 0–7 standard, 8–15 configurable, 16–17 tool.
         analog_in: two values in volt or ampere.
         analog_out: two fractions 0 … 1 of the range.
-        analog_voltage: whether each analogue output is in volt (0 … 10 V), else ampere (4 … 20 mA).
+        analog_voltage: whether each analogue output is in volt (0 … 10 V) instead of ampere (4 … 20 mA).
     """
 
     digital_in: int = 0
@@ -45,12 +46,12 @@ class Signals:
         self.digital_out = self.digital_out | (1 << bit) if level else self.digital_out & ~(1 << bit)
 
     def set_outputs(self, mask: int, levels: int, offset: int) -> None:
-        """Switch the digital outputs that a mask names."""
+        """Switch the digital outputs in a mask."""
         mask, levels = mask << offset, levels << offset
         self.digital_out = (self.digital_out & ~mask) | (levels & mask)
 
     def set_input(self, bit: int, level: bool) -> None:
-        """What the outside world applies to a digital input."""
+        """Set the level of a digital input."""
         self.digital_in = self.digital_in | (1 << bit) if level else self.digital_in & ~(1 << bit)
 
     def analog_reading(self, number: int) -> float:
@@ -67,13 +68,13 @@ class _Watch:
 
 
 class Watchdogs:
-    """All that a program has set up. They watch a network, so they go by wall time, however time is scaled."""
+    """The watchdogs of a program. They monitor a network, so they use wall time in scaled time, too."""
 
     def __init__(self) -> None:
         self._watches: dict[str, _Watch] = {}
 
     def set(self, name: str, longest: float, action: str) -> None:
-        """Watch an input.
+        """Monitor an input.
 
         Args:
             name: of the input.
@@ -83,21 +84,21 @@ class Watchdogs:
         self._watches[name] = _Watch(longest, action)
 
     def remove(self, name: str) -> None:
-        """Watch it no more."""
+        """Remove the watchdog of an input."""
         self._watches.pop(name, None)
 
     def clear(self) -> None:
-        """Watch nothing."""
+        """Remove all watchdogs."""
         self._watches.clear()
 
     def written(self, name: str) -> None:
-        """A client wrote this input."""
+        """Record that a client wrote this input."""
         watch = self._watches.get(name)
         if watch is not None:
             watch.waited = 0.0
 
     def step(self, wall: float) -> tuple[str, str] | None:
-        """Let wall time pass [s]. Returns the action that is due, and why; None if none is."""
+        """Let wall time pass [s]. Returns the action that is due and its reason; None if none is."""
         for name, watch in self._watches.items():
             watch.waited += wall
             if watch.waited > watch.longest:

@@ -1,8 +1,7 @@
-"""The arm itself: where it is commanded to be, where it is, what it carries, what it reports of itself.
+"""The arm: its commanded and measured state, tool and payload, power modes, and the emulated models.
 
-From switched off to running: modes and how long they take.
-
-The robots with the controllers that they pretend to have.
+`Robot` follows the targets of its `Mover` and reports measured values. `Power` switches between the power modes with
+their delays. `MODELS` lists the robots with the controllers that the emulator imitates.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ STEADY = 1e-4
 """Joint speed below which the arm counts as steady [rad/s]."""
 
 SETTLING = 0.2
-"""Time that it must have been below for that [s]."""
+"""Time below `STEADY` until the arm counts as steady [s]."""
 
 HISTORY_RATE = 125.0
-"""Positions remembered per second of controller time [Hz]."""
+"""Positions stored per second of controller time [Hz]."""
 
 HISTORY_TIME = 120.0
-"""How long they are remembered [s]."""
+"""Time for which positions are stored [s]."""
 
 Pose = tuple[float, float, float, float, float, float]
 
@@ -43,12 +42,12 @@ class Robot:
     """Joints, tool and payload.
 
     Args:
-        model: which robot.
-        q: where it stands [rad].
+        model: robot model.
+        q: initial positions [rad].
         configuration: safety limits.
 
     Attributes:
-        q, qd: what the joints measure, noise included [rad], [rad/s].
+        q, qd: measured positions and speeds, noise included [rad], [rad/s].
         noise: standard deviation of the measured positions [rad].
         lag: time constant with which the joints follow their targets [s].
         payload: [kg]; `cog` [m], `inertia` [kg m²].
@@ -81,30 +80,30 @@ class Robot:
         self.configure(configuration)
 
     def configure(self, configuration: SafetyConfiguration) -> None:
-        """Take over safety limits."""
+        """Apply safety limits."""
         self.configuration = configuration
         self.mover.joint_range = configuration.joint_ranges
         self.mover.joint_speed = configuration.joint_speeds
 
     def set_tcp(self, pose: Pose) -> None:
-        """Mount a tool: its centre point in the flange's frame."""
+        """Set the tool: its centre point in the flange's frame."""
         self.tcp = pose
         self.arm = KinematicArm(self.kinematics, transform_of(pose))
         self._point = self.arm.frame(self.mover.q)[1]
         self._cache.clear()
 
     def forget(self) -> None:
-        """As after a power cut: no tool, no payload, no memory."""
+        """Reset as after a power cut: no tool, no payload, no history."""
         self.set_tcp((0.0,) * 6)
         self.payload, self.cog, self.inertia = 0.0, (0.0, 0.0, 0.0), (0.0,) * 6
         self.history.clear()
         self._next_memory = 0.0
 
     def step(self, now: float, dt: float) -> None:
-        """One control cycle.
+        """Run one control cycle.
 
         Raises:
-            ViolationError: a limit; the mover is stopping already, or must be stopped.
+            ViolationError: a limit was exceeded; the mover is stopping already, or must be stopped.
         """
         self._cache.clear()
         moves = self.mover.moving
@@ -129,7 +128,7 @@ class Robot:
                 raise ViolationError(beyond)
 
     def _deeper(self, before: Vector, point: Vector) -> bool:
-        """Whether a step led (further) out of the allowed space: the way back is free."""
+        """Whether a step moved further out of the allowed space; the motion back is permitted."""
 
         def inside(p: Vector) -> float:
             return min(
@@ -162,11 +161,11 @@ class Robot:
             self._next_memory = now + 1.0 / HISTORY_RATE - 1e-9
             self.history.append((now, self._true))
 
-    # ---- what it reports
+    # ---- reported values
 
     @property
     def steady(self) -> bool:
-        """Whether it stands still, and has for a moment."""
+        """Whether the arm has been still for `SETTLING`."""
         return self._steady_for >= SETTLING
 
     @property
@@ -187,7 +186,7 @@ class Robot:
 
     @property
     def target_pose(self) -> Pose:
-        """Pose of the tool centre point, as targeted."""
+        """Target pose of the tool centre point."""
         cached = self._cache.get("target_pose")
         if cached is None:
             cached = self._cache["target_pose"] = pose_of(self.arm.frame(self.mover.q))
@@ -219,7 +218,7 @@ class Robot:
 
     @property
     def target_tool_speed(self) -> Pose:
-        """Targeted velocity of the tool centre point [m/s], [rad/s]."""
+        """Target velocity of the tool centre point [m/s], [rad/s]."""
         if self.mover.qd == _ZERO:
             return _ZERO
         point = self.arm.frame(self.mover.q)[1]
@@ -227,7 +226,9 @@ class Robot:
 
     @property
     def holding_torques(self) -> Joints:
-        """Joint torques that hold the arm and its payload against gravity [N m]; friction and acceleration left out."""
+        """Joint torques that hold the arm and its payload against gravity [N m]; friction and acceleration are left
+        out.
+        """
         axes, origins = self.kinematics.axes(self.q)
         frames, model = self.kinematics.links(self.q), self.model
         weights = [
@@ -250,7 +251,7 @@ _ZERO: Joints = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class RobotMode(IntEnum):
-    """As RTDE and the dashboard report it."""
+    """Robot mode as RTDE and the dashboard report it."""
 
     NO_CONTROLLER = -1
     DISCONNECTED = 0
@@ -265,20 +266,20 @@ class RobotMode(IntEnum):
 
 
 BOOT_TIME = 4.0
-"""From 'power on' until the joints answer [s]. Plausible, not measured."""
+"""Time from 'power on' until the joints respond [s]. Plausible, not measured."""
 
 POWER_ON_TIME = 1.0
-"""From there to idle [s]."""
+"""Time from the response of the joints to idle [s]."""
 
 BRAKE_TIME = 3.0
-"""From 'brake release' to running [s]."""
+"""Time from 'brake release' to running [s]."""
 
 
 class Power:
-    """Modes over controller time.
+    """Power modes over controller time.
 
     Args:
-        mode: to begin with.
+        mode: initial mode.
     """
 
     def __init__(self, mode: RobotMode = RobotMode.RUNNING) -> None:
@@ -302,7 +303,7 @@ class Power:
             self._plan = [(now + BOOT_TIME, RobotMode.POWER_ON), (now + BOOT_TIME + POWER_ON_TIME, RobotMode.IDLE)]
 
     def release_brakes(self, now: float) -> None:
-        """Release the brakes, switching on first if need be."""
+        """Release the brakes, after switching on if necessary."""
         self.on(now)
         if self.mode is RobotMode.RUNNING or (self._plan and self._plan[-1][1] is RobotMode.RUNNING):
             return
@@ -310,7 +311,7 @@ class Power:
         self._plan.append((idle + BRAKE_TIME, RobotMode.RUNNING))
 
     def off(self) -> None:
-        """Switch off: brakes close."""
+        """Switch off; the brakes close."""
         self.mode, self._plan = RobotMode.POWER_OFF, []
 
     def step(self, now: float) -> None:
@@ -321,11 +322,11 @@ class Power:
 
 @dataclass(frozen=True, kw_only=True)
 class ControlledModel(RobotModel):
-    """One model of robot with its controller.
+    """One robot model with its controller.
 
     Attributes:
         version: of the controller's software: major, minor, bugfix, build.
-        remote_control: whether the controller knows the remote-control mode.
+        remote_control: whether the controller has the remote-control mode.
         serial: its number; digits only.
         primary_type: robot type and subtype in configuration data.
     """
@@ -350,7 +351,7 @@ UR10E = ControlledModel(
 )
 
 MODELS = {"ur10": UR10, "ur10e": UR10E}
-"""By the name that starts them."""
+"""Models by the names of the `--model` option."""
 
 HOME: Joints = tuple(radians(v) for v in (0.0, -90.0, 90.0, -90.0, -90.0, 0.0))  # type: ignore[assignment]
-"""Where a robot stands when its controller is started: a pose in the middle of its reach, away from singularities."""
+"""Initial joint positions: a pose in the middle of the workspace, away from singularities."""

@@ -1,8 +1,8 @@
 """Forward and inverse kinematics of the six-axis arm, in closed form.
 
-Source: standard Denavit–Hartenberg frames with twists π/2, 0, 0, π/2, −π/2, 0. Three parallel axes (2, 3, 4) let the
-inverse fall apart: joint 1 from where the wrist is, 5 and 6 from orientation, 2, 3, 4 from a triangle in the plane.
-Up to eight solutions: shoulder left or right, wrist up or down, elbow up or down.
+Source: standard Denavit–Hartenberg frames with twists π/2, 0, 0, π/2, −π/2, 0. Three parallel axes (2, 3, 4) decouple
+the inverse: joint 1 follows from the wrist position, 5 and 6 from the orientation, 2, 3, 4 from a triangle in the
+plane. There are up to eight solutions: shoulder left or right, wrist up or down, elbow up or down.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from actors.arm.ur.robot_models import Joints, RobotModel
 from actors.emulators.ur_controller.poses import IDENTITY, Transform, Vector, compose, multiply, rotation_matrix
 
 _SINGULAR_WRIST = 1e-6
-"""Below this |sin q5| joints 4 and 6 turn about the same axis, and q6 is taken as it was."""
+"""Below this |sin q5| joints 4 and 6 turn about the same axis, and q6 keeps its given value."""
 
 
 class Kinematics:
-    """Kinematics of one robot model. Poses are those of the flange; a tool is composed by the caller.
+    """Kinematics of one robot model. Poses are those of the flange; the caller composes a tool.
 
     Args:
         model: lengths and joint ranges.
@@ -28,7 +28,7 @@ class Kinematics:
         self.model = model
 
     def flange(self, q: Sequence[float]) -> Transform:
-        """Where the flange is in the base's frame [m]."""
+        """Transform of the flange in the base's frame [m]."""
         m = self.model
         q1, q2, q3, q4, q5, q6 = q
         s1, c1, s5, c5, s6, c6 = sin(q1), cos(q1), sin(q5), cos(q5), sin(q6), cos(q6)
@@ -76,7 +76,7 @@ class Kinematics:
         return [(0.0, 0.0, 1.0), across, across, across, wrist, tool], [(0.0, 0.0, 0.0), shoulder, elbow, w1, w2, w3]
 
     def links(self, q: Sequence[float]) -> list[Transform]:
-        """Denavit–Hartenberg frames of the six links, each at its link's far end, base frame."""
+        """Denavit–Hartenberg frames of the six links, each at its link's distal end, base frame."""
         m = self.model
         lengths = ((0.0, m.d1, 0.5), (m.a2, 0.0, 0.0), (m.a3, 0.0, 0.0), (0.0, m.d4, 0.5), (0.0, m.d5, -0.5))
         frame: Transform = (IDENTITY, (0.0, 0.0, 0.0))
@@ -106,18 +106,18 @@ class Kinematics:
         return vx, vy, vz, wx, wy, wz
 
     def inverse(self, flange: Transform, q6: float = 0.0) -> Iterator[Joints]:
-        """All joint positions, each in (−π, π], that put the flange there. None if it is out of reach.
+        """Yield all joint positions, each in (−π, π], for a flange transform; none if it is out of the workspace.
 
         Args:
-            flange: where to.
-            q6: taken where the wrist is singular and joint 6 may be anything [rad].
+            flange: target transform.
+            q6: used for a singular wrist, where joint 6 is arbitrary [rad].
         """
         m = self.model
         r, p = flange
         wx, wy, wz = p[0] - m.d6 * r[2], p[1] - m.d6 * r[5], p[2] - m.d6 * r[8]
         radius = hypot(wx, wy)
         if radius < m.d4 - 1e-9 or radius == 0.0:
-            return  # inside the cylinder about the base that the wrist can't enter
+            return  # inside the cylinder about the base that the wrist cannot enter
         bearing, offset = atan2(wy, wx), asin(min(1.0, m.d4 / radius))
         for q1 in (bearing + offset, bearing + pi - offset):
             s1, c1 = sin(q1), cos(q1)
@@ -142,10 +142,10 @@ class Kinematics:
                     yield _turn(q1), _turn(q2), q3, _turn(q234 - q2 - q3), q5, sixth
 
     def nearest(self, flange: Transform, near: Sequence[float]) -> Joints | None:
-        """The solution whose joints are nearest to `near`, within the joints' ranges. None if there is none.
+        """Return the solution nearest to `near` within the joint ranges; None if there is none.
 
         Args:
-            flange: where to.
+            flange: target transform.
             near: joint positions [rad]; solutions may lie beyond ±π to stay near them.
         """
         best: Joints | None = None

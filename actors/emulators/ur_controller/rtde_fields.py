@@ -1,13 +1,12 @@
-"""Which values clients may read and write over RTDE, and what they mean here.
+"""The values that clients may read and write over RTDE, and the recipes that they set up.
 
-Names, types and versions: the manufacturer's RTDE guide. Fields that came after the software modelled here (3.15, 5.12)
-are not found: `collision_detection_ratio`, `time_scale_source`, `actual_current_as_torque`, energies, accelerations of
-the tool and others. For `tcp_offset`, encoders and configurable inputs and outputs no version could be found; they are
-assumed to have come with the e-Series.
+`output_fields` lists the readable values, `INPUT_KINDS` the writable ones. `OutputRecipe` and `InputRecipe` encode and
+decode the data packages of one client.
 
-What a controller puts into its frames of real-time data exchange: messages, and the recipes that clients set up.
-
-Source: the manufacturer's RTDE guide; what real clients send was measured.
+Source of names, types and versions: the manufacturer's RTDE guide; the messages of real clients were measured. Fields
+newer than the modelled software (3.15, 5.12) are not found: `collision_detection_ratio`, `time_scale_source`,
+`actual_current_as_torque`, energies, accelerations of the tool and others. For `tcp_offset`, encoders and configurable
+inputs and outputs the guide gives no version; they are assumed to exist since the e-Series.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from actors.emulators.ur_controller.registers import REGISTERS
 
 
 def text_message(protocol: int, message: str, source: str, level: int) -> bytes:
-    """A message for people.
+    """Return a text message.
 
     Args:
         protocol: 1 or 2.
@@ -42,7 +41,7 @@ class Field:
 
     Attributes:
         kind: RTDE type.
-        read: the value, a number or a sequence of the type's length.
+        read: returns the value, a number or a sequence of the type's length.
     """
 
     kind: str
@@ -50,7 +49,7 @@ class Field:
 
 
 class OutputRecipe:
-    """What one client is sent.
+    """The values that one client receives.
 
     Args:
         number: of the recipe; 0 leaves it out, as protocol 1 does.
@@ -65,7 +64,7 @@ class OutputRecipe:
         self._read = [field.read for field in fields]
 
     def package(self) -> bytes:
-        """The values now, as a package."""
+        """Return the current values as a package."""
         values = list(self._head)
         for read, single in zip(self._read, self._single, strict=True):
             if single:
@@ -76,7 +75,7 @@ class OutputRecipe:
 
 
 class InputRecipe:
-    """What one client sends.
+    """The values that one client sends.
 
     Args:
         fields: names in order.
@@ -89,7 +88,7 @@ class InputRecipe:
         self._struct = struct.Struct(">" + "".join(FORMATS[kind][0] for kind in kinds))
 
     def read(self, payload: bytes) -> dict[str, Any] | None:
-        """Values by name; None if there are too few or too many bytes for them."""
+        """Return the values by name; None if the number of bytes is wrong."""
         if len(payload) != self._struct.size:
             return None
         values = self._struct.unpack(payload)
@@ -105,17 +104,17 @@ _ZERO6 = (0.0,) * 6
 _RUNNING, _POWER_OFF, _IDLE = 253, 239, 255
 _TEMPERATURES = (31.0, 32.0, 32.0, 34.0, 35.0, 36.0)
 _DIGITAL_OUTPUTS, _SINKING = 0, 1
-"""Modes of the tool's outputs: digital outputs rather than power, and NPN."""
+"""Modes of the tool's outputs: digital outputs instead of power, and NPN."""
 
 _CURRENT_WINDOW = (5.0, 5.0, 4.0, 2.5, 2.5, 2.5)
 """Allowed deviations from the target currents [A]. Plausible, not measured."""
 
 _DEVIATION_LIMIT = 0.2
-"""Deviation of a joint from its target that a real controller stops for [rad]. Plausible, not measured."""
+"""Deviation of a joint from its target at which a real controller stops [rad]. Plausible, not measured."""
 
 
 def output_fields(controller: Controller) -> dict[str, Field]:
-    """What can be read, by name."""
+    """Return the readable values, by name."""
     robot, mover, power = controller.robot, controller.robot.mover, controller.power
     safety, signals, registers = controller.safety, controller.signals, controller.registers
     slow = _Slow(controller)
@@ -225,7 +224,7 @@ def _bit(bits: Callable[[], int], at: int) -> Callable[[], bool]:
 
 
 class _Slow:
-    """Values that follow from gravity: computed ten times a second of controller time, for nobody steers by them."""
+    """Values derived from gravity: computed ten times per second of controller time, as no control loop uses them."""
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
@@ -267,13 +266,13 @@ INPUT_KINDS: dict[str, str] = {
     **{f"input_int_register_{i}": "INT32" for i in range(REGISTERS)},
     **{f"input_double_register_{i}": "DOUBLE" for i in range(REGISTERS)},
 }
-"""What can be written, with its type."""
+"""Writable values, with their types."""
 
 _DIGITAL = {"standard": 0, "configurable": 8, "tool": 16}
 
 
 def write(controller: Controller, values: dict[str, Any]) -> None:
-    """Take over what a client sent. Values that make no sense (NaN, say) are left out."""
+    """Apply the values that a client sent. Invalid values, such as NaN, are ignored."""
     registers, signals = controller.registers, controller.signals
     for name, value in values.items():
         controller.watchdogs.written(name)

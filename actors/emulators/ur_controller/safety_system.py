@@ -1,4 +1,8 @@
-"""What the safety system knows: its configuration with a checksum, and which stop is in force."""
+"""The safety system: its configuration with a checksum, and the active stop.
+
+`SafetyConfiguration` holds the limits and `Safety` the state. The module moves nothing; the controller reacts to the
+state.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +18,11 @@ from actors.arm.ur.robot_models import Joints, RobotModel
 from actors.emulators.ur_controller.poses import Vector
 
 UNLOCK_DELAY = 5.0
-"""A protective stop can't be unlocked earlier after it occurred [s of controller time]."""
+"""Minimum time between a protective stop and its unlocking [s of controller time]."""
 
 
 class SafetyMode(IntEnum):
-    """As RTDE and the dashboard report it."""
+    """Safety mode as RTDE and the dashboard report it."""
 
     NORMAL = 1
     REDUCED = 2
@@ -33,7 +37,7 @@ class SafetyMode(IntEnum):
 
 @dataclass(frozen=True)
 class SafetyPlane:
-    """The tool centre point must stay where normal · point ≥ offset.
+    """A half-space: the tool centre point must satisfy normal · point ≥ offset.
 
     Attributes:
         normal: unit vector in the base's frame, into the allowed side.
@@ -46,7 +50,7 @@ class SafetyPlane:
 
 @dataclass(frozen=True)
 class SafetyConfiguration:
-    """Limits that a program can't change.
+    """Limits that a program cannot change.
 
     Attributes:
         joint_ranges: lowest and highest position of each joint [rad].
@@ -71,7 +75,7 @@ class SafetyConfiguration:
         return f"{zlib.crc32(json.dumps(asdict(self), sort_keys=True).encode()):08X}"
 
     def joints_violation(self, q: Sequence[float]) -> str | None:
-        """Why these joint positions are forbidden [rad]; None if they aren't."""
+        """Why these joint positions are forbidden [rad]; None if they are allowed."""
         for i, (angle, (low, high)) in enumerate(zip(q, self.joint_ranges, strict=True)):
             if not low <= angle <= high:
                 allowed = f"{degrees(low):.0f} … {degrees(high):.0f} deg"
@@ -79,7 +83,7 @@ class SafetyConfiguration:
         return None
 
     def point_violation(self, point: Vector) -> str | None:
-        """Why the tool centre point must not be here [m]; None if it may."""
+        """Why the tool centre point is forbidden here [m]; None if it is allowed."""
         for number, plane in enumerate(self.planes):
             inside = sum(a * b for a, b in zip(plane.normal, point, strict=True)) - plane.offset
             if inside < 0.0:
@@ -88,13 +92,13 @@ class SafetyConfiguration:
 
 
 class Safety:
-    """Which stop is in force. Knows no motion: the controller acts on it.
+    """The active stop. The controller reacts to it; this class moves nothing.
 
     Args:
         configuration: limits.
 
     Attributes:
-        reported_checksum: told instead of the configuration's, if set: for tests of those who compare it.
+        reported_checksum: reported instead of the configuration's, if set; for tests of programs that compare it.
     """
 
     def __init__(self, configuration: SafetyConfiguration) -> None:
@@ -108,12 +112,12 @@ class Safety:
 
     @property
     def checksum(self) -> str:
-        """As it is shown to people and sent to programs."""
+        """Checksum as displayed and as sent to programs."""
         return self.reported_checksum or self.configuration.checksum
 
     @property
     def mode(self) -> SafetyMode:
-        """The gravest that is in force."""
+        """The most severe active mode."""
         if self.fault:
             return SafetyMode.FAULT
         if self._emergency is not None:
@@ -126,8 +130,9 @@ class Safety:
 
     @property
     def status_bits(self) -> int:
-        """As RTDE's safety_status_bits: normal, reduced, protective, recovery, safeguard, system and robot emergency,
-        any emergency, violation, fault, stopped due to safety."""
+        """RTDE's safety_status_bits: normal, reduced, protective, recovery, safeguard, system and robot emergency, any
+        emergency, violation, fault, stopped due to safety.
+        """
         mode = self.mode
         bits = {SafetyMode.NORMAL: 1 << 0, SafetyMode.FAULT: 1 << 9}.get(mode, 0)
         bits |= (1 << 1) if self.reduced else 0
@@ -140,15 +145,15 @@ class Safety:
 
     @property
     def may_move(self) -> bool:
-        """Whether no stop is in force."""
+        """Whether no stop is active."""
         return self.mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)
 
     def protective_stop(self, now: float) -> None:
-        """Begin one, or start its time anew."""
+        """Begin a protective stop, or restart its time."""
         self._protective_since = now
 
     def unlock(self, now: float) -> str | None:
-        """End a protective stop. Returns why that can't be, or None."""
+        """Unlock a protective stop. Returns why that is not possible, or None."""
         if self._protective_since is None:
             return None
         if now - self._protective_since < UNLOCK_DELAY:
@@ -160,15 +165,15 @@ class Safety:
         return None
 
     def emergency_stop(self, *, system: bool = False) -> None:
-        """The button is pressed."""
+        """Press the emergency stop button."""
         self._emergency = SafetyMode.SYSTEM_EMERGENCY_STOP if system else SafetyMode.ROBOT_EMERGENCY_STOP
 
     def release_emergency_stop(self) -> None:
-        """The button is released. Power stays off until somebody switches it on."""
+        """Release the emergency stop button. Power stays off until the operator switches it on."""
         self._emergency = None
         self._protective_since = None
 
     def restart(self) -> None:
-        """After a fault or violation: as if switched on anew. A pressed button stays pressed."""
+        """Restart after a fault or violation, as after switching on. A pressed button stays pressed."""
         self.fault = False
         self._protective_since = None

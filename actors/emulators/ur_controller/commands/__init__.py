@@ -1,4 +1,4 @@
-"""What a program may call, by subject: motion, questions, signals, mathematics."""
+"""The commands that a URScript program can call, by subject: motion, state, settings, signals, mathematics."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from actors.emulators.ur_controller.urscript.program import Command
 
 
 def commands_of(controller: ControllerAccess) -> dict[str, Command]:
-    """All commands, bound to one controller, by the names that programs use."""
+    """Return all commands, bound to one controller, by their URScript names."""
     found: dict[str, Command] = {}
     for part in (maths.COMMANDS, motion.MoveCommands(controller).commands(), queries.Queries(controller).commands()):
         found.update(part)

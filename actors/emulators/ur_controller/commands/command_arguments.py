@@ -1,6 +1,6 @@
-"""Reading what a program passes.
+"""Checks of the arguments that a program passes to a command, and the view of the controller that commands get.
 
-What commands may touch of a controller. The controller knows its commands; they know only this.
+`ControllerAccess` is the part of a controller that commands may use; the commands depend on nothing else of it.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from actors.emulators.ur_controller.urscript.program import Program
 from actors.emulators.ur_controller.urscript.script_values import UrPose, number, numbers, show
 
 SLOWEST, FASTEST = 1e-6, 1e4
-"""Rates are taken as at least and at most this [rad/s], [m/s²] …: neither ever matters to an arm."""
+"""Limits to which rates are clipped [rad/s], [m/s²] …; an arm never reaches either of them."""
 
 LONGEST = 1e7
-"""Times are taken as at most this [s]."""
+"""Limit to which times are clipped [s]."""
 
 
 def six(value: Any) -> Joints:
-    """Six numbers, of a list or a pose."""
+    """Return the six numbers of a list or a pose."""
     a, b, c, d, e, f = numbers(value, 6)
     return a, b, c, d, e, f
 
 
 def is_pose(value: Any) -> bool:
-    """Whether it is p[…]."""
+    """Whether the value is a pose p[…]."""
     return isinstance(value, UrPose)
 
 
 def positive(value: Any, name: str) -> float:
-    """A number above zero.
+    """Return a number above zero.
 
     Raises:
-        ScriptError: it isn't.
+        ScriptError: it is not.
     """
     result = number(value)
     if result <= 0.0:
@@ -46,15 +46,15 @@ def positive(value: Any, name: str) -> float:
 
 
 def rate(value: Any, name: str) -> float:
-    """A speed, an acceleration or a deceleration: positive, and within what can be computed with."""
+    """Return a speed, an acceleration or a deceleration: positive, and clipped to the computable range."""
     return min(max(positive(value, name), SLOWEST), FASTEST)
 
 
 def whole(value: Any, low: int, high: int, name: str) -> int:
-    """A whole number within limits, both included.
+    """Return an integer within limits, both included.
 
     Raises:
-        ScriptError: it isn't.
+        ScriptError: it is not.
     """
     result = number(value)
     if result != int(result) or not low <= result <= high:
@@ -63,12 +63,12 @@ def whole(value: Any, low: int, high: int, name: str) -> int:
 
 
 class ControllerAccess(Protocol):
-    """A controller, as programs see it.
+    """A controller as its programs' commands use it.
 
     Attributes:
         dt: duration of a control cycle [s].
         running: the program that is being advanced.
-        popup: a message that somebody has to close.
+        popup: message that the operator has to close.
     """
 
     dt: float
@@ -81,7 +81,7 @@ class ControllerAccess(Protocol):
     popup: str | None
 
     def tell(self, kind: str, text: str, line: int = 0) -> None:
-        """Give a message to all who listen."""
+        """Send a message to all listeners."""
 
     def protective_stop(self, reason: str) -> None:
-        """Stop the arm, hold the program; to be unlocked by a person."""
+        """Stop the arm and pause the program; a person has to unlock the stop."""

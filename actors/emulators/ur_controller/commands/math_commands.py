@@ -27,31 +27,31 @@ from actors.emulators.ur_controller.urscript.script_values import LONGEST_STRING
 
 
 def pose_trans(p_from: Any, p_from_to: Any) -> UrPose:
-    """A pose given in another, in the frame of that other."""
+    """Express a pose, given in the frame of another pose, in the frame in which that other pose is given."""
     return UrPose(pose_of(compose(transform_of(six(p_from)), transform_of(six(p_from_to)))))
 
 
 def pose_inv(p_from: Any) -> UrPose:
-    """The pose that undoes one."""
+    """Return the inverse of a pose."""
     return UrPose(pose_of(invert(transform_of(six(p_from)))))
 
 
 def pose_add(p_1: Any, p_2: Any) -> UrPose:
-    """Positions added, rotations one after the other."""
+    """Add the positions and compose the rotations."""
     a, b = transform_of(six(p_1)), transform_of(six(p_2))
     shift = [x + y for x, y in zip(a[1], b[1], strict=True)]
     return UrPose([*shift, *rotation_vector(multiply(a[0], b[0]))])
 
 
 def pose_sub(p_to: Any, p_from: Any) -> UrPose:
-    """Positions subtracted, and the rotation from one to the other."""
+    """Subtract the positions; return the rotation from one to the other."""
     a, b = transform_of(six(p_to)), transform_of(six(p_from))
     shift = [x - y for x, y in zip(a[1], b[1], strict=True)]
     return UrPose([*shift, *rotation_vector(multiply(a[0], transpose(b[0])))])
 
 
 def interpolate_pose(p_from: Any, p_to: Any, alpha: Any) -> UrPose:
-    """Between two poses, 0 … 1, or beyond them."""
+    """Interpolate between two poses for 0 … 1, or extrapolate."""
     a, b, k = transform_of(six(p_from)), transform_of(six(p_to)), number(alpha)
     shift = [x + k * (y - x) for x, y in zip(a[1], b[1], strict=True)]
     turn = [k * r for r in rotation_between(a[0], b[0])]
@@ -59,45 +59,45 @@ def interpolate_pose(p_from: Any, p_to: Any, alpha: Any) -> UrPose:
 
 
 def pose_dist(p_from: Any, p_to: Any) -> float:
-    """Distance of two poses: positions and rotations together, as the controller's six numbers."""
+    """Return the distance of two poses: norm over position and rotation together, as a controller computes it."""
     return math.sqrt(sum(x * x for x in pose_sub(p_to, p_from)))
 
 
 def norm(a: Any) -> float:
-    """Length of a list, or a number without its sign."""
+    """Return the length of a list, or the absolute value of a number."""
     if isinstance(a, list):
         return math.sqrt(sum(number(x) ** 2 for x in a))
     return abs(number(a))
 
 
 def normalize(v: Any) -> list[float]:
-    """A list divided by its length."""
+    """Return a list divided by its length."""
     given, size = numbers(v, length(v)), norm(v)
     return [x / size for x in given]
 
 
 def rpy2rotvec(rpy: Any) -> list[float]:
-    """Roll, pitch, yaw to a rotation vector [rad]."""
+    """Convert roll, pitch, yaw to a rotation vector [rad]."""
     r, p, y = numbers(rpy, 3)
     yaw, pitch, roll = rotation_matrix((0, 0, y)), rotation_matrix((0, p, 0)), rotation_matrix((r, 0, 0))
     return list(rotation_vector(multiply(yaw, multiply(pitch, roll))))
 
 
 def rotvec2rpy(rotation: Any) -> list[float]:
-    """A rotation vector to roll, pitch, yaw [rad]."""
+    """Convert a rotation vector to roll, pitch, yaw [rad]."""
     m: Matrix = rotation_matrix(numbers(rotation, 3))
     return [math.atan2(m[7], m[8]), math.atan2(-m[6], math.hypot(m[7], m[8])), math.atan2(m[3], m[0])]
 
 
 def length(v: Any) -> int:
-    """Entries of a list."""
+    """Return the number of entries of a list."""
     if not isinstance(v, list):
         raise ScriptError(f"{show(v)} is not a list")
     return len(v)
 
 
 def str_cat(a: Any, b: Any) -> str:
-    """Two strings in a row."""
+    """Concatenate two strings."""
     joined = show(a) + show(b)
     if len(joined) > LONGEST_STRING:
         raise ScriptError(f"a string of more than {LONGEST_STRING} characters")
@@ -105,7 +105,7 @@ def str_cat(a: Any, b: Any) -> str:
 
 
 def make_list(count: Any, value: Any, capacity: Any = 0) -> list[Any]:
-    """A list of equal entries."""
+    """Return a list of equal entries."""
     entries = int(number(count))
     if not 0 <= entries <= 10_000:
         raise ScriptError("a list has 0 … 10000 entries")
@@ -148,4 +148,4 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
 }
 
 COMMANDS = {name: Command(function) for name, function in _FUNCTIONS.items()}
-"""By name; they are the same for every controller."""
+"""Commands by name; they are the same for every controller."""

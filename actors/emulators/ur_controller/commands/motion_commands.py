@@ -32,14 +32,14 @@ UNSUPPORTED = (
     "track_conveyor_linear",
     "track_conveyor_circular",
 )
-"""Real controllers know these; a program that calls one here ends with an error."""
+"""Commands of real controllers that are not emulated; a program that calls one ends with an error."""
 
 
 class MoveCommands:
-    """Bound to one controller.
+    """The motion commands of one controller.
 
     Args:
-        controller: whose arm moves.
+        controller: of the arm.
     """
 
     def __init__(self, controller: ControllerAccess) -> None:
@@ -48,7 +48,7 @@ class MoveCommands:
         self._mover = controller.robot.mover
 
     def commands(self) -> dict[str, Command]:
-        """By name."""
+        """Return the commands by name."""
         waiting: dict[str, Callable[..., Steps]] = {
             "movej": self.movej,
             "movel": self.movel,
@@ -73,15 +73,15 @@ class MoveCommands:
     # ---- paths
 
     def movej(self, q: Any, a: Any = 1.4, v: Any = 1.05, t: Any = 0, r: Any = 0) -> Steps:
-        """To joint positions or a pose, straight in joint space."""
+        """Move to joint positions or a pose, linearly in joint space."""
         target = self._inverse(transform_of(six(q))) if is_pose(q) else six(q)
         while beyond := self._controller.safety.configuration.joints_violation(target):
             self._controller.protective_stop(f"the target is not allowed: {beyond}")
-            yield  # until somebody lets the program go on, which won't help
+            yield  # even if the program is resumed, the target stays forbidden
         yield from self._follow(lambda start: JointLine(self._robot.arm, start, target), a, v, t, r)
 
     def movel(self, pose: Any, a: Any = 1.2, v: Any = 0.25, t: Any = 0, r: Any = 0) -> Steps:
-        """To a pose or joint positions, the tool straight in space."""
+        """Move to a pose or joint positions, linearly in tool space."""
         target = transform_of(six(pose)) if is_pose(pose) else self._robot.arm.frame(six(pose))
         self._inverse(target)
         arm = self._robot.arm
@@ -98,25 +98,25 @@ class MoveCommands:
             while not path.released:
                 yield
                 if not path.released and self._mover.action is not path:
-                    # A protective stop ended it, and somebody let the program go on.
+                    # A protective stop ended the path, and the program was resumed.
                     path = self._mover.follow(line, speed, acceleration, duration=duration, radius=radius)
             done = True
         finally:
-            self._let_go(thread, done)
+            self._release(thread, done)
 
     # ---- servo and speed
 
     def servoj(
         self, q: Any, a: Any = 0, v: Any = 0, t: Any = 0.002, lookahead_time: Any = 0.1, gain: Any = 300
     ) -> Steps:
-        """Towards joint positions for a time; to be called again and again."""
+        """Move towards joint positions for a time; to be called in every cycle."""
         target = six(q)
-        lookahead = min(max(positive(lookahead_time, "lookahead_time"), 0.03), 0.2)  # as the manual limits them
+        lookahead = min(max(positive(lookahead_time, "lookahead_time"), 0.03), 0.2)  # limits of the manual
         strength = min(max(positive(gain, "gain"), 100.0), 2000.0)
         return self._hold(self._cycles(t), lambda: self._mover.servo(target, lookahead, strength))
 
     def servoc(self, pose: Any, a: Any = 1.2, v: Any = 0.25, r: Any = 0) -> Steps:
-        """Towards a pose at the tool's speed, braking in time; to be called again and again."""
+        """Move towards a pose at the tool speed, braking in time; to be called in every cycle."""
         target, speed, acceleration = transform_of(six(pose)), rate(v, "speed"), rate(a, "acceleration")
 
         def aim() -> None:
@@ -133,7 +133,7 @@ class MoveCommands:
         return self._hold(1, aim)
 
     def speedj(self, qd: Any, a: Any = 1.4, t: Any = None) -> Steps:
-        """Keep joint speeds for a time; without one, until they are reached."""
+        """Hold joint speeds for a time; without a time, until they are reached."""
         target, acceleration = six(qd), rate(a, "acceleration")
         return self._hold(
             self._cycles(t),
@@ -142,7 +142,7 @@ class MoveCommands:
         )
 
     def speedl(self, xd: Any, a: Any = 1.2, t: Any = None, aRot: Any = None) -> Steps:
-        """Keep a velocity of the tool for a time; without one, until it is reached."""
+        """Hold a tool velocity for a time; without a time, until it is reached."""
         target, acceleration = six(xd), rate(a, "acceleration")
         turning = acceleration if aRot is None else rate(aRot, "aRot")
         return self._hold(
@@ -170,16 +170,16 @@ class MoveCommands:
                     break
             done = True
         finally:
-            self._let_go(thread, done)
+            self._release(thread, done)
 
     # ---- stops and time
 
     def stopj(self, a: Any) -> Steps:
-        """Come to rest in joint space."""
+        """Stop in joint space."""
         return self._stop(self._mover.stop_joints, a)
 
     def stopl(self, a: Any, aRot: Any = None) -> Steps:
-        """Come to rest along the tool's way."""
+        """Stop along the tool's path."""
         return self._stop(lambda rate: self._mover.stop_tool(self._robot.arm, rate), a)
 
     def _stop(self, begin: Callable[[float], MotionAction], a: Any) -> Steps:
@@ -192,10 +192,10 @@ class MoveCommands:
                 if self._mover.action is None:
                     break
         finally:
-            self._let_go(thread, True)
+            self._release(thread, True)
 
     def sync(self) -> Steps:
-        """Give way until the next cycle."""
+        """Suspend the thread until the next cycle."""
         yield
 
     def sleep(self, t: Any) -> Steps:
@@ -203,7 +203,7 @@ class MoveCommands:
         for _ in range(max(1, round(min(number(t), LONGEST) / self._controller.dt))):
             yield
 
-    # ---- what they share
+    # ---- common parts
 
     def _take(self) -> int:
         program = self._controller.running
@@ -215,7 +215,7 @@ class MoveCommands:
             raise ScriptError(str(error)) from None
         return program.current
 
-    def _let_go(self, thread: int, done: bool) -> None:
+    def _release(self, thread: int, done: bool) -> None:
         self._mover.let_go(thread)
         if not done:
             self._mover.abandon()

@@ -1,8 +1,7 @@
-"""Commands that ask: where the arm is, whether a pose can be reached, what is mounted.
+"""Commands that read the arm's state, set tool, payload and messages, and access registers and signals.
 
-Commands that set what is mounted, where down is, and what a program tells people.
-
-Commands for registers and for digital and analogue inputs and outputs.
+`Queries` reads poses, joints and reachability. `SettingCommands` sets TCP, payload and gravity, and sends messages.
+`Signalling` reads and writes registers and digital and analogue inputs and outputs.
 """
 
 from __future__ import annotations
@@ -21,14 +20,14 @@ from actors.emulators.ur_controller.urscript.program import Command
 from actors.emulators.ur_controller.urscript.script_values import UrPose, number, numbers, show
 
 _HEAVY = {"get_inverse_kin", "get_inverse_kin_has_solution", "is_within_safety_limits", "get_joint_torques"}
-"""Answers that take a tenth of a millisecond."""
+"""Commands that take about 0.1 ms."""
 
 
 class Queries:
-    """Bound to one controller.
+    """The query commands of one controller.
 
     Args:
-        controller: who is asked.
+        controller: source of the values.
     """
 
     def __init__(self, controller: ControllerAccess) -> None:
@@ -36,7 +35,7 @@ class Queries:
         self._robot = controller.robot
 
     def commands(self) -> dict[str, Command]:
-        """By name."""
+        """Return the commands by name."""
         robot, controller = self._robot, self._controller
         answers: dict[str, Callable[..., Any]] = {
             "get_actual_joint_positions": lambda: list(robot.q),
@@ -72,13 +71,13 @@ class Queries:
         return {name: Command(answer, work=300 if name in _HEAVY else 30) for name, answer in answers.items()}
 
     def history(self, steps: Any = 0) -> list[float]:
-        """Measured joint positions some cycles ago."""
+        """Return the measured joint positions of some cycles ago."""
         recent = self._robot.recent
         back = min(whole(steps, 0, 1_000_000, "steps"), len(recent) - 1)
         return list(recent[-1 - back])
 
     def target_waypoint(self) -> UrPose:
-        """Where the present path leads; where the arm stands if there is none."""
+        """Return the target of the current path, or the target pose if there is none."""
         action = self._robot.mover.action
         line = action.target if isinstance(action, Path) else None
         if line is None:
@@ -93,7 +92,7 @@ class Queries:
         return KinematicArm(self._robot.kinematics, transform_of(six(tcp)))
 
     def forward(self, q: Any = None, tcp: Any = None) -> UrPose:
-        """Pose of the tool at joint positions; measured ones by default."""
+        """Return the tool pose at joint positions; measured ones by default."""
         return UrPose(pose_of(self._arm(tcp).frame(self._robot.q if q is None else six(q))))
 
     def _solve(self, x: Any, qnear: Any, tcp: Any) -> Joints:
@@ -103,7 +102,9 @@ class Queries:
     def inverse(
         self, x: Any, qnear: Any = None, maxPositionError: Any = 0, maxOrientationError: Any = 0, tcp: Any = None
     ) -> list[float]:
-        """Joint positions for a pose, nearest to others; the solution is exact, so the tolerances don't matter."""
+        """Return the joint positions for a pose, nearest to the given ones; the solution is exact, so the tolerances
+        are unused.
+        """
         try:
             return list(self._solve(x, qnear, tcp))
         except UnreachableError as error:
@@ -135,10 +136,10 @@ class Queries:
 
 
 FARTHEST = 10.0
-"""Entries of a tool centre point [m], [rad]: more is a mistake of units."""
+"""Largest entry of a tool centre point [m], [rad]; a larger one is a mistake of units."""
 
 HEAVIEST = 12.5
-"""Payload that the arm can carry [kg]."""
+"""Maximum payload of the arm [kg]."""
 
 WITHOUT_EFFECT = (
     "force_mode_set_damping",
@@ -153,10 +154,10 @@ WITHOUT_EFFECT = (
 
 
 class SettingCommands:
-    """Bound to one controller.
+    """The setting commands of one controller.
 
     Args:
-        controller: what is set.
+        controller: receives the settings.
     """
 
     def __init__(self, controller: ControllerAccess) -> None:
@@ -164,7 +165,7 @@ class SettingCommands:
         self._robot = controller.robot
 
     def commands(self) -> dict[str, Command]:
-        """By name."""
+        """Return the commands by name."""
         found = dict.fromkeys(WITHOUT_EFFECT, Command(lambda *_, **__: None))
         found |= {
             "set_tcp": Command(self.set_tcp),
@@ -181,14 +182,14 @@ class SettingCommands:
         return found
 
     def set_tcp(self, pose: Any, tcp_name: Any = "") -> None:
-        """Tool centre point in the flange's frame."""
+        """Set the tool centre point in the flange's frame."""
         tool = six(pose)
         if max(abs(x) for x in tool) > FARTHEST:
             raise ScriptError(f"a tool centre point at {show(list(tool))}: no entry may be beyond {FARTHEST:g}")
         self._robot.set_tcp(tool)
 
     def set_payload(self, m: Any, cog: Any = None, inertia: Any = None, transition_time: Any = 0) -> None:
-        """Mass [kg], centre of gravity [m] and inertia [kg m²] behind the flange."""
+        """Set mass [kg], centre of gravity [m] and inertia [kg m²] of the payload at the flange."""
         mass = number(m)
         if not 0.0 <= mass <= HEAVIEST:
             raise ScriptError(f"a payload of {show(m)} kg; the arm carries 0 … {HEAVIEST:g} kg")
@@ -200,23 +201,23 @@ class SettingCommands:
             self._robot.inertia = six(inertia)
 
     def set_gravity(self, d: Any) -> None:
-        """Acceleration that the base feels [m/s²]; upwards is positive for an arm that stands."""
+        """Set the acceleration of the base that corresponds to gravity [m/s²]; it points upwards for an upright arm."""
         x, y, z = numbers(d, 3)
         self._robot.gravity = (x, y, z)
 
     def textmsg(self, s1: Any, s2: Any = "") -> None:
-        """A line in the log."""
+        """Write a line to the log."""
         self._controller.tell("text", show(s1) + show(s2))
 
     def popup(
         self, s: Any, title: Any = "Popup", warning: Any = False, error: Any = False, blocking: Any = False
     ) -> None:
-        """A message that somebody has to close."""
+        """Show a message that the operator has to close."""
         self._controller.popup = show(s)
         self._controller.tell("popup", show(s))
 
     def set_watchdog(self, variable_name: Any, min_frequency: Any, action: Any = "pause") -> None:
-        """Pause or stop the program when a client doesn't write an input often enough."""
+        """Pause or stop the program if a client does not write an input often enough."""
         name, doing = str(variable_name), str(action).lower()
         if doing not in ("pause", "stop", "ignore"):
             raise ScriptError(f"a watchdog can 'pause', 'stop' or 'ignore', not '{doing}'")
@@ -231,10 +232,10 @@ _GROUPS = {"standard_digital": (0, 7), "configurable_digital": (8, 7), "tool_dig
 
 
 class Signalling:
-    """Bound to one controller.
+    """The register and signal commands of one controller.
 
     Args:
-        controller: whose registers and signals.
+        controller: owner of registers and signals.
     """
 
     def __init__(self, controller: ControllerAccess) -> None:
@@ -242,7 +243,7 @@ class Signalling:
         self._signals = controller.signals
 
     def commands(self) -> dict[str, Command]:
-        """By name."""
+        """Return the commands by name."""
         r, found = self._registers, {}
         for name, store in (("integer", (r.input_int, r.output_int)), ("float", (r.input_double, r.output_double))):
             inputs, outputs = store
@@ -281,11 +282,11 @@ class Signalling:
         return get
 
     def set_analog(self, n: Any, f: Any) -> None:
-        """An analogue output as a fraction of its range."""
+        """Set an analogue output as a fraction of its range."""
         self._signals.analog_out[whole(n, 0, 1, "output")] = min(1.0, max(0.0, number(f)))
 
     def set_domain(self, n: Any, domain: Any) -> None:
-        """An analogue output in ampere (0) or volt (1)."""
+        """Set the domain of an analogue output: ampere (0) or volt (1)."""
         self._signals.analog_voltage[whole(n, 0, 1, "output")] = bool(whole(domain, 0, 1, "domain"))
 
 

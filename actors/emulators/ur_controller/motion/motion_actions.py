@@ -1,4 +1,7 @@
-"""What the arm may be doing in a control cycle: following a path, servoing, keeping a speed, coming to a stop."""
+"""The actions of the arm in a control cycle: following a path, servoing, holding a speed, stopping.
+
+Every class implements `MotionAction`; the `Mover` runs one action at a time.
+"""
 
 from __future__ import annotations
 
@@ -11,38 +14,38 @@ from actors.emulators.ur_controller.motion.motion_lines import Corner, Kinematic
 from actors.emulators.ur_controller.poses import Transform, multiply, norm3, rotation_matrix
 
 STILL = 1e-9
-"""Joint speed that counts as none [rad/s]."""
+"""Joint speed below which a joint counts as still [rad/s]."""
 
 
 class MotionAction(Protocol):
-    """One motion under way."""
+    """One motion."""
 
     finished: bool
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
-        """Where the joints are one cycle later.
+        """Return the joint positions one cycle later.
 
         Args:
-            q, qd: where they are and how fast [rad], [rad/s].
-            dt: time that passes for the motion [s]; less than the cycle's where motion is slowed down.
+            q, qd: current positions and speeds [rad], [rad/s].
+            dt: time that passes for the motion [s]; less than the cycle time if motion is slowed down.
 
         Raises:
-            UnreachableError: the path leads where the arm can't.
+            UnreachableError: the path leaves the workspace.
         """
         ...
 
 
 class Path:
-    """Along a line in a trapezoidal profile, rounding the corner from the line before and, with a radius, to the next.
+    """Follows a line with a trapezoidal profile. It blends with the line before and, with a radius, with the next.
 
     Args:
-        line: made of the joint positions where it starts, once the arm stands there or its corner is known.
+        line: creates the line from its start positions, once the arm stands there or its corner is known.
         speed, acceleration: along the line.
         limits: joint speeds [rad/s].
-        duration: if positive, the whole line takes so long [s].
+        duration: if positive, the duration of the whole line [s].
         radius: of the blend at its end [m]; 0 stops there.
-        prelude: what must come to its end before. A path that is running out towards a corner is blended with instead,
-            if both lines are of one kind.
+        prelude: action that must end before. If it is a path on its way to a corner and both lines are of one kind, the
+            two are blended instead.
 
     Attributes:
         released: the next path may begin: the end is reached, or the blend's radius.
@@ -78,13 +81,13 @@ class Path:
         self._main = Profile(way - into, speed, self._acceleration, self._entry, speed if into else 0.0)
         if self._duration > 0.0 and self._corner is None and not into and way > 0.0:
             self._main = Profile.timed(way, self._duration, self._acceleration)
-        # What happens if nothing follows: braking within the blend's radius.
+        # Used if no path follows: brake within the blend radius.
         self._tail = Profile(into, self._main.end, self._acceleration, self._main.end)
         self._line, self._prelude = line, None
         return line
 
     def _round(self, before: Path, q: Joints) -> Line | None:
-        """Begin with a blend out of another path, if that can be."""
+        """Begin with a blend out of another path, if possible."""
         if before._line is None or not before.released or before.finished:
             return None
         done, speed = before._progress()
@@ -101,7 +104,7 @@ class Path:
         return self._start(line)
 
     def _blend_distance(self, line: Line, way: float) -> float:
-        """Length of the line's end that lies within the blend radius: at most half of it."""
+        """Length of the line's end that lies within the blend radius: at most half of the line."""
         low, high = line.length - 0.5 * way, line.length
         if line.distance_to_end(low) <= self._radius:
             return high - low
@@ -119,7 +122,7 @@ class Path:
         return self._line
 
     def _progress(self) -> tuple[float, float]:
-        """Distance along the line and speed."""
+        """Return the distance along the line, and the speed."""
         time = self._time - self._corner_time
         if time < self._main.duration:
             return self._from + self._main.at(time), self._main.speed(time)
@@ -127,7 +130,7 @@ class Path:
         return self._from + self._main.length + self._tail.at(time), self._tail.speed(time)
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
-        """See `Action.step`."""
+        """See `MotionAction.step`."""
         line = self._line
         if line is None:
             before = self._prelude
@@ -146,10 +149,10 @@ class Path:
 
 
 class Servo:
-    """Towards a target that is given anew each cycle, smoothed by a critically damped filter.
+    """Moves towards a target that is set in each cycle, smoothed by a critically damped filter.
 
-    A target that moves evenly is followed late by the lookahead time, at gain 300; a higher gain shortens the delay.
-    The filter is ours: what a real controller does inside servoj is not published.
+    For a target with constant speed, the delay is the lookahead time at gain 300; a higher gain shortens it. The filter
+    is an assumption: the real controller's servoj filter is not published.
     """
 
     def __init__(self) -> None:
@@ -159,12 +162,12 @@ class Servo:
         self._velocity: list[float] | None = None
 
     def aim(self, target: Joints, lookahead: float, gain: float) -> None:
-        """Set where to [rad], [s], dimensionless."""
+        """Set target [rad], lookahead time [s] and gain (dimensionless)."""
         self.target = target
         self.omega = 2.0 / max(lookahead, 0.005) * sqrt(max(gain, 1.0) / 300.0)
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
-        """See `Action.step`."""
+        """See `MotionAction.step`."""
         if self._velocity is None:
             self._velocity = list(qd)
         decay = exp(-self.omega * dt)
@@ -178,7 +181,7 @@ class Servo:
 
 
 class JointSpeed:
-    """Towards joint speeds, the joint that changes most at the given acceleration; with target 0 it is a stop.
+    """Approaches joint speeds; the joint with the largest change uses the given acceleration. A target of 0 is a stop.
 
     Args:
         target: [rad/s].
@@ -195,7 +198,7 @@ class JointSpeed:
         self._stops = not any(self.target)
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
-        """See `Action.step`."""
+        """See `MotionAction.step`."""
         if dt <= 0.0:
             return q
         change = [t - v for t, v in zip(self.target, qd, strict=True)]
@@ -207,7 +210,7 @@ class JointSpeed:
 
 
 class ToolSpeed:
-    """Towards a velocity of the tool; with target 0 it is a stop along the way it goes.
+    """Approaches a tool velocity; a target of 0 is a stop along the current path.
 
     Args:
         arm: kinematics and tool.
@@ -230,7 +233,7 @@ class ToolSpeed:
         self._ceiling: float | None = None
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
-        """See `Action.step`."""
+        """See `MotionAction.step`."""
         if dt <= 0.0:
             return q
         if self._frame is None:

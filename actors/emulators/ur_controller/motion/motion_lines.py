@@ -1,6 +1,7 @@
-"""Straight lines in joint space and in tool space, and the curves that round the corners between two of a kind.
+"""Straight lines in joint space and in tool space, blends between two of a kind, and speed profiles.
 
-Trapezoidal profile of speed along a path, from any speed to any other.
+`JointLine` and `ToolLine` implement `Line`; `Corner` is the blend between two lines. `Profile` is a trapezoidal speed
+profile along a path, between any two end speeds.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from actors.emulators.ur_controller.robot_kinematics import Kinematics
 
 
 class UnreachableError(Exception):
-    """A point of a path, or its target, can't be reached by the tool."""
+    """A point of a path, or its target, is outside the tool's workspace."""
 
 
 class Line(Protocol):
-    """A path from one point to another, by its length s, 0 … `length`."""
+    """A path between two points, parameterised by its length s, 0 … `length`."""
 
     length: float
 
@@ -41,16 +42,16 @@ class Line(Protocol):
         ...
 
     def distance_to_end(self, s: float) -> float:
-        """Distance of the tool to the end [m]: what a blend radius is measured by."""
+        """Distance of the tool to the end [m]; blend radii refer to it."""
         ...
 
     def speed_limit(self, limits: Joints) -> float:
-        """Highest speed along the line that no joint's limit forbids from the outset."""
+        """Highest speed along the line that the joint limits allow, as far as known in advance."""
         ...
 
 
 class KinematicArm:
-    """Kinematics with the tool that is mounted now.
+    """Kinematics with the current tool.
 
     Args:
         kinematics: of the model.
@@ -63,11 +64,11 @@ class KinematicArm:
         self._back = invert(tool)
 
     def frame(self, q: Joints) -> Transform:
-        """Where the tool centre point is."""
+        """Transform of the tool centre point."""
         return compose(self.kinematics.flange(q), self.tool)
 
     def joints(self, frame: Transform, near: Joints) -> Joints:
-        """Joint positions for the tool centre point, nearest to others.
+        """Joint positions for a transform of the tool centre point, nearest to the given ones.
 
         Raises:
             UnreachableError: there are none.
@@ -80,10 +81,10 @@ class KinematicArm:
 
 
 class JointLine:
-    """All joints move in proportion; s is the angle of the one that moves farthest [rad].
+    """All joints move in proportion; s is the angle of the joint with the largest motion [rad].
 
     Args:
-        arm: to tell tool distances.
+        arm: computes tool distances.
         start, end: joint positions [rad].
     """
 
@@ -117,7 +118,7 @@ class JointLine:
 
 
 class ToolLine:
-    """The tool moves straight while it turns about one axis; s is the way [m] or the angle [rad], whichever is more.
+    """The tool moves straight while it turns about one axis; s is the larger of distance [m] and angle [rad].
 
     Args:
         arm: kinematics and tool.
@@ -147,17 +148,17 @@ class ToolLine:
         return norm3(self.shift) * (1.0 - s / self.length) if self.length else 0.0
 
     def speed_limit(self, limits: Joints) -> float:
-        """See `Line.speed_limit`: unknown before it is followed."""
+        """See `Line.speed_limit`; unknown in advance, so infinite."""
         return float("inf")
 
 
 class Corner:
-    """From one line into the next without a stop: a parabola tangent to both (constant acceleration throughout).
+    """A blend from one line into the next without a stop: a parabola tangent to both, with constant acceleration.
 
     Args:
         before, after: lines of one kind; the corner is where `before` ends and `after` starts.
-        into: distance to the corner at which `before` is left.
-        out: distance from the corner at which `after` is joined.
+        into: distance to the corner at which the blend leaves `before`.
+        out: distance from the corner at which the blend joins `after`.
     """
 
     def __init__(self, before: Line, after: Line, into: float, out: float) -> None:
@@ -204,9 +205,9 @@ class Profile:
 
     Args:
         length: of the path; > 0 or the profile is empty.
-        speed: at most.
-        acceleration: and deceleration, at most; more is used only where the path is too short to stop with it.
-        start, end: speeds at both ends. `end` is what it will be at most: a short path may not allow it.
+        speed: maximum speed.
+        acceleration: maximum acceleration and deceleration; exceeded only if the path is too short to stop with it.
+        start, end: speeds at both ends. `end` is an upper limit: a short path may not allow it.
 
     Attributes:
         duration: [s].
@@ -218,7 +219,7 @@ class Profile:
         end = min(end, speed)
         self.length = length
         if start * start - end * end > 2.0 * acceleration * length:
-            # Too short to come down to `end`: brake as hard as it takes.
+            # The path is too short to reach `end` with the given deceleration: use a higher one.
             acceleration = (start * start - end * end) / (2.0 * length) if length > 0.0 else inf
         end = min(end, sqrt(start * start + 2.0 * acceleration * length)) if acceleration < inf else end
         self.start, self.end, self.acceleration = start, end, acceleration
@@ -235,13 +236,13 @@ class Profile:
 
     @classmethod
     def timed(cls, length: float, duration: float, acceleration: float) -> Profile:
-        """The profile from rest to rest that takes just so long; harder acceleration where it must be."""
+        """Return the profile from rest to rest with the given duration; the acceleration is raised if necessary."""
         acceleration = max(acceleration, 4.0 * length / duration**2)
         root = sqrt(max((acceleration * duration) ** 2 - 4.0 * acceleration * length, 0.0))
         return cls(length, 0.5 * (acceleration * duration - root), acceleration)
 
     def at(self, time: float) -> float:
-        """Distance covered at a time since the start, both 0 … their ends."""
+        """Distance covered at a time since the start, clipped to the profile's range."""
         if time >= self.duration:
             return self.length
         if time <= 0.0:

@@ -1,7 +1,7 @@
-"""The part of a controller that moves the arm: one action at a time, one step per control cycle.
+"""The mover of the arm: one action at a time, one step per control cycle.
 
-It makes target positions and velocities that never jump. What must not happen (a joint too fast or out of its range, a
-point out of reach) ends the action with a `ViolationError` and a stop.
+`Mover` generates target positions and velocities without jumps. A violation (a joint too fast or out of its range, a
+point out of the workspace) ends the action with a `ViolationError` and a stop.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ SAFETY_STOP = 10.0
 """Deceleration of a protective, safeguard or emergency stop [rad/s²]. Plausible, not measured."""
 
 RAMP = 2.0
-"""How fast the speed slider takes effect [1/s]."""
+"""Rate of change of the effective speed after a change of the slider [1/s]."""
 
 _GRACE = 3
 """Cycles that a servo or speed command may be late before the arm is stopped."""
 
 _SPEED_MARGIN = 1.1
-"""A joint may be so much faster than its limit before that counts as a violation: rounding, filters, blends."""
+"""Factor by which a joint may exceed its speed limit before it is a violation: rounding, filters, blends."""
 
 
 class ViolationError(Exception):
-    """A motion that a controller ends with a protective stop; the text tells why."""
+    """A motion that a controller ends with a protective stop; the text gives the reason."""
 
 
 class ControlledElsewhereError(Exception):
@@ -43,12 +43,12 @@ class Mover:
 
     Args:
         model: limits.
-        q: where the arm stands [rad].
+        q: initial positions [rad].
 
     Attributes:
         q, qd, qdd: targets [rad], [rad/s], [rad/s²].
-        slider: speed of paths, 0 … 1.
-        rate: what of it is in effect.
+        slider: requested speed fraction of paths, 0 … 1.
+        rate: effective speed fraction.
         joint_speed, joint_range: limits; a safety configuration may narrow the model's.
     """
 
@@ -64,7 +64,7 @@ class Mover:
         self._idle = 0
         self._frozen = False
 
-    # ---- what may be asked
+    # ---- state
 
     @property
     def moving(self) -> bool:
@@ -73,15 +73,15 @@ class Mover:
 
     @property
     def action(self) -> MotionAction | None:
-        """What is under way."""
+        """The current action."""
         return self._action
 
     @property
     def frozen(self) -> bool:
-        """Paths are held where they are until `thaw`."""
+        """Whether paths are paused until `thaw`."""
         return self._frozen
 
-    # ---- who moves
+    # ---- owner
 
     @property
     def holder(self) -> int | None:
@@ -89,17 +89,17 @@ class Mover:
         return self._holder
 
     def take(self, thread: int) -> None:
-        """A thread's command begins.
+        """Begin a thread's command.
 
         Raises:
-            ControlledElsewhereError: another thread's is not over.
+            ControlledElsewhereError: another thread's command is still running.
         """
         if self._holder is not None and self._holder != thread:
             raise ControlledElsewhereError("another thread is already controlling the robot")
         self._holder = thread
 
     def let_go(self, thread: int) -> None:
-        """A thread's command is over, or the thread is."""
+        """End a thread's command, or the thread."""
         if self._holder == thread:
             self._holder = None
 
@@ -114,7 +114,7 @@ class Mover:
         duration: float = 0.0,
         radius: float = 0.0,
     ) -> Path:
-        """Begin a path; out of any other motion than a path's blend the arm is stopped first."""
+        """Begin a path. The arm stops first, unless the current motion is a path that blends into it."""
         prelude = self._action
         if prelude is None or not isinstance(prelude, Path) or not prelude.released:
             prelude = self._braking() if any(abs(v) > STILL for v in self.qd) else None
@@ -125,14 +125,14 @@ class Mover:
         return path
 
     def servo(self, target: Joints, lookahead: float, gain: float) -> None:
-        """One servo command."""
+        """Execute one servo command."""
         if not isinstance(self._action, Servo):
             self._action = Servo()
         self._action.aim(target, lookahead, gain)
         self._idle = 0
 
     def joint_speeds(self, target: Sequence[float], acceleration: float) -> None:
-        """One speed command in joint space."""
+        """Execute one speed command in joint space."""
         if isinstance(self._action, JointSpeed):
             self._action.aim(target, acceleration)
         else:
@@ -140,7 +140,7 @@ class Mover:
         self._idle = 0
 
     def tool_speed(self, arm: KinematicArm, target: Sequence[float], acceleration: float, turning: float) -> None:
-        """One speed command in tool space."""
+        """Execute one speed command in tool space."""
         if isinstance(self._action, ToolSpeed):
             self._action.aim(target, acceleration, turning)
         else:
@@ -148,33 +148,33 @@ class Mover:
         self._idle = 0
 
     def stop_joints(self, deceleration: float) -> MotionAction:
-        """Come to rest in joint space."""
+        """Stop in joint space."""
         self._action = JointSpeed((0.0,) * 6, deceleration)
         return self._action
 
     def stop_tool(self, arm: KinematicArm, deceleration: float) -> MotionAction:
-        """Come to rest along the way the tool goes."""
+        """Stop along the tool's path."""
         self._action = ToolSpeed(arm, (0.0,) * 6, deceleration, deceleration)
         return self._action
 
     def abandon(self) -> None:
-        """Nobody commands any more: come to rest."""
+        """Stop, because no thread controls the arm any more."""
         self._holder = None
         if self._action is not None:
             self._action = self._braking()
 
     def freeze(self) -> None:
-        """Come to rest quickly; a path stays where it is, to be gone on with."""
+        """Stop quickly; a path is paused and can be resumed."""
         self._frozen = True
         if self._action is not None and not isinstance(self._action, Path):
             self._action = JointSpeed((0.0,) * 6, SAFETY_STOP)
 
     def thaw(self) -> None:
-        """Go on."""
+        """Resume."""
         self._frozen = False
 
     def place(self, q: Joints) -> None:
-        """Stand somewhere, at once: for the start only."""
+        """Set the positions at once; for the start only."""
         zero: Joints = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self.q, self.qd, self.qdd, self._action = q, zero, zero, None
 
@@ -184,13 +184,13 @@ class Mover:
     # ---- one cycle
 
     def step(self, dt: float) -> None:
-        """One control cycle.
+        """Run one control cycle.
 
         Args:
             dt: its length [s].
 
         Raises:
-            ViolationError: why the motion was broken off; the arm is being stopped.
+            ViolationError: reason for which the motion was aborted; the arm is stopping.
         """
         action = self._action
         if action is None:
@@ -207,8 +207,8 @@ class Mover:
             q = action.step(self.q, self.qd, dt * self.rate if isinstance(action, Path) else dt)
             self._check(q, dt)
         except (UnreachableError, ViolationError) as error:
-            # Out of reach, near a singularity, out of range: whatever it was, the arm brakes in joint space. For a stop
-            # that is all there is to do.
+            # Out of the workspace, near a singularity or out of range: the arm brakes in joint space. A stop needs no
+            # further action.
             self._break_off(dt)
             if _is_stop(action):
                 return
@@ -230,7 +230,7 @@ class Mover:
     def _check(self, q: Joints, dt: float) -> None:
         for i in range(6):
             speed = abs(q[i] - self.q[i]) / dt
-            if not speed <= _SPEED_MARGIN * self.joint_speed[i]:  # so that what is not a number is caught too
+            if not speed <= _SPEED_MARGIN * self.joint_speed[i]:  # written so that NaN is caught, too
                 raise ViolationError(
                     f"{JOINT_NAMES[i]} would turn at {degrees(speed):.0f} deg/s; "
                     f"its limit is {degrees(self.joint_speed[i]):.0f} deg/s"

@@ -1,6 +1,8 @@
-"""What all TCP connections of a controller have in common: they can be silenced and cut off, and some may command.
+"""The common parts of a controller's TCP connections, and the script port.
 
-Program upload on port 30003: text in, nothing out. A real controller also streams its state here.
+`Connection` can be silenced and closed, and may be privileged to send commands; `Connections` is the set of all of
+them. `ScriptConnection` on port 30003 accepts programs and sends nothing. A real controller also streams its state
+there.
 """
 
 from __future__ import annotations
@@ -13,14 +15,14 @@ from actors.emulators.ur_controller.program_uploads import Uploads
 from actors.emulators.ur_controller.urscript.lexer import ScriptError, Splitter
 
 MOST_UNSENT = 1_000_000
-"""Bytes that a client may leave unread before it is cut off."""
+"""Unread bytes above which a client is disconnected."""
 
 
 class Connections:
     """All connections of one controller.
 
     Args:
-        controller: what they talk to.
+        controller: the controller that they serve.
 
     Attributes:
         uploads: programs that came over them.
@@ -34,17 +36,17 @@ class Connections:
 
     @property
     def silent(self) -> bool:
-        """Nothing is read or sent, though connections stay and new ones are accepted."""
+        """Whether nothing is read or sent; connections stay, and new ones are accepted."""
         return self._silent
 
     def silence(self, active: bool) -> None:
-        """Fall silent, or speak again; what arrived in between is read then."""
+        """Stop reading and sending, or resume; input that arrived in between is read then."""
         self._silent = active
         for connection in list(self.open):
             connection.hold(active)
 
     def drop(self, *kinds: type[Connection]) -> None:
-        """Cut connections off; all, or those of some kinds."""
+        """Disconnect all connections, or those of some kinds."""
         for connection in list(self.open):
             if not kinds or isinstance(connection, kinds):
                 connection.drop()
@@ -54,7 +56,7 @@ class Connection(asyncio.Protocol):
     """One TCP connection.
 
     Args:
-        connections: it adds itself to these, and removes itself.
+        connections: set to which it adds itself and from which it removes itself.
     """
 
     def __init__(self, connections: Connections) -> None:
@@ -68,7 +70,7 @@ class Connection(asyncio.Protocol):
 
     @property
     def privileged(self) -> bool:
-        """Whether it may command: it was made in remote control, and nobody has switched since."""
+        """Whether it may send commands: it was opened in remote control, and the mode was not switched since."""
         known = self.controller.model.remote_control
         return not known or (self._privileged and self._switches == self.controller.switches)
 
@@ -84,7 +86,7 @@ class Connection(asyncio.Protocol):
             self.greet()
 
     def greet(self) -> None:
-        """Say what comes first; nothing by default."""
+        """Send the first bytes of a connection; none by default."""
 
     def connection_lost(self, exc: Exception | None) -> None:
         """See `asyncio.Protocol`."""
@@ -92,7 +94,7 @@ class Connection(asyncio.Protocol):
         self._transport = None
 
     def send(self, data: bytes) -> None:
-        """Send bytes; a client that doesn't read is cut off before they pile up."""
+        """Send bytes; a client with too many unread bytes is disconnected."""
         if self._transport is None or self._transport.is_closing() or self.connections.silent:
             return
         if self._transport.get_write_buffer_size() > MOST_UNSENT:
@@ -101,12 +103,12 @@ class Connection(asyncio.Protocol):
             self._transport.write(data)
 
     def hold(self, active: bool) -> None:
-        """Fall silent: read no more; or again."""
+        """Stop reading while the connection is silenced, or resume."""
         self._held = active
         self._read()
 
     def wait(self, active: bool) -> None:
-        """Read no more while what was read is being worked off; or again."""
+        """Stop reading while earlier input is being processed, or resume."""
         self._waits = active
         self._read()
 
@@ -119,12 +121,12 @@ class Connection(asyncio.Protocol):
             self._transport.resume_reading()
 
     def finish(self) -> None:
-        """Close once everything is sent."""
+        """Close after everything is sent."""
         if self._transport is not None:
             self._transport.close()
 
     def drop(self) -> None:
-        """Cut off, with a reset."""
+        """Disconnect with a reset."""
         if self._transport is not None:
             self._transport.abort()
 
@@ -133,7 +135,7 @@ PORT = 30003
 
 
 class ScriptConnection(Connection):
-    """One connection; its text is cut into programs, and each is run."""
+    """One connection; its text is split into programs, and each is run."""
 
     def __init__(self, connections: Connections) -> None:
         super().__init__(connections)
@@ -145,13 +147,13 @@ class ScriptConnection(Connection):
             programs = self._splitter.feed(data.decode("utf-8", "replace"))
         except ScriptError as error:
             self.controller.tell("exception", error.text)
-            self.drop()  # what follows can't be distinguished from programs
+            self.drop()  # the boundaries of later programs are unknown
             return
         for program in programs:
             self.connections.uploads.put(program, self)
 
     def refuse(self) -> None:
-        """A program came over a connection that may only read."""
+        """Reject a program from a read-only connection."""
         self.controller.tell(
             "key", "a program was ignored: the connection is read-only, the robot was in local control"
         )

@@ -1,4 +1,7 @@
-"""The dashboard on port 29999: one line asks, one line answers."""
+"""The dashboard on port 29999: one line per request, one line per reply.
+
+`DashboardServer` answers the lines; `DashboardConnection` is one client.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,10 @@ LONGEST_LINE = 10_000
 
 
 class DashboardServer:
-    """Answers lines. Knows no sockets.
+    """Answers lines. It uses no sockets.
 
     Args:
-        controller: asked and told.
+        controller: executes the commands.
     """
 
     def __init__(self, controller: Controller) -> None:
@@ -67,11 +70,11 @@ class DashboardServer:
         ]
 
     def answer(self, line: str, privileged: bool = True) -> str:
-        """What a line is answered with.
+        """Return the reply to a line.
 
         Args:
             line: as sent.
-            privileged: whether it came over a connection that may command.
+            privileged: whether it came over a connection that may send commands.
         """
         asked = " ".join(line.split())
         for name, do, remote_only in self._commands:
@@ -142,8 +145,8 @@ class DashboardConnection(Connection):
     """One connection.
 
     Args:
-        connections: it adds itself to these.
-        dashboard: answers.
+        connections: set to which it adds itself.
+        dashboard: answers the lines.
     """
 
     def __init__(self, connections: Connections, dashboard: DashboardServer) -> None:

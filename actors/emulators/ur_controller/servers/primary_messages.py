@@ -1,12 +1,11 @@
-"""Primary and secondary interface (ports 30001, 30002): packages of the robot's state ten times a second, and messages.
+"""Packages of the primary and secondary interfaces (ports 30001, 30002): robot states and messages.
 
-A package is `int32 size, uint8 type, …`, big-endian, the size including itself; a robot state (type 16) consists of
-sub-packages of the same shape.
+A package is `int32 size, uint8 type, …`, big-endian, the size including itself. A robot state (type 16) consists of
+sub-packages of the same structure; it is sent ten times per second. `PrimaryState` holds its values, and `robot_state`
+encodes it. `ControllerMessage` is a message to the user and to the clients of the primary interface.
 
-Source: the manufacturer's page on primary and secondary interfaces (software 5.10). Where it says "used internally",
-zeros are sent; the safety data's first four bytes are the checksum, as the manufacturer's forum has it.
-
-What a controller tells people and the clients of its primary interface.
+Source: the manufacturer's page on primary and secondary interfaces (software 5.10). Fields marked "used internally" are
+sent as zeros. The first four bytes of the safety data are the checksum, according to the manufacturer's forum.
 """
 
 from __future__ import annotations
@@ -27,16 +26,16 @@ _SIZE = struct.Struct(">iB")
 
 
 def package(kind: int, *parts: bytes) -> bytes:
-    """A package or sub-package."""
+    """Encode a package or sub-package."""
     body = b"".join(parts)
     return _SIZE.pack(_SIZE.size + len(body), kind) + body
 
 
 def split(data: bytes) -> list[tuple[int, bytes]]:
-    """Packages in a row, as type and body.
+    """Split consecutive packages into types and bodies.
 
     Raises:
-        ValueError: the sizes don't add up.
+        ValueError: the sizes are inconsistent.
     """
     found, place = [], 0
     while place < len(data):
@@ -52,7 +51,7 @@ def split(data: bytes) -> list[tuple[int, bytes]]:
 
 @dataclass(frozen=True)
 class PrimaryState:
-    """What a robot state tells, SI units.
+    """The values of a robot state, in SI units.
 
     Attributes:
         time: of the controller [s].
@@ -93,7 +92,7 @@ class PrimaryState:
 
 
 def robot_state(s: PrimaryState, *more: bytes) -> bytes:
-    """A robot state, with further sub-packages behind the usual ones."""
+    """Encode a robot state, with further sub-packages after the usual ones."""
     joints = b"".join(
         struct.pack(">3d4fB", q, target, qd, current, 48.0 if s.powered else 0.0, 32.0, 32.0, s.joint_mode)
         for q, target, qd, current in zip(s.q, s.target_q, s.qd, s.currents, strict=True)
@@ -122,10 +121,10 @@ def robot_state(s: PrimaryState, *more: bytes) -> bytes:
 
 
 def safety_checksum(state: bytes) -> str | None:
-    """Checksum of the safety configuration in a robot state, as eight hexadecimal digits.
+    """Return the checksum of the safety configuration in a robot state, as eight hexadecimal digits.
 
     Args:
-        state: the body of a package of type `ROBOT_STATE`, as `split` gives it.
+        state: the body of a package of type `ROBOT_STATE`, as `split` returns it.
 
     Returns:
         None if the state has none: controllers leave it out while no configuration is applied.
@@ -135,7 +134,7 @@ def safety_checksum(state: bytes) -> str | None:
 
 
 def kinematics_info(a: Sequence[float], d: Sequence[float], alpha: Sequence[float]) -> bytes:
-    """Denavit–Hartenberg parameters without calibration."""
+    """Encode the Denavit–Hartenberg parameters without calibration."""
     zeros = (0.0,) * 6
     return package(KINEMATICS_INFO, bytes(24), struct.pack(">24dI", *zeros, *a, *d, *alpha, 0))
 
@@ -148,7 +147,7 @@ def configuration_data(
     alpha: Sequence[float],
     robot_type: tuple[int, int],
 ) -> bytes:
-    """Limits, defaults and lengths."""
+    """Encode limits, defaults and lengths."""
     limits = [angle for pair in ranges for angle in pair]
     motion = [value for speed in speeds for value in (speed, 40.0)]
     defaults = (1.05, 1.4, 0.25, 1.2, 0.3)
@@ -166,39 +165,39 @@ def _short(text: str) -> bytes:
 
 
 def version_message(time: float, version: tuple[int, int, int, int]) -> bytes:
-    """What a client is sent first."""
+    """Encode the version message, the first message to a client."""
     major, minor, bugfix, build = version
     numbers = struct.pack(">BBii", major, minor, bugfix, build)
     return _message(time, VERSION, _short("URControl"), numbers, b"01-01-2022, 00:00:00")
 
 
 def text_message(time: float, text: str) -> bytes:
-    """What a program tells."""
+    """Encode a program's text message."""
     return _message(time, TEXT, text.encode())
 
 
 def key_message(time: float, title: str, text: str) -> bytes:
-    """What the controller tells of programs."""
+    """Encode a message of the controller about programs."""
     return _message(time, KEY, struct.pack(">ii", 0, 0), _short(title), text.encode())
 
 
 def error_message(time: float, code: int, text: str) -> bytes:
-    """What is wrong, with a code: C210, say, for a program sent to a connection that may only read."""
+    """Encode an error with its code, e.g. C210 for a program sent to a read-only connection."""
     return _message(time, ERROR_CODE, struct.pack(">iiiII", code, 0, 2, 0, 0), text.encode())
 
 
 def exception_message(time: float, line: int, text: str) -> bytes:
-    """A program can't be read or can't go on."""
+    """Encode a program's error: it cannot be parsed or cannot continue."""
     return _message(time, RUNTIME_EXCEPTION, struct.pack(">ii", line, 0), text.encode())
 
 
 def safety_message(time: float, mode: int) -> bytes:
-    """The safety mode has changed."""
+    """Encode a change of the safety mode."""
     return _message(time, SAFETY_MODE, struct.pack(">iiBII", 0, 0, mode, 0, 0))
 
 
 def popup_message(time: float, text: str) -> bytes:
-    """A message that somebody has to close."""
+    """Encode a message that the operator has to close."""
     return _message(time, POPUP, struct.pack(">I4B", 0, 0, 0, 0, 0), _short("Popup"), text.encode())
 
 
@@ -207,8 +206,9 @@ class ControllerMessage:
     """One message.
 
     Attributes:
-        kind: 'text' (a program's), 'key' (the controller's), 'exception' (a program can't go on), 'safety', 'popup'.
-        text: what it says.
+        kind: 'text' (from a program), 'key' (from the controller), 'exception' (a program cannot continue), 'safety',
+            'popup'.
+        text: its text.
         line: of the program, for an exception.
         time: of the controller [s].
     """

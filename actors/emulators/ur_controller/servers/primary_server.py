@@ -1,6 +1,6 @@
-"""Primary (30001, 30011) and secondary (30002, 30012) interface: the robot's state at 10 Hz, programs the other way.
+"""Primary (30001, 30011) and secondary (30002, 30012) interface: sends the robot's state at 10 Hz, accepts programs.
 
-Ports 30011 and 30012 only read. On the others a connection that was made in local control only reads too, for good.
+Ports 30011 and 30012 are read-only. On the others, a connection that was opened in local control stays read-only.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from actors.emulators.ur_controller.servers.connections import Connections, Scri
 from actors.emulators.ur_controller.servers.primary_messages import ControllerMessage
 
 PORTS = {30001: (True, True), 30002: (False, True), 30011: (True, False), 30012: (False, False)}
-"""For each port whether messages are sent, and whether programs are taken."""
+"""For each port whether messages are sent, and whether programs are accepted."""
 
 INTERVAL = 0.1
 """Time between two states [s]."""
@@ -27,19 +27,19 @@ class PrimaryServer:
     """All clients of these ports.
 
     Args:
-        controller: read.
-        connections: its clients are among these.
+        controller: source of the state.
+        connections: all connections, including the clients of these ports.
     """
 
     def __init__(self, controller: Controller, connections: Connections) -> None:
         self.controller = controller
         self.connections = connections
         self._due = 0.0
-        controller.listeners.append(self._told)
+        controller.listeners.append(self._on_message)
 
     def publish(self, clock: float) -> None:
         """Send a state if it is due; see `RtdeServer.publish`."""
-        if self._due - INTERVAL <= clock < self._due - 1e-9:  # a clock that was set back is due at once
+        if self._due - INTERVAL <= clock < self._due - 1e-9:  # also due after the clock was set back
             return
         self._due = clock + INTERVAL
         clients = [c for c in self.connections.open if isinstance(c, PrimaryConnection)]
@@ -49,7 +49,7 @@ class PrimaryServer:
                 client.send(state)
 
     def state(self, *more: bytes) -> bytes:
-        """The robot's state now."""
+        """Return the robot's current state."""
         c, robot = self.controller, self.controller.robot
         power, mode = c.power, c.safety.mode
         return primary.robot_state(
@@ -82,7 +82,7 @@ class PrimaryServer:
         )
 
     def first(self) -> bytes:
-        """What a new client gets: version, and a state with everything that hardly changes."""
+        """Return the first bytes for a new client: version, and a state with the data that rarely changes."""
         c, m = self.controller, self.controller.model
         a, d = (0.0, m.a2, m.a3, 0.0, 0.0, 0.0), (m.d1, 0.0, 0.0, m.d4, m.d5, m.d6)
         limits = c.safety.configuration
@@ -93,7 +93,7 @@ class PrimaryServer:
             primary.kinematics_info(a, d, _ALPHA), configuration
         )
 
-    def _told(self, message: ControllerMessage) -> None:
+    def _on_message(self, message: ControllerMessage) -> None:
         clients = [c for c in self.connections.open if isinstance(c, PrimaryConnection) and c.messages]
         if not clients:
             return
@@ -118,9 +118,9 @@ class PrimaryConnection(ScriptConnection):
     """One client.
 
     Args:
-        server: whose client it is.
-        messages: messages are sent, beside states.
-        writable: programs are taken.
+        server: its server.
+        messages: whether it receives messages in addition to states.
+        writable: whether programs are accepted.
     """
 
     def __init__(self, server: PrimaryServer, *, messages: bool, writable: bool) -> None:

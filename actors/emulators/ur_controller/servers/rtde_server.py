@@ -1,4 +1,8 @@
-"""RTDE on port 30004: several clients at once, each with its recipes and its rate."""
+"""RTDE on port 30004: several clients at once, each with its recipes and its rate.
+
+`RtdeServer` holds the readable fields and the owners of inputs; `RtdeConnection` is one client. Fields and recipes are
+in `rtde_fields`.
+"""
 
 from __future__ import annotations
 
@@ -20,18 +24,18 @@ from actors.emulators.ur_controller.servers.connections import Connection, Conne
 PORT = 30004
 
 SLOWEST = 0.1
-"""Lowest rate of outputs [Hz]; a client that asks for less gets this."""
+"""Lowest rate of outputs [Hz]; a lower requested rate is raised to it."""
 
 LONGEST_NAMES = 2048
-"""Bytes that a list of field names may have, as the guide says; what is beyond is cut."""
+"""Longest list of field names [bytes], according to the guide; longer lists are truncated."""
 
 
 class RtdeServer:
     """All RTDE clients of one controller.
 
     Args:
-        controller: read and written.
-        connections: its clients are among these.
+        controller: source and target of the values.
+        connections: all connections, including the RTDE clients.
     """
 
     def __init__(self, controller: Controller, connections: Connections) -> None:
@@ -41,10 +45,10 @@ class RtdeServer:
         self.owners: dict[str, RtdeConnection] = {}
 
     def publish(self, clock: float) -> None:
-        """Send every client what is due.
+        """Send every client the values that are due.
 
         Args:
-            clock: what rates are measured by [s]: wall time where time is scaled up, controller time else.
+            clock: reference for the rates [s]: wall time if time is scaled up, otherwise controller time.
         """
         if self.connections.silent:
             return
@@ -57,7 +61,7 @@ class RtdeConnection(Connection):
     """One client.
 
     Args:
-        server: whose client it is.
+        server: its server.
     """
 
     def __init__(self, server: RtdeServer) -> None:
@@ -86,7 +90,7 @@ class RtdeConnection(Connection):
         except PackageError:
             self.drop()
 
-    # ---- the protocol's side
+    # ---- protocol
 
     def _send(self, kind: int, payload: bytes) -> None:
         self.send(rtde.package(kind, payload))
@@ -116,10 +120,10 @@ class RtdeConnection(Connection):
             case rtde.TEXT_MESSAGE:
                 pass
             case _:
-                self._complain(f"unknown package type {kind}")
+                self._report_error(f"unknown package type {kind}")
 
-    def _complain(self, text: str) -> None:
-        # Never before the start: a client in its setup takes whatever comes next for its answer.
+    def _report_error(self, text: str) -> None:
+        # Not before the start: during its setup, a client takes the next message for its reply.
         if self._started:
             self.send(text_message(self._protocol, text, "RTDE", 1))
 
@@ -132,7 +136,7 @@ class RtdeConnection(Connection):
                 return
             (frequency,) = struct.unpack_from(">d", payload)
             payload = payload[8:]
-        if not SLOWEST <= frequency <= highest:  # also where it is not a number
+        if not SLOWEST <= frequency <= highest:  # also for NaN
             frequency = SLOWEST if frequency < SLOWEST else highest
         names = rtde.names(payload[:LONGEST_NAMES])
         kinds = [self._server.fields[n].kind if n in self._server.fields else "NOT_FOUND" for n in names]
@@ -165,12 +169,12 @@ class RtdeConnection(Connection):
         recipe = self._inputs.get(payload[0]) if payload else None
         values = recipe.read(payload[1:]) if recipe is not None else None
         if values is None:
-            self._complain("a data package that fits no recipe is ignored")
+            self._report_error("a data package that fits no recipe is ignored")
             return
         write(self.controller, values)
 
     def publish(self, clock: float) -> None:
-        """Send the present values if they are due."""
+        """Send the current values if they are due."""
         if not self._started or self._outputs is None or clock < self._due - 1e-9:
             return
         late = clock > self._due + self._interval

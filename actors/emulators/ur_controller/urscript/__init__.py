@@ -1,1 +1,1 @@
-"""URScript: read, translated into Python generators, and run one control cycle at a time."""
+"""URScript: parsed, translated into Python generators, and run one control cycle at a time."""

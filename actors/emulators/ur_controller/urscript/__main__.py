@@ -1,4 +1,4 @@
-"""`python -m actors.emulators.ur_controller.urscript`: translate one program apart from the controller's clock."""
+"""`python -m actors.emulators.ur_controller.urscript`: translate one program outside the controller's process."""
 
 from actors.emulators.ur_controller.urscript.translator import main
 

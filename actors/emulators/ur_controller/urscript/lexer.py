@@ -1,6 +1,7 @@
-"""From text to words. Also tells where a program ends in a stream of text.
+"""The lexer of URScript: splits a program into tokens, and a stream of text into programs.
 
-What is wrong with a program, and where in its text.
+`words` returns the tokens of a program, and `Splitter` finds the programs in a stream. `ScriptError` is the error of
+all stages, with the line in the program's text.
 """
 
 from __future__ import annotations
@@ -10,11 +11,11 @@ from dataclasses import dataclass
 
 
 class ScriptError(Exception):
-    """A program can't be read or can't go on.
+    """A program cannot be parsed or cannot continue.
 
     Args:
-        text: what is wrong.
-        line: in the program's text, from 1; 0 where unknown.
+        text: the error.
+        line: in the program's text, from 1; 0 if unknown.
     """
 
     def __init__(self, text: str, line: int = 0) -> None:
@@ -24,7 +25,7 @@ class ScriptError(Exception):
 
 
 LONGEST = 1_000_000
-"""Characters that a program may have."""
+"""Maximum length of a program [characters]."""
 
 KEYWORDS = frozenset(
     (
@@ -35,7 +36,7 @@ KEYWORDS = frozenset(
 )
 
 OPENERS = frozenset({"def", "thread", "sec", "if", "while"})
-"""Words that an `end` belongs to."""
+"""Keywords that are closed by an `end`."""
 
 _WORD = re.compile(
     r"""(?P<space>[ \t\r\f\v]+)
@@ -52,13 +53,13 @@ _WORD = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class ScriptToken:
-    """One word of a program.
+    """One token of a program.
 
     Attributes:
         kind: 'number', 'name', 'keyword', 'string', 'op', or 'end of text'.
         text: as written; of a string, without its quotes.
         line: from 1.
-        fresh: it is the first of its line.
+        fresh: whether it is the first of its line.
     """
 
     kind: str
@@ -68,10 +69,10 @@ class ScriptToken:
 
 
 def words(text: str) -> list[ScriptToken]:
-    """All words of a program, closed by one of the kind 'end of text'.
+    """Return all tokens of a program, ended by one of the kind 'end of text'.
 
     Raises:
-        ScriptError: a character that no word begins with.
+        ScriptError: a character that starts no token.
     """
     found: list[ScriptToken] = []
     line, fresh, place = 1, True, 0
@@ -98,7 +99,7 @@ _STRUCTURE = re.compile(r"""\#[^\n]*|"[^"\n]*"|'[^'\n]*'|[A-Za-z_][A-Za-z_0-9]*"
 
 
 class Splitter:
-    """Cuts a stream of text into programs: from `def`, `sec` to their `end`; other lines are programs of their own.
+    """Splits a stream of text into programs: from `def`, `sec` to their `end`; other lines are programs of their own.
 
     Args:
         limit: longest text without an end that is kept [characters].
@@ -112,13 +113,13 @@ class Splitter:
         self._depth = 0
 
     def feed(self, text: str) -> list[str]:
-        """Take the next piece of the stream.
+        """Add the next piece of the stream.
 
         Returns:
             Programs that are complete now.
 
         Raises:
-            ScriptError: too much text without an end; what was kept is dropped.
+            ScriptError: too much text without an end; the kept text is dropped.
         """
         *lines, self._rest = (self._rest + text).split("\n")
         programs = []

@@ -1,6 +1,7 @@
-"""From words to a tree. Lines end statements only where they must: text injected into a program joins lines.
+"""The parser of URScript: from tokens to a syntax tree.
 
-What a program consists of. Values without behaviour; `parser` makes them, `translator` reads them.
+The node classes are values without behaviour; `parse` creates them, and `translator` reads them. Line ends terminate
+statements only where they must, because text injected into a program may join lines.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class NameNode:
 
 @dataclass(frozen=True, slots=True)
 class Items:
-    """A list [...] or, with six entries behind a p, a pose."""
+    """A list [...] or, with six entries after a p, a pose."""
 
     items: tuple[Expression, ...]
     pose: bool
@@ -76,7 +77,7 @@ class Assign:
 
 @dataclass(frozen=True, slots=True)
 class Evaluate:
-    """An expression for what it does."""
+    """An expression used as a statement."""
 
     value: Expression
     line: int
@@ -84,7 +85,7 @@ class Evaluate:
 
 @dataclass(frozen=True, slots=True)
 class Branch:
-    """if, elif … else: conditions with what to do; the last condition is None for else."""
+    """if, elif … else: conditions with their blocks; the last condition is None for else."""
 
     cases: tuple[tuple[Expression | None, tuple[Statement, ...]], ...]
     line: int
@@ -124,7 +125,7 @@ Statement = Assign | Evaluate | Branch | Loop | Simple | Function
 
 
 DEEPEST = 60
-"""Levels of nesting that a program may have, of blocks and of brackets."""
+"""Maximum nesting depth of a program, of blocks and of brackets."""
 
 _LEVELS: tuple[frozenset[str], ...] = (
     frozenset({"or", "xor"}),
@@ -133,19 +134,19 @@ _LEVELS: tuple[frozenset[str], ...] = (
     frozenset({"+", "-"}),
     frozenset({"*", "/", "%"}),
 )
-"""Operators with two operands, loosest first; `not` stands between `and` and the comparisons."""
+"""Operators with two operands, lowest precedence first; `not` is between `and` and the comparisons."""
 
 _COMPARISON = 2
 
 
 def parse(text: str) -> Function:
-    """Read one program.
+    """Parse one program.
 
     Args:
-        text: a `def` or `sec` with all that belongs to it, or loose statements, which become a program of their own.
+        text: a complete `def` or `sec`, or loose statements, which become a program of their own.
 
     Raises:
-        ScriptError: what is wrong and in which line.
+        ScriptError: a syntax error, with its line.
     """
     return _Parser(words(text)).program()
 
@@ -157,7 +158,7 @@ class _Parser:
         self._depth = 0
         self._brackets = 0
 
-    # ---- words
+    # ---- tokens
 
     @property
     def _word(self) -> ScriptToken:
@@ -296,13 +297,13 @@ class _Parser:
     # ---- expressions
 
     def _inside(self) -> Expression:
-        """Read within brackets, where line ends mean nothing."""
+        """Parse within brackets, where line ends have no meaning."""
         self._brackets += 1
         expression = self._expression()
         self._brackets -= 1
         return expression
 
-    def _goes_on(self) -> bool:
+    def _continues(self) -> bool:
         return self._brackets > 0 or not self._word.fresh
 
     def _expression(self, level: int = 0) -> Expression:
@@ -321,7 +322,7 @@ class _Parser:
             self._depth -= 1
             return Operation("not", (operand,))
         left = self._binary(level + 1)
-        while self._is(*_LEVELS[level]) and self._goes_on():
+        while self._is(*_LEVELS[level]) and self._continues():
             operator = self._next().text
             left = Operation(operator, (left, self._binary(level + 1)))
         return left
@@ -338,7 +339,7 @@ class _Parser:
         return self._postfix(self._primary())
 
     def _postfix(self, value: Expression) -> Expression:
-        while self._is("[") and self._goes_on():
+        while self._is("[") and self._continues():
             self._next()
             at = self._list("]")
             if not 1 <= len(at) <= 2:
@@ -383,7 +384,7 @@ class _Parser:
         raise self._unexpected("a value")
 
     def _pose(self, word: ScriptToken) -> Expression:
-        # p[…] with six entries is a pose; with fewer it is an entry of a variable that happens to be called p.
+        # p[…] with six entries is a pose; with fewer it is an entry of a variable named p.
         self._take("[")
         items = self._list("]")
         if len(items) == 6:

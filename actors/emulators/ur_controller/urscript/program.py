@@ -1,4 +1,7 @@
-"""A running program: its threads, each advanced once per control cycle until it gives way."""
+"""A running program: its threads, each advanced once per control cycle until it yields.
+
+`Program` runs the translated code with limits on time and memory. A `Command` is a function that programs can call.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +15,17 @@ from actors.emulators.ur_controller.urscript.lexer import ScriptError
 from actors.emulators.ur_controller.urscript.translator import Translated
 
 WORK_PER_CYCLE = 100_000
-"""Work in one control cycle after which a program counts as stuck, as on a controller. It is counted in parts of
-expressions, which take some 0.3 µs each."""
+"""Limit of work in one control cycle; a program above it counts as stuck, as on a controller. The unit is one node of
+an expression, which takes about 0.3 µs."""
 
 COMMAND_WORK = 30
-"""What calling a command costs beside the entries of lists that it is given and gives back."""
+"""Work of a command call, in addition to the entries of its list arguments and list result."""
 
 LOOK_AT_MEMORY = 1_000_000
-"""Work between two looks at how much memory the process holds."""
+"""Work between two checks of the process's memory."""
 
 MOST_MEMORY = 300_000_000
-"""What the process may grow by while a program runs [bytes]."""
+"""Limit of the process's memory growth while a program runs [bytes]."""
 
 MOST_THREADS = 50
 
@@ -32,16 +35,16 @@ Steps = Generator[None, None, Any]
 
 
 class _HaltedError(Exception):
-    """The program asked for its own end."""
+    """The program requested its own end."""
 
 
 class Command:
-    """What a program may call.
+    """A function that a program can call.
 
     Args:
         function: a generator function if it `waits`.
-        waits: whether it gives way.
-        work: what a call costs beside its lists, in parts of expressions.
+        waits: whether it yields.
+        work: work of a call in addition to its lists, in nodes of expressions.
     """
 
     def __init__(self, function: Callable[..., Any], *, waits: bool = False, work: int = COMMAND_WORK) -> None:
@@ -51,21 +54,21 @@ class Command:
 
 
 def waiting(commands: Mapping[str, Command]) -> frozenset[tuple[str, bool]]:
-    """What the translator has to know of commands: their names, and whether they give way."""
+    """Return the translator's view of the commands: their names, and whether they yield."""
     return frozenset((name, command.waits) for name, command in commands.items())
 
 
 class Program:
-    """One uploaded program. Made whole or not at all; run by `tick`.
+    """One uploaded program. It is created completely or not at all; `tick` runs it.
 
     Args:
         translated: the program, by `translate`.
-        commands: what it may call.
+        commands: the commands that it can call.
 
     Attributes:
         name: from its first line.
-        secondary: it was sent as `sec`: it runs beside the main program, may not move the arm, and ends soon.
-
+        secondary: whether it was sent as `sec`: it runs in parallel to the main program, may not move the arm, and ends
+            soon.
     """
 
     def __init__(self, translated: Translated, commands: Mapping[str, Command]) -> None:
@@ -115,10 +118,10 @@ class Program:
         """Advance all threads by one control cycle.
 
         Returns:
-            Whether the program goes on.
+            Whether the program continues.
 
         Raises:
-            ScriptError: it can't go on.
+            ScriptError: it cannot continue.
         """
         self._work = WORK_PER_CYCLE
         for number in list(self._threads):
@@ -143,7 +146,7 @@ class Program:
         return True
 
     def line_of(self, number: int) -> int:
-        """Line of the text that a thread has got to; 0 if there is no such thread."""
+        """Current text line of a thread; 0 if there is no such thread."""
         line, steps = 0, self._threads.get(number)
         while steps is not None:
             frame = getattr(steps, "gi_frame", None)
@@ -163,7 +166,7 @@ class Program:
     def _text_line(self, code_line: int) -> int:
         return self._lines[min(code_line, len(self._lines)) - 1]
 
-    # ---- bounds of time and memory
+    # ---- limits of time and memory
 
     def _spend(self, work: int) -> None:
         self._work -= work
@@ -198,7 +201,7 @@ class Program:
 
         return call
 
-    # ---- what programs say that concerns threads
+    # ---- statements about threads
 
     def _run(self, function: Callable[..., Any], *arguments: Any) -> int:
         if len(self._threads) >= MOST_THREADS:

@@ -1,6 +1,7 @@
-"""What a program computes with: numbers, strings, lists and poses, with a controller's arithmetic.
+"""The values of a program: numbers, strings, lists and poses, with a controller's arithmetic.
 
-Whole numbers have 32 bits and nothing grows: a hostile program can't fill memory with one long list or number.
+Integers have 32 bits, and strings and lists have maximum lengths. A hostile program can therefore not fill memory with
+one long list or number.
 """
 
 from __future__ import annotations
@@ -11,31 +12,31 @@ from typing import Any
 from actors.emulators.ur_controller.urscript.lexer import ScriptError
 
 LONGEST_STRING = 1023
-"""Characters that a string may have, as on a controller."""
+"""Maximum length of a string [characters], as on a controller."""
 
 MOST_ENTRIES = 10_000
-"""Entries that a list may have, those of lists within it included."""
+"""Maximum number of entries of a list, including those of nested lists."""
 
 DEEPEST_LIST = 20
-"""Levels of lists within lists."""
+"""Maximum nesting depth of lists."""
 
 
 class UrPose(list[float]):
-    """p[x, y, z, rx, ry, rz]. A list that motion commands know for a pose."""
+    """p[x, y, z, rx, ry, rz]: a list that motion commands recognise as a pose."""
 
     __slots__ = ()
 
 
 def pose(items: list[Any]) -> UrPose:
-    """A pose of six numbers."""
+    """Return a pose of six numbers."""
     return UrPose(number(item) for item in items)
 
 
 def number(value: Any) -> float:
-    """A finite number.
+    """Return a finite number.
 
     Raises:
-        ScriptError: it is none.
+        ScriptError: it is not one.
     """
     if not isinstance(value, int | float) or not isfinite(value):
         raise ScriptError(f"expected a number, found {show(value)}")
@@ -43,7 +44,7 @@ def number(value: Any) -> float:
 
 
 def numbers(value: Any, count: int) -> list[float]:
-    """So many finite numbers.
+    """Return a list of finite numbers.
 
     Raises:
         ScriptError: it is not a list of that length, or not of numbers.
@@ -54,7 +55,7 @@ def numbers(value: Any, count: int) -> list[float]:
 
 
 def copy(value: Any) -> Any:
-    """Lists are values: what is given on is a copy."""
+    """Return a copy of a list; lists have value semantics."""
     if isinstance(value, list):
         fresh = [copy(item) if isinstance(item, list) else item for item in value]
         return UrPose(fresh) if isinstance(value, UrPose) else fresh
@@ -62,7 +63,7 @@ def copy(value: Any) -> Any:
 
 
 def size(value: Any, depth: int = 0) -> int:
-    """Entries of a value, those of lists within lists included; 0 for what is not a list.
+    """Number of entries of a value, including those of nested lists; 0 for anything but a list.
 
     Raises:
         ScriptError: there are too many, or the lists are nested too deeply.
@@ -83,10 +84,10 @@ def size(value: Any, depth: int = 0) -> int:
 
 
 def index(value: Any) -> int:
-    """A list's index.
+    """Return a list's index.
 
     Raises:
-        ScriptError: no whole number, or negative.
+        ScriptError: not an integer, or negative.
     """
     if not isinstance(value, int) or value < 0:
         raise ScriptError(f"{show(value)} is not an index")
@@ -94,7 +95,7 @@ def index(value: Any) -> int:
 
 
 def show(value: Any) -> str:
-    """As a message or log would have it."""
+    """Format a value for a message or log."""
     if isinstance(value, list):
         text = "[" + ", ".join(show(item) for item in value[:50]) + "]"
         return "p" + text if isinstance(value, UrPose) else text
@@ -104,7 +105,7 @@ def show(value: Any) -> str:
 
 
 def _whole(value: Any) -> Any:
-    """Wrapped to 32 bits if it is a whole number."""
+    """Wrap an integer to 32 bits; other values are unchanged."""
     if isinstance(value, int) and not -0x80000000 <= value <= 0x7FFFFFFF:
         return (value + 0x80000000) % 0x100000000 - 0x80000000
     return value

@@ -1,13 +1,15 @@
-"""From a tree to Python generators, which give way once per control cycle.
+"""The translator of URScript: from a syntax tree to Python generators, which yield once per control cycle.
 
-Every name gets a prefix, every constant is written by repr, and the code runs without Python's built-in functions: a
-program can reach nothing but the commands it is given. Only functions that may wait (directly or by what they call)
-become generators; the others stay plain, for they are called hundreds of times a second.
+Every name gets a prefix, every constant is written by repr, and the code runs without Python's built-in functions. A
+program can therefore use nothing but its commands. Only functions that may wait (directly or by a function that they
+call) become generators; the others stay plain functions, because they are called hundreds of times per second.
 
-Scopes follow the manual: a name declared `global` anywhere is global wherever it isn't declared `local` or a parameter;
-any other is local to the function that assigns it. Lists and poses are values: they are copied where they are given on.
+Scopes follow the manual: a name declared `global` anywhere is global, except where it is declared `local` or a
+parameter. Any other name is local to the function that assigns it. Lists and poses are values: they are copied when
+they are passed on.
 
-From a program's text to code that can be run: here, or where it is long in a process of its own, bounded in all.
+`translate` runs in this process. Long programs are translated in a process of their own, with limits on time and memory
+(`main`, `read_answer`).
 """
 
 from __future__ import annotations
@@ -46,15 +48,15 @@ _HELPERS = {"+": "_add", "-": "_sub", "*": "_mul", "/": "_div", "%": "_mod", "xo
 
 
 _CHUNK = 20
-"""Statements in a row whose work is counted at once."""
+"""Number of consecutive statements whose work is counted at once."""
 
 
 class Translation:
-    """Python for one program.
+    """The Python code of one program.
 
     Args:
-        program: what was read.
-        commands: what a program may call; True for those that wait.
+        program: the syntax tree.
+        commands: the commands that a program can call; True for those that wait.
 
     Attributes:
         source: Python, defining `main`.
@@ -75,7 +77,7 @@ class Translation:
         self._define(program, "main", 0, main=True)
         self.source = "\n".join(self._out) + "\n"
 
-    # ---- which functions wait
+    # ---- functions that wait
 
     def _find_waiting(self) -> set[str]:
         callers: dict[str, set[str]] = {}
@@ -124,7 +126,7 @@ class Translation:
             self._emit(depth + 1, "yield")
 
     def _body(self, statements: tuple[Statement, ...], depth: int, more: int = 1) -> None:
-        """Write a block; it begins with what its statements cost, `more` than they say themselves."""
+        """Write a block; it begins with the work of its statements, plus `more`."""
         own = [s for s in statements if not isinstance(s, Function)]
         for first in range(0, max(len(own), 1), _CHUNK):
             chunk = own[first : first + _CHUNK]
@@ -239,11 +241,11 @@ class Translation:
         return f"(yield from {text})" if call.name in self._waiting else text
 
 
-# ---- what stands where in a tree
+# ---- queries on a syntax tree
 
 
 def _work(statement: Statement) -> int:
-    """What a statement costs, without blocks within it."""
+    """Return the work of a statement, without blocks within it."""
     return 1 + sum(_nodes(e) for e in _expressions(statement))
 
 
@@ -345,26 +347,26 @@ def _called(expression: Expression) -> Iterator[str]:
 
 
 LONGEST_HERE = 60_000
-"""Characters of a program that is translated between two control cycles: with some 25 ms for the 42,000 of a client's
-control program the clock catches up. Longer ones are translated apart (`Uploads`)."""
+"""Longest program that is translated between two control cycles [characters]. The 42,000 of a client's control program
+take about 25 ms, and the clock catches up. Longer ones are translated in a separate process (`Uploads`)."""
 
 _MEMORY = 2_000_000_000
-"""Memory that a translation apart may take [bytes]."""
+"""Memory limit of a translation in a separate process [bytes]."""
 
 _SECONDS = 20
-"""Processor time that a translation apart may take [s]."""
+"""Processor time limit of a translation in a separate process [s]."""
 
 _NICENESS = 10
-"""How far a translation apart gives way to the controller's clock [nice]."""
+"""Niceness of a translation in a separate process, relative to the controller's clock."""
 
 
 @dataclass(frozen=True)
 class Translated:
-    """A program that can be run.
+    """An executable program.
 
     Attributes:
         name: from its first line.
-        secondary: it was sent as `sec`.
+        secondary: whether it was sent as `sec`.
         lines: for each line of the code, from 0, the program's.
         code: defines `main`.
     """
@@ -375,21 +377,21 @@ class Translated:
     code: CodeType
 
 
-@lru_cache(maxsize=8)  # clients send the same program again and again
+@lru_cache(maxsize=8)  # clients send the same program repeatedly
 def translate(text: str, commands: frozenset[tuple[str, bool]]) -> Translated:
     """Translate a program.
 
     Args:
         text: the program.
-        commands: what it may call, and whether it gives way (`waiting`).
+        commands: the commands that it can call, and whether they yield (`waiting`).
 
     Raises:
-        ScriptError: it can't be read.
+        ScriptError: it cannot be translated.
     """
     try:
         tree = parse(text)
         translation = Translation(tree, dict(commands))
-        with warnings.catch_warnings(action="ignore"):  # of the code's own making: `1[0]`, say
+        with warnings.catch_warnings(action="ignore"):  # warnings about the generated code, e.g. `1[0]`
             code = compile(translation.source, "<program>", "exec")
     except RecursionError:
         raise ScriptError("nested too deeply") from None
@@ -398,19 +400,19 @@ def translate(text: str, commands: frozenset[tuple[str, bool]]) -> Translated:
     return Translated(tree.name, tree.kind == "sec", translation.lines, code)
 
 
-# ---- apart
+# ---- separate process
 
 
 def question(text: str, commands: Iterable[tuple[str, bool]]) -> bytes:
-    """What the process that translates is given on its standard input."""
+    """Return the input for the translating process."""
     return json.dumps({"text": text, "commands": sorted(commands)}).encode()
 
 
 def read_answer(data: bytes) -> Translated:
-    """What the process that translates has answered on its standard output.
+    """Decode the output of the translating process.
 
     Raises:
-        ScriptError: the program can't be read, or its translation took too much.
+        ScriptError: the program is invalid, or its translation exceeded a limit.
     """
     try:
         answer = marshal.loads(data)
@@ -422,7 +424,7 @@ def read_answer(data: bytes) -> Translated:
 
 
 def main() -> None:
-    """Translate what stands on standard input: `python -m actors.emulators.ur_controller.urscript`."""
+    """Translate the program on standard input: `python -m actors.emulators.ur_controller.urscript`."""
     import os
     import resource
 
