@@ -279,7 +279,7 @@ def _kept(strategy: Strategy, when: str) -> None:
     except (AttributeError, TypeError, ValueError, RunError) as error:
         raise AssertionError(
             f"{when} the strategy's result, {type(result).__name__}, cannot be kept in a journal: {error}; "
-            "a result is a class of its own that derives from Learnt and declares its kind"
+            "a result is a class of its own that derives from StageResult and declares its kind"
         ) from error
     if read != written:
         raise AssertionError(f"{when} the strategy's result is read back as {read}; it was written as {written}")

@@ -6,7 +6,7 @@ import ast
 import hashlib
 from pathlib import Path
 
-ROOT = Path(__file__).parent.parent.parent
+ROOT = Path(__file__).parent.parent
 BEGINNINGS = ("sim_engine.simulator", "sim_engine.fluid.engine")
 """What simulates a pour; the engine is imported when it is needed."""
 

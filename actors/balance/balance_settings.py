@@ -105,7 +105,7 @@ class Settling:
 AUTO = "auto"
 """Value of `dialect` that selects automatic detection."""
 
-SERIAL_EMULATOR = "actors.emulators.serial_balance.balance_process:SerialStandIn"
+SERIAL_EMULATOR = "actors.emulators.serial_balance.balance_process:SerialBalanceEmulator"
 """Emulates a balance on a serial line of a virtual bench; a name, because drivers do not import emulators."""
 
 DRIFTING = 60.0

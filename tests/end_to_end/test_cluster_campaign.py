@@ -118,7 +118,7 @@ def test_a_bench_lost_before_it_tilts_has_poured_nothing_and_a_resumed_run_ends_
     process = place.start(*RUN)
     with ended(process):
         until(lambda: finished_in("pours", place.entries()) == 1 and pour_under_way(place.entries()), process)
-        assert {title(worker) for worker in cluster.workers(1)} >= {"ray::NumbersArm", "ray::VirtualBalance"}
+        assert {title(worker) for worker in cluster.workers(1)} >= {"ray::SimulatedArm", "ray::VirtualBalance"}
         time.sleep(1.0)  # its operator is still at work, for four seconds
         cluster.kill_node(1)
         _, errors = process.communicate(timeout=PATIENCE)

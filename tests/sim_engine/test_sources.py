@@ -27,9 +27,9 @@ def change(root: Path, file: str, old: str, new: str) -> None:
     ("file", "old", "new"),
     [
         ("fluid/step.py", "CFL = 1.5", "CFL = 1.4"),
-        ("fluid/columns.py", "+ (EIGHT - 1)", "+ EIGHT"),
-        ("calm.py", "LEAD = 0.3", "LEAD = 0.2"),
-        ("vessel/corners.py", "EDITION = 1", "EDITION = 2"),
+        ("fluid/neighbours.py", "+ (EIGHT - 1)", "+ EIGHT"),
+        ("simulator.py", "LEAD = 0.3", "LEAD = 0.2"),
+        ("vessel/wall_correction.py", "EDITION = 1", "EDITION = 2"),
     ],
 )
 def test_another_solver_has_another_fingerprint(copy: Path, file: str, old: str, new: str) -> None:
@@ -39,8 +39,8 @@ def test_another_solver_has_another_fingerprint(copy: Path, file: str, old: str,
 
 
 def test_words_and_what_is_told_beside_a_pour_leave_it_alone(copy: Path) -> None:
-    change(copy, "fluid/step.py", "Largest displacement per step", "The largest displacement of a step")
-    change(copy, "fluid/engine.py", '"""Taichi\'s start and end', '"""How Taichi starts and ends')
-    change(copy, "bands.py", '"""', '"""Words. ')
-    (copy / "sim_engine" / "regimes.py").write_text("SOMETHING = 1\n", encoding="utf-8")
+    change(copy, "fluid/step.py", '"""', '"""Words. ')
+    change(copy, "fluid/engine.py", '"""', '"""Words. ')
+    change(copy, "prediction_band.py", '"""', '"""Words. ')
+    (copy / "sim_engine" / "model_validity.py").write_text("SOMETHING = 1\n", encoding="utf-8")
     assert solver_fingerprint(copy) == solver_fingerprint()

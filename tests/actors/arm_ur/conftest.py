@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors import contracts
 from actors.arm.planned_pour import PourPath
 from actors.arm.ur.ur_driver import UrArm
+from actors.contract_tests import contract_calls
 from actors.emulators.ur_controller import VirtualController
 from tests.patience import PATIENCE
 
@@ -29,7 +29,7 @@ def next_address() -> str:
     return f"127.{160 + pid % 64}.{pid // 64 % 256}.{number}"
 
 
-class Call(contracts.Call):
+class Call(contract_calls.Call):
     """A blocking call in a thread, with what it gave."""
 
     def result(self, patience: float = PATIENCE) -> Any:

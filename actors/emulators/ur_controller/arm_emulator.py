@@ -1,0 +1,108 @@
+"""The emulated UR controller of a virtual bench.
+
+`UrEmulator` starts a controller with the settings of an arm, fills in its address, and reads what the arm truly did.
+"""
+
+from __future__ import annotations
+
+import random
+import socket
+import time
+from dataclasses import replace
+from typing import Any
+
+from actors.arm.arm_settings import UrArmSpec
+from actors.bench.device_emulators import History
+from actors.emulators.ur_controller.controller_process import VirtualController, VirtualControllerError
+from actors.interfaces import LaboratoryError
+
+PORTS = (29999, 30001, 30002, 30003, 30004, 30011, 30012)
+"""Ports of a controller: the same at every address."""
+
+ATTEMPTS = 20
+
+FREQUENCY = 125.0
+"""Control cycles per controller second [Hz]; in scaled time, more cost much and do not change the weighed masses."""
+
+
+SCRIPTS = 30003
+
+
+class UrEmulator:
+    """A controller in a process of its own, which ends with this process.
+
+    Args:
+        spec: settings of the arm.
+    """
+
+    def __init__(self, spec: UrArmSpec) -> None:
+        self._spec = spec
+        self._controller = _start_controller(spec)
+
+    @property
+    def arm(self) -> UrArmSpec:
+        """See `ArmEmulator.arm`."""
+        return replace(self._spec, address=self._controller.address)
+
+    def install(self) -> None:
+        """See `ArmEmulator.install`; sets gravity, TCP and payload, which a real controller has in its installation."""
+        arm = self._spec
+        tool = ", ".join(f"{value!r}" for value in arm.tool.as_list)
+        centre = ", ".join(f"{value!r}" for value in arm.payload_centre)
+        up = ", ".join(f"{9.82 * value!r}" for value in arm.mount.up)
+        lines = [f"set_gravity([{up}])", f"set_tcp(p[{tool}])", f"set_payload({arm.payload!r}, [{centre}])"]
+        program = "\n  ".join(["def install():", *lines]) + "\nend\n"
+        with socket.create_connection((self._controller.address, SCRIPTS), timeout=5.0) as connection:
+            connection.sendall(program.encode("ascii"))
+            time.sleep(0.3)
+
+    def history(self, since: float) -> History:
+        """See `ArmEmulator.history`; two minutes of it are kept.
+
+        Raises:
+            LaboratoryError: the controller does not reply.
+        """
+        try:
+            now = float(self._controller.fault("state")["time"])
+            answer = self._controller.fault("history", since=since)
+        except VirtualControllerError as error:
+            raise LaboratoryError(f"what the virtual arm did is not known: {error}") from error
+        return History(tuple(answer["times"]), tuple(tuple(q) for q in answer["joints"]), now)
+
+    def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        """See `ArmEmulator.fault`, and docs/virtual-ur.md."""
+        try:
+            return self._controller.fault(name, **arguments)
+        except VirtualControllerError as error:
+            raise LaboratoryError(str(error)) from error
+
+    def close(self) -> None:
+        """End it. May be called again."""
+        self._controller.close()
+
+
+def _start_controller(arm: UrArmSpec) -> VirtualController:
+    """Start a controller at a free random loopback address, because campaigns and tests run in parallel."""
+    chance, reason = random.SystemRandom(), ""
+    for _ in range(ATTEMPTS):
+        address = f"127.{chance.randint(1, 254)}.{chance.randint(0, 254)}.{chance.randint(1, 254)}"
+        if not _is_free(address):
+            continue
+        try:
+            return VirtualController.start(
+                address, arm.model, arm.time_scale, FREQUENCY if arm.time_scale > 1.0 else None, joints=arm.home
+            )
+        except VirtualControllerError as error:
+            reason = str(error)
+    raise LaboratoryError(f"no virtual controller could be started: {reason or 'no free loopback address was found'}")
+
+
+def _is_free(address: str) -> bool:
+    for port in PORTS:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((address, port))
+            except OSError:
+                return False
+    return True

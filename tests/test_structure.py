@@ -1,0 +1,74 @@
+"""The structure of the product: no import cycles, unique file names, and texts that name modules or classes resolve."""
+
+from __future__ import annotations
+
+import ast
+import collections
+import re
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+from pkgutil import resolve_name
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LAYERS = ("sim_engine", "actors", "orchestrator", "decant")
+
+
+def modules() -> dict[str, Path]:
+    files = [path for layer in LAYERS for path in (ROOT / layer).rglob("*.py")]
+    return {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
+
+
+def imported(name: str, path: Path, known: dict[str, Path]) -> set[str]:
+    """Modules that one imports anywhere in its text: at the top, within functions, and for types only."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            full = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {module if module in known else node.module for module in full}
+    return (found & known.keys()) - {name}
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    known = modules()
+    order = TopologicalSorter({name: imported(name, path, known) for name, path in known.items()})
+    try:
+        order.prepare()
+    except CycleError as error:
+        raise AssertionError(" → ".join(error.args[1])) from None
+
+
+def test_every_file_name_is_unique() -> None:
+    names = collections.Counter(path.name for path in modules().values() if not path.name.startswith("__"))
+    assert [name for name, count in names.items() if count > 1] == []
+
+
+TEXTS = sorted(
+    {
+        text
+        for path in modules().values()
+        for text in re.findall(r'"((?:sim_engine|actors|orchestrator|decant)(?:\.\w+)+:\w+)"', path.read_text("utf-8"))
+    }
+)
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_a_class_or_function_that_is_named_by_text_exists(text: str) -> None:
+    assert resolve_name(text) is not None
+
+
+def test_modules_that_commands_name_exist() -> None:
+    """`python -m MODULE` and the modules in docstrings, comments and pages: a file or a package of that name exists."""
+    known = modules()
+    pattern = re.compile(r"(?<![\w./])((?:sim_engine|actors|orchestrator)(?:\.[a-z_0-9]+)+)")
+    wrong = []
+    for path in [*known.values(), *(ROOT / "docs").rglob("*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]:
+        for name in pattern.findall(path.read_text(encoding="utf-8")):
+            parts = name.split(".")
+            # the last part may be a function or constant of a module
+            if name not in known and ".".join(parts[:-1]) not in known:
+                wrong.append(f"{path.relative_to(ROOT)}: {name}")
+    assert wrong == []
