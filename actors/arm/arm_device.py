@@ -108,8 +108,7 @@ class DeviceArm:
         await self.device.call("close", deadline=PATIENCE)
 
     def _deadline(self, seconds: float) -> float:
-        """The deadline for an action of that duration on the controller [s]: twice the duration, to detect a lost arm.
-        """
+        """The deadline for an action of this duration on the controller [s]: twice as long, to detect a lost arm."""
         return PATIENCE + 2.0 * self._spec.on_clock(seconds)
 
     @contextlib.asynccontextmanager

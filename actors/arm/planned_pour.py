@@ -242,7 +242,7 @@ class ExecutedMotion:
     """See `actors.arm.arm_interface.Executed`; poses as the arm read them back.
 
     Attributes:
-        times: shape (T,) Duration [s].
+        times: shape (T,) [s].
         poses: shape (T, 7).
         completed: False if it was stopped before its end.
     """

@@ -45,8 +45,7 @@ _NEEDLESS = ("start_api_server", "start_monitor", "start_log_monitor")
 """Parts of a Ray node that are not used here: the dashboard's server, the autoscaler and the log monitor."""
 
 _TOKEN = secrets.token_hex(32)
-"""Ray refuses other users of this machine, who do not have this token. One per process, since Ray reads it only once.
-"""
+"""Ray refuses users without this token. One per process, since Ray reads it only once."""
 
 
 @dataclass

@@ -120,8 +120,7 @@ def forget_ray_logs() -> None:
 
 
 def ray_lost() -> str:
-    """The lost part of a private Ray: one of its processes, or its connection to this one. Empty while nothing is lost.
-    """
+    """The lost part of a private Ray, a process or its connection to this one; empty while nothing is lost."""
     cluster = _cluster
     if cluster is None or cluster.private is None:
         return ""

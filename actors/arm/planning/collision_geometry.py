@@ -1,5 +1,4 @@
-"""Collision geometry: the pourer's outermost points, its distance from the receiver, and the arm's links as capsules.
-"""
+"""Collision geometry: the pourer's outermost points, its distance from the receiver, and links as capsules."""
 
 from __future__ import annotations
 
@@ -22,8 +21,7 @@ COARSE, FINE = 10e-3, 2e-3
 
 LINKS = (("upper arm", 1, 2, 0.08), ("forearm", 3, 4, 0.06), ("wrist", 4, 5, 0.06), ("wrist", 5, 6, 0.06),
          ("wrist", 6, 7, 0.05), ("gripper", 7, 8, 0.04))  # fmt: skip
-"""Name, ends as `link_points` counts (8 is the TCP), radius [m]. The radii are rough; the gripper's assumes a slim one.
-"""
+"""Name, ends as `link_points` counts (8 is the TCP), radius [m]. Radii are rough; the gripper's is for a slim one."""
 
 _hulls: WeakKeyDictionary[Vessel, FloatArray] = WeakKeyDictionary()
 

@@ -17,8 +17,7 @@ from actors.arm.planning.trajectory import trapezoid
 FloatArray = NDArray[np.float64]
 
 TOOL_ACCELERATION = 0.5
-"""Acceleration of a pourer that is carried [m/s²]. Its liquid then leans by 3 deg, and by twice that while it swings.
-"""
+"""Acceleration of a pourer that is carried [m/s²]. Its liquid leans by 3 deg, and twice as far while it swings."""
 
 TOOL_SPEED = 0.4
 """Speed of a pourer that is carried [m/s], if the limits allow it."""
@@ -28,8 +27,7 @@ STEP = 0.02
 
 
 MOST_TURNS = 3.0
-"""Rotation of a joint along a line, at its fastest. Near a singularity a joint would make tens or thousands of turns.
-"""
+"""Most turns of a joint along a line, at its fastest. Near a singularity it would make tens or thousands."""
 
 LONGEST = 60.0
 """Longest duration of a line on which a joint rotates that much [s]."""

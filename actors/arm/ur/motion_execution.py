@@ -36,8 +36,7 @@ from actors.arm.ur.worker_messages import (
 )
 
 AT_START = 0.01
-"""Largest distance of the joints from a path's first point [rad]; the program removes it slowly before the path begins.
-"""
+"""Largest distance of the joints from a path's first point [rad]; the program first removes it slowly."""
 
 AT_END = 0.01
 """Largest distance of the joints from a path's last point [rad] for the path to count as completed."""
