@@ -1,1 +1,1 @@
-"""Who can do it: simulators, arm, balance, optimiser. Ray lives on this floor only."""
+"""The actors of a laboratory: simulators, arm, balance and optimiser. Ray is used in this layer only."""

@@ -1,10 +1,11 @@
-"""What the orchestrator may ask of a laboratory. Real hardware, the virtual bench and in-process twins implement these.
+"""Interfaces between the orchestrator and a laboratory, and their errors.
 
-All are asynchronous; none of them knows what a strategy is.
+- `SimulatorPool`, `Bench` and `Optimizer` are the parts of a `Laboratory`. Hardware, the virtual bench and in-process
+  replacements for tests implement them. All are asynchronous.
+- `Operator` answers an `OperatorQuestion` at the bench; `OperatorSpec` holds its settings.
+- `Notice` is a message from a laboratory, `DeviceCheck` one line of `decant doctor`.
 
-The person at the bench, as actors know them: questions with answers. Values and a protocol.
-
-One line of what `decant doctor` says about a thing of the laboratory.
+None of these depends on strategies.
 """
 
 from __future__ import annotations
@@ -20,42 +21,45 @@ from sim_engine.scene import PourTask, Scene
 
 
 class LaboratoryError(DecantError):
-    """Something in the laboratory can't do what was asked; the text is for the person who can mend it."""
+    """The laboratory cannot do what was requested; the text is for the person who can fix it."""
 
 
 class BenchLostError(LaboratoryError):
-    """The bench's machine is gone: no pour can be made until it is back. Nobody knows what came of one under way."""
+    """The bench's machine is lost: no pour is possible until it is back. The outcome of a running pour is unknown."""
 
 
 class NotPouredError(LaboratoryError):
-    """The pour did not begin, and nothing was poured: it may be made once a person has seen to what stands here."""
+    """The pour did not begin, and nothing was poured.
+
+    It can be repeated once the operator has removed the stated cause.
+    """
 
 
 class UnknownPourError(LaboratoryError):
-    """A pour had begun and did not go as it should: a person has to say what came of it, and software never pours anew.
+    """A pour began and did not end as planned. A person has to state its outcome; software never repeats the pour.
 
-    The text says where it stopped, and what could still be weighed.
+    The text gives the point where it stopped, and the weights that could still be measured.
     """
 
 
 class PourFailedError(LaboratoryError):
-    """A pour came to nothing that could be weighed, and everybody knows why: it counts as failed."""
+    """A pour gave nothing that could be weighed, and the reason is known: it counts as failed."""
 
 
 class InvalidActionError(LaboratoryError):
-    """The vessels would touch, or the motion can't be made: refused before anything moved or was simulated."""
+    """The vessels would touch, or the motion is impossible: refused before anything moved or was simulated."""
 
 
 class UnreachablePlaceError(InvalidActionError):
-    """The arm can't get to where a pour begins, whatever would be poured there."""
+    """The arm cannot reach the place where a pour begins, whatever is poured there."""
 
 
 class SimulationError(LaboratoryError):
-    """A simulation gave no result (diverged, or its worker died more often than it may)."""
+    """A simulation gave no result: it diverged, or its worker died more often than allowed."""
 
 
 class SimulatorPool(Protocol):
-    """Several simulators that share a queue. Dead members are replaced and their jobs retried."""
+    """Several simulators that share a queue. Dead workers are replaced and their jobs retried."""
 
     @property
     def size(self) -> int:
@@ -64,7 +68,9 @@ class SimulatorPool(Protocol):
 
     @property
     def separate(self) -> bool:
-        """Whether simulators disturb nobody: they run in processes of their own, and what is cancelled ends at once."""
+        """Whether simulators run in separate processes: they then do not disturb others, and a cancelled job ends at
+        once.
+        """
         ...
 
     async def simulate(self, task: PourTask) -> SimulatedPour:
@@ -81,17 +87,17 @@ class SimulatorPool(Protocol):
 
 @dataclass(frozen=True)
 class PourProgress:
-    """Where a pour on the bench stands: for people and the monitor, never for control.
+    """Progress of a pour on the bench, for display only, never for control.
 
     Attributes:
         checkpoint: one of 'operator', 'tare', 'approach', 'tilt', 'hold', 'return', 'settle', 'weigh', 'record'.
         fraction: 0 … 1 of the whole pour.
         tilt: of the pourer [rad], if known.
         balance: last reading [kg], if known.
-        stable: whether the balance says that it is at rest, if known.
-        joints: of the arm as last measured [rad]; empty where it doesn't tell.
-        pourer: pose of the pourer in the world (x y z [m], qw qx qy qz), from an arm without joints; empty likewise.
-        liquid: particles of this pour, told once by a virtual bench. Nobody who learns sees them.
+        stable: whether the balance reports a stable value, if known.
+        joints: of the arm as last measured [rad]; empty if the arm does not report them.
+        pourer: pose of the pourer in the world (x y z [m], qw qx qy qz), from an arm without joints; else empty.
+        liquid: particles of this pour, reported once by a virtual bench. Hidden from the learning algorithms.
     """
 
     checkpoint: str
@@ -108,7 +114,7 @@ ProgressCallback = Callable[[PourProgress], None]
 
 
 class Bench(Protocol):
-    """Arm, balance and operator together: it can pour once and weigh what came of it."""
+    """Arm, balance and operator together: it makes one pour and weighs its outcome."""
 
     @property
     def mode(self) -> str:
@@ -122,32 +128,32 @@ class Bench(Protocol):
 
         Args:
             action: `sim_engine.action.Action`.
-            seed: hidden noise of a virtual bench; ignored by hardware.
+            seed: of the hidden noise of a virtual bench; ignored by hardware.
 
         Raises:
             InvalidActionError: refused before anything moved.
-            NotPouredError: it did not begin; nothing was poured, and it may be asked for again.
-            UnknownPourError: it began, and a person has to say what came of it.
+            NotPouredError: it did not begin; nothing was poured, and it may be requested again.
+            UnknownPourError: it began, and a person has to state its outcome.
             LaboratoryError: it failed after something had moved, and counts as failed.
-            BenchLostError: so is the bench; nothing more can be poured.
+            BenchLostError: the bench is lost; no further pour is possible.
         """
         ...
 
 
 class Optimizer(Protocol):
-    """Proposes points. Keeps no state: the same question may be asked again after a death."""
+    """Proposes points. It is stateless: after a worker's death the same request may be made again."""
 
     async def suggest(self, problem: SuggestProblem) -> Suggestion:
-        """Answer a `SuggestProblem`."""
+        """Compute the suggestion for a `SuggestProblem`."""
         ...
 
 
 @dataclass(frozen=True)
 class Notice:
-    """Something that happened to a laboratory, in words for people.
+    """A message from a laboratory to the user.
 
     Attributes:
-        level: how much it matters; a 'note' is written into the journal and not shown.
+        level: importance; a 'note' is written into the journal and not displayed.
         text: whole sentences.
         asked: whether the operator's own screen shows it too, with a question.
     """
@@ -159,10 +165,10 @@ class Notice:
 
 @runtime_checkable
 class Telling(Protocol):
-    """A laboratory that tells what happens to it."""
+    """A laboratory that publishes notices."""
 
     def listen(self, hear: Callable[[Notice], None]) -> None:
-        """Be told from now on, and at once what has happened so far.
+        """Subscribe to future notices, and receive the previous ones at once.
 
         Args:
             hear: called in the event loop; must not raise.
@@ -172,13 +178,13 @@ class Telling(Protocol):
 
 @runtime_checkable
 class Stoppable(Protocol):
-    """A laboratory whose arm can be stopped by somebody who does not wait for it."""
+    """A laboratory whose arm can be stopped by a task that does not own the pour."""
 
     async def stop_arm(self) -> bool:
-        """Stop what moves; it stays locked. Returns whether there is an arm.
+        """Stop any motion; the arm stays locked. Returns whether there is an arm.
 
         Raises:
-            LaboratoryError: it can't be reached.
+            LaboratoryError: it cannot be reached.
         """
         ...
 
@@ -193,16 +199,16 @@ class Laboratory(Protocol):
 
     @property
     def bench(self) -> Bench | None:
-        """None where a campaign needs no pours (recorded data, planning).
+        """None if the campaign needs no pours (recorded data, planning).
 
         Raises:
-            BenchLostError: its machine is gone.
+            BenchLostError: the bench's machine is lost.
         """
         ...
 
     @property
     def optimizer(self) -> Optimizer:
-        """Proposes points."""
+        """The optimiser, which proposes points."""
         ...
 
     async def __aenter__(self) -> Laboratory: ...
@@ -215,15 +221,15 @@ OperatorAnswer = Literal["done", "weight", "yes or no"]
 
 @dataclass(frozen=True)
 class OperatorQuestion:
-    """Something to do and say, for the person at the bench.
+    """An instruction or question for the operator at the bench.
 
     Attributes:
         text: what to do; whole sentences.
         wants: 'done' when it is done, a 'weight' with its unit, or 'yes' or 'no'.
-        problem: why it is asked again; '' the first time.
-        about: what it is about, for programs: a weighing's key, 'tare', 'start', 'recover' …
-        hands: whether it invites hands into the cell; then no program runs on the controller until it is answered.
-        details: numbers that belong to it, for screens and records; JSON-ready.
+        problem: why the question is repeated; '' the first time.
+        about: its subject, for programs: a weighing's key, 'tare', 'start', 'recover' …
+        hands: whether the operator reaches into the cell; then no program runs on the controller until the answer.
+        details: numbers for screens and records; JSON-ready.
     """
 
     text: str
@@ -236,13 +242,13 @@ class OperatorQuestion:
 
 @dataclass(frozen=True)
 class OperatorSpec:
-    """Who answers, and how long they may take.
+    """The source of answers, and their time limits.
 
     Attributes:
         answers: 'person', at the terminal; or 'virtual', on a virtual bench only.
-        time: refilling, placing, wiping, for a virtual one [s of bench time].
-        reminder: after which a person is asked again [s].
-        deadline: after which the question is given up [s]; nothing moves then, and nothing is lost.
+        time: of a virtual operator for refilling, placing, wiping [s of bench time].
+        reminder: time after which the question is repeated [s].
+        deadline: time after which the question is given up [s]; nothing moves then, and nothing is lost.
     """
 
     answers: Literal["person", "virtual"] = "person"
@@ -258,12 +264,12 @@ class Operator(Protocol):
         """Put a question and await the answer: 'done', a weight as typed ('12.3 g'), 'yes' or 'no'.
 
         Raises:
-            LaboratoryError: nobody answered in time, or the pour is given up.
+            LaboratoryError: there was no answer in time, or the pour was given up.
         """
         ...
 
     async def announce(self, text: str, seconds: float) -> None:
-        """Say that something moves in so many seconds [s of the clock]; that needs no answer, and returns at once."""
+        """Announce a motion that begins in so many seconds [s of the clock]. Needs no answer and returns at once."""
         ...
 
 
@@ -272,13 +278,13 @@ State = Literal["ok", "warn", "fail"]
 
 @dataclass(frozen=True)
 class DeviceCheck:
-    """One line of the table.
+    """One line of the table of `decant doctor`.
 
     Attributes:
-        name: what was looked at.
-        state: 'warn' lets pours be made, 'fail' doesn't.
-        found: what was found.
-        advice: what to do about it; '' where nothing is to be done.
+        name: of the checked item.
+        state: 'warn' permits pours, 'fail' does not.
+        found: the result.
+        advice: the remedy; '' if none is needed.
     """
 
     name: str

@@ -1,4 +1,8 @@
-"""A laboratory as a campaign uses it: opened and closed as one, over Ray or inside this process."""
+"""A laboratory as a campaign uses it: opened and closed as one, over Ray or inside this process.
+
+`open_laboratory` returns a `RayLaboratory` or an `InProcessLaboratory`; `check_laboratory` checks beforehand that it
+can be opened. The bench itself is made by `actors.bench`.
+"""
 
 from __future__ import annotations
 
@@ -34,15 +38,15 @@ if TYPE_CHECKING:
 
 
 def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = False) -> None:
-    """Whether what a laboratory needs, on this machine and from others, is there. Starts nothing that stays.
+    """Check that everything a laboratory needs on this machine and others is available. Leaves nothing running.
 
     Args:
-        spec: where to run.
-        need_bench: whether pours will be asked for.
+        spec: of the laboratory.
+        need_bench: whether pours will be requested.
         brief: see `open_laboratory`.
 
     Raises:
-        LaboratoryError: with what is wrong and what would be right.
+        LaboratoryError: with the problem and its remedy.
     """
     if spec.arm is not None and need_bench and (missing := spec.arm.missing()) is not None:
         raise LaboratoryError(
@@ -63,7 +67,7 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = Fa
 
 
 def check_bench_packages(spec: LaboratorySpec) -> None:
-    """Whether the packages are installed that reach, or emulate, the arm and the balance of a laboratory.
+    """Check that the packages are installed that control, or emulate, the arm and the balance of a laboratory.
 
     Raises:
         LaboratoryError: some are not; the text names them and their extra.
@@ -96,22 +100,21 @@ def open_laboratory(
     kept: ClosablePool | None = None,
     optimizer: Optimizer | None = None,
 ) -> Laboratory:
-    """A laboratory, to be entered with `async with`; nothing starts before that.
+    """Create a laboratory, to be entered with `async with`; nothing starts before that.
 
     Args:
-        spec: where to run.
-        need_bench: whether pours will be asked for.
-        brief: for work of seconds that a person waits for: simulators in plain processes, which are there before a
-            private Ray would be. Where a bench is needed, or a cluster named, it is as ever.
-        make: makes simulators, where they run.
-        operator: who answers questions, where a person does.
-        kept: simulators that outlive the laboratory, in place of its own (`actors.simulators.shared_pool`). Not on a
-        cluster, whose
-            members come and go.
-        optimizer: likewise, in place of one of its own: it keeps no state that matters.
+        spec: of the laboratory.
+        need_bench: whether pours will be requested.
+        brief: for interactive work of a few seconds: simulators run in plain processes, which start sooner than a
+            private Ray. Ignored if a bench is needed or a cluster is named.
+        make: creates simulators in their processes.
+        operator: answers questions, if a person does.
+        kept: simulators to use instead of its own (`actors.simulators.shared_pool`); they stay open. Not on a
+        cluster, whose nodes change.
+        optimizer: an optimiser to use instead of its own; it is stateless.
 
     Raises:
-        LaboratoryError: a bench is needed and there is none, or nobody to stand beside it, or the mode is not known.
+        LaboratoryError: a bench is needed and there is none, or it has no operator, or the mode is unknown.
     """
     if spec.mode not in ("virtual", "hardware"):
         raise LaboratoryError(f"laboratory {spec.name}: mode '{spec.mode}' is not known; 'virtual' and 'hardware' are")
@@ -132,7 +135,7 @@ def open_laboratory(
 
 
 class ClosablePool(SimulatorPool, Protocol):
-    """A pool that ends."""
+    """A pool that can be closed."""
 
     async def close(self) -> None:
         """End its simulators."""
@@ -140,14 +143,14 @@ class ClosablePool(SimulatorPool, Protocol):
 
 
 class _OpenLaboratory:
-    """What both kinds of laboratory have in common.
+    """Common part of both kinds of laboratory.
 
     Args:
-        spec: see each of them.
-        make: makes simulators, where they run.
-        operator: a person, where one answers.
-        kept: simulators to use in place of its own; they stay open.
-        optimizer: to use in place of its own; it stays open.
+        spec: see the subclasses.
+        make: creates simulators in their processes.
+        operator: a person who answers questions, if there is one.
+        kept: simulators to use instead of its own; they stay open.
+        optimizer: to use instead of its own; it stays open.
     """
 
     def __init__(
@@ -194,7 +197,7 @@ class _OpenLaboratory:
         """The bench, if one was needed.
 
         Raises:
-            BenchLostError: its machine is gone.
+            BenchLostError: its machine is lost.
         """
         if self._bench_problem is not None:
             raise BenchLostError(self._bench_problem)
@@ -208,10 +211,10 @@ class _OpenLaboratory:
         return self._optimizer
 
     async def stop_arm(self) -> bool:
-        """Stop what moves, past everything that waits for the arm; it stays locked. Returns whether there is an arm.
+        """Stop any motion without waiting for other calls to the arm; it stays locked. Returns whether there is an arm.
 
         Raises:
-            LaboratoryError: it can't be reached; only its own emergency stop helps then.
+            LaboratoryError: the arm cannot be reached; only its own emergency stop can stop it.
         """
         if self._opened is None:
             return False
@@ -220,7 +223,7 @@ class _OpenLaboratory:
 
     @property
     def opened(self) -> OpenBench | None:
-        """What is behind the bench; None where there is none."""
+        """The parts of the open bench; None if there is no bench."""
         return self._opened
 
     def _own_optimizer(self, proposer: Device) -> Optimizer:
@@ -249,11 +252,12 @@ def _local(name: str, cls: type[Any], *args: Any) -> Device:
 
 
 class InProcessLaboratory(_OpenLaboratory):
-    """Everything in threads of this process, or with simulators in plain processes beside it: for fast tests and single
-    commands.
+    """Runs everything in threads of this process, or with simulators in plain processes.
 
-    Without those the hidden liquid shares the one simulator with the pool (a process has one Taichi), so that nothing
-    is simulated while the bench computes its liquid. Outcomes are those of `RayLaboratory`.
+    For fast tests and single commands.
+
+    Without separate processes the hidden liquid uses the pool's only simulator, since a process has one Taichi: no
+    other simulation runs while the bench computes its liquid. Outcomes equal those of `RayLaboratory`.
     """
 
     def __init__(self, *args: Any, processes: int = 0, **options: Any) -> None:
@@ -279,9 +283,9 @@ class InProcessLaboratory(_OpenLaboratory):
 
 
 class RayLaboratory(_OpenLaboratory):
-    """Everything in processes of its own: on this machine, or on the machines of a cluster.
+    """Runs everything in separate processes: on this machine, or on the machines of a cluster.
 
-    `spec` says how large the pool is, how much memory there is, which cluster is to be joined, if any.
+    `spec` gives the size of the pool, the memory, and the cluster to join, if any.
     """
 
     _cluster: JoinedCluster | None = None
@@ -295,7 +299,7 @@ class RayLaboratory(_OpenLaboratory):
         try:
             await asyncio.shield(starting)
         except asyncio.CancelledError:
-            # Starting can't be cut short; but it must not outlive the one who wanted it.
+            # The start cannot be interrupted, and must not continue after its caller has ended.
             await asyncio.wait({starting})
             if starting.exception() is None:
                 await self._stop_ray()
@@ -349,19 +353,23 @@ class RayLaboratory(_OpenLaboratory):
         return pool
 
     def _open_liquid(self) -> RaySimulatorPool:
-        """The hidden liquid's simulator, beside the arm. No core is counted for it: the pool's size is the campaign's
-        choice, and a pour must never wait for it."""
+        """The hidden liquid's simulator, on the arm's machine.
+
+        It reserves no core: the pool's size is the campaign's choice, and a pour must never wait for it."""
         node = None if self._cluster is None else self._cluster.bench
         return RaySimulatorPool(1, make=self._make, cpus=0.0, placement=None if node is None else node.options)
 
     def _lose_bench(self, reason: str) -> None:
-        """Its machine is gone: calls to arm and balance find out by themselves, the liquid's simulator would wait."""
+        """Handle the loss of the bench's machine.
+
+        Calls to arm and balance detect it; the liquid's simulator would wait.
+        """
         self._bench_problem = reason
         if self._liquid is not None:
             self._liquid.abandon(BenchLostError(reason))
 
     def _lose_all(self, reason: str) -> None:
-        """Ray on this machine is gone: without it nothing can be asked of anybody."""
+        """Handle the loss of Ray on this machine, which ends all of its actors."""
         self._lose_bench(reason)
         if isinstance(self._pool, RaySimulatorPool):
             self._pool.abandon(LaboratoryError(reason))
@@ -380,7 +388,7 @@ class RayLaboratory(_OpenLaboratory):
             await self._close_all()
             if self._cluster is not None:
                 await self._cluster.close()
-        finally:  # also where the closing was cut short: Ray counts who uses it
+        finally:  # also if closing was interrupted, since Ray counts its users
             await self._stop_ray()
 
     async def _stop_ray(self) -> None:

@@ -1,6 +1,6 @@
-"""Settings of a laboratory: the pool of simulators, and the bench if there is one. Plain values.
+"""Settings of a laboratory: the pool of simulators, the Ray cluster, and the bench if there is one. Plain values.
 
-Settings of the virtual bench. Plain values.
+`LaboratorySpec` contains `RaySpec` and `VirtualBenchSpec`. Settings of arm and balance are in their own packages.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from sim_engine.settings.model import FREE
 
 @dataclass(frozen=True)
 class VirtualBenchSpec:
-    """The virtual bench: what is hidden from calibration, and how fast time runs.
+    """The virtual bench: the ground truth hidden from calibration, and its time scale.
 
     Attributes:
         liquid: hidden θ of the 'real' liquid.
         pose_error: systematic error of grip and placement.
-        pose_noise: standard deviation of the same, drawn anew for each pour.
-        time_scale: bench seconds per wall second; 0 waits for nothing.
+        pose_noise: standard deviation of the same, drawn for each pour.
+        time_scale: bench seconds per wall-clock second; 0 skips all waits.
         operator_time: refilling, placing, wiping [s of bench time].
         balance_resolution, balance_noise, balance_drift: [kg], [kg], [kg/s]; settling_time [s].
     """
@@ -43,11 +43,11 @@ class VirtualBenchSpec:
 
 @dataclass(frozen=True)
 class RaySpec:
-    """A Ray cluster that runs already.
+    """A Ray cluster that is already running.
 
     Attributes:
         address: of its head, host:port.
-        bench_resource: custom resource of the node that arm, balance and bench run on.
+        bench_resource: custom resource of the node on which arm, balance and bench run.
     """
 
     address: str
@@ -56,22 +56,22 @@ class RaySpec:
 
 @dataclass(frozen=True)
 class LaboratorySpec:
-    """Where a campaign runs.
+    """Settings of the laboratory in which a campaign runs.
 
-    What belongs to the machine, or to who stands beside it, decides nothing of a campaign.
+    Settings of the machine or the operator do not affect a campaign's results.
 
     Attributes:
         simulators: size of the pool; 0: one per core, of this machine or of the cluster.
-        bench: what is hidden on a virtual bench; None on hardware, and where the laboratory can't pour.
+        bench: ground truth of a virtual bench; None on hardware, and if the laboratory cannot pour.
         mode: 'virtual' or 'hardware'.
         in_process: everything in threads of one process, without Ray.
-        object_store_mb: a private Ray's shared memory for results [MiB]; Ray takes no less than 80.
+        object_store_mb: a private Ray's shared memory for results [MiB]; Ray needs at least 80.
         ray: the cluster to join; None for a private Ray on this machine.
-        arm: of any kind, virtual or not; None for a bench of numbers, or none.
-        balance: beside the arm; its time scale is the bench's.
-        operator: beside the arm.
-        accepted_checksum: of the safety settings of hardware that people have accepted; '' if nobody has. Filled in
-            for a run, not part of a file.
+        arm: of any kind, virtual or not; None for a simulated bench, or none.
+        balance: of the bench with the arm; its time scale is the bench's.
+        operator: of the bench with the arm.
+        accepted_checksum: of the accepted safety settings of the hardware; '' if none are accepted. Filled in for a
+            run, not part of a file.
     """
 
     name: str

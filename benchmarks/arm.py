@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from machine import describe, say, show
 
-from actors.arm.arm_interface import ArmLimits, ArmStoppedError, Pose, RobotCell
+from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
+from actors.arm.arm_interface import ArmStoppedError
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planned_pour import PourPath
 from actors.arm.planning.pour_planner import plan_path

@@ -1,4 +1,4 @@
-"""What has been run on this machine, and what was poured, as tables: the catalogue of `decant runs`."""
+"""Runs and pours of this machine as tables, from the catalogue of `decant runs`."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ if TYPE_CHECKING:
 
 
 def find_runs(*words: str, **conditions: Unpack[Conditions]) -> pd.DataFrame:
-    """Runs of this machine, the newest first; `open_run(path)` opens one. Names may hold * and ?.
+    """Runs of this machine, newest first; `open_run(path)` opens one. Names may contain * and ?.
 
     Args:
-        words: that all stand somewhere in a run's names, vessels, tags or notes.
+        words: all of them must occur in a run's names, vessels, tags or notes.
         conditions: any of `since`, `until` ('2030-03-01', '2030-03', '7d' ago; to the end of the day or month),
             `campaign`, `pourer`, `receiver`, `liquid`, `strategy`, `tag` (names), `mode` ('virtual' or 'real'), and
-            `state` as `decant runs` shows it ('finished', 'interrupted' …). All that are given must hold.
+            `state` as `decant runs` shows it ('finished', 'interrupted' …). All given conditions must hold.
 
     Returns:
-        One row for each run; what the columns mean stands in the data dictionary of `decant runs export`.
+        One row for each run; the data dictionary of `decant runs export` describes the columns.
 
     Raises:
-        ValueError: a date or the mode is none.
-        RunError: the catalogue can't be read.
+        ValueError: a date or the mode is invalid.
+        RunError: the catalogue cannot be read.
     """
     return _table("run", search.find_runs, search.searching(words=words, **conditions))
 
 
 def find_pours(*words: str, **conditions: Unpack[PourConditions]) -> pd.DataFrame:
-    """Pours of all runs of this machine, the oldest first: action in display units, masses [g], spillage, loss.
+    """Pours of all runs of this machine, oldest first: action in display units, masses [g], spillage, loss.
 
     Args:
         words: see `find_runs`.

@@ -1,4 +1,8 @@
-"""A run that has ended, or stands still: what it learnt, its pours, decisions and curves as tables, its figures."""
+"""Results of a run that has ended, was interrupted or is still running.
+
+`open_run` returns a `Run` with stage results, pours, decisions and curves as tables, and figures. `publish` writes its
+files. This module does not start or resume runs.
+"""
 
 from __future__ import annotations
 
@@ -33,12 +37,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Run:
-    """A run. Its tables are pandas.DataFrames, made when they are asked for.
+    """A run. Its tables are pandas.DataFrames, created on access.
 
     Attributes:
-        campaign: what it does.
-        result: state, counts, times, and what each stage learnt.
-        published: what was written about it; None where it was opened as it stood.
+        campaign: its campaign.
+        result: state, counts, times, and the result of each stage.
+        published: the files written about it; None if the run was only opened.
     """
 
     campaign: CampaignPlan
@@ -52,12 +56,12 @@ class Run:
 
     @property
     def results(self) -> Results:
-        """What each closed stage learnt, by its name."""
+        """The result of each closed stage, by its name."""
         return self.result.results
 
     @property
     def calibrated(self) -> CalibratedTheta | None:
-        """θ*, what is expected of it and which other θ fit; None where nothing was calibrated."""
+        """θ*, its predictions and other θ that fit; None without a calibration."""
         return theta_of(self.results)
 
     @property
@@ -70,7 +74,7 @@ class Run:
 
     @property
     def calibration_gain(self) -> CalibrationGain | None:
-        """Whether the weighed pours justify θ*, in numbers and words (`text`); None where that was not compared."""
+        """Whether the weighed pours justify θ*, in numbers and words (`text`); None if this was not compared."""
         return gain_of(self.results)
 
     @property
@@ -82,7 +86,7 @@ class Run:
 
     @property
     def predictions(self) -> dict[str, dict[str, SampleStatistics]]:
-        """What fresh seeds of the recommended actions came to, by receiver and quantity."""
+        """Outcomes of the recommended actions with fresh seeds, by receiver and quantity."""
         names = _receivers(self.campaign)
         return {names.get(scene, scene): one.over_seeds for scene, one in predictions_of(self.results).items()}
 
@@ -98,17 +102,17 @@ class Run:
 
     @property
     def decisions(self) -> pd.DataFrame:
-        """Why the strategies asked for what they asked for, in words and numbers."""
+        """The reasons for the strategies' requests, in words and numbers."""
         return _frame(self._decisions())
 
     @property
     def curves(self) -> pd.DataFrame:
-        """How far each stage had come: the loss of every pour and the discrepancy of every θ, with the best so far."""
+        """Progress of each stage: the loss of every pour and the discrepancy of every θ, with the best so far."""
         return _frame(self._curves())
 
     @property
     def outflows(self) -> pd.DataFrame:
-        """Outflow of every simulation in time: fractions of the load that have been poured and spilled."""
+        """Outflow of every simulation over time: fractions of the load that have been poured and spilled."""
         return _frame(self._outflows())
 
     def figures(self) -> dict[str, Figure]:
@@ -118,14 +122,14 @@ class Run:
         return figures_of(self.campaign, self.results)
 
     def report(self, path: Path | str | None = None) -> Path:
-        """Write the page about the run, one HTML file that needs nothing beside it, with figures drawn anew.
+        """Write the report of the run: one self-contained HTML file with newly drawn figures.
 
         Args:
             path: of the page; 'report.html' in the run's folder unless given.
 
         Raises:
-            OSError: it can't be written.
-            RunError: the journal can't be read.
+            OSError: it cannot be written.
+            RunError: the journal cannot be read.
         """
         return report_on(self.campaign, self.result, None if path is None else Path(path).expanduser())[0]
 
@@ -225,16 +229,16 @@ class Run:
 
 
 def open_run(directory: Path | str, campaign: CampaignPlan | None = None) -> Run:
-    """Open a run's folder, of a run that has ended, stands still, or is being written.
+    """Open a run's folder. The run may have ended, be interrupted, or still be running.
 
     Args:
         directory: of the run.
-        campaign: what it does; read from the folder unless given.
+        campaign: of the run; read from the folder unless given.
 
     Raises:
         FileNotFoundError: there is no run in that folder.
-        JournalError: its journal can't be read.
-        ConfigError: its campaign can't be read.
+        JournalError: its journal cannot be read.
+        ConfigError: its campaign cannot be read.
     """
     folder = Path(directory).expanduser()
     if not (folder / JOURNAL_NAME).is_file():

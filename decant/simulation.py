@@ -1,4 +1,7 @@
-"""One action in the simulator of this process: what comes of it over several seeds, and its picture."""
+"""One action in the simulator of this process: its outcomes over several seeds, and its figure.
+
+`simulate` returns a `Simulation`. It starts no laboratory and makes no pour.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FRAME_RATE = 20.0
-"""Frames of the first seed that are kept for the picture [1/s]."""
+"""Rate of the frames of the first seed that are kept for the figure [1/s]."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class Simulation:
 
     Attributes:
         task: the first seed's.
-        pours: what came of each; the first one has its frames.
+        pours: the outcome of each seed; the first one has its frames.
     """
 
     task: PourTask
@@ -43,7 +46,7 @@ class Simulation:
         return spreads([pour.outcome for pour in self.pours])
 
     def figure(self) -> Figure:
-        """Four moments of the first seed from the side, and where the liquid was at every time."""
+        """Four moments of the first seed from the side, and the place of the liquid at every time."""
         from orchestrator.results import figure_style as style
         from orchestrator.results.pour_figures import simulation_png
 
@@ -61,21 +64,21 @@ def simulate(
     seed: int = 0,
     seeds: int = 1,
 ) -> Simulation:
-    """Simulate an action in a campaign's scene. Vessels whose shape may be off have another one with each seed.
+    """Simulate an action in a campaign's scene. Vessels of uncertain shape are drawn again for each seed.
 
     Args:
-        campaign: whose vessels, liquid and motion these are: its first deployment's scene, else calibration's.
-        action: dimensions with units, '40 deg/s'; plain numbers are in display units (deg/s, deg, mm, s). What the
-            campaign fixes need not be given.
+        campaign: defines vessels, liquid and motion: the scene of its first deployment, else of its calibration.
+        action: dimensions with units, '40 deg/s'; plain numbers are in display units (deg/s, deg, mm, s). Dimensions
+            that the campaign fixes need not be given.
         receiver: another vessel, or its file.
         theta: simulation parameters; the campaign's unless given.
-        seed: of the first pour's initial positions; those that follow have the next ones.
+        seed: of the first pour's initial positions; later pours use the next seeds.
         seeds: how many, 1 or more.
 
     Raises:
-        ConfigError: the receiver's file is wrong.
-        ValueError: `seeds` is below 1, the action is not complete, or the vessels touch, don't hold the load, or can't
-            be built (each is a `DecantError`).
+        ConfigError: the receiver's file is invalid.
+        ValueError: `seeds` is below 1, the action is incomplete, or the vessels touch, are too small for the load, or
+            cannot be built (each is a `DecantError`).
     """
     from orchestrator.cli.pour_prediction import scene_to_simulate
     from sim_engine.simulator import PourSimulator

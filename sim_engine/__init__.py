@@ -1,1 +1,4 @@
-"""What a pour is, and how liquid moves. The lowest floor: it knows neither actors nor orchestrator."""
+"""The definition of a pour, and the simulation of its liquid.
+
+The lowest layer: it does not import actors or orchestrator.
+"""

@@ -1,8 +1,10 @@
-"""Actions: what a robot may choose about a pour (the paper's `a`). Plain values in SI units.
+"""Actions: a robot's choices for a pour (the paper's `a`). Plain values in SI units.
 
-Frames and signs (docs/frames.md has the picture): the world frame stands on the table below the receiver, z up,
-x horizontal from the pourer towards the receiver; the receiver's axis is the z axis and its underside lies at z = 0.
-A positive tilt turns the pourer about +y, so that it tips towards +x.
+`ACTION_DIMENSIONS` declares each `Dimension` once; an `Action` is one complete choice.
+
+Frames and signs (docs/frames.md has the picture). The world frame has its origin on the table below the receiver, z up,
+x horizontal from the pourer towards the receiver. The receiver's axis is the z axis and its underside is at z = 0. A
+positive tilt turns the pourer about +y, so that it tips towards +x.
 """
 
 from __future__ import annotations
@@ -21,11 +23,11 @@ class Dimension:
     Attributes:
         name: key in YAML, CSV and code.
         unit: SI unit that code uses.
-        display_unit: unit that people see and type.
+        display_unit: unit that users read and type.
         lower: smallest sensible value [unit].
         upper: largest sensible value [unit].
-        meaning: one line for people.
-        switched_off: word for the choice to do without it (None in an `Action`), see `meaning`; empty: there is none.
+        meaning: one line for users.
+        switched_off: word for omitting it (None in an `Action`), see `meaning`; empty if it cannot be omitted.
     """
 
     name: str
@@ -38,7 +40,7 @@ class Dimension:
 
     @property
     def optional(self) -> bool:
-        """It may be switched off."""
+        """Whether it may be switched off."""
         return bool(self.switched_off)
 
     @property
@@ -90,10 +92,10 @@ ACTION_DIMENSIONS: dict[str, Dimension] = {
 
 @dataclass(frozen=True)
 class Action:
-    """One complete choice of how to pour. SI units; see `ACTION_DIMENSIONS` for meanings and bounds.
+    """One complete choice for a pour. SI units; see `ACTION_DIMENSIONS` for meanings and bounds.
 
-    `None` switches an optional dimension off: `angular_acceleration` (a step), `hold_time` (until the predicted end
-    of flow), `return_velocity` (no return).
+    `None` switches an optional dimension off: `angular_acceleration` (a step), `hold_time` (until the predicted end of
+    flow), `return_velocity` (no return).
     """
 
     angular_velocity: float
@@ -144,12 +146,12 @@ class Action:
         return replace(self, **changes)  # type: ignore[arg-type]
 
     def display(self, *names: str) -> str:
-        """Named dimensions, or all of them, in the units that people read; see `described`."""
+        """Named dimensions, or all of them, in display units; see `described`."""
         return described({name: getattr(self, name) for name in names or ACTION_DIMENSIONS})
 
 
 def described(values: Mapping[str, float | None]) -> str:
-    """Action dimensions [SI] in the units that people read: 'angular_velocity 41.2 deg/s  x_offset 104 mm'."""
+    """Action dimensions [SI] in display units: 'angular_velocity 41.2 deg/s  x_offset 104 mm'."""
     parts = []
     for name, value in values.items():
         dimension = ACTION_DIMENSIONS[name]

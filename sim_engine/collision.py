@@ -1,16 +1,18 @@
-"""Whether two vessels touch while the pourer moves: found before anything is simulated or moved.
+"""Detects contact between two vessels while the pourer moves, before anything is simulated or moved.
 
 Both solids are sampled on their surfaces, and each sample is looked up in the other's signed distance grid. Samples are
-kept in patches with bounding spheres: a patch whose centre is farther from the other solid than its radius can't touch
-it, so that only the few patches near a wall are looked at closely. A lip that dips into the other's opening without
+grouped in patches with bounding spheres. A patch whose centre is farther from the other solid than its radius cannot
+touch it, so only the few patches near a wall are examined closely. A lip that dips into the other's opening without
 touching its wall is not contact.
 
-A motion is looked at along the way that the pourer's points make (`poses_along`), never along the clock: a pour that is
-held for a minute is not looked at more coarsely than one that is not held.
+A motion is sampled along the path of the pourer's points (`poses_along`), not along time: a long hold does not make the
+sampling coarser.
 
-Limitations: poses are checked one by one, not the way between them, so that a touch between two of them may be up to
-half of `WAY` deep and unseen; walls are sampled about every half wall thickness, so that a touch shallower than the
-samples' spacing on a curved wall may be found late.
+Limitations:
+
+- Poses are checked one by one. A contact between two of them may be missed if it is less than half of `WAY` deep.
+- Walls are sampled about every half wall thickness. A contact shallower than the samples' spacing on a curved wall may
+  be detected late.
 """
 
 from __future__ import annotations
@@ -30,13 +32,13 @@ Floats = NDArray[np.float64]
 Part = Literal["rim", "wall", "underside"]
 
 TOLERANCE = 2e-4
-"""Overlap that counts as a touch: below it lies the error of the interpolated distance at sharp edges [m]."""
+"""Overlap that counts as contact: below it is the error of the interpolated distance at sharp edges [m]."""
 
 WAY = 3e-3
-"""Largest way of any point of the pourer between two poses of a motion that are looked at [m]: less than most walls."""
+"""Largest displacement of any point of the pourer between two checked poses [m]: less than most walls."""
 
 _FIRST_LOOK = 0.02
-"""A motion is first sampled so often [s]: within that time no pour goes somewhere and comes back."""
+"""Interval of the first sampling of a motion [s]: no pour moves away and back within that time."""
 
 FEWEST_POINTS, MOST_POINTS = 3_000, 16_000
 PATCHES = 160
@@ -44,12 +46,12 @@ PATCHES = 160
 
 @dataclass(frozen=True)
 class Contact:
-    """Where two vessels touch.
+    """A contact of two vessels.
 
     Attributes:
         index: of the pose.
-        depth: how far the deepest sample lies inside the other's material there [m]. A thin wall that has gone right
-            through another reports at most half a wall.
+        depth: of the deepest sample inside the other's material [m]. A thin wall that has passed completely through
+            another reports at most half a wall.
         point: that sample, in the world, shape (3,) [m].
         part: part of the pourer that touches.
     """
@@ -80,7 +82,7 @@ def _sampled(vessel: Vessel) -> _Samples:
         patches = PATCHES
         each = math.ceil(float(np.clip(wanted, FEWEST_POINTS, MOST_POINTS)) / patches)
         points = vessel.surface_points(each * patches)
-        # halving along the longest side again and again gives compact patches of equal size
+        # repeated halving along the longest side gives compact patches of equal size
         groups = [points]
         while len(groups) < patches:
             groups.sort(key=len)
@@ -109,7 +111,7 @@ def rotations(poses: Floats) -> Floats:
 
 
 def way_of(poses: Floats, vessel: Vessel) -> Floats:
-    """How far a vessel's points have come, at most, from pose to pose.
+    """Upper bound of the displacement of a vessel's points from pose to pose, accumulated.
 
     Args:
         poses: shape (T, 7), x y z [m] qw qx qy qz.
@@ -129,10 +131,12 @@ def way_of(poses: Floats, vessel: Vessel) -> Floats:
 
 
 def thinned(way: Floats, step: float = WAY) -> NDArray[np.int64]:
-    """As few samples along a way as are at most `step` apart, or neighbours; the first and the last among them.
+    """Indices of as few samples along a way as possible that are at most `step` apart, or neighbours.
+
+    The first and the last one are included.
 
     Args:
-        way: that was made up to every sample, shape (T,), see `way_of` [m].
+        way: accumulated displacement at every sample, shape (T,), see `way_of` [m].
         step: [m].
     """
     chosen, last = [0], len(way) - 1
@@ -147,17 +151,17 @@ def poses_along(motion: Motion, pourer: Vessel, until: float) -> tuple[Floats, F
 
     Args:
         motion: planned or read back.
-        pourer: that it moves.
-        until: time after which no new poses come [s].
+        pourer: the moving vessel.
+        until: time after which no new poses occur [s].
 
     Returns:
-        Times (T,) [s] and poses (T, 7) x y z [m] qw qx qy qz; the first and the last one are among them.
+        Times (T,) [s] and poses (T, 7) x y z [m] qw qx qy qz; they include the first and the last one.
     """
     times = np.linspace(0.0, until, max(math.ceil(until / _FIRST_LOOK), 1) + 1)
     while True:
         poses = motion.sample(times)
         way = way_of(poses, pourer)
-        # Finer than asked for, so that few are left over when they are thinned; a jump gets no finer.
+        # Finer than needed, so that thinning leaves few samples; a jump is not refined.
         wide = np.flatnonzero((np.diff(way) > 0.2 * WAY) & (np.diff(times) > 1e-9))
         if not wide.size:
             break
@@ -185,10 +189,10 @@ class _Direction:
     shift: Floats
 
     def centre_distances(self) -> Floats:
-        """Least possible distance of every patch's points from the other solid, shape (T, P) [m]."""
+        """Smallest possible distance of every patch's points from the other solid, shape (T, P) [m]."""
         centres = np.einsum("pi,tij->tpj", self.samples.centres, self.turn) + self.shift[:, None]
         away = self.other.grid.lower_bound(centres.reshape(-1, 3)).reshape(centres.shape[:2])
-        # the interpolant may be off by a part of the spacing, so a patch is let go only with that to spare
+        # the interpolant may deviate by a part of the spacing, so a patch is excluded only beyond that margin
         return away - self.samples.radii - self.other.grid.spacing
 
     def nearest(self, pose: int, patches: NDArray[np.int64]) -> tuple[float, Floats]:
@@ -218,9 +222,9 @@ def first_contact(pourer: Vessel, receiver: Vessel, poses: Floats) -> Contact | 
 
     Args:
         pourer: the moving one.
-        receiver: the one that stands upright at the world's origin.
+        receiver: stands upright at the world's origin.
         poses: of the pourer's frame in the world, shape (T, 7), x y z [m] qw qx qy qz; no more than a few millimetres
-            apart (see `poses_along`), or a thin wall can pass another unseen.
+            apart (see `poses_along`), or a thin wall can pass another undetected.
 
     Returns:
         The contact, or None when they stay clear of each other.
@@ -261,18 +265,18 @@ def contact_during(
     *,
     receiver_at: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[Contact, float] | None:
-    """The first touch of two vessels during a motion.
+    """The first contact of two vessels during a motion.
 
     Args:
         motion: of the pourer.
         pourer: the moving one.
         receiver: stands upright.
-        receiver_at: where the receiver stands, off the place and height that were intended [m].
+        receiver_at: displacement of the receiver from its intended position [m].
 
     Returns:
         The contact and the pourer's tilt there [rad]; None when they stay clear of each other.
     """
-    # A planned pourer turns about one line, and comes back through the poses that it went through on its way out.
+    # A planned pourer turns about one line and returns through the same poses.
     until = motion.phases[0].end if isinstance(motion, PourMotion) else motion.duration
     times, poses = poses_along(motion, pourer, until)
     poses[:, :3] -= receiver_at
@@ -298,7 +302,7 @@ def clearance(pourer: Vessel, receiver: Vessel, poses: Floats) -> Floats:
         poses: shape (T, 7), see `first_contact`.
 
     Returns:
-        Shape (T,) [m]; negative where they overlap (then the depth as in `Contact`). Accurate to a part of the grids'
+        Shape (T,) [m]; negative if they overlap (then the depth as in `Contact`). Accurate to a part of the grids'
         spacing up to their margin (12 mm); farther apart it is an upper estimate, but never less than the margin.
 
     Raises:
@@ -310,7 +314,7 @@ def clearance(pourer: Vessel, receiver: Vessel, poses: Floats) -> Floats:
     for direction in (into_receiver, into_pourer):
         least = direction.centre_distances()
         for row in range(len(poses)):
-            # nearest patches first, until no other one can come closer
+            # nearest patches first, until no other one can be closer
             order = np.argsort(least[row])
             for start in range(0, len(order), 16):
                 batch = order[start : start + 16]
@@ -323,17 +327,17 @@ def clearance(pourer: Vessel, receiver: Vessel, poses: Floats) -> Floats:
 def describe_contact(
     contact: Contact, tilt: float | None = None, *, pourer: str = "the pourer", receiver: str = "the receiver"
 ) -> str:
-    """What to tell the person whose action it was.
+    """The message about a contact.
 
     Args:
         contact: from `first_contact`.
         tilt: of the pourer at that pose [rad], if known.
-        pourer: what to call it.
-        receiver: what to call it.
+        pourer: its name in the message.
+        receiver: its name in the message.
 
     Returns:
-        For instance 'cups touch: at tilt 37° the pourer (its rim, at x = 12 mm, z = 96 mm) enters the receiver by
-        4.1 mm'.
+        For instance 'cups touch: at tilt 37° the pourer (its rim, at x = 12 mm, z = 96 mm) enters the receiver by 4.1
+        mm'.
     """
     when = "" if tilt is None else f"at tilt {math.degrees(tilt):.0f}° "
     x, _, z = 1e3 * contact.point

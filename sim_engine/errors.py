@@ -1,4 +1,4 @@
-"""The base of Decant's errors, and why a pour can't be simulated. Light: importing this starts nothing."""
+"""The base of Decant's errors, and the errors of simulated pours. This module has no slow imports."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from collections.abc import Iterable
 
 
 class DecantError(Exception):
-    """Base of all errors that Decant's public functions raise on purpose; the text is for the user.
+    """Base of all errors that Decant's public functions raise deliberately; the text is for the user.
 
-    Errors of files that can't be opened, read or written remain Python's (`OSError`).
+    Errors of files that cannot be opened, read or written remain Python's (`OSError`).
     """
 
 
 class InvalidArgumentError(DecantError, ValueError):
-    """An argument of a public function can't be used; the text says which, and what would be right."""
+    """An argument of a public function is invalid; the text names it and a valid value."""
 
 
 class InvalidSceneError(DecantError, ValueError):
-    """The pour can't be made at all: the vessels touch, or the load does not fit. Nothing was simulated."""
+    """The pour is impossible: the vessels touch, or the load does not fit. Nothing was simulated."""
 
 
-class SimulationCancelled(Exception):  # noqa: N818 - a message, not a fault
-    """Nobody waits for this simulation any more."""
+class SimulationCancelled(Exception):  # noqa: N818 - a notification, not an error
+    """The simulation was cancelled, because its result is not needed any more."""
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str | None:
-    """The known word that a misspelt one most resembles, if any does."""
+    """The known word that is most similar to a misspelt one, if any is."""
     candidates = list(known)
     matches = difflib.get_close_matches(word, candidates, n=1, cutoff=0.6)
     if matches:

@@ -1,12 +1,11 @@
-"""Liquid in a tilted vessel without particles: what it retains at rest, where its surface stands, how fast it leaves.
+"""Hydrostatics of a tilted vessel, without particles: retained volume, level of the free surface, and outflow.
 
-A tilt θ turns the vessel about +y, so that it tips towards +x; a point (x, y, z) of the vessel's frame then stands
-z cos θ − x sin θ high. The spill point is the lip's lowest point then, or, in a tilted bottle, the inner corner of its
-neck if that stands higher. Volumes are midpoint sums over `Vessel.cavity_points`.
+A tilt θ turns the vessel about +y, so that it tips towards +x. A point (x, y, z) of the vessel's frame is then at the
+height z cos θ − x sin θ. The spill point is the lip's lowest point, or, in a tilted bottle, the inner corner of its
+neck if that is higher. Volumes are midpoint sums over `Vessel.cavity_points`.
 
-Limitations: the free surface stays horizontal (no sloshing, no drops that cling), and air gets in as fast as liquid
-gets out (no glugging), so a bottle's outflow is too fast. The lip is taken as a circle of the opening's radius; spouts
-let out less.
+Limitations: the free surface stays horizontal (no sloshing, no clinging drops). Air enters as fast as liquid leaves (no
+glugging), so a bottle's outflow is too fast. The lip is a circle of the opening's radius; spouts let out less.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ from sim_engine.vessel.vessel import Vessel
 Floats = NDArray[np.float64]
 
 GRAVITY = 9.81
-"""[m/s²]"""
+"""Acceleration of gravity [m/s²]."""
 
 DISCHARGE = 0.6
 """Discharge coefficient of the lip as a weir (Rehbock's C_d tends to 0.602 for a low head)."""
 
 FLOW_LIMIT = 1e-7
-"""Flow below which a pour counts as over: 0.1 mL/s, about two drips a second [m³/s]."""
+"""Flow below which a pour counts as ended: 0.1 mL/s, about two drips a second [m³/s]."""
 
 BINS = 4096
 """Bins in which points of a pool are counted by their height: 0.03 mm each."""
@@ -41,11 +40,11 @@ TIME_STEP = 0.01
 
 @dataclass(frozen=True)
 class SpillPoint:
-    """Where liquid leaves a tilted vessel.
+    """The point at which liquid leaves a tilted vessel.
 
     Attributes:
         height: above the vessel's origin, along the vertical [m].
-        z: its height along the vessel's axis; liquid beyond it is outside the pool already [m].
+        z: its height along the vessel's axis; liquid beyond it has already left the pool [m].
     """
 
     height: float
@@ -95,7 +94,7 @@ def _check_volume(vessel: Vessel, volume: float) -> None:
 
 
 def retained_volume(vessel: Vessel, tilt: float) -> float:
-    """Liquid that a tilted vessel holds at rest.
+    """Volume of liquid that a tilted vessel holds at rest.
 
     Args:
         vessel: any vessel.
@@ -123,7 +122,7 @@ def level(vessel: Vessel, volume: float, tilt: float) -> float:
         tilt: [rad], −π … π.
 
     Returns:
-        [m]; negative while nothing leaves. More than the tilted pool can hold gets the level of a full one.
+        [m]; negative while nothing leaves. A volume larger than the tilted pool gets the level of a full pool.
 
     Raises:
         ValueError: tilt or volume outside their ranges.
@@ -172,7 +171,7 @@ def _table(vessel: Vessel) -> _Table:
 
 
 def _surfaces(heights: Floats, each: float, volumes: Floats) -> Floats:
-    """Heights below which points make up some volumes, to a `BINS`th of their extent: a tenth of the price of sorting.
+    """Heights below which points make up given volumes, to 1/`BINS` of their extent: a tenth of the cost of sorting.
 
     Args:
         heights: of points [m].
@@ -190,10 +189,10 @@ def _lip_flow(radius: float, heads: Floats, tilt: float) -> Floats:
     """q / C_d = ∫ c(s) √(2g (h − s sin θ)) ds over the wetted part of a circular opening, per head h [m³/s].
 
     s runs along the opening's plane from the lip's lowest point, c(s) = 2√(s(2R − s)) is the chord there. With the
-    width L at a height, this is the tilting-cup equation q = ∫ L √(2g·depth) d(depth) / sin θ: what leaves crosses the
+    width L at a height, this is the tilting-cup equation q = ∫ L √(2g·depth) d(depth) / sin θ: the flow crosses the
     opening's plane, not its vertical projection.
     """
-    # s = R(1 − cos φ) takes the chord's square-root ends away
+    # s = R(1 − cos φ) removes the square-root singularities at the chord's ends
     phi = (np.arange(200) + 0.5) * math.pi / 200
     s = radius * (1.0 - np.cos(phi))
     chord_ds = 2.0 * (radius * np.sin(phi)) ** 2 * math.pi / 200
@@ -236,7 +235,7 @@ def _drain(
         place = math.sqrt(min(head / table.head, 1.0)) * (last_flow + 1)
         at = min(int(place), last_flow)
         q = flows[k][at] + (place - at) * (flows[k][at + 1] - flows[k][at])
-        # at most what stands above the spill point: head divided by d(head)/dV, and at most what is there
+        # at most the volume above the spill point: head divided by d(head)/dV, and at most the whole volume
         above = min(head / max(slope * per_volume, 1e-12), v)
         lost = min(discharge * q * dt, above)
         outflow[k] = lost / dt if dt > 0.0 else 0.0
@@ -246,7 +245,7 @@ def _drain(
 
 @dataclass(frozen=True)
 class LipFlow:
-    """What passes the lip during a pour, by the tilting-cup equation; all arrays (T,).
+    """Flow over the lip during a pour, by the tilting-cup equation; all arrays (T,).
 
     Attributes:
         times: evenly spaced [s].
@@ -319,13 +318,13 @@ def predicted_end_of_flow(
     *,
     flow_limit: float = FLOW_LIMIT,
 ) -> float:
-    """When a pour will have stopped: decides how long to hold the largest tilt.
+    """The time at which a pour ends: it determines the hold at the largest tilt.
 
     Args:
         vessel: the pourer.
         volume: in it at t = 0 [m³].
         tilt_of_time: tilts (T,) [rad] at times (T,) [s].
-        t_end: how far to look [s].
+        t_end: end of the examined time [s].
         flow_limit: flow that counts as none [m³/s].
 
     Returns:

@@ -1,19 +1,24 @@
 """The film at the lip and the falling stream of a planned pour, without particles, and their dimensionless numbers.
 
-From the tilting-cup equation (`sim_engine.hydrostatics`), ρ, σ and μ of the liquid, and g, at two places:
+They follow from the tilting-cup equation (`sim_engine.hydrostatics`), ρ, σ and μ of the liquid, and g, at two places:
 
-* **at the lip**: a film of thickness e and mean velocity U that leaves over the wetted width b of the opening,
-  Q = U e b. U = ∫√(2g·depth) dA / A over the wetted area A of the opening; the discharge coefficient is taken as the
-  jet's contraction, e = C_d A / b. That is what inertia makes of Q. Viscosity makes of it a film e = (3νQ/gb)^(1/3)
-  that runs down a vertical wall at U = Q/(b e), and a thicker one on any lesser slope: where that is thicker than what
-  inertia makes, it counts. Re = ρUe/μ, We = ρU²e/σ, Bo = ρge²/σ = (e / capillary length)².
-* **in the falling stream**, where it passes the level of the receiver's rim: v² = U² + 2g·(fall), a round stream of
-  diameter D = √(4Q/πv). Re = ρvD/μ, We = ρv²D/σ, Bo = ρgD²/σ.
+* **At the lip**: a film of thickness e and mean velocity U that leaves over the wetted width b of the opening, Q = U e
+  b.
 
-Source of the viscous film: Nusselt, Z. VDI 60 (1916): u = ge²/3ν in the mean.
+  Inertia: U = ∫√(2g·depth) dA / A over the wetted area A of the opening. The discharge coefficient is the jet's
+  contraction, e = C_d A / b.
 
-Limitations: the liquid's surface is level, so that in fast pours the film is thinner and faster than told. The opening
-is a circle; spouts concentrate the flow.
+  Viscosity: a film that runs down a vertical wall has e = (3νQ/gb)^(1/3) and U = Q/(b e); on any smaller slope it is
+  thicker. If this film is thicker than the inertial one, it is used.
+
+  Re = ρUe/μ, We = ρU²e/σ, Bo = ρge²/σ = (e / capillary length)².
+* **In the falling stream**, at the level of the receiver's rim: v² = U² + 2g·(fall), a round stream of diameter D =
+  √(4Q/πv). Re = ρvD/μ, We = ρv²D/σ, Bo = ρgD²/σ.
+
+Source of the viscous film: Nusselt, Z. VDI 60 (1916): mean velocity u = ge²/3ν.
+
+Limitations: the liquid's surface is assumed level, so in fast pours the true film is thinner and faster. The opening is
+a circle; spouts concentrate the flow.
 """
 
 from __future__ import annotations
@@ -33,8 +38,7 @@ Floats = NDArray[np.float64]
 Which = NDArray[np.bool_]
 
 EDGE = 0.05
-"""Every flow begins and ends with nothing, and all numbers with it: the part of what is poured that ranges leave out at
-either end."""
+"""Fraction of the poured liquid omitted at either end, since every flow and its numbers begin and end at zero."""
 
 
 def reynolds(liquid: Liquid, velocity: Floats, thickness: Floats) -> Floats:
@@ -59,7 +63,7 @@ def capillary_length(liquid: Liquid) -> float:
 
 @dataclass(frozen=True)
 class ValueRange:
-    """Smallest and largest value, SI, leaving out `EDGE` of what is poured at either end."""
+    """Smallest and largest value, SI, without `EDGE` of the poured liquid at either end."""
 
     smallest: float
     largest: float
@@ -67,7 +71,7 @@ class ValueRange:
 
 @dataclass(frozen=True)
 class FlowNumbers:
-    """What a place of the flow is like over a pour.
+    """Properties of the flow at one place during a pour.
 
     Attributes:
         velocity: [m/s].
@@ -82,7 +86,7 @@ class FlowNumbers:
     bond: ValueRange
 
     def as_json(self) -> dict[str, list[float]]:
-        """JSON-ready: [smallest, largest]; lengths in millimetres as people read them."""
+        """JSON-ready: [smallest, largest]; lengths in millimetres."""
         return {
             "velocity_m_s": [self.velocity.smallest, self.velocity.largest],
             "thickness_mm": [self.thickness.smallest * 1e3, self.thickness.largest * 1e3],
@@ -102,7 +106,7 @@ class FlowCourse:
         stream_velocity, diameter: of the stream at the receiver's rim [m/s], [m].
         covered: whether liquid covers the whole opening.
         lip: x of the lip in the world [m].
-        fall: from the lip to the level of the receiver's rim, 0 where it is not above it [m].
+        fall: from the lip to the level of the receiver's rim, 0 if it is not above it [m].
     """
 
     volume: Floats
@@ -115,19 +119,19 @@ class FlowCourse:
     fall: Floats
 
     def landing(self) -> float:
-        """Where the middle of the stream passes the level of the receiver's rim, x in the world [m].
+        """Position at which the middle of the stream passes the level of the receiver's rim, x in the world [m].
 
-        A free jet that leaves horizontally with the mean velocity at the lip; in simulated pours into a narrow cup
-        what is received falls to nothing within 15 mm of where this leaves the opening.
+        A free jet that leaves horizontally with the mean velocity at the lip. In simulated pours into a narrow cup the
+        received fraction falls to zero within 15 mm of the point where this position leaves the opening.
         """
         return self.quantile(self.lip + self.velocity * np.sqrt(2.0 * self.fall / GRAVITY), 0.5)
 
     def share(self, where: Which) -> float:
-        """Part of what is poured for which something holds."""
+        """Fraction of the poured liquid for which a condition holds."""
         return float(self.volume[where].sum() / self.volume.sum())
 
     def quantile(self, values: Floats, part: float) -> float:
-        """Value that this part of what is poured does not exceed."""
+        """Value that this fraction of the poured liquid does not exceed."""
         order = np.argsort(values)
         place = np.searchsorted(np.cumsum(self.volume[order]), part * self.volume.sum())
         return float(values[order][min(int(place), len(order) - 1)])
@@ -158,14 +162,14 @@ def flow_course(motion: Motion, liquid: Liquid, pourer: Vessel, receiver: Vessel
 
     Args:
         motion: of the pourer.
-        liquid: that the pourer holds at first.
+        liquid: initial content of the pourer.
         pourer, receiver: vessels.
 
     Returns:
         None if nothing leaves.
 
     Raises:
-        ValueError: the pourer can't hold the volume.
+        ValueError: the pourer cannot hold the volume.
     """
     times = np.linspace(0.0, motion.duration, max(2, math.ceil(motion.duration / 0.01)))
     flow = lip_flow(pourer, liquid.volume, times, motion.tilt(times))
@@ -208,10 +212,10 @@ class _Opening:
     """A circular opening under a level surface; arrays (K,).
 
     Attributes:
-        area: that liquid covers [m²].
-        width: of the liquid where it is widest [m].
+        area: covered by liquid [m²].
+        width: largest width of the liquid [m].
         ideal_flow: ∫√(2g·depth) dA [m³/s].
-        covered: all of it.
+        covered: whether liquid covers all of it.
     """
 
     area: Floats
@@ -224,7 +228,7 @@ def _wetted(radius: float, heads: Floats, tilts: Floats) -> _Opening:
     """s runs along the opening from the lip's lowest point; it is c(s) = 2√(s(2R − s)) wide, h − s sin θ deep there."""
     sine = np.maximum(np.abs(np.sin(tilts)), 1e-6)
     top = np.minimum(heads / sine, 2.0 * radius)
-    # s = top·(1 − cos φ)/2 takes the square roots' ends away
+    # s = top·(1 − cos φ)/2 removes the singularities of the square roots
     phi = (np.arange(100) + 0.5) * math.pi / 100
     s = top[:, None] * 0.5 * (1.0 - np.cos(phi))
     strips = 2.0 * np.sqrt(s * (2.0 * radius - s)) * top[:, None] * 0.5 * np.sin(phi) * math.pi / 100

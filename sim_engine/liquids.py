@@ -1,10 +1,13 @@
-"""Liquids and the simulator's knobs: what is poured (SI), and what calibration may turn: θ_s, nuisances.
+"""Liquids, and the parameters of the simulator.
 
-Liquids that laboratories pour, by name and temperature: density, viscosity, surface tension, from published data.
+- `Liquid` is a load of liquid in SI units.
+- `SimulationParameters` are the parameters that calibration may change: θ_s, and nuisances of the bench.
+- `look_up` returns density, viscosity and surface tension of common laboratory liquids by name and temperature, from
+  published data.
 
-Names: water, ethanol, isopropanol, rapeseed oil, 'glycerol 80 %' and 'sugar syrup 60 %' (percent by
-mass). What is not known to a few percent says so in `Source`. Tensions of solutions are rougher than their viscosities
-and matter less; contact angles depend on the vessel more than on the liquid, and are not in the table.
+Names: water, ethanol, isopropanol, rapeseed oil, 'glycerol 80 %' and 'sugar syrup 60 %' (percent by mass). If a value
+is uncertain by more than a few percent, `Source` states it. Tensions of solutions are less accurate than their
+viscosities and less important. Contact angles depend on the vessel more than on the liquid, and are not in the table.
 """
 
 from __future__ import annotations
@@ -20,32 +23,32 @@ from pydantic import BaseModel, ConfigDict, Field
 LARGEST_LIP_DROP = 1.0
 
 THIN = 5e-6
-"""Up to this kinematic viscosity a liquid is as thin as water to the solver: its boundary layers √(πνt), a millimetre
-or two in what a pour takes, are thinner than half a spacing of a usual simulation [m²/s]."""
+"""Largest kinematic viscosity at which the solver treats a liquid like water [m²/s]. Its boundary layers √(πνt), a
+millimetre or two during a pour, are thinner than half a spacing of a usual simulation."""
 
 NEUTRAL = 0.5 * math.pi
-"""Contact angle of a wall that is neither wet nor shunned: what the solver has where nobody says otherwise [rad]."""
+"""Contact angle of a wall that neither attracts nor repels the liquid: the solver's default [rad]."""
 
 FARTHEST_TILT = math.radians(5.0)
 
 SHOWN = {"mm": 1e-3, "deg": math.pi / 180.0}
-"""Units that people read in place of SI units, and what one of them is in SI."""
+"""Display units that replace SI units, and their values in SI."""
 
 
 def _nuisance(unit: str, shown: str, tolerance: float) -> dict[str, Any]:
-    """What a bench's nuisance declares beside default, bounds and meaning: `tolerance` is a standard deviation."""
+    """A nuisance's declaration besides default, bounds and meaning; `tolerance` is a standard deviation."""
     return {"unit": unit, "shown": shown, "tolerance": tolerance}
 
 
 @dataclass(frozen=True)
 class ParameterInfo:
-    """A simulation parameter as forms, schema and plots need it (bounds are those of the model field).
+    """A simulation parameter for forms, schema and plots (its bounds are those of the model field).
 
     Attributes:
         unit: SI; '1' for a plain number.
-        shown: unit that people read and write.
-        tolerance: of a bench's nuisance, the standard deviation that it is thought to have before anything is measured,
-            in SI; 0 for what is turned in the solver.
+        shown: display unit.
+        tolerance: of a bench's nuisance: its standard deviation before any measurement, in SI; 0 for parameters of the
+            solver.
     """
 
     name: str
@@ -64,7 +67,7 @@ class ParameterInfo:
 
     @property
     def nuisance(self) -> bool:
-        """Whether it is about how a bench differs from what was commanded, and not about the solver."""
+        """Whether it describes the difference between bench and command, instead of the solver."""
         return self.tolerance > 0.0
 
 
@@ -72,16 +75,17 @@ class Liquid(BaseModel):
     """A load of liquid.
 
     Attributes:
-        name: for people.
+        name: for display.
         mass: loaded mass [kg].
         density: [kg/m³].
         surface_tension: against air [N/m].
         dynamic_viscosity: [Pa s].
         contact_angle: of the liquid on the vessels [rad].
 
-    A liquid of more than `THIN` is simulated with this viscosity and this tension, and sticks to walls. For one as thin
-    as water they decide nothing: θ's `viscosity` and `cohesion` do, and it slips. From all of them and the planned flow
-    follows what a simulation can't tell, see `sim_engine.model_validity`. The defaults are water's at 20 °C.
+    A liquid above `THIN` is simulated with this viscosity and this tension, and sticks to walls. For a liquid as thin
+    as water these values have no effect: θ's `viscosity` and `cohesion` are used, and it slips. Together with the
+    planned flow they determine the effects that a simulation does not cover, see `sim_engine.model_validity`. The
+    defaults are water's at 20 °C.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -109,20 +113,22 @@ class Liquid(BaseModel):
         return self.kinematic_viscosity > THIN
 
     def free_fields(self) -> frozenset[str]:
-        """Fields that decide no request of this very liquid; of a thin one a simulation does not look at them."""
+        """Fields that do not affect any request of this liquid: a simulation of a thin liquid does not use them."""
         free = set() if self.is_thick else {"surface_tension", "dynamic_viscosity"}
         return frozenset(free | ({"contact_angle"} if self.contact_angle == NEUTRAL else set()))
 
     def millilitres(self, mass: float) -> float:
-        """Volume of some of it, as people read it [mL]; mass in [kg]."""
+        """Volume of a part of it [mL]; mass in [kg]."""
         return 1e6 * mass / self.density
 
 
 class SimulationParameters(BaseModel):
-    """What calibration may turn: θ_s and nuisances of the bench. Names follow FleX where it has one; meanings are ours.
+    """Parameters that calibration may change: θ_s and nuisances of the bench.
 
-    Nuisances say how a bench differs, pour after pour, from what was given: where the receiver stands, how the pourer
-    is held, how fast the arm's clock runs. The simulator applies them in one place (`PourTask.placement`).
+    Names follow FleX if it has one; the meanings are Decant's.
+
+    Nuisances describe constant differences of a bench from the commanded pour: the receiver's position, the grip of the
+    pourer, the speed of the arm. The simulator applies them in one place (`PourTask.placement`).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
@@ -131,48 +137,48 @@ class SimulationParameters(BaseModel):
     """Number of particles at fixed liquid volume; sets the spacing d = (V/N)^(1/3)."""
 
     cohesion: float = Field(default=0.02, ge=0.0, le=0.2, json_schema_extra={"unit": "N/m"})
-    """Surface tension [N/m], the same at any spacing: drops oscillate at Rayleigh's frequency.
-    Below about one capillary length per spacing (2.7 mm for water) it only acts on drips."""
+    """Surface tension [N/m], the same at any spacing: drops oscillate at Rayleigh's frequency. If the spacing exceeds
+    about one capillary length (2.7 mm for water), it only affects drips."""
 
     viscosity: float = Field(default=3.0, ge=0.0, le=60.0, json_schema_extra={"unit": "1/s"})
-    """Rate at which a particle's velocity relaxes to its neighbours' mean (XSPH) [1/s], whatever the time step, of
-    liquids as thin as water."""
+    """Rate at which a particle's velocity relaxes to its neighbours' mean (XSPH) [1/s], independent of the time step.
+    For liquids as thin as water."""
 
     viscosity_factor: float = Field(default=1.0, ge=0.1, le=10.0, json_schema_extra={"unit": "1"})
-    """Of liquids above 5 mm²/s: their true viscosity over that of the scene's liquid. A degree of temperature changes
+    """True viscosity divided by that of the scene's liquid, for liquids above 5 mm²/s. A degree of temperature changes
     it by 2 to 9 %, a point of water in glycerol by 10 %."""
 
     eddies: float = Field(default=0.17, ge=0.0, le=0.3, json_schema_extra={"unit": "1"})
-    """Smagorinsky's constant C: motion that is finer than a spacing has the viscosity (C d)² |S|. 0.17 follows from
+    """Smagorinsky's constant C: motion finer than a spacing has the viscosity (C d)² |S|. The value 0.17 follows from
     theory, and keeps streams of few particles as narrow as those of many. At 0 shear makes particles climb over each
     other and widens the stream, as in solvers without such a viscosity."""
 
     friction: float = Field(default=0.0, ge=0.0, le=1.0, json_schema_extra={"unit": "1"})
     """Coulomb coefficient between particles and vessel walls. Water slips along cups: 0.05 already delays the standard
-    pour by more than other solvers differ among themselves."""
+    pour by more than the differences between other solvers."""
 
     wall_distance: float = Field(default=0.5, ge=0.3, le=1.5, json_schema_extra={"unit": "1"})
     """Distance from a wall at which particles come to rest, in spacings (FleX: collision distance). At 0.5 a vessel
-    holds its true volume; more narrows vessels and raises lips, as walls made of particles do."""
+    holds its true volume; a larger value narrows vessels and raises lips, as walls made of particles do."""
 
     lip_drop: float = Field(default=0.5, ge=0.0, le=LARGEST_LIP_DROP, json_schema_extra={"unit": "1"})
-    """Rims are lower by so many spacings for particles at rest, and less the faster they are, down to not at all from
-    √(g d) on. A layer of particles can't be thinner than a spacing: at 0.5 its middle passes a lip with the head that a
-    film's needs. At 0 a lip holds back more, as in solvers that don't correct their lips."""
+    """Rims are lower by so many spacings for particles at rest, by less for faster particles, and not at all above the
+    speed √(g d). A layer of particles cannot be thinner than a spacing: at 0.5 its middle passes a lip with the head
+    that a true film needs. At 0 a lip holds back more, as in solvers that do not correct their lips."""
 
     receiver_x: float = Field(default=0.0, ge=-0.03, le=0.03, json_schema_extra=_nuisance("m", "mm", 0.005))
-    """The receiver stands that much further from the pourer than intended."""
+    """Displacement of the receiver away from the pourer."""
 
     receiver_y: float = Field(default=0.0, ge=-0.03, le=0.03, json_schema_extra=_nuisance("m", "mm", 0.003))
-    """The receiver stands that much sideways."""
+    """Sideways displacement of the receiver."""
 
     receiver_z: float = Field(default=0.0, ge=-0.03, le=0.03, json_schema_extra=_nuisance("m", "mm", 0.003))
-    """The receiver stands that much higher: the liquid falls less far."""
+    """Upward displacement of the receiver: the liquid falls less far."""
 
     tilt_zero: float = Field(
         default=0.0, ge=-FARTHEST_TILT, le=FARTHEST_TILT, json_schema_extra=_nuisance("rad", "deg", math.radians(0.7))
     )
-    """The pourer is held that much more tilted than commanded."""
+    """Additional tilt of the pourer beyond the command."""
 
     speed_factor: float = Field(default=1.0, ge=0.8, le=1.25, json_schema_extra=_nuisance("1", "1", 0.02))
     """Executed over commanded angular velocity."""
@@ -200,11 +206,11 @@ class SimulationParameters(BaseModel):
 
     @classmethod
     def nuisances(cls) -> dict[str, ParameterInfo]:
-        """Those that are about the bench."""
+        """The parameters of the bench."""
         return {name: info for name, info in cls.info().items() if info.nuisance}
 
     def of_the_solver(self) -> dict[str, float]:
-        """Values of those that are not about the bench."""
+        """Values of the solver's parameters, without those of the bench."""
         return self.model_dump(exclude=set(self.nuisances()))
 
     @classmethod
@@ -215,12 +221,12 @@ class SimulationParameters(BaseModel):
 
 
 ROOM = 20.0
-"""Temperature unless one is given [°C]."""
+"""Default temperature [°C]."""
 
 
 @dataclass(frozen=True)
 class Properties:
-    """What a liquid is like at a temperature.
+    """Properties of a liquid at a temperature.
 
     Attributes:
         density: [kg/m³].
@@ -239,9 +245,9 @@ class KnownLiquid:
 
     Attributes:
         name: without the share.
-        share: smallest and largest percent by mass; None: it is not a solution.
-        temperatures: for which the data are good [°C].
-        uncertainty: of the viscosity, a standard deviation over it: data, and a degree of temperature.
+        share: smallest and largest percent by mass; None if it is not a solution.
+        temperatures: range of the data [°C].
+        uncertainty: relative standard deviation of the viscosity, from the data and from one degree of temperature.
         source: of the data.
         at: properties at a temperature [°C] and a share [%].
     """
@@ -262,7 +268,7 @@ def _between(x: float, table: tuple[tuple[float, float], ...]) -> float:
 
 
 def _arrhenius(t: float, table: tuple[tuple[float, float], ...]) -> float:
-    """The logarithm's parabola in 1/T through the three points that are nearest (Lagrange)."""
+    """Parabola of the logarithm in 1/T through the three nearest points (Lagrange)."""
     near = sorted(sorted(table, key=lambda point: abs(point[0] - t))[:3])
     x = 1.0 / (t + 273.15)
     places = [1.0 / (point[0] + 273.15) for point in near]
@@ -384,10 +390,10 @@ def split_share(name: str) -> tuple[str, float | None]:
 
 
 def find(name: str) -> tuple[KnownLiquid, float] | None:
-    """The table's liquid of a name and the share in it [%]; None if there is none of that name.
+    """The table's liquid of a name and the share in it [%]; None if the name is unknown.
 
     Raises:
-        ValueError: it is a solution and says no share, or one that is outside the data.
+        ValueError: a solution without a share, or with one outside the data.
     """
     plain, share = split_share(name)
     for liquid in KNOWN:
@@ -415,7 +421,7 @@ def look_up(name: str, temperature: float = ROOM) -> Properties | None:
         None if the table has no such liquid.
 
     Raises:
-        ValueError: a share or a temperature outside the data, with what would be right.
+        ValueError: a share or a temperature outside the data; the text gives the valid range.
     """
     found = find(name)
     if found is None:

@@ -1,20 +1,21 @@
-"""What a planned pour calls for and the simulator does not have: told from dimensionless numbers, before it runs.
+"""Effects of a planned pour that the simulator does not cover, predicted from dimensionless numbers before it runs.
 
-The numbers are those of `sim_engine.lip_flow`. A warning is given when more than 5 % of what is poured leaves under
-such
-conditions; every pour begins and ends with a trickle.
+The numbers are those of `sim_engine.lip_flow`. A warning is given if more than 5 % of the poured liquid leaves under
+such conditions, since every pour begins and ends with a trickle. `regimes` returns a `ModelValidity` with a list of
+`NotCovered`.
 
 Sources:
-    Duez, Ybert, Clanet & Bocquet, Wetting controls separation of inertial flows from solid surfaces, PRL 104, 084503
-    (2010), and Bouwhuis & Snoeijer, The effect of surface wettability on inertial pouring flows (2015): a critical
-    Weber number, which grows with wetting and with the roundness of the edge.
-    Kistler & Scriven, The teapot effect, J. Fluid Mech. 263 (1994): wetting and its hysteresis.
-    Taylor, Proc. R. Soc. A 253 (1959): how fast the edge of a sheet recedes.
-    de Gennes, Brochard-Wyart & Quéré, Capillarity and Wetting Phenomena (2004), chapter 2: capillary length, puddles.
-    Bretherton, J. Fluid Mech. 10 (1961): bubbles that don't rise in narrow tubes.
-    Clanet & Searby, On the glug-glug of ideal bottles, J. Fluid Mech. 510 (2004).
+    - Duez, Ybert, Clanet & Bocquet, Wetting controls separation of inertial flows from solid surfaces, PRL 104, 084503
+      (2010), and Bouwhuis & Snoeijer, The effect of surface wettability on inertial pouring flows (2015): a critical
+      Weber number, which grows with wetting and with the roundness of the edge.
+    - Kistler & Scriven, The teapot effect, J. Fluid Mech. 263 (1994): wetting and its hysteresis.
+    - Taylor, Proc. R. Soc. A 253 (1959): speed at which the edge of a sheet recedes.
+    - de Gennes, Brochard-Wyart & Quéré, Capillarity and Wetting Phenomena (2004), chapter 2: capillary length, puddles.
+    - Bretherton, J. Fluid Mech. 10 (1961): bubbles that do not rise in narrow tubes.
+    - Clanet & Searby, On the glug-glug of ideal bottles, J. Fluid Mech. 510 (2004).
 
-Limitations: those of `sim_engine.lip_flow`; and the limits are orders of magnitude. No warning is no promise.
+Limitations: those of `sim_engine.lip_flow`. The limits are orders of magnitude; the absence of a warning guarantees
+nothing.
 """
 
 from __future__ import annotations
@@ -31,41 +32,44 @@ from sim_engine.scene import Scene
 from sim_engine.vessel.vessel import Vessel
 
 DRIBBLING_WEBER = 2.0
-"""Film at the lip: below it surface tension, which pulls a free sheet's edge back with 2σ, outweighs the momentum ρU²e
-that carries it away (Taylor 1959); a wetted wall at a right angle to the film holds it with up to as much,
-σ (1 + cos of the contact angle). Over round, well wetted edges liquid dribbles at several times that already."""
+"""Weber number of the film at the lip below which liquid dribbles. Surface tension, which pulls a free sheet's edge
+back with 2σ, then exceeds the momentum flux ρU²e that carries it away (Taylor 1959). A wetted wall at a right angle to
+the film holds it with up to the same force, σ (1 + cos of the contact angle). Over round, well wetted edges liquid
+already dribbles at several times this value."""
 
 WETTING_BOND = 1.0
-"""Film at the lip: below it the film is thinner than the capillary length √(σ/ρg). Liquid that does not wet its lip
-stands up to twice that length above it before it leaves, and one that does creeps over it."""
+"""Bond number of the film at the lip below which it is thinner than the capillary length √(σ/ρg). Liquid that does not
+wet its lip rises up to twice that length above it before it leaves; liquid that does creeps over it."""
 
 VISCOUS_REYNOLDS = 100.0
-"""Film at the lip: a boundary layer of 5√(νl/U) fills the film within the l ≈ 3e in which it gathers its speed at about
-Re = 75. Above, so short a time is not enough for the liquid's viscosity to be felt. Of liquids as thin as water only:
-of others it is simulated, …"""
+"""Reynolds number of the film at the lip below which viscosity matters. A boundary layer of 5√(νl/U) fills the film
+within the length l ≈ 3e in which it accelerates at about Re = 75; above, the time is too short for viscosity to act.
+For liquids as thin as water only; for others viscosity is simulated, …"""
 
 CREEPING = 2.0
-"""… up to this viscosity [Pa s], the largest that was held against theory (`decant physics film`) …"""
+"""… up to this viscosity [Pa s], the largest that was compared with theory (`decant physics film`) …"""
 
 FLOOR = 300e-6
-"""… and roughly below that kinematic viscosity [m²/s]: so much the solver adds by itself at most, in a tank 41 mm deep
-(`decant physics floor`, spacings of 4.1 to 5.9 mm, .05 and .2 m/s)."""
+"""… and approximately below this kinematic viscosity [m²/s], the largest that the solver itself adds in a tank 41 mm
+deep (`decant physics floor`, spacings of 4.1 to 5.9 mm, 0.05 and 0.2 m/s)."""
 
 PARTICLES_ACROSS = 2.0
-"""Particles across the falling stream: with fewer none has neighbours all around it, and the stream is a string."""
+"""Particles across the falling stream: with fewer, no particle has neighbours all around it, and the stream is a
+string.
+"""
 
 AIRTIGHT_BOND = 0.842
-"""Bond number of the opening: air does not rise into a narrower one that is full of liquid (Bretherton 1961)."""
+"""Bond number of the opening below which air does not rise into it while it is full of liquid (Bretherton 1961)."""
 
 
 @dataclass(frozen=True)
 class NotCovered:
-    """Something that decides where the liquid goes and that the simulator does not know.
+    """An effect that influences where the liquid goes and that the simulator does not model.
 
     Attributes:
         kind: 'dribbling', 'wetting', 'viscous', 'thin_stream', 'glugging' or 'airtight'.
-        share: of what is poured that leaves under such conditions.
-        text: what it is and what to do about it, for people.
+        share: fraction of the poured liquid that leaves under such conditions.
+        text: description and remedy, for the user.
     """
 
     kind: str
@@ -79,12 +83,12 @@ class NotCovered:
 
 @dataclass(frozen=True)
 class ModelValidity:
-    """What a planned pour is like.
+    """Flow of a planned pour, and its effects outside the model.
 
     Attributes:
         poured: fraction of the load that leaves, by the tilting-cup equation.
-        lip, stream: None where nothing leaves.
-        not_covered: what the simulator can't tell about this pour.
+        lip, stream: None if nothing leaves.
+        not_covered: effects of this pour that the simulator does not cover.
     """
 
     poured: float
@@ -105,17 +109,17 @@ class ModelValidity:
 def regimes(
     scene: Scene, action: Action, pourer: Vessel, receiver: Vessel, *, spacing: float, motion: Motion | None = None
 ) -> ModelValidity:
-    """What a planned pour is like, without simulating it.
+    """Analyse a planned pour without simulating it.
 
     Args:
         scene: its liquid, pivot and fixed values.
         action: complete action.
         pourer, receiver: geometry of the scene's vessels.
-        spacing: of the particles that the pour would be simulated with [m].
-        motion: other than the planned one.
+        spacing: of the particles in the pour's simulation [m].
+        motion: to use instead of the planned one.
 
     Raises:
-        ValueError: the pourer can't hold the load.
+        ValueError: the pourer cannot hold the load.
     """
     motion = plan_motion(scene, action, pourer, receiver) if motion is None else motion
     liquid = scene.liquid
@@ -181,7 +185,7 @@ def _viscous(course: FlowCourse, liquid: Liquid) -> NotCovered:
 
 
 def _thin_stream(course: FlowCourse, liquid: Liquid, spacing: float) -> NotCovered:
-    """Told of the median: the first and the last of any pour is a thin stream."""
+    """Uses the median, because every pour begins and ends with a thin stream."""
     median = course.quantile(course.diameter, 0.5)
     share = course.share(course.diameter < PARTICLES_ACROSS * spacing) if median < PARTICLES_ACROSS * spacing else 0.0
     enough = liquid.volume * (PARTICLES_ACROSS / median) ** 3
@@ -218,6 +222,6 @@ def _percent(share: float) -> str:
 
 
 def _rounded_up(number: float) -> str:
-    """To two digits, with a blank between thousands as elsewhere: '3 500'."""
+    """Rounded up to two digits, with a space between thousands: '3 500'."""
     digits = 10 ** max(math.floor(math.log10(number)) - 1, 0)
     return f"{math.ceil(number / digits) * digits:,}".replace(",", " ")

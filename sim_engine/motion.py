@@ -1,8 +1,11 @@
-"""Action → PourMotion: the pourer's pose over time. One definition: the arm executes it, the solver replays it.
+"""Action → PourMotion: the pourer's pose over time. The arm executes it and the solver replays it.
 
-Frames and signs: `sim_engine.action` (picture in docs/frames.md). The pourer stands upright at
-(−x_offset, y_offset) with its lip `height` above the receiver's rim, turns about a horizontal line along y (the pivot),
-holds, and returns upright.
+`plan_motion` makes a `PourMotion` of `Segment`s; `Motion` is the interface that executed motions share
+(`sim_engine.scene.SampledMotion`).
+
+Frames and signs: `sim_engine.action` (picture in docs/frames.md). The pourer stands upright at (−x_offset, y_offset)
+with its lip `height` above the receiver's rim, turns about a horizontal line along y (the pivot), holds, and returns
+upright.
 """
 
 from __future__ import annotations
@@ -59,7 +62,7 @@ class Motion(Protocol):
 
     @property
     def duration(self) -> float:
-        """[s]."""
+        """Duration [s]."""
         ...
 
     def sample(self, times: FloatArray) -> FloatArray:
@@ -72,7 +75,7 @@ class Motion(Protocol):
 
 
 def turn(start: float, from_tilt: float, to_tilt: float, speed: float, acceleration: float | None) -> list[Segment]:
-    """Segments that turn from rest to rest: trapezoid in velocity, triangle if the way is short, a step without
+    """Segments that turn from rest to rest: a trapezoid in velocity, a triangle if the turn is short, a step without
     `acceleration`.
 
     Args:
@@ -119,7 +122,7 @@ class PourMotion:
 
     @property
     def duration(self) -> float:
-        """[s]."""
+        """Duration [s]."""
         return self.phases[-1].end
 
     def tilt(self, times: FloatArray) -> FloatArray:

@@ -1,11 +1,12 @@
-"""What came of a pour, simulated or weighed: plain values.
+"""Outcomes of pours, simulated or weighed, and the deployment loss. Plain values.
 
-A simulated pour: what came of it, and its particles at some times where those were asked for.
+- `PourOutcome` and `SimulatedPour` are simulated; `SimulatedPour` also holds particles at some times if requested
+  (`RecordedFrames`).
+- `PourMeasurement` is weighed.
+- `normalised_spillage` and `Loss` are the quantities that are compared and minimised.
 
-What is minimised, written down once.
-
-Calibration compares the normalised spillage r = spilled / poured, which is undefined below 5 % poured.
-Deployment minimises, by default, (spilled + w·retained) / loaded, so that not pouring is not a solution.
+Calibration compares the normalised spillage r = spilled / poured, which is undefined below 5 % poured. Deployment
+minimises, by default, (spilled + w·retained) / loaded, so that not pouring is not a solution.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 
 class ParticleState(IntEnum):
-    """Where a particle is. Those from SPILLED on have left the solver for good."""
+    """Place of a particle. Particles from SPILLED on have left the solver for good."""
 
     IN_POURER = 0
     IN_FLIGHT = 1
@@ -29,12 +30,12 @@ class ParticleState(IntEnum):
 
 
 ESCAPED_LIMIT = 0.002
-"""Largest escaped fraction of a valid simulation: above it the solver has leaked, and nothing it says counts."""
+"""Largest escaped fraction of a valid simulation: above it the solver has leaked, and its results are invalid."""
 
 
 @dataclass(frozen=True)
 class Fractions:
-    """Where the liquid is at the end, as fractions of the load.
+    """Final places of the liquid, as fractions of the load.
 
     Attributes:
         poured: left the pourer (received + spilled + still in flight).
@@ -53,9 +54,9 @@ class PourOutcome:
 
     Attributes:
         received: inside the receiver.
-        spilled: in neither vessel and past any chance to get there.
+        spilled: in neither vessel and unable to reach one.
         retained: inside the pourer.
-        in_flight: still falling when the simulated time was over.
+        in_flight: still falling at the end of the simulated time.
         escaped: crossed solid vessel wall in a step; more than `ESCAPED_LIMIT` makes the outcome invalid.
         particles: number of particles.
         spacing: d = (V/N)^(1/3) [m].
@@ -93,7 +94,7 @@ class PourOutcome:
         return Fractions(self.received + self.spilled + self.in_flight, self.spilled, self.retained)
 
     def as_json(self) -> dict[str, Any]:
-        """JSON-ready mapping; lengths in millimetres as people read them."""
+        """JSON-ready mapping; lengths in millimetres."""
         return {
             "received": self.received,
             "spilled": self.spilled,
@@ -122,9 +123,9 @@ class PourMeasurement:
 
     Attributes:
         loaded: mass in the pourer before [kg].
-        spilled: mass beside the receiver [kg].
+        spilled: mass next to the receiver [kg].
         retained: mass left in the pourer after [kg].
-        notes: what the bench has to say about it (tare, settling time, drift …), JSON-ready.
+        notes: details from the bench (tare, settling time, drift …), JSON-ready.
     """
 
     loaded: float
@@ -134,7 +135,7 @@ class PourMeasurement:
 
     @property
     def delivered(self) -> float:
-        """Mass that must be in the receiver: what is neither left in the pourer nor beside the receiver [kg]."""
+        """Mass in the receiver: neither left in the pourer nor spilled next to the receiver [kg]."""
         return max(self.loaded - self.retained - self.spilled, 0.0)
 
     @property
@@ -160,20 +161,20 @@ class RecordedFrames:
     pourer_poses: NDArray[np.float64]
 
     def copied(self) -> RecordedFrames:
-        """The same in memory of its own."""
+        """A copy in its own memory."""
         positions, states = [np.array(p) for p in self.positions], [np.array(s) for s in self.states]
         return RecordedFrames(np.array(self.times), positions, states, np.array(self.pourer_poses))
 
 
 @dataclass(frozen=True)
 class SimulatedPour:
-    """A simulated pour; `frames` only if the task asked for any."""
+    """A simulated pour; `frames` only if the task requested any."""
 
     outcome: PourOutcome
     frames: RecordedFrames | None = None
 
     def copied(self) -> SimulatedPour:
-        """The same in memory of its own: arrays from a shared store would hold that for as long as they live."""
+        """A copy in its own memory: arrays from a shared store would occupy that as long as they live."""
         return self if self.frames is None else SimulatedPour(self.outcome, self.frames.copied())
 
 
@@ -207,13 +208,13 @@ class Loss:
     retained_weight: float = 1.0
 
     def __call__(self, fractions: Fractions, *, loaded_mass: float, particles: int) -> float | None:
-        """Loss of a pour, to be minimised; None where it is undefined.
+        """Loss of a pour, to be minimised; None if it is undefined.
 
         Args:
-            fractions: what came of the pour.
+            fractions: outcome of the pour.
             loaded_mass: [kg], for `grams`.
-            particles: number of particles that a simulation of it has (for a real pour: that the simulator would
-                have), for `particles`.
+            particles: number of particles in a simulation of the pour (for a real pour: in the simulator's), for
+                `particles`.
         """
         match self.name:
             case "spilled_and_retained":

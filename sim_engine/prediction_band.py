@@ -1,18 +1,22 @@
-"""How far a pour may come out from what was simulated of it: seeds, θ, shapes, what calibration left over, resolution.
+"""Prediction intervals: how far a single pour may deviate from its simulations.
 
-What lands beyond the rim is the tail of a stream whose landing places scatter about their median, to a good
-approximation normally: r = Φ(z), where z is the median's distance past the rim in the stream's own width. A simulator
-whose stream lands a little off is wrong by a shift of z, whatever spills: by next to nothing where the whole stream
-hits or misses, by most where half of it does. So errors of the simulator are stated as standard deviations of that
-shift. What calibration left over was found with coarse particles, and holds their error in its own scene: it is not
-added to what they are off in others, the larger of the two counts. A band is the interval of r in which a single pour
-lies with probability `LEVEL`.
+Contributions are the seeds, θ, shapes, the residual of the calibration, and the resolution. `band` and `band_of` return
+a `PredictionInterval`; `SampleStatistics` holds the mean over seeds and the deviation of a single one.
 
-Source: ours, by the above; measured in `docs/validation.md` (landing, convergence), held against unseen pours in
+Model. The liquid that lands beyond the rim is the tail of a stream whose landing positions scatter about their median,
+approximately normally: r = Φ(z). Here z is the median's distance past the rim, in units of the stream's width. If a
+simulator's stream lands slightly off, its error is a shift of z. The shift changes r by almost nothing if the whole
+stream hits or misses, and most if half of it does. Therefore errors of the simulator are stated as standard deviations
+of that shift.
+
+The calibration residual was measured with coarse particles, and contains their error in its own scene. It is not added
+to their error in other scenes; the larger of the two is used. A band is the interval of r that contains a single pour
+with probability `LEVEL`.
+
+Source: derived here; measured in `docs/validation.md` (landing, convergence), and compared with unseen pours in
 `docs/results.md`.
-Limitations: the shift of one pour says nothing about that of another, nor about liquid that stays in the pourer.
 
-What several seeds of one pour come to: a prediction is a mean, and how much a single pour differs from it.
+Limitations: the shift of one pour does not determine that of another, or the liquid that stays in the pourer.
 """
 
 from __future__ import annotations
@@ -26,29 +30,29 @@ from typing import Any
 from sim_engine.outcome import PourOutcome, normalised_spillage
 
 LEVEL = 0.9
-"""Probability that a single pour lies in its band."""
+"""Probability with which a single pour lies in its band."""
 
 RESOLUTION, RESOLUTION_AT = 0.25, 1_000
-"""Shift by which coarse particles are off (standard deviation), and the number of particles that it was measured with:
+"""Shift caused by coarse particles (standard deviation), and the number of particles at which it was measured. It is
 the root mean square of Φ⁻¹(r) − Φ⁻¹(limit) over those of the nineteen pours of `sim_engine.validation.convergence`
-whose limit is above one in a thousand (fifteen). With 500 particles it was .32: the error falls with the spacing, as
-N^(−1/3)."""
+whose limit is above one in a thousand (fifteen). With 500 particles it was 0.32: the error decreases with the spacing,
+as N^(−1/3)."""
 
 _NORMAL = NormalDist()
 _WIDEST = 8.0
-"""Φ is 0 or 1 to the last bit beyond it."""
+"""Φ is 0 or 1 to the last bit beyond this."""
 
 
 @dataclass(frozen=True)
 class PredictionInterval:
-    """Where the spillage of a single pour lies.
+    """Interval of the spillage of a single pour.
 
     Attributes:
-        low, high: ends of the interval of r = spilled / poured; less than half a particle is nothing.
-        level: probability that a pour lies in it.
-        simulations: standard deviation of r over the seeds, with the θ and the vessels' shapes if they took turns.
-        discrepancy: that of what the best θ lacks beside weighed pours; None where nothing was calibrated.
-        resolution: that of the number of particles.
+        low, high: ends of the interval of r = spilled / poured; less than half a particle counts as 0.
+        level: probability with which a pour lies in it.
+        simulations: standard deviation of r over the seeds, and over θ and the vessels' shapes if they varied.
+        discrepancy: standard deviation due to the best θ's residual against weighed pours; None without calibration.
+        resolution: standard deviation due to the number of particles.
     """
 
     low: float
@@ -63,7 +67,7 @@ class PredictionInterval:
         return self.low <= spillage <= self.high
 
     def percent(self, decimals: int = 1) -> str:
-        """For people: '1.2 … 6.0 %'."""
+        """As text: '1.2 … 6.0 %'."""
         return f"{100 * self.low:.{decimals}f} … {100 * self.high:.{decimals}f} %"
 
     def as_json(self) -> dict[str, Any]:
@@ -81,25 +85,25 @@ class PredictionInterval:
 
 
 def resolution_shift(particles: int) -> float:
-    """Standard deviation of the shift by which a simulation with so many particles is off its limit."""
+    """Standard deviation of the shift between a simulation with so many particles and its limit."""
     return float(RESOLUTION * (RESOLUTION_AT / particles) ** (1.0 / 3.0))
 
 
 def lacking_shift(particles: int, discrepancy: float | None) -> float:
-    """Standard deviation of the shift by which a pour is off its simulations.
+    """Standard deviation of the shift between a pour and its simulations.
 
-    By the number of particles, or by what calibration left over where that is more: it was found with coarse particles,
-    too, and holds their error.
+    It is the larger of the shift from the number of particles and the calibration residual, because the residual was
+    measured with coarse particles too and contains their error.
 
     Args:
         particles: of a simulation.
-        discrepancy: see `left_over`; None where nothing was calibrated.
+        discrepancy: see `left_over`; None without calibration.
     """
     return max(resolution_shift(particles), discrepancy or 0.0)
 
 
 def shift_of(spillage: float, particles: int) -> float:
-    """z of a simulated spillage. None or all of the particles spilled stands for half a particle less than one.
+    """z of a simulated spillage. If no particle or every particle is spilled, half a particle is added or subtracted.
 
     Args:
         spillage: r.
@@ -110,14 +114,14 @@ def shift_of(spillage: float, particles: int) -> float:
 
 
 def left_over(pairs: Sequence[tuple[float, float]], fitted: int) -> float | None:
-    """The shift that a calibration left over: how far its θ* stays from the pours that it was fitted to.
+    """The residual shift of a calibration: the difference between θ* and the pours to which it was fitted.
 
     Args:
         pairs: measured and simulated r of every pour.
-        fitted: number of parameters that were fitted.
+        fitted: number of fitted parameters.
 
     Returns:
-        Standard deviation of the shift about none; None where there are no more pours than parameters.
+        Standard deviation of the shift about 0; None if there are no more pours than parameters.
     """
     if len(pairs) <= fitted:
         return None
@@ -128,14 +132,14 @@ def left_over(pairs: Sequence[tuple[float, float]], fitted: int) -> float | None
 def band(
     spillages: Sequence[float], particles: int, discrepancy: float | None = None, level: float = LEVEL
 ) -> PredictionInterval:
-    """Where a single pour lies, given its simulations.
+    """The interval of a single pour, given its simulations.
 
     Args:
-        spillages: r of simulations of the pour with fresh seeds, which may take turns with θ of a posterior and with
-            shapes that the vessels may have; ≥ 1.
+        spillages: r of simulations of the pour with fresh seeds, which may alternate between θ of a posterior and
+            between possible shapes of the vessels; ≥ 1.
         particles: of a simulation.
-        discrepancy: shift that the calibration left (standard deviation); None where nothing was calibrated.
-        level: probability that a pour lies in it.
+        discrepancy: residual shift of the calibration (standard deviation); None without calibration.
+        level: probability with which a pour lies in it.
 
     Raises:
         ValueError: no simulation, or a level that is not between 0 and 1.
@@ -163,7 +167,7 @@ def band(
 
 
 def band_of(outcomes: Sequence[PourOutcome], discrepancy: float | None = None) -> PredictionInterval | None:
-    """The band of one pour's simulations; None where none of them has a spillage.
+    """The band of one pour's simulations; None if none of them has a spillage.
 
     Args:
         outcomes: of the same action, with fresh seeds, perhaps of several θ and shapes.
@@ -175,7 +179,7 @@ def band_of(outcomes: Sequence[PourOutcome], discrepancy: float | None = None) -
 
 
 def _quantile(places: Sequence[float], width: float, share: float) -> float:
-    """The quantile of an even mixture of normal distributions, by bisection."""
+    """The quantile of a mixture of normal distributions with equal weights, by bisection."""
     low, high = -_WIDEST, _WIDEST
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -204,7 +208,7 @@ class SampleStatistics:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> SampleStatistics | None:
-        """The spread of some values; None without any."""
+        """The statistics of some values; None without values."""
         if not values:
             return None
         mean = math.fsum(values) / len(values)
@@ -217,7 +221,7 @@ class SampleStatistics:
         return {"mean": self.mean, "deviation": self.deviation, "count": self.count}
 
     def percent(self, decimals: int = 1) -> str:
-        """A fraction for people: '3.1 ± 0.4 %'; of a single seed '3.1 %'."""
+        """A fraction as text: '3.1 ± 0.4 %'; of a single seed '3.1 %'."""
         spread = "" if self.deviation is None else f" ± {100 * self.deviation:.{decimals}f}"
         return f"{100 * self.mean:.{decimals}f}{spread} %"
 
@@ -226,8 +230,8 @@ def spreads(outcomes: Sequence[PourOutcome]) -> dict[str, SampleStatistics]:
     """Every fraction of some outcomes of one pour, and 'spillage', r = spilled / poured, over seeds.
 
     Args:
-        outcomes: of the same task but for the seed; invalid ones are left out. What has no valid outcome, and r where
-            too little was poured for it, is missing in the answer.
+        outcomes: of the same task except for the seed; invalid ones are left out. Quantities without a valid outcome
+            are missing in the result, and so is r if too little was poured.
     """
     valid = [outcome for outcome in outcomes if outcome.invalid is None]
     values = {name: [float(getattr(outcome, name)) for outcome in valid] for name in FRACTIONS}

@@ -1,8 +1,11 @@
-"""Where results that are slow to compute wait for the next run: one directory, safe to delete at any time.
+"""Resources of the machine: the cache directory, optional packages and compute backends.
 
-Packages that only some installations have, by the extra that brings them.
+- `load_arrays` and `store_arrays` keep results that are slow to compute in one cache directory, which may be deleted at
+  any time.
+- `require` checks that the package of an extra is installed.
+- `require_backend` refuses a missing backend before Taichi starts.
 
-Where kernels run. Light to import: a backend is refused before Taichi starts.
+This module has no slow imports.
 """
 
 from __future__ import annotations
@@ -35,8 +38,8 @@ _reported: set[Path] = set()
 def cache_directory() -> Path:
     """The cache directory, created on demand: $DECANT_CACHE_DIR, else the platform's user cache under 'decant'.
 
-    If it can't be written, such as in a home directory that is read-only, a folder of this user in the directory for
-    temporary files takes its place. That is logged once, with the cause.
+    If it cannot be written, for example in a read-only home directory, a folder of this user in the directory for
+    temporary files is used. This is logged once, with the cause.
 
     Raises:
         OSError: neither can be written; the text names both.
@@ -60,7 +63,10 @@ _CURE = f"${ENVIRONMENT_VARIABLE} to a folder that you can write"
 
 
 def _temporary(cause: str) -> Path:
-    """A folder that only this user can write: compiled kernels are executed, so that it must not be anybody else's."""
+    """A folder that only this user can write.
+
+    Compiled kernels are executed, so other users must not be able to write it.
+    """
     directory = Path(tempfile.gettempdir()) / f"decant-cache-{getpass.getuser() if os.name == 'nt' else os.getuid()}"
     try:
         directory.mkdir(mode=0o700, exist_ok=True)
@@ -88,7 +94,7 @@ def _configured() -> Path:
 
 
 def load_arrays(name: str) -> dict[str, NDArray[np.generic]] | None:
-    """Arrays stored under a name, or None when there are none or the file is damaged (it is removed then).
+    """Arrays stored under a name; None if there are none or the file is damaged (it is then removed).
 
     Args:
         name: file name without suffix.
@@ -99,13 +105,13 @@ def load_arrays(name: str) -> dict[str, NDArray[np.generic]] | None:
             return {key: stored[key] for key in stored.files}
     except FileNotFoundError:
         return None
-    except Exception:  # a truncated zip raises half a dozen kinds of error; none of them is worth a campaign
+    except Exception:  # a truncated zip file raises various errors; none of them should end a campaign
         discard(name)
         return None
 
 
 def discard(name: str) -> None:
-    """Remove what is stored under a name, if it is there and may be removed."""
+    """Remove the data stored under a name, if they exist and may be removed."""
     try:
         (cache_directory() / f"{name}.npz").unlink(missing_ok=True)
     except OSError:
@@ -118,7 +124,7 @@ def store_arrays(name: str, arrays: Mapping[str, NDArray[np.generic]], *, compre
     Args:
         name: file name without suffix.
         arrays: by name.
-        compressed: small on disk; what hardly gets any smaller is stored in a tenth of the time without.
+        compressed: smaller on disk; without compression storing takes a tenth of the time.
 
     Returns:
         Whether they were stored. A full or read-only disk costs time on the next run, not this one.
@@ -162,7 +168,7 @@ PACKAGES = {
     "skimage": "scikit-image",
     "pythonjsonlogger": "python-json-logger",
 }
-"""Importable name → name of the package that brings it, if they differ."""
+"""Importable name → name of the package that provides it, if they differ."""
 
 
 class MissingExtraError(DecantError, ImportError):
@@ -170,12 +176,12 @@ class MissingExtraError(DecantError, ImportError):
 
 
 def installed(module: str) -> bool:
-    """Whether a package is there; it is not imported."""
+    """Whether a package is installed; it is not imported."""
     return importlib.util.find_spec(module) is not None
 
 
 def require(module: str, what_for: str) -> None:
-    """Say which extra is missing before anything begins.
+    """Check that the package of an extra is installed.
 
     Args:
         module: one of `EXTRAS`.
@@ -197,17 +203,17 @@ BACKENDS: tuple[Backend, ...] = ("cpu", "cuda")
 
 
 class BackendError(DecantError, RuntimeError):
-    """A backend was asked for that is not there."""
+    """A requested backend is not available."""
 
 
 def require_backend(backend: str) -> None:
-    """Make sure that this machine has a backend; Taichi itself would fall back to another without a word.
+    """Check that this machine has a backend; Taichi itself would silently use another one.
 
     Args:
         backend: one of `BACKENDS`.
 
     Raises:
-        BackendError: with what to do.
+        BackendError: with the remedy.
     """
     if backend not in BACKENDS:
         raise BackendError(f"there is no backend '{backend}'; there are {', '.join(BACKENDS)}")
@@ -219,7 +225,7 @@ def require_backend(backend: str) -> None:
 
 
 def cuda_devices() -> int:
-    """How many devices NVIDIA's driver finds; 0 without a driver."""
+    """Number of devices that NVIDIA's driver finds; 0 without a driver."""
     try:
         driver = ctypes.CDLL("libcuda.so.1")
     except OSError:

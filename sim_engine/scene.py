@@ -1,6 +1,8 @@
-"""What is asked of a simulator: a scene, an action, θ_s and a seed. Small values without Taichi.
+"""Input of a simulation: a scene, an action, θ_s and a seed. Small values without Taichi.
 
-A motion that an arm has executed, read back from it. Planned motions need a task's scene.
+- `PourTask` is one simulated pour in a `Scene`.
+- `PoseError` is the difference between the real and the intended placement.
+- `SampledMotion` is a motion that was read back from an arm. Planned motions are in `sim_engine.motion`.
 """
 
 from __future__ import annotations
@@ -37,11 +39,13 @@ class SampledMotion:
 
     @property
     def duration(self) -> float:
-        """[s]."""
+        """Duration [s]."""
         return float(self.times[-1])
 
     def sample(self, times: FloatArray) -> FloatArray:
-        """Linear in position; normalised linear in the quaternion (fine for samples a few degrees apart)."""
+        """Poses at times: linear in position, normalised linear in the quaternion (accurate for samples a few degrees
+        apart).
+        """
         t = np.asarray(times, dtype=float)
         out = np.stack([np.interp(t, self.times, self.poses[:, k]) for k in range(7)], axis=-1)
         out[..., 3:] /= np.linalg.norm(out[..., 3:], axis=-1, keepdims=True)
@@ -74,7 +78,7 @@ class Scene:
     """Everything about a pour that is not chosen: vessels, liquid, pivot, fixed action dimensions.
 
     Attributes:
-        name: key by which strategies and the journal refer to it.
+        name: key in strategies and the journal.
         fixed: action dimensions that are not searched, SI (None switches an optional one off).
         hold_cap: longest hold 'until the predicted end of flow' [s].
     """
@@ -93,23 +97,23 @@ class Scene:
 
     @property
     def uncertain(self) -> bool:
-        """Whether it is known how far the shape of one of its vessels may be off."""
+        """Whether the shape of one of its vessels has a known uncertainty."""
         return self.pourer.uncertain or self.receiver.uncertain
 
     def drawn(self, seed: int) -> Scene:
-        """The scene with vessels as they may as well be, see `VesselSpec.drawn`."""
+        """The scene with vessels drawn from their uncertain shapes, see `VesselSpec.drawn`."""
         return replace(self, pourer=self.pourer.drawn(seed), receiver=self.receiver.drawn(seed))
 
 
 @dataclass(frozen=True)
 class PoseError:
-    """How the real placement differs from the intended one (the virtual bench's grip and placement errors).
+    """Difference between real and intended placement (the virtual bench's errors of grip and placement).
 
     Attributes:
-        x: the receiver stands that much further from the pourer [m].
-        y: … and that much sideways [m].
-        z: … and that much higher [m].
-        tilt: the pourer is held that much more tilted than commanded [rad].
+        x: displacement of the receiver away from the pourer [m].
+        y: sideways displacement of the receiver [m].
+        z: upward displacement of the receiver [m].
+        tilt: additional tilt of the pourer beyond the command [rad].
         speed_factor: executed over commanded angular velocity.
     """
 
@@ -147,11 +151,11 @@ class PourTask:
 
     Attributes:
         seed: of the initial positions; same task, same seed → same bits on one CPU thread.
-        record_rate: frames of all particles kept per simulated second; 0 keeps none.
+        record_rate: frames of all particles that are kept per simulated second; 0 keeps none.
         parameters: θ_s, and the bench's nuisances.
-        pose_error: deviations of this one pour, beside those nuisances; None for a plain simulation.
-        motion: what an arm did, read back from it, in place of the motion planned for `action`; what of `pose_error`
-            changes a motion must then be in it already.
+        pose_error: deviations of this one pour in addition to those nuisances; None for a plain simulation.
+        motion: executed motion that was read back from an arm, instead of the motion planned for `action`. It must
+            already contain the parts of `pose_error` that change a motion.
     """
 
     scene: Scene
@@ -169,9 +173,10 @@ class PourTask:
 
     @property
     def placement(self) -> PoseError:
-        """How the pour truly goes: nuisances of the bench and `pose_error` together, the one place that joins them.
+        """The real placement of the pour: the nuisances of the bench and `pose_error` are combined here only.
 
-        An executed motion tells its own tilt and speed; of the nuisances it leaves the receiver's place.
+        An executed motion contains its own tilt and speed; then only the receiver's position is taken from the
+        nuisances.
         """
         nuisances = PoseError.of(self.parameters)
         if self.motion is not None:

@@ -38,7 +38,7 @@ class Axis:
             raise ValueError(f"{self.name}: a log scale needs a lower bound above 0, got {self.lower}")
 
     def decode(self, unit: float) -> float:
-        """Value at a place in the unit interval (clipped into it)."""
+        """Value at a position in the unit interval (clipped to it)."""
         u = min(max(float(unit), 0.0), 1.0)
         if self.scale == "log":
             value = math.exp(math.log(self.lower) + u * (math.log(self.upper) - math.log(self.lower)))
@@ -48,7 +48,7 @@ class Axis:
         return float(round(value)) if self.integer else value
 
     def encode(self, value: float) -> float:
-        """Place in the unit interval of a value; outside the bounds it leaves [0, 1]."""
+        """Position of a value in the unit interval; values outside the bounds lie outside [0, 1]."""
         if self.scale == "log":
             return (math.log(value) - math.log(self.lower)) / (math.log(self.upper) - math.log(self.lower))
         return (value - self.lower) / (self.upper - self.lower)
@@ -81,7 +81,7 @@ class Space:
         return {axis.name: axis.decode(u) for axis, u in zip(self.axes, unit, strict=True)}
 
     def encode(self, values: Mapping[str, float]) -> NDArray[np.float64]:
-        """Point of the unit cube for named values, shape (dimension,). Further names are ignored.
+        """Point of the unit cube for named values, shape (dimension,). Other names are ignored.
 
         Raises:
             KeyError: a value for one of the axes is missing.

@@ -1,18 +1,17 @@
-"""PourTask → PourOutcome: sets the scene, runs the solver until nothing can change any more, and counts.
+"""PourTask → PourOutcome: sets up the scene, runs the solver until the outcome is final, and counts particles.
 
-Light to import; Taichi starts with the first simulation.
+`PourSimulator` runs pours. Importing this module is fast; Taichi starts with the first simulation.
 
-Initial positions: a jittered lattice that fills the pourer from the bottom.
+- **Initial positions** (`fill`): a jittered lattice that fills the pourer from the bottom.
+- **Time loop** (`TimeLoop`, `follow`): slices of time, recordings between them, the end of the pour, and its outcome.
+- **Quiescent start** (`calm_until`): the time at which a simulation has to begin. Until then the liquid lies level in a
+  slowly turning cup, and hydrostatics describes it completely.
 
-The course of a simulated pour: slices of time, what is seen between them, when it is over, and what came of it.
+A slow pour spends half of its time before any liquid can leave. Simulating this time costs as much as the pour and does
+not affect the outcome. Therefore the lattice is laid level into the tilted cup shortly before it may spill, and moves
+with it from then on. This is allowed only while the motion is slow, so that the waves it could have caused are low.
 
-When a simulation has to begin: of liquid that lies level in a slowly turning cup hydrostatics knows all.
-
-A slow pour spends half of its time before anything can leave. Simulating that costs as much as the pour and decides
-nothing. So the lattice is laid level into the cup as it is tilted shortly before it may spill, and moves off with it.
-That is allowed only while the motion is slow: waves that it could have made must be low.
-
-Source: ours. Limitations: waves from before the begin are left out; `CALM` bounds them.
+Source of the quiescent start: derived here. Limitations: waves from before the start are left out; `CALM` bounds them.
 """
 
 from __future__ import annotations
@@ -43,11 +42,11 @@ if TYPE_CHECKING:
     from sim_engine.fluid.engine import FluidEngine
 
 JITTER = 0.05
-"""Largest displacement from the lattice, in spacings; it makes seeds differ and breaks the crystal."""
+"""Largest displacement from the lattice, in spacings; it makes seeds differ and breaks the crystal order."""
 
 
 def spacing(volume: float, particles: int) -> float:
-    """d = (V/N)^(1/3) [m]."""
+    """The particle spacing d = (V/N)^(1/3) [m]."""
     return float((volume / particles) ** (1.0 / 3.0))
 
 
@@ -60,9 +59,10 @@ def fill(
         vessel: filled from below.
         volume: of the liquid [m³].
         particles: N.
-        wall_distance: lattice points keep about that many spacings from solid, as the density constraint will.
+        wall_distance: approximate distance of lattice points from solid, in spacings, as the density constraint keeps
+            it.
         tilt: of the vessel when it is filled, towards +x [rad].
-        seed: shifts the lattice, jitters it, and chooses among the places of the topmost layer.
+        seed: shifts the lattice, jitters it, and selects places of the topmost layer.
 
     Returns:
         Shape (N, 3), float32, in the vessel's frame [m].
@@ -72,8 +72,8 @@ def fill(
     """
     rng = np.random.default_rng(seed)
     d = spacing(volume, particles)
-    # A narrow or brimful vessel may leave the lattice too few places: then squeeze it, the solver relaxes it again.
-    # Rims are lowered for particles, so the uppermost spacing is used only if nothing else helps.
+    # In a narrow or brimful vessel the lattice may have too few places: then it is compressed, and the solver relaxes
+    # it. Rims are lower for particles, so the uppermost spacing is used only if nothing else helps.
     for top in (vessel.rim_height - d, vessel.rim_height):
         for squeeze in (1.0, 0.98, 0.96, 0.94, 0.92, 0.9, 0.87, 0.84):
             places = _lattice(vessel, d, d * squeeze, wall_distance, top, rng)
@@ -108,28 +108,28 @@ def _lattice(
 
 
 SLICE = 0.02
-"""The solver is called for so much simulated time at once; curve and frames are taken between calls [s]."""
+"""Simulated time of one call of the solver [s]; curve and frames are recorded between calls."""
 
 QUIET = 0.15
-"""With nothing in flight for so long after the motion (or with an empty pourer), the pour is over [s]."""
+"""Time without liquid in flight after the motion, or with an empty pourer, after which the pour has ended [s]."""
 
 LONGEST_TAIL = 1.0
-"""The pour ends so long after the motion even if something is still in flight [s]."""
+"""Time after the motion at which the pour ends even if liquid is still in flight [s]."""
 
 
 @dataclass
 class TimeLoop:
-    """One pour on its way.
+    """The simulation of one pour.
 
     Attributes:
-        task, motion: what is simulated.
-        start: time from which it is simulated, a multiple of `SLICE`; the liquid lies level before [s].
-        scene: its place in the engine.
-        times, poured, spilled: what was seen: [s], fractions.
+        task, motion: of the pour.
+        start: time at which the simulation begins, a multiple of `SLICE`; the liquid lies level before [s].
+        scene: its index in the engine.
+        times, poured, spilled: recorded curve: [s], fractions.
         frames: time, positions (N, 3) [m], states (N,).
-        slices: how far it is, in `SLICE`.
-        over: nothing can change any more.
-        cpu_s: that the process spent on it; for pours side by side an even share.
+        slices: time reached, in `SLICE`.
+        over: whether the outcome is final.
+        cpu_s: CPU time of the process for this pour [s]; pours that run side by side share it evenly.
 
     Raises:
         ValueError: it would start within a slice.
@@ -156,11 +156,11 @@ class TimeLoop:
 
     @property
     def clock(self) -> float:
-        """Time that was simulated to [s]."""
+        """Simulated time reached [s]."""
         return self.slices * SLICE
 
     def look(self, fluid: FluidEngine, counts: NDArray[np.int32]) -> None:
-        """Take down what is to be seen between two slices, and decide whether the pour is over.
+        """Record the state between two slices, and decide whether the pour has ended.
 
         Args:
             fluid: the engine.
@@ -179,7 +179,7 @@ class TimeLoop:
         if fluid.fault(self.scene) is not None or self.clock >= self.motion.duration + LONGEST_TAIL:
             self.over = True
             return
-        # Over when nothing is in flight and nothing can start to fly.
+        # The pour has ended when nothing is in flight and nothing more can leave.
         if counts[ParticleState.IN_FLIGHT] > 0:
             self._still_since = None
         elif self._still_since is None:
@@ -192,7 +192,7 @@ def follow(fluid: FluidEngine, courses: Sequence[TimeLoop], cancelled: Callable[
     """Advance neighbouring scenes slice by slice until all are over.
 
     Raises:
-        SimulationCancelled: `cancelled` said so.
+        SimulationCancelled: `cancelled` returned True.
     """
     first, end = courses[0].scene, courses[-1].scene + 1
     until = np.zeros(end)
@@ -220,12 +220,12 @@ def follow(fluid: FluidEngine, courses: Sequence[TimeLoop], cancelled: Callable[
 
 
 def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome:
-    """Count where everybody ended.
+    """Count the particles by their final place.
 
     Args:
         fluid: the engine.
-        course: of a pour that is over.
-        loading: CPU seconds that setting it up took.
+        course: of a pour that has ended.
+        loading: CPU time of its setup [s].
     """
     n, scene = course.task.parameters.particles, course.scene
     counts = fluid.census(scene)
@@ -268,26 +268,26 @@ def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome
 Floats = NDArray[np.float64]
 
 LEAD = 0.3
-"""The simulation begins so long before the level is `FREEBOARD` below the lip [s]."""
+"""Time by which the simulation begins before the level is `FREEBOARD` below the lip [s]."""
 
 FREEBOARD = 0.12
-"""In opening radii: below that, no wave that `CALM` allows reaches the lip."""
+"""Distance of the level below the lip, in opening radii: no wave that `CALM` allows reaches the lip from there."""
 
 CALM = 0.06
-"""Waves may be so high, in opening radii: 2.4 mm in a cup of 40 mm, about what turning it at 30 deg/s makes."""
+"""Largest wave height, in opening radii: 2.4 mm in a cup of 40 mm, about that of a turn at 30 deg/s."""
 
 STEP = SLICE
-"""Resolution [s]. A simulation can begin between two slices of its course only, and begins at a multiple of this."""
+"""Resolution of the start [s]: a simulation begins between two slices of its time loop."""
 
 FALL = 2e-3
-"""A tilt that has come down so far is on its way back; less is the tremor of an arm that was read back [rad]."""
+"""Decrease of the tilt above which the motion is on its way back; less is tremor of an arm that was read back [rad]."""
 
 
 def wave_height(velocities: Floats, step: float, radius: float) -> float:
-    """Largest height of the waves in a cup that is moved about.
+    """Largest height of the waves in a moving cup.
 
-    The first lateral mode as an undamped oscillator that accelerations push, ω² = 1.84 g / R (deep liquid):
-    |∫ a(t) exp(iωt) dt| / ω. A sudden start at a speed u raises u/ω, a steady acceleration a about 2 R a / (1.84 g).
+    The first lateral mode is an undamped oscillator driven by accelerations, ω² = 1.84 g / R (deep liquid): |∫ a(t)
+    exp(iωt) dt| / ω. A sudden start at a speed u raises u/ω, a steady acceleration a about 2 R a / (1.84 g).
 
     Args:
         velocities: of the cup, shape (T, 3), `step` apart; it is at rest before [m/s].
@@ -295,7 +295,7 @@ def wave_height(velocities: Floats, step: float, radius: float) -> float:
         radius: R [m].
 
     Returns:
-        At the wall [m].
+        Height at the wall [m].
     """
     frequency = math.sqrt(1.841 * GRAVITY / radius)
     pushes = np.diff(velocities[:, :2], axis=0, prepend=0.0)
@@ -313,7 +313,7 @@ def calm_until(motion: Motion, pourer: Vessel, volume: float) -> float:
         volume: of the liquid [m³].
 
     Returns:
-        A multiple of `STEP` [s]; 0 if the pour has to be simulated from its begin.
+        A multiple of `STEP` [s]; 0 if the pour has to be simulated from its start.
     """
     times = np.arange(0.0, motion.duration + STEP, STEP)
     if len(times) < 4:
@@ -344,7 +344,7 @@ def _last_below(pourer: Vessel, volume: float, tilts: Floats) -> int:
 
 
 def liquid_velocity(motion: Motion, pourer: Vessel, time: float) -> Floats:
-    """Velocity of the pourer's middle, shape (3,) [m/s]."""
+    """Velocity of the pourer's centre, shape (3,) [m/s]."""
     places = _middles(motion, pourer, np.array([time, time + 1e-3]))
     return np.asarray((places[1] - places[0]) / 1e-3)
 
@@ -365,11 +365,11 @@ __all__ = [
 ]
 
 SETTLING = 0.15
-"""The lattice may settle so long before the motion begins [s]."""
+"""Time for the lattice to settle before the motion begins [s]."""
 
 PLANES_KEPT = 16
 VESSELS_KEPT = 32
-"""About 3 MB each; a prediction draws the shapes of uncertain vessels anew for each of its simulations."""
+"""Number of vessels kept, about 3 MB each; a prediction draws a new shape of uncertain vessels for each simulation."""
 
 
 def check_motion(
@@ -378,7 +378,7 @@ def check_motion(
     """Refuse a motion in which the vessels touch.
 
     Raises:
-        InvalidSceneError: with where, how deep and at which tilt.
+        InvalidSceneError: with position, depth and tilt.
     """
     found = contact_during(motion, pourer, receiver, receiver_at=(error.x, error.y, error.z))
     if found is not None:
@@ -388,7 +388,7 @@ def check_motion(
 
 
 class PourSimulator:
-    """Simulates pours, one by one or many in a call. One per process: Taichi's arrays are shared.
+    """Simulates pours, one by one or many in one call. One per process: Taichi's arrays are shared.
 
     Args:
         backend: 'cpu' or 'cuda'.
@@ -404,7 +404,7 @@ class PourSimulator:
         """A vessel, built once; the last few are kept.
 
         Raises:
-            VesselError: it can't be built.
+            VesselError: it cannot be built.
         """
         if spec not in self._vessels:
             if len(self._vessels) >= VESSELS_KEPT:
@@ -416,7 +416,7 @@ class PourSimulator:
         return self._vessels[spec]
 
     def prepare(self, task: PourTask) -> Motion:
-        """Everything that can be refused before anything moves: load, vessels, contact.
+        """Check everything that can be refused before the simulation: load, vessels, contact. Returns the motion.
 
         Raises:
             InvalidSceneError: with the reason.
@@ -444,9 +444,9 @@ class PourSimulator:
             The outcome; `outcome.invalid` says why a result must not be used (leak, divergence).
 
         Raises:
-            InvalidSceneError: the pour can't be made.
-            SimulationCancelled: `cancelled` said so.
-            BackendError: the backend is not there.
+            InvalidSceneError: the pour is impossible.
+            SimulationCancelled: `cancelled` returned True.
+            BackendError: the backend is not available.
         """
         (run,) = self.simulate_many([task], cancelled=cancelled)
         return run
@@ -456,20 +456,20 @@ class PourSimulator:
     ) -> list[SimulatedPour]:
         """Run many pours, of any actions, θ, vessels and seeds, in one set of kernels.
 
-        On a CPU the pours follow each other; on a GPU they run side by side, as many as there is memory for. Every
-        outcome is the one that the pour has alone.
+        On a CPU the pours run one after another; on a GPU they run side by side, as many as fit into memory. Every
+        outcome equals that of the pour alone.
 
         Args:
             tasks: what to simulate.
             cancelled: polled every `SLICE` of simulated time.
 
         Returns:
-            As many runs, in the same order.
+            The simulated pours, in the same order.
 
         Raises:
-            InvalidSceneError: one of the pours can't be made; nothing was simulated.
-            SimulationCancelled: `cancelled` said so.
-            BackendError: the backend is not there.
+            InvalidSceneError: one of the pours is impossible; nothing was simulated.
+            SimulationCancelled: `cancelled` returned True.
+            BackendError: the backend is not available.
         """
         from sim_engine.fluid.engine import engine
 
@@ -516,7 +516,7 @@ class PourSimulator:
         ]
 
     def _laid(self, task: PourTask, motion: Motion, at: float) -> NDArray[np.float32]:
-        """Positions of the liquid at rest in the pourer as it stands at a time [s], (N, 3) in the world [m]."""
+        """Positions of the liquid at rest in the pourer in its pose at a time [s], (N, 3) in the world [m]."""
         # The lattice is laid into the upright cup; a tilt error of the grip then moves cup and liquid together.
         tilt = float(motion.tilt(np.array([at]))[0]) if at > 0.0 else 0.0
         pourer, parameters = self.vessel(task.scene.pourer), task.parameters
@@ -536,7 +536,7 @@ class PourSimulator:
         return [(float(t), self._laid(task, motion, float(t)), homes) for t in times]
 
     def _setup(self, task: PourTask, motion: Motion, start: float) -> SceneSetup:
-        """The scene as the engine takes it, at the time from which it has to be simulated [s]."""
+        """The scene for the engine, from the time at which its simulation begins [s]."""
         from sim_engine.fluid.state import SUPPORT
 
         scene, parameters, error = task.scene, task.parameters, task.placement
@@ -563,7 +563,7 @@ class PourSimulator:
         )
 
     def _walls(self, spec: VesselSpec, support: float) -> SolidWalls:
-        """The vessel's; the last few planes are kept, for calibration changes θ again and again."""
+        """The walls of a vessel; the last few planes are kept, because calibration changes θ repeatedly."""
         vessel = self.vessel(spec)
         key = (spec, support)
         if key not in self._planes:
@@ -582,7 +582,7 @@ class PourSimulator:
 
 
 def recorded_frames(course: TimeLoop, motion: Motion) -> RecordedFrames | None:
-    """The frames, if any were asked for."""
+    """The frames, if any were requested."""
     if not course.frames:
         return None
     times = np.array([t for t, _, _ in course.frames])

@@ -1,4 +1,4 @@
-"""Which sources a pour is simulated by: results of the same ones belong together."""
+"""Fingerprint of the solver's sources: results of the same sources belong together."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 BEGINNINGS = ("sim_engine.simulator", "sim_engine.fluid.engine")
-"""What simulates a pour; the engine is imported when it is needed."""
+"""Modules from which the search begins; the engine is imported only when it is needed."""
 
 
 def solver_fingerprint(root: Path = ROOT) -> str:
-    """Hash of what the solver's modules do, in 16 digits: neither comments, docstrings nor layout count.
+    """Hash of the solver's code, in 16 digits: comments, docstrings and layout do not change it.
 
     Args:
-        root: folder that `sim_engine` lies in.
+        root: folder that contains `sim_engine`.
     """
     digest = hashlib.sha256()
     for name, tree in sorted(_modules(root).items()):
@@ -24,7 +24,7 @@ def solver_fingerprint(root: Path = ROOT) -> str:
 
 
 def _modules(root: Path) -> dict[str, ast.Module]:
-    """The modules that `BEGINNINGS` import from this project, and those that these do, without docstrings."""
+    """The modules that `BEGINNINGS` import from this project, directly or indirectly, without docstrings."""
     found: dict[str, ast.Module] = {}
     waiting = list(BEGINNINGS)
     while waiting:
@@ -40,7 +40,7 @@ def _modules(root: Path) -> dict[str, ast.Module]:
                 waiting += [alias.name for alias in node.names]
         for node in ast.walk(tree):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
-                # A string that stands alone does nothing, wherever it stands; below names it explains them.
+                # A string expression has no effect: it is a docstring, or explains the name above it.
                 node.body = [each for each in node.body if not _is_text(each)] or [ast.Pass()]
     return found
 

@@ -1,1 +1,1 @@
-"""Arms that pour: the protocol, a virtual one, and the actor around a driver."""
+"""Arms that pour: the interface, the simulated arm, the UR driver, and planning."""

@@ -1,6 +1,6 @@
-"""What an arm looks like to those who watch: where its links are for given joints, as plain rounded bars. No driver.
+"""The appearance of an arm in the live view: the positions of its links for given joints, drawn as rounded bars.
 
-Bars and not a manufacturer's meshes: they are worked out from the kinematics, and nobody's drawings are copied.
+The bars are computed from the kinematics, so that no manufacturer's meshes are needed. This module contains no driver.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LinkFigure:
-    """A UR arm, drawn by its kinematics.
+    """A figure of a UR arm, drawn from its kinematics.
 
     Args:
         spec: of the arm and its cell (`actors.arm.arm_settings.UrArmSpec`).

@@ -1,4 +1,7 @@
-"""An arm's driver from the event loop: its calls, awaited, with their deadlines."""
+"""An arm's driver for the event loop: its calls are awaited, with their deadlines.
+
+`DeviceArm` wraps a `Device` that holds the driver. It plans nothing and does not retry motions.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +15,19 @@ from actors.interfaces import LaboratoryError
 from actors.runtime.remote_object import Device
 
 PATIENCE = 60.0
-"""Longest wait for what moves nothing [s]: a process starts, a controller is asked some questions."""
+"""Longest wait for a call that moves nothing [s], such as a process start or controller queries."""
 
 POWER_TIME = 180.0
 """Longest wait for power and brakes after an emergency stop [s of controller time]."""
 
 LOOK_INTERVAL = 0.1
-"""Between two looks at a moving arm [s]."""
+"""Time between two readings of a moving arm's state [s]."""
 
 Follow = Callable[[ArmState], None]
 
 
 def _nobody(state: ArmState) -> None:
-    """Whoever gets the place of an arm that nobody follows."""
+    """Default callback, which ignores the arm's state."""
 
 
 class DeviceArm:
@@ -39,7 +42,7 @@ class DeviceArm:
         self.device, self._spec = device, spec
 
     async def ready(self) -> ArmFacts:
-        """Connected, and who is there; nothing moves."""
+        """Connect and return the arm's facts; nothing moves."""
         await self.device.revive()
         try:
             facts: ArmFacts = await self.device.call("facts", deadline=PATIENCE)
@@ -48,15 +51,15 @@ class DeviceArm:
         return facts
 
     async def hands_in(self) -> None:
-        """See to it that no program runs on the controller and the arm stands, and read both back."""
+        """Make sure that no program runs on the controller and that the arm stands still, and read both back."""
         await self.device.call("hands_in", deadline=PATIENCE)
 
     async def release(self) -> None:
-        """A person has said that it may move."""
+        """Allow the arm to move, after an operator's consent."""
         await self.device.call("release", deadline=PATIENCE, urgent=True)
 
     async def move_to_start(self, path: PlannedPour, follow: Follow = _nobody) -> None:
-        """From home to the pour's start; `follow` is called now and then with its place."""
+        """Move from home to the pour's start. `follow` is called periodically with the arm's state."""
         async with self._followed(follow):
             await self.device.call("move_to_start", path, deadline=self._deadline(path.approach_time))
 
@@ -64,8 +67,8 @@ class DeviceArm:
         """Tilt, hold, return.
 
         Args:
-            path: whose start it stands at.
-            follow: told now and then where it is.
+            path: the pour; the arm stands at its start.
+            follow: called periodically with the arm's state.
         """
         async with self._followed(follow):
             deadline = self._deadline(path.pour_time)
@@ -73,41 +76,44 @@ class DeviceArm:
             return executed
 
     async def retreat(self, path: PlannedPour, follow: Follow = _nobody) -> None:
-        """Home, from wherever on the ways to and from the pour it stands upright; `follow` as in `move_to_start`."""
+        """Move home from any upright pose on the way to or from the pour; `follow` as in `move_to_start`."""
         async with self._followed(follow):
             await self.device.call("retreat", path, deadline=self._deadline(3.0 * path.retreat_time))
 
     async def untilt(self, path: PlannedPour) -> None:
-        """Slowly upright again, after that pour was stopped."""
+        """Bring the pourer slowly upright again after that pour was stopped."""
         await self.device.call("untilt", path, deadline=self._deadline(self._spec.untilt_time))
 
     async def recover(self) -> str:
-        """After a stop whose cause a person has seen to: connected and ready, not released; says what was done."""
+        """Reconnect and make the arm ready after a stop whose cause the operator has removed.
+
+        The arm is not released. Returns a description of the actions taken.
+        """
         await self.device.revive()
         await self.release()
         done: str = await self.device.call("recover", deadline=self._deadline(POWER_TIME))
         return done
 
     async def stop(self) -> None:
-        """Stop what moves; it stays locked."""
+        """Stop any motion; the arm stays locked."""
         await self.device.call("stop", deadline=PATIENCE, urgent=True)
 
     async def state(self) -> ArmState:
-        """Where it is."""
+        """The arm's present state."""
         state: ArmState = await self.device.call("state", deadline=PATIENCE, urgent=True)
         return state
 
     async def close(self) -> None:
-        """Let go of the controller."""
+        """Disconnect from the controller."""
         await self.device.call("close", deadline=PATIENCE)
 
     def _deadline(self, seconds: float) -> float:
-        """For something that takes so long on the controller [s]: twice that, for a lost arm must be noticed."""
+        """The deadline for an action of this duration on the controller [s]: twice as long, to detect a lost arm."""
         return PATIENCE + 2.0 * self._spec.on_clock(seconds)
 
     @contextlib.asynccontextmanager
     async def _followed(self, follow: Follow) -> AsyncIterator[None]:
-        """Somebody gets the arm's place, meanwhile."""
+        """Call `follow` with the arm's state while the body runs."""
         if follow is _nobody:
             yield
             return

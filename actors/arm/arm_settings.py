@@ -1,8 +1,11 @@
-"""Settings of arms: plain values that know which driver they are for, and what plans pours for it.
+"""Settings of arms.
 
-Drivers and planners are named by text and imported when they are needed: settings are read where nothing is started.
+- `ArmSpec` is the base class: plain values that name the driver's class and the planner. `UrArmSpec` is for UR arms.
+- `SafetyRecord` holds safety settings that an operator has accepted.
+- `ArmDiagnostics` holds what an arm reports to `decant doctor`.
 
-What an arm tells when it is looked at, for `decant doctor`: lines for people, and what of it people accept.
+Drivers and planners are named by text and imported when they are needed, because settings are also read where no arm is
+started.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from actors.arm.arm_interface import ArmLimits, Joints, Mount, Pose, RobotCell, Vector
+from actors.arm.arm_geometry import ArmLimits, Joints, Mount, Pose, RobotCell, Vector
 from actors.interfaces import DeviceCheck
 from sim_engine.action import Action
 from sim_engine.scene import Scene
@@ -26,15 +29,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SafetyRecord:
-    """Safety settings of an arm that somebody has accepted.
+    """Safety settings of an arm that an operator has accepted.
 
     Attributes:
-        checksum: of the settings, as the arm tells it.
+        checksum: of the settings, as the arm reports it.
         serial: of the robot.
         model: of the robot.
         software: version on its controller.
         date: day and time, ISO 8601.
-        accepted_by: who.
+        accepted_by: name of the operator.
     """
 
     checksum: str
@@ -47,12 +50,12 @@ class SafetyRecord:
 
 @dataclass(frozen=True)
 class ArmDiagnostics:
-    """An arm that was looked at, moving and setting nothing. Arms with more to tell derive from this.
+    """Results of reading an arm, without moving it or changing a setting. Arms with more facts derive from this class.
 
     Attributes:
-        checksum: of the settings that keep people safe; '' if the arm tells none, and then none can be accepted.
+        checksum: of the safety settings; '' if the arm reports none, and then none can be accepted.
         serial, model, software: as in `SafetyRecord`.
-        problem: why the arm can't move now, or can't be reached; '' if it could.
+        problem: why the arm cannot move now or cannot be reached; '' if it can move.
     """
 
     checksum: str = ""
@@ -62,12 +65,12 @@ class ArmDiagnostics:
     problem: str = ""
 
     def checks(self, record: SafetyRecord | None, *, accept: str, virtual: bool) -> list[DeviceCheck]:
-        """One line for everything that was found.
+        """One line for each fact that was read.
 
         Args:
-            record: what was accepted; None if nothing was.
-            accept: the command that accepts it.
-            virtual: nobody has to.
+            record: the accepted settings; None if there are none.
+            accept: the command that accepts them.
+            virtual: whether the arm is virtual and needs no acceptance.
         """
         who = " ".join(filter(None, (self.model, self.serial, self.software))) or "not reached"
         checks = [DeviceCheck("arm", "fail" if self.problem else "ok", self.problem or who)]
@@ -79,7 +82,7 @@ class ArmDiagnostics:
         return checks
 
     def at_home(self) -> DeviceCheck:
-        """Whether the arm stands where it waits."""
+        """Whether the arm stands at its home pose."""
         return DeviceCheck("position", "ok", "at home, as far as the driver tells")
 
 
@@ -87,15 +90,15 @@ ArmModel = Literal["ur10", "ur10e"]
 
 
 class ArmSpec(ABC):
-    """Settings of one arm: frozen values that travel to where the bench is.
+    """Settings of one arm: frozen values that are sent to the machine of the bench.
 
     Attributes:
         kind: as registered in `decant.arms`, and as written in files.
-        stand_in: 'module:callable' that makes of these settings what stands in for the arm on a virtual bench, see
-            `actors.bench.device_emulators.ArmEmulator`; '' for a driver that moves nothing but numbers itself.
-        time_scale: bench seconds per second of the clock; 1 for anything real, 0 waits for nothing.
-        announcement: from a person's consent to the first movement [s].
-        untilt_speed: at which a stopped, tilted pourer is brought upright [rad/s].
+        stand_in: 'module:callable' that makes, from these settings, the emulator of the arm on a virtual bench. See
+            `actors.bench.device_emulators.ArmEmulator`; '' for a driver that only simulates.
+        time_scale: bench seconds per second of the clock; 1 for hardware, 0 to skip all waits.
+        announcement: from the operator's consent to the first movement [s].
+        untilt_speed: angular velocity at which a stopped, tilted pourer is brought upright [rad/s].
     """
 
     kind: ClassVar[str]
@@ -109,8 +112,8 @@ class ArmSpec(ABC):
         """The class of the driver (an `actors.arm.arm_interface.Arm`), importable by name, and its arguments.
 
         Args:
-            accepted: checksum of the safety settings of hardware that people have accepted, '' if nobody has; None
-                where nothing is hardware.
+            accepted: checksum of the accepted safety settings of the hardware; '' if none are accepted, None if there
+                is no hardware.
         """
 
     @abstractmethod
@@ -118,15 +121,15 @@ class ArmSpec(ABC):
         """Check a whole pour and plan it.
 
         Raises:
-            InvalidActionError: it can't be made; with everything that is wrong with it.
+            InvalidActionError: the pour is impossible; the text lists all problems.
         """
 
     def paced(self, time_scale: float) -> ArmSpec:
-        """The same arm in a virtual bench's time."""
+        """The same settings with a virtual bench's time scale."""
         return replace(self, time_scale=time_scale)  # type: ignore[type-var]
 
     def announced(self, announcement: float) -> ArmSpec:
-        """The same arm, which waits for so long between consent and movement [s]."""
+        """The same settings with another time between consent and movement [s]."""
         return replace(self, announcement=announcement)  # type: ignore[type-var]
 
     @property
@@ -135,34 +138,34 @@ class ArmSpec(ABC):
         return 4.0 * math.radians(140.0) / self.untilt_speed
 
     def on_clock(self, seconds: float) -> float:
-        """Bench time on the clock [s]; none where nothing is waited for."""
+        """Bench time converted to clock time [s]; 0 if nothing is waited for."""
         return seconds / self.time_scale if self.time_scale > 0.0 else 0.0
 
     def figure(self) -> ArmFigure | None:
-        """What it looks like, for those who watch; None: nobody says, and only the vessel in its hand is shown."""
+        """The arm's figure for the live view. None if there is none; then only the pourer is shown."""
         return None
 
     def missing(self) -> str | None:
-        """What its driver needs that isn't installed, in words; None if nothing is missing."""
+        """The missing software that the driver needs, as a message; None if nothing is missing."""
         return None
 
     @property
     def title(self) -> str:
-        """Who it is, for people."""
+        """Name of the arm in messages."""
         return self.kind
 
     @property
     def payload_limit(self) -> float | None:
-        """What it is set up to carry [kg]; None where nobody said."""
+        """The payload that is set up [kg]; None if unknown."""
         return None
 
     @property
     def tilt_speed_limit(self) -> float | None:
-        """How fast it may turn the pourer [rad/s]; None where nobody said."""
+        """Largest angular velocity of the pourer [rad/s]; None if unknown."""
         return None
 
     def look(self) -> ArmDiagnostics:
-        """Ask the arm everything that `decant doctor` tells of; nothing moves, nothing is set."""
+        """Read everything that `decant doctor` reports; nothing moves, no setting changes."""
         from actors.interfaces import LaboratoryError
 
         cls, arguments = self.driver(None)
@@ -181,21 +184,21 @@ class UrArmSpec(ArmSpec):
     """A UR arm that holds the pourer.
 
     Attributes:
-        model: which one.
-        limits: what it may do here.
-        cell: what stands where.
-        home: joints where it waits, out of people's way, the pourer upright [rad].
-        address: of the controller; '' for a virtual one, which is started and has its address filled in.
-        mount: how the robot is screwed down.
+        model: of the robot.
+        limits: of its motion in this cell.
+        cell: positions of the objects around it.
+        home: joints of the home pose, out of the operator's way, with the pourer upright [rad].
+        address: of the controller; '' for a virtual one, whose address is filled in when it starts.
+        mount: mounting of the robot.
         tool: TCP in the flange's frame.
         payload: of gripper and filled pourer [kg].
         payload_centre: in the flange's frame [m].
         grip: pourer in the TCP's frame.
         approach_speed: of the fastest joint on the way between home and pour [rad/s].
-        approach_acceleration: likewise [rad/s²].
-        untilt_speed: at which a stopped, tilted pourer is brought upright [rad/s].
+        approach_acceleration: of the fastest joint, likewise [rad/s²].
+        untilt_speed: angular velocity at which a stopped, tilted pourer is brought upright [rad/s].
         announcement: from an operator's consent to the first movement [s].
-        rate: at which it is read back [Hz], at least 100.
+        rate: of readings [Hz], at least 100.
         time_scale: controller seconds per second of the clock; 1 for a real one.
     """
 

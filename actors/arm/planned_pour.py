@@ -1,6 +1,9 @@
-"""What a pour is for the joints of an arm: values that planning makes, checks judge and the driver executes.
+"""Pours as values: planned, and executed.
 
-Pours for arms that don't look at joints: planned as the motion itself, read back as poses of the pourer. Values.
+- `PourPath` and `JointPath` are a pour for the joints of an arm: planning creates them, checks examine them, the driver
+  executes them. `ExecutedPath` is the measured motion.
+- `MotionPath` and `ExecutedMotion` are the same for arms without joints: the plan is the motion itself, and poses of
+  the pourer are read back.
 """
 
 from __future__ import annotations
@@ -21,15 +24,15 @@ from sim_engine.scene import SampledMotion
 FloatArray = NDArray[np.float64]
 
 JOINT_UNIT = 1e-6
-"""Joints are kept to this [rad]: a thousandth of what an arm repeats."""
+"""Resolution of joints in records [rad]: a thousandth of an arm's repeatability."""
 
 TIME_UNIT = 1e-5
-"""Times likewise [s]."""
+"""Resolution of times in records [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointPath:
-    """Joints over time, from rest to rest; linear in between.
+    """Joints over time, from rest to rest, linear in between.
 
     Attributes:
         times: (T,) increasing from 0 [s]; T ≥ 2.
@@ -41,7 +44,7 @@ class JointPath:
 
     @property
     def duration(self) -> float:
-        """[s]."""
+        """Duration [s]."""
         return float(self.times[-1])
 
     def at(self, times: FloatArray) -> FloatArray:
@@ -51,7 +54,7 @@ class JointPath:
 
 @dataclass(frozen=True, eq=False)
 class PourPath:
-    """A whole pour for the arm: checked, ready to be executed.
+    """A whole pour for the arm: checked and ready for execution.
 
     Attributes:
         approach: from home to the pour's start, the pourer upright.
@@ -59,7 +62,7 @@ class PourPath:
         retreat: back home.
         tilts: (T,) of the pourer at `pour.times` [rad].
         phases: (name, start, end) of the pour's parts [s].
-        report: what the checks found.
+        report: results of the checks.
     """
 
     approach: JointPath
@@ -71,21 +74,21 @@ class PourPath:
 
     @property
     def approach_time(self) -> float:
-        """[s]."""
+        """Duration [s]."""
         return self.approach.duration
 
     @property
     def pour_time(self) -> float:
-        """[s]."""
+        """Duration [s]."""
         return self.pour.duration
 
     @property
     def retreat_time(self) -> float:
-        """[s]."""
+        """Duration [s]."""
         return self.retreat.duration
 
     def slowed(self, factor: float) -> PourPath:
-        """The same way, with all its times divided by a factor in (0, 1]."""
+        """The same path with all its times divided by a factor in (0, 1]."""
         if factor == 1.0:
             return self
         approach, pour, retreat = (
@@ -110,15 +113,15 @@ class PourPath:
 
 @dataclass(frozen=True, eq=False)
 class ExecutedPath:
-    """What an arm's own encoders say it did.
+    """The motion that an arm's own encoders measured.
 
     Attributes:
-        times: (T,) since the path's begin, increasing from 0 [s of controller time], at least 100 Hz.
+        times: (T,) since the path's start, increasing from 0 [s of controller time], at least 100 Hz.
         joints: (T, 6) [rad].
-        completed: False if it was stopped on the way.
-        tracking: what the path was followed with: 'rms_angle', 'max_angle' [rad] of the joints, 'rms_tool',
-            'max_tool' [m], 'lag' [s] taken out of them, 'longest_gap' between two readings [s].
-        poses: of the pourer in the world, (T, 7); empty where nobody knows the cell, as after `unpack`.
+        completed: False if it was stopped before its end.
+        tracking: errors in following the path: 'rms_angle', 'max_angle' [rad] of the joints, 'rms_tool', 'max_tool'
+            [m], the 'lag' [s] that was removed from them, and the 'longest_gap' between two readings [s].
+        poses: of the pourer in the world, (T, 7); empty if the cell is unknown, as after `unpack`.
     """
 
     times: FloatArray
@@ -133,7 +136,7 @@ class ExecutedPath:
 
 
 def pack(executed: ExecutedPath) -> dict[str, Any]:
-    """JSON-ready; a ten-second pour at 125 Hz takes some ten kilobytes.
+    """Convert to JSON-ready values; a ten-second pour at 125 Hz takes about ten kilobytes.
 
     Args:
         executed: as read back.
@@ -153,7 +156,7 @@ def unpack(data: dict[str, Any]) -> ExecutedPath:
     """Inverse of `pack`.
 
     Raises:
-        ValueError: it is not what `pack` made.
+        ValueError: `pack` did not make these values.
     """
     try:
         raw = zlib.decompress(base64.b85decode(data["packed"]))
@@ -167,11 +170,11 @@ def unpack(data: dict[str, Any]) -> ExecutedPath:
 
 @dataclass(frozen=True, eq=False)
 class MotionPath:
-    """A pour for an arm that makes any motion, and looks at no joints: the motion itself.
+    """A pour for an arm that makes any motion and does not use joints: the motion itself.
 
     Attributes:
         motion: of the pourer.
-        approach_time, retreat_time: of the ways there and back [s].
+        approach_time, retreat_time: durations of the ways there and back [s].
         factor: of its speed.
     """
 
@@ -182,7 +185,7 @@ class MotionPath:
 
     @property
     def pour_time(self) -> float:
-        """[s]."""
+        """Duration [s]."""
         return self.motion.duration / self.factor
 
     @property
@@ -209,11 +212,11 @@ class MotionPath:
 
 
 def motion_report(motion: PourMotion, travel_time: float = 0.0, factor: float = 1.0) -> PathReport:
-    """What a motion says of a pour, for arms that don't look at their joints: the pourer's origin stands for the tool.
+    """The report of a motion, for arms that do not use joints: the pourer's origin represents the tool.
 
     Args:
         motion: of the pourer.
-        travel_time: way there and back together [s].
+        travel_time: of the ways there and back together [s].
         factor: of the motion's speed.
     """
     times = np.linspace(0.0, motion.duration, 500)
@@ -241,7 +244,7 @@ class ExecutedMotion:
     Attributes:
         times: shape (T,) [s].
         poses: shape (T, 7).
-        completed: False if it was stopped on the way.
+        completed: False if it was stopped before its end.
     """
 
     times: FloatArray
@@ -251,9 +254,9 @@ class ExecutedMotion:
 
     @property
     def motion(self) -> SampledMotion:
-        """As a motion that can be simulated again."""
+        """The executed motion, which can be simulated again."""
         return SampledMotion(self.times, self.poses)
 
     def record(self) -> dict[str, Any]:
-        """See `Executed.record`: the action says all of it."""
+        """See `Executed.record`: empty, since the action describes the motion completely."""
         return {}

@@ -1,4 +1,7 @@
-"""An arm of numbers: it makes a `PourMotion` in scaled time, a little wrong, and can be stopped. Nothing moves."""
+"""A simulated arm. It executes a `PourMotion` in scaled time, with small errors, and can be stopped.
+
+`NumbersSpec` holds its settings, `Grip` the hidden errors of a pour. No hardware moves.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +14,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_interface import (
-    ArmFacts,
-    ArmNotReleasedError,
-    ArmPose,
-    ArmRefusedError,
-    ArmState,
-    ArmStoppedError,
-    Pose,
-)
+from actors.arm.arm_geometry import Pose
+from actors.arm.arm_interface import ArmFacts, ArmNotReleasedError, ArmPose, ArmRefusedError, ArmState, ArmStoppedError
 from actors.arm.arm_settings import ArmSpec
 from actors.arm.planned_pour import ExecutedMotion, MotionPath
 from actors.bench.bench_clock import Pace
@@ -30,26 +26,26 @@ from sim_engine.scene import Scene
 FloatArray = NDArray[np.float64]
 
 SAMPLE_RATE = 50.0
-"""Poses that an arm reads back per bench second [Hz]."""
+"""Rate of the poses that the arm reads back, in bench time [Hz]."""
 
 APPROACH_TIME = 4.0
-"""Bench time from the rest pose to the motion's first one [s]."""
+"""Bench time from the home pose to the motion's first pose [s]."""
 
 POSITION_NOISE = 3e-5
 """Standard deviation of a pose read back [m]: an industrial arm's repeatability."""
 
 FARTHEST_TURN, FARTHEST_WAY = math.radians(10.0), 0.05
-"""Noise of one step by hand [rad], [m]."""
+"""Largest manual step (jog) [rad], [m]."""
 
 _STEP = 0.02
-"""Wall time between two looks at a stop button [s]."""
+"""Wall-clock time between two checks of the stop flag [s]."""
 
 _UPRIGHT_TIME = 4.0
 
 
 @dataclass(frozen=True)
 class Grip:
-    """What is wrong with the next pour's execution; hidden from those who learn from it.
+    """Errors of the next pour's execution; hidden from the learning algorithms.
 
     Attributes:
         speed_factor: executed over commanded angular velocity.
@@ -62,10 +58,10 @@ class Grip:
 
 @dataclass(frozen=True)
 class NumbersSpec(ArmSpec):
-    """An arm of numbers.
+    """A simulated arm.
 
     Attributes:
-        time_scale: bench seconds per wall second; 0 waits for nothing.
+        time_scale: bench seconds per wall-clock second; 0 skips all waits.
         announcement: from consent to the first movement [s].
     """
 
@@ -88,10 +84,10 @@ class NumbersSpec(ArmSpec):
 class SimulatedArm:
     """See `actors.arm.arm_interface.Arm`.
 
-    What it reads back depends on the motion, the grip and nothing else: neither on the clock nor on earlier pours.
+    Its readings depend only on the motion and the grip, not on the clock or on earlier pours.
 
     Args:
-        spec: its pace.
+        spec: its time scale.
     """
 
     def __init__(self, spec: NumbersSpec) -> None:
@@ -105,7 +101,7 @@ class SimulatedArm:
         self._place = [0.0] * 6
 
     def grip(self, grip: Grip) -> None:
-        """Hold the vessel for the next pour with these errors."""
+        """Set the errors of the next pour."""
         self._grip = grip
 
     # ---- nothing moves
@@ -155,7 +151,7 @@ class SimulatedArm:
     def execute(self, path: MotionPath) -> ExecutedMotion:
         """See `Arm.execute`.
 
-        The grip's speed factor stretches or shrinks the tilting phase; hold and return keep their times.
+        The grip's speed factor stretches or shortens the tilting phase; hold and return keep their durations.
         """
         executed = _Executed(path.motion, self._grip.speed_factor, path.factor)
         reached = self._travel(executed.duration, executed.where, executed.pose)
@@ -169,7 +165,7 @@ class SimulatedArm:
         return done
 
     def retreat(self, path: MotionPath) -> None:
-        """See `Arm.retreat`; nobody waits for it."""
+        """See `Arm.retreat`; takes no time."""
         self._way("retreat", path.retreat_time, lambda t: 0.0)
         self._released = False
 
@@ -196,14 +192,14 @@ class SimulatedArm:
         self._released = False
         with self._lock:
             self._state = replace(self._state, stopped=True)
-        with self._working:  # whatever was under way has ended
+        with self._working:  # wait until the running motion has ended
             return 0.0
 
     def close(self) -> None:
         """See `Arm.close`."""
         self.stop()
 
-    # ---- how
+    # ---- implementation
 
     def _consent(self) -> None:
         if not self._released or self._pace.interrupted:
@@ -229,12 +225,12 @@ class SimulatedArm:
         where: Callable[[float], tuple[str, float]],
         pose: Callable[[float], tuple[float, ...]] = lambda t: (),
     ) -> float:
-        """Let bench time pass on a way.
+        """Let bench time pass during a motion.
 
         Args:
-            duration: of the way [s].
-            where: phase and tilt [rad] at a time on the way.
-            pose: of the pourer then, see `ArmState.pourer`.
+            duration: of the motion [s].
+            where: phase and tilt [rad] at a time of the motion.
+            pose: of the pourer at that time, see `ArmState.pourer`.
 
         Returns:
             Time reached [s]: `duration`, or less if the arm was stopped.
@@ -261,7 +257,7 @@ class SimulatedArm:
 
     def _read_back(self, motion: PourMotion, executed: _Executed, reached: float) -> ExecutedMotion:
         times = np.arange(0.0, reached, 1.0 / SAMPLE_RATE)
-        # The last sample stands at the end itself, and no closer to the one before than half a sample.
+        # The last sample is at the end itself; the one before is at least half a sample earlier.
         times = np.append(times[times < reached - 0.5 / SAMPLE_RATE], reached)
         poses = motion.sample(executed.commanded(times))
         poses[:, :3] += np.random.default_rng(self._grip.seed).normal(0.0, POSITION_NOISE, (len(times), 3))
@@ -273,7 +269,7 @@ class SimulatedArm:
 
 
 class _Executed:
-    """A motion whose tilting phase runs at another speed than commanded."""
+    """A motion whose tilting phase runs at a speed other than the commanded one."""
 
     def __init__(self, motion: PourMotion, speed_factor: float, slowed: float = 1.0) -> None:
         self._motion = motion
@@ -282,11 +278,11 @@ class _Executed:
 
     @property
     def duration(self) -> float:
-        """[s]."""
+        """Duration [s]."""
         return (self._tilted / self._factor + self._motion.duration - self._tilted) / self._slowed
 
     def commanded(self, times: FloatArray) -> FloatArray:
-        """Times of the commanded motion at which it is where this one is at `times`, both shape (T,) [s]."""
+        """Times at which the commanded motion has the state that this one has at `times`; both of shape (T,) [s]."""
         times = times * self._slowed
         tilting = times * self._factor
         later = times - self._tilted / self._factor + self._tilted

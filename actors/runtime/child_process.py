@@ -9,7 +9,7 @@ Every child has:
 
 - an explicit copy of the environment. Without one, the system reads the C array of this process while another thread
   may change `os.environ`; the start then fails with EFAULT ('Bad address').
-- a session of its own. Ctrl-C in the terminal reaches this program only, which ends its children in order.
+- its own session. Ctrl-C in the terminal reaches this program only, which ends its children in order.
 - a way to notice the end of this program, however it ends: its standard input ends, or its connection does.
 
 `ConnectedProcess` exchanges Python objects with its child. `run` and `run_async` start a program and wait for its end.
@@ -45,7 +45,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def child_environment(changes: Mapping[str, str | None] | None = None) -> dict[str, str]:
-    """A copy of this process's environment for a child. Other threads may change `os.environ` meanwhile.
+    """Return a copy of this process's environment for a child. Other threads may change `os.environ` meanwhile.
 
     Args:
         changes: variables to add or replace; None removes one.
@@ -59,7 +59,7 @@ def child_environment(changes: Mapping[str, str | None] | None = None) -> dict[s
 
 
 def python_module(module: str, *arguments: str) -> list[str]:
-    """The command that runs a module with this interpreter."""
+    """Return the command that runs a module with this interpreter."""
     return [sys.executable, "-m", module, *arguments]
 
 
@@ -70,12 +70,12 @@ class ChildProcess:
         command: program and arguments.
         environment: variables that differ from this process's.
         input: whether its standard input is a pipe; else it is empty.
-        output: whether its standard output is a pipe; else it goes where the errors go.
+        output: whether its standard output is a pipe; else it goes to the same target as the errors.
         errors: its standard error: 'kept' for `errors_kept`, 'shown' on this process's, 'dropped', or a file.
-        inherited: file descriptors that it gets.
+        inherited: file descriptors that the child inherits.
         dies_with_parent: Linux kills it when this process ends, even by SIGKILL. Only for a process with one thread:
-            code between fork and exec must not wait for another thread's lock, and the kernel means the *thread* that
-            started the child.
+            code between fork and exec must not wait for another thread's lock, and the kernel kills the child when the
+            *thread* that started it ends.
 
     Raises:
         OSError: it does not start.
@@ -86,7 +86,7 @@ class ChildProcess:
         command: Sequence[str],
         *,
         environment: Mapping[str, str | None] | None = None,
-        input: bool = True,  # noqa: A002 - subprocess calls it so
+        input: bool = True,  # noqa: A002 - the name that subprocess uses
         output: bool = True,
         errors: Literal["kept", "shown", "dropped"] | IO[bytes] = "kept",
         inherited: Sequence[int] = (),
@@ -95,7 +95,7 @@ class ChildProcess:
         self._errors: IO[bytes] | None = None
         target: IO[bytes] | int | None
         if errors == "kept":
-            # A file: a pipe that is not read fills up, and its writer waits for ever.
+            # A file, because a pipe that is not read fills up and blocks its writer.
             target = self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with this object
         else:
             target = {"shown": None, "dropped": subprocess.DEVNULL}[errors] if isinstance(errors, str) else errors
@@ -125,7 +125,7 @@ class ChildProcess:
 
     @property
     def errors_kept(self) -> str:
-        """The end of its standard error (and of its output, if that is no pipe), where these are kept."""
+        """The end of its standard error, and of its output if that is no pipe. Empty unless `errors` is 'kept'."""
         if self._errors is None:
             return ""
         with contextlib.suppress(OSError, ValueError):  # closed
@@ -136,7 +136,7 @@ class ChildProcess:
 
     @property
     def last_error(self) -> str:
-        """The last line of `errors_kept`, or nothing."""
+        """The last line of `errors_kept`, or an empty string."""
         return (self.errors_kept.splitlines() or [""])[-1].strip()
 
     def write(self, data: bytes) -> None:
@@ -154,11 +154,11 @@ class ChildProcess:
         """The next line of its standard output, with its end.
 
         Args:
-            deadline: longest wait [s]; 0: only what has come already; None: no limit.
+            deadline: longest wait [s]; 0: only data that has already arrived; None: no limit.
 
         Raises:
-            TimeoutError: no whole line in time; what came of it is kept for the next call.
-            EOFError: it has closed its output, by ending as a rule.
+            TimeoutError: no whole line in time; a part of a line is kept for the next call.
+            EOFError: the child has closed its output, usually because it has ended.
         """
         assert self._process.stdout is not None
         end = None if deadline is None else time.monotonic() + deadline
@@ -174,13 +174,13 @@ class ChildProcess:
         return line + newline
 
     def close_input(self) -> None:
-        """End its standard input, by which most children end. May be called again."""
-        with contextlib.suppress(OSError):  # what was not flushed is lost with a child that has ended
+        """Close its standard input; most children end then. May be called again."""
+        with contextlib.suppress(OSError):  # unflushed data is lost with a child that has ended
             if self._process.stdin is not None:
                 self._process.stdin.close()
 
     def wait(self, seconds: float) -> bool:
-        """Wait for its end; whether it has come."""
+        """Wait for its end. Returns whether it has ended."""
         try:
             self._process.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -201,7 +201,7 @@ class ChildProcess:
         self.wait(patience)
 
     def close(self, grace: float = GRACE, *, terminate: bool = False) -> None:
-        """End it: end its input, wait, kill it if it goes on, release the pipes. May be called again.
+        """End the child: close its input, wait, kill it if it still runs, release the pipes. May be called again.
 
         Args:
             grace: time to end by itself [s].
@@ -215,7 +215,7 @@ class ChildProcess:
         self.release()
 
     def release(self) -> None:
-        """Close the pipes and what is kept, whether it has ended or not. May be called again."""
+        """Close the pipes and the file of errors, whether the child has ended or not. May be called again."""
         self.close_input()
         for file in (self._process.stdout, self._errors):
             if file is not None:
@@ -294,7 +294,7 @@ async def run_async(command: Sequence[str], data: bytes, *, timeout: float) -> b
 
 
 def _tied_to_parent() -> Callable[[], None] | None:
-    """For `preexec_fn`: the kernel kills the child when this thread ends. None where there is no such call.
+    """For `preexec_fn`: the kernel kills the child when this thread ends. None if the system has no such call.
 
     Source: prctl(2), PR_SET_PDEATHSIG.
     """

@@ -1,7 +1,11 @@
-"""Will a cluster do? Asked before anything starts, by a process of its own.
+"""Checks whether a Ray cluster is suitable, before anything starts.
 
-Ray waits for minutes where nothing answers, and may end a process that it can't connect: neither must happen to the
-program. Run as a module, this is that process: it joins, looks around, prints what it found as JSON, and leaves.
+The check runs in a separate process. Ray waits for minutes if an address does not respond, and it may end a process
+that it cannot connect. Neither may happen to the program itself.
+
+Run as a module, this file is that process. It joins the cluster, reads its nodes, prints them as JSON and leaves.
+
+`check_cluster` returns `NodeFacts`. It reserves nothing; `actors.runtime.ray_cluster` does that.
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ ANSWER_DEADLINE = 5.0
 """Longest time for the head to accept a connection [s]."""
 
 JOIN_DEADLINE = 60.0
-"""Longest time for joining, looking around and leaving [s]."""
+"""Longest time to join, read the nodes and leave [s]."""
 
 WORKER_DEADLINE = 40.0
 """Longest time for a node to start a Python process [s]."""
@@ -32,7 +36,7 @@ _IMPATIENT = {
     "RAY_gcs_server_request_timeout_seconds": "10",
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
 }
-"""Ray's own patience is minutes."""
+"""Shorter timeouts for Ray; its own are minutes long."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +44,11 @@ class NodeFacts:
     """A node of a cluster.
 
     Attributes:
-        id: Ray's.
-        host: name and address, for people.
-        cpus: cores that Ray gives out.
+        id: Ray's id of the node.
+        host: name and address, for messages.
+        cpus: cores that Ray assigns.
         total: its resources by name.
-        versions: of what decides outcomes; None if no process could be started or Decant is missing there.
+        versions: of everything that affects outcomes. None if no process could be started or Decant is missing there.
         problem: why there are no versions.
     """
 
@@ -57,17 +61,17 @@ class NodeFacts:
 
 
 def check_cluster(spec: RaySpec, *, need_bench: bool) -> list[NodeFacts]:
-    """Whether a laboratory can be opened on a cluster. Nothing of it remains there.
+    """Check that a laboratory can be opened on a cluster. The check leaves nothing on the cluster.
 
     Args:
-        spec: which cluster.
+        spec: the cluster.
         need_bench: whether arm, balance and bench need their node.
 
     Returns:
         The nodes that are alive.
 
     Raises:
-        LaboratoryError: with what is wrong and what would be right.
+        LaboratoryError: with the problem and its remedy.
     """
     _check_answers(spec.address)
     found = _ask(spec.address)
@@ -118,7 +122,7 @@ def _check_nodes(spec: RaySpec, nodes: list[NodeFacts]) -> None:
         raise LaboratoryError(f"{where}: none of its {len(nodes)} node(s) has a core to simulate on (--num-cpus)")
     for node in nodes:
         if not node.cpus and spec.bench_resource not in node.total:
-            continue  # nothing of ours will run there
+            continue  # no Decant process will run there
         if node.versions is None:
             raise LaboratoryError(f"{where}: node {node.host} can't run Decant: {node.problem}")
         if (difference := versions().difference(node.versions)) is not None:
@@ -141,7 +145,7 @@ def _check_bench(spec: RaySpec, nodes: list[NodeFacts], available: dict[str, flo
 
 
 def _look_around(address: str) -> dict[str, Any]:
-    """What the process finds."""
+    """The facts that the separate process collects."""
     import logging
 
     import ray
@@ -153,7 +157,7 @@ def _look_around(address: str) -> dict[str, Any]:
     nodes = _living()
     asked = [_ask_versions(node.id) for node in nodes]
     ray.wait(asked, num_returns=len(asked), timeout=WORKER_DEADLINE)
-    still = {node.id for node in _living()}  # Ray needs a while to see that a node is dead
+    still = {node.id for node in _living()}  # Ray needs some time to notice that a node is dead
     found = [_with_versions(node, ref) for node, ref in zip(nodes, asked, strict=True) if node.id in still]
     answer = {"nodes": [dataclasses.asdict(node) for node in found], "available": ray.available_resources()}
     ray.shutdown()
@@ -205,7 +209,7 @@ def _with_versions(node: NodeFacts, ref: Any) -> NodeFacts:
 
 
 def _why(error: BaseException) -> str:
-    """Ray's reason, in words for the person who can mend it."""
+    """Ray's reason, in words that help the user to fix it."""
     chain: list[str] = []
     link: BaseException | None = error
     while link is not None:

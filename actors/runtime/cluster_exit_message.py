@@ -1,7 +1,7 @@
-"""A small process that speaks for its parent when Ray has ended it.
+"""A small process that prints a message after Ray has ended its parent.
 
-Where the head of a cluster dies, or Ray on the program's own machine, Ray ends the program on the spot: no Python code
-runs any more. The process holds the reading end of a pipe; a parent that leaves in order writes `GOODBYE` first.
+If the head of a cluster dies, or Ray on the program's own machine, Ray ends the program immediately: no further Python
+code runs. This process holds the reading end of a pipe. A parent that ends in order writes `GOODBYE` first.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def speaker(address: str) -> ChildProcess:
 
 
 def dismiss(process: ChildProcess) -> None:
-    """End it without a word."""
+    """End the process without a message."""
     with contextlib.suppress(OSError):
         process.write(GOODBYE)
     process.close()

@@ -1,6 +1,9 @@
-"""Where an actor runs in a cluster, and whether that machine is still there.
+"""Nodes of a Ray cluster, and the software versions on them.
 
-What must be the same on every machine of a cluster, so that the same task has the same outcome anywhere.
+`PinnedNode` places an actor on one node and reports whether that node has died. `Versions` holds the versions that must
+be the same on every machine of a cluster, so that a task has the same outcome on each of them.
+
+This module does not check a cluster before it is used; `actors.runtime.cluster_check` does.
 """
 
 from __future__ import annotations
@@ -22,13 +25,13 @@ _PATIENCE = 2.0
 
 @dataclass(frozen=True)
 class Node:
-    """A node as Ray's table has it.
+    """A node, as listed by Ray.
 
     Attributes:
-        id: Ray's.
-        host: name and address, for people.
-        address, port: of the process that every node has (the raylet).
-        cpus: cores that Ray gives out.
+        id: Ray's id of the node.
+        host: name and address, for messages.
+        address, port: of the node's raylet, a process that every node has.
+        cpus: cores that Ray assigns.
     """
 
     id: str
@@ -39,7 +42,7 @@ class Node:
 
 
 def living_nodes() -> dict[str, Node]:
-    """Nodes that Ray takes for alive, by id. Blocks for some milliseconds."""
+    """The nodes that Ray lists as alive, by id. Blocks for some milliseconds."""
     import ray
 
     return {
@@ -57,19 +60,21 @@ def living_nodes() -> dict[str, Node]:
 
 @dataclass(frozen=True)
 class PinnedNode:
-    """One node, for actors that may run there only.
+    """One node, for actors that may run only there.
 
     Attributes:
-        node: which.
-        options: what Ray needs to put an actor there.
+        node: the node.
+        options: Ray's options that place an actor there.
     """
 
     node: Node
     options: Mapping[str, Any]
 
     async def is_gone(self) -> bool:
-        """Whether the node has died. Ray itself takes fifteen seconds to be sure of that; a dead node's raylet refuses
-        connections at once. Where nobody answers, a lost packet is not a death: Ray decides then."""
+        """Whether the node has died.
+
+        Ray itself needs fifteen seconds to detect this; a dead node's raylet refuses connections at once. If a
+        connection times out, a packet may have been lost: then Ray decides."""
         try:
             _, writer = await asyncio.wait_for(
                 asyncio.open_connection(self.node.address, self.node.port), timeout=_PATIENCE
@@ -80,13 +85,13 @@ class PinnedNode:
         except ConnectionRefusedError:
             return True
         except (OSError, TimeoutError):
-            with contextlib.suppress(Exception):  # the head may be gone, too
+            with contextlib.suppress(Exception):  # the head may have died, too
                 return self.node.id not in await asyncio.to_thread(living_nodes)
             return False
 
 
 def this_node() -> PinnedNode:
-    """The node that this program is connected to; without it the program can't go on anyway."""
+    """The node that this program is connected to; the program cannot continue without it."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -114,10 +119,10 @@ class Versions:
     numpy: str
 
     def difference(self, other: Versions) -> str | None:
-        """The first thing in which two machines differ, for people; None if there is none.
+        """The first version in which two machines differ, as a message; None if all are equal.
 
         Args:
-            other: of the other machine.
+            other: versions of the other machine.
         """
         for field in fields(self):
             ours, theirs = getattr(self, field.name), getattr(other, field.name)
@@ -151,6 +156,6 @@ def sources(folder: Path) -> str:
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*.py")):
         if path.parent.name == "validation":
-            continue  # judges outcomes, and makes none
+            continue  # it evaluates outcomes but does not produce any
         digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()[:12]

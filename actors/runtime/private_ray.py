@@ -1,11 +1,14 @@
-"""A Ray of our own: on this machine only, and with nothing left behind.
+"""A private Ray on this machine, which leaves nothing behind.
 
-It runs with stated memory, without dashboard, autoscaler or usage statistics, on the loopback interface, with a token
-of its own, in a short private folder that is removed at the end. Folders of clusters whose program is gone are removed
-at the next start. `actors.runtime.ray_cleanup` cleans up behind a program that was killed.
-`actors.runtime.ray_runtime` decides when.
+It runs:
 
-Ray's settings, which it reads from the environment.
+- with a stated amount of memory, and without dashboard, autoscaler or usage statistics.
+- on the loopback interface only, with its own token.
+- in a short private folder that is removed at the end. Folders of clusters whose program has ended are removed at the
+  next start.
+
+`ray_settings` sets the environment variables that Ray reads. `actors.runtime.ray_cleanup` cleans up after a program
+that was killed. `actors.runtime.ray_runtime` decides when a private Ray starts and ends.
 """
 
 from __future__ import annotations
@@ -33,44 +36,44 @@ from actors.runtime.child_process import ChildProcess, python_module
 from actors.runtime.ray_cleanup import MARK, end_cluster
 
 _LONGEST_FOLDER = 40
-"""Ray puts sockets some 65 characters below its folder, and a socket's path may have 107."""
+"""Ray puts sockets about 65 characters below its folder, and a socket's path may have 107."""
 
 _WORKER_LOG = re.compile(r"(?:worker-|python-core-worker-).*[-_](\d+)\.(?:out|err|log)")
 """Name of a worker's log; the number is its process id."""
 
 _NEEDLESS = ("start_api_server", "start_monitor", "start_log_monitor")
-"""What Ray's node starts and nobody here uses: a dashboard's server, an autoscaler, a reader of logs."""
+"""Parts of a Ray node that are not used here: the dashboard's server, the autoscaler and the log monitor."""
 
 _TOKEN = secrets.token_hex(32)
-"""Without it nobody else on this machine may talk to our Ray. One per process, since Ray reads it only once."""
+"""Ray refuses users without this token. One per process, since Ray reads it only once."""
 
 
 @dataclass
 class PrivateRay:
-    """What holds it: its folder, the lock on it, and the process that cleans up behind us."""
+    """The resources of a private Ray: its folder, the lock on it, and the cleanup process."""
 
     folder: Path
     lock: TextIOWrapper
     warden: ChildProcess
 
     def settings(self) -> dict[str, str]:
-        """What has to be in the environment before Ray starts (`actors.runtime.private_ray`)."""
+        """The environment variables that must be set before Ray starts (see `ray_settings`)."""
         return {
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN_PATH": str(self.folder / "token"),
             "RAY_USAGE_STATS_ENABLED": "0",
             "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
-            # Ray lets all its workers step back behind other programs (nice 15). Here simulators do so, an arm doesn't.
+            # By default Ray runs all its workers at nice 15. Here only simulators lower their priority, not an arm.
             "RAY_worker_niceness": "0",
-            # Makes Ray take 127.0.0.1 for the node's address and listen there only. On Windows and macOS that is its
-            # habit; on Linux it would offer itself to the network.
+            # Makes Ray use 127.0.0.1 as the node's address and listen only there. This is its default on Windows and
+            # macOS; on Linux it would listen on the network.
             "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
-            # Ray remembers 100,000 each of dead actors, dead workers and calls, for a dashboard that nobody opens: over
-            # weeks that is memory.
+            # Ray keeps 100,000 each of dead actors, dead workers and calls for its dashboard, which is not used here:
+            # over weeks this fills memory.
             "RAY_maximum_gcs_destroyed_actor_cached_count": "50",
             "RAY_maximum_gcs_dead_worker_cached_count": "50",
             "RAY_task_events_report_interval_ms": "0",
-            # Its own processes log some 5 MB an hour, up to gigabytes.
+            # Ray's own processes log about 5 MB an hour, up to gigabytes.
             "RAY_ROTATION_MAX_BYTES": "2000000",
             "RAY_ROTATION_BACKUP_COUNT": "1",
         }
@@ -93,16 +96,16 @@ def _root() -> Path:
 
 @contextlib.contextmanager
 def _only_one(root: Path) -> Iterator[None]:
-    """One process at a time makes or removes cluster folders."""
+    """Lock: only one process at a time creates or removes cluster folders."""
     with (root / "lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 
 def prune_clusters(root: Path | None = None) -> list[Path]:
-    """Remove the clusters of programs that are gone, with processes that are left of them.
+    """Remove the clusters of programs that have ended, including processes left from them.
 
-    A living program holds a lock on its cluster's `alive` file; the system drops it whatever way the program ends.
+    A running program holds a lock on its cluster's `alive` file; the system releases it however the program ends.
 
     Returns:
         The folders removed.
@@ -118,7 +121,7 @@ def prune_clusters(root: Path | None = None) -> list[Path]:
 
 
 def open_private() -> PrivateRay:
-    """A folder for it, a token, and a warden; nothing of Ray runs yet."""
+    """Create a folder, a token and a cleanup process. Ray does not run yet."""
     root = _root()
     with _only_one(root):
         prune_clusters(root)
@@ -140,10 +143,11 @@ def close_private(private: PrivateRay) -> None:
 
 
 def start_private(private: PrivateRay, spec: LaboratorySpec) -> None:
-    """Start Ray's processes and connect to them; its settings must be in place. Linux ends them with this thread.
+    """Start Ray's processes and connect to them; its settings must be in the environment. Linux ends them with this
+    thread.
 
     Raises:
-        LaboratoryError: Ray listens elsewhere than on the loopback interface.
+        LaboratoryError: Ray listens on an interface other than loopback.
     """
     import ray
 
@@ -175,10 +179,10 @@ def start_private(private: PrivateRay, spec: LaboratorySpec) -> None:
 
 @contextlib.contextmanager
 def _bare_ray() -> Iterator[None]:
-    """A Ray that is started within this has neither a server for a dashboard, nor an autoscaler, nor a log monitor.
+    """Context in which Ray starts without a dashboard server, an autoscaler or a log monitor.
 
-    Nobody uses them. The first two take 90 MB and seconds of Ray's start each, the third holds up to 200 logs open. Ray
-    has no setting for that: `include_dashboard=False` has the server serve less.
+    None of them is used. The first two need 90 MB and seconds of Ray's start each; the third keeps up to 200 logs open.
+    Ray has no setting for this: with `include_dashboard=False` the server still runs with fewer functions.
     """
     from ray._private.node import Node
 
@@ -197,10 +201,10 @@ def _bare_ray() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _marked(folder: Path) -> Iterator[None]:
-    """Ray's processes that are started within this carry the cluster's mark, and their children inherit it.
+    """Context in which Ray's processes start with the cluster's mark, which their children inherit.
 
-    The mark is not in this program's own environment: programs that it starts meanwhile are not Ray's, and must not be
-    ended with it.
+    This program's own environment does not get the mark: other programs that it starts meanwhile do not belong to Ray
+    and must not be ended with it.
     """
     from ray._private import services
 
@@ -217,10 +221,10 @@ def _marked(folder: Path) -> Iterator[None]:
 
 
 def forget_logs(private: PrivateRay) -> int:
-    """Remove the logs of Ray's workers that are gone: each bench that is opened and closed leaves some.
+    """Remove the logs of Ray's workers that have ended: each bench that is opened and closed leaves some.
 
     Returns:
-        How many files were removed.
+        Number of files removed.
     """
     removed = 0
     for path in private.folder.glob("session_*/logs/*-*"):
@@ -232,7 +236,7 @@ def forget_logs(private: PrivateRay) -> int:
 
 
 def dead_processes() -> list[str]:
-    """Ray's own processes that have died; empty as long as all is well, and where there is no Ray."""
+    """Ray's own processes that have died; empty while all of them run, and if there is no Ray."""
     from ray._private import worker
 
     node = worker._global_node
@@ -240,9 +244,10 @@ def dead_processes() -> list[str]:
 
 
 def is_forgotten() -> bool:
-    """Whether Ray takes this program for dead, since its connection was cut: it has then ended all that it ran for it.
+    """Whether Ray treats this program as dead because its connection was cut. Ray has then ended all of its actors and
+    tasks.
 
-    Asks Ray's directory: a millisecond, and a minute where that doesn't answer.
+    Queries Ray's directory: this takes a millisecond, or a minute if the directory does not respond.
     """
     import ray
     from ray._private.state import state
@@ -253,12 +258,12 @@ def is_forgotten() -> bool:
 
 @contextlib.contextmanager
 def ray_settings(**values: str) -> Iterator[None]:
-    """Have settings in the environment, and what was there back afterwards.
+    """Set environment variables for Ray, and restore their previous values afterwards.
 
-    Ray reads most of them when it is imported; where that has happened already, it is made to read them again.
+    Ray reads most of them when it is imported. If it is already imported, this function makes Ray read them again.
 
     Args:
-        values: of environment variables.
+        values: values of environment variables.
     """
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)

@@ -1,8 +1,8 @@
-"""A small process that outlives its parent by a moment, to clean up behind a parent that was killed.
+"""A small process that cleans up after its parent was killed.
 
-Ray's own processes notice the death of the program that started them, but some take half a minute. The warden holds
-the reading end of a pipe whose writing end only the parent has: when the parent is gone, for whatever reason, the pipe
-ends, and the warden ends every process that carries the cluster's mark and removes the cluster's folder.
+Ray's own processes notice the death of the program that started them, but some need half a minute. The cleanup process
+holds the reading end of a pipe; only the parent holds the writing end. When the parent ends for any reason, the pipe
+closes. The cleanup process then ends every process that carries the cluster's mark and removes the cluster's folder.
 """
 
 from __future__ import annotations
@@ -15,16 +15,17 @@ import sys
 import time
 from pathlib import Path
 
-import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a package of their own
+import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a separate package
 
 MARK = "DECANT_RAY_CLUSTER"
 """Environment variable that all processes of one Ray cluster carry; its value is the cluster's folder."""
 
 
 def cluster_processes(folder: Path) -> list[int]:
-    """Process ids of this user that belong to a cluster, the asking process excepted.
+    """Process ids of this user that belong to a cluster, except the calling process.
 
-    Most carry the mark in their environment. Ray's helpers write their titles over it, but they hold log files open.
+    Most processes carry the mark in their environment. Ray's helpers overwrite it with their titles, but they hold log
+    files open.
 
     Args:
         folder: the cluster's folder, as in `MARK`.
@@ -42,11 +43,11 @@ def _belongs(process: psutil.Process, folder: Path) -> bool:
 
 
 def end_cluster(folder: Path, *, patience: float = 10.0) -> None:
-    """Kill what is left of a cluster and remove its folder.
+    """Kill the remaining processes of a cluster and remove its folder.
 
     Args:
         folder: the cluster's folder.
-        patience: how long to go on while processes still appear or linger [s].
+        patience: longest time to continue while processes still appear or do not end [s].
     """
     end = time.monotonic() + patience
     while time.monotonic() < end:

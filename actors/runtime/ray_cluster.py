@@ -1,4 +1,7 @@
-"""A laboratory's ground on a cluster: who simulates, where the bench stands, and what becomes of both."""
+"""A laboratory on a Ray cluster: which nodes simulate, which node has the bench, and how their losses are reported.
+
+`JoinedCluster` reserves the bench and polls the nodes. It does not join the cluster; `actors.runtime.ray_runtime` does.
+"""
 
 from __future__ import annotations
 
@@ -13,26 +16,26 @@ from actors.laboratory_settings import RaySpec
 from actors.runtime.cluster_nodes import Node, PinnedNode, living_nodes, this_node
 
 LOOK_INTERVAL = 2.0
-"""Time between two looks at the nodes [s]."""
+"""Time between two polls of the nodes [s]."""
 
 RESERVE_DEADLINE = 20.0
-"""Longest time to get hold of the bench [s]."""
+"""Longest time to reserve the bench [s]."""
 
 CLOSE_DEADLINE = 10.0
-"""Longest time to give it back [s]."""
+"""Longest time to release the bench [s]."""
 
 
 @dataclass
 class JoinedCluster:
-    """The cluster that this program has joined, while it is in it.
+    """The cluster that this program has joined, until it leaves.
 
     Args:
-        spec: which cluster.
-        tell: told of nodes that come and go.
+        spec: the cluster.
+        tell: called with a message when nodes join or leave.
         bench_lost: called with the reason when the bench's node has died.
-        here_lost: called with the reason when the node that this program is connected to has died. Ray may have ended
-            the program before.
-        grown: called with the number of cores when there are more.
+        here_lost: called with the reason when the node that this program is connected to has died. Ray may end the
+            program earlier.
+        grown: called with the number of cores when it increases.
     """
 
     spec: RaySpec
@@ -53,10 +56,10 @@ class JoinedCluster:
         return sum(node.cpus for node in self._nodes.values())
 
     async def open(self, *, need_bench: bool) -> None:
-        """Look around, and reserve the bench for this program if it is needed.
+        """Read the nodes, and reserve the bench for this program if it is needed.
 
         Raises:
-            LaboratoryError: no node has the bench's resource, or another program has it.
+            LaboratoryError: no node has the bench's resource, or another program has reserved it.
         """
         self.here = await asyncio.to_thread(this_node)
         bench_node, options = await self._reserve() if need_bench else (None, {})
@@ -71,21 +74,21 @@ class JoinedCluster:
         self.tell(Notice("info", f"on the Ray cluster at {self.spec.address}: {nodes}{bench}"))
 
     async def close(self) -> None:
-        """Give the bench back."""
+        """Release the bench."""
         if self._watching is not None:
             self._watching.cancel()
             await asyncio.wait({self._watching})
         if self._bundle is not None:
             from ray.util.placement_group import remove_placement_group
 
-            with contextlib.suppress(Exception):  # Ray gives it back in any case, when this program is gone
+            with contextlib.suppress(Exception):  # Ray releases it in any case when this program ends
                 await asyncio.wait_for(asyncio.to_thread(remove_placement_group, self._bundle), CLOSE_DEADLINE)
 
     async def _reserve(self) -> tuple[str, dict[str, Any]]:
-        """All of the bench's resource on one node: a second program can't move the same arm.
+        """Reserve all of the bench's resource on one node, so that a second program cannot move the same arm.
 
         Returns:
-            The node's id, and what Ray needs to put an actor there.
+            The node's id, and Ray's options that place an actor there.
         """
         from ray.util.placement_group import placement_group, placement_group_table
         from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
@@ -102,14 +105,14 @@ class JoinedCluster:
         return node, {"scheduling_strategy": strategy}
 
     async def _watch(self) -> None:
-        """Compare the nodes with those of the last look."""
+        """Compare the nodes with those of the previous poll."""
         while True:
             await asyncio.sleep(LOOK_INTERVAL)
             try:
                 now = await asyncio.to_thread(living_nodes)
                 for pinned in [pinned for pinned in (self.here, self.bench) if pinned is not None]:
                     if pinned.node.id in self._nodes and await pinned.is_gone():
-                        self._dead.add(pinned.node.id)  # Ray will list it for a while yet
+                        self._dead.add(pinned.node.id)  # Ray still lists it for some time
             except Exception:
                 continue  # the head may be busy; if it is dead, Ray ends this program
             self._compare({id_: node for id_, node in now.items() if id_ not in self._dead})

@@ -1,12 +1,10 @@
-"""Starts and ends Ray for this process: a private one (`actors.runtime.private_ray`), or a cluster that is there
-already.
+"""Starts and ends Ray for this process: a private Ray (`actors.runtime.private_ray`) or an existing cluster.
 
-A cluster is joined with the environment as it is (its token is the user's) and left running. Ray itself removes the
-actors of a program that leaves it or dies.
-
-`start_ray` and `stop_ray` count: Ray ends, or is left, with the last `stop_ray`.
-
-A private Ray whose own processes die, or that was cut off, answers nobody; who waits is told within seconds.
+- A cluster is joined with the environment as it is (its token is the user's) and left running. Ray itself removes the
+  actors of a program that leaves the cluster or dies.
+- `start_ray` and `stop_ray` count their calls: the last `stop_ray` ends Ray or leaves the cluster.
+- A private Ray whose own processes die, or that was cut off, does not reply any more. `ray_lost` and `watch_ray` report
+  this within seconds.
 """
 
 from __future__ import annotations
@@ -41,14 +39,14 @@ START_DEADLINE = 120.0
 """Longest time that Ray may take to start [s]; a busy machine with a cold disk needs twenty."""
 
 LOOK_INTERVAL = 2.0
-"""Between looks whether a private Ray still takes this program for alive [s]."""
+"""Time between two checks whether a private Ray still treats this program as alive [s]."""
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass
 class _Cluster:
-    """A running Ray, a private one or one that was joined at its address."""
+    """A running Ray: a private one, or a cluster joined at its address."""
 
     private: PrivateRay | None
     address: str | None
@@ -65,13 +63,13 @@ _guard = threading.RLock()
 
 
 def start_ray(spec: LaboratorySpec) -> None:
-    """Start Ray for a laboratory or join its cluster; or use what this process has already started.
+    """Start Ray for a laboratory, join its cluster, or use the Ray that this process has already started.
 
-    Blocks for some seconds: call it in a thread (`asyncio.to_thread`) from a running event loop, and `keep_signals`
-    afterwards in the main thread.
+    Blocks for some seconds. From a running event loop, call it in a thread (`asyncio.to_thread`), and then
+    `keep_signals` in the main thread.
 
     Raises:
-        LaboratoryError: Ray doesn't start, or this process has another Ray.
+        LaboratoryError: Ray does not start, or this process has another Ray.
     """
     global _cluster
     address = None if spec.ray is None else spec.ray.address
@@ -96,7 +94,7 @@ def start_ray(spec: LaboratorySpec) -> None:
 
 
 def stop_ray() -> None:
-    """Undo one `start_ray`; the last one ends a private Ray with all its processes, and leaves another one."""
+    """Undo one `start_ray`. The last call ends a private Ray with all its processes, or leaves a cluster."""
     global _cluster
     with _guard:
         if _cluster is None:
@@ -110,19 +108,19 @@ def stop_ray() -> None:
 
 
 def ray_folder() -> Path | None:
-    """Folder of the private Ray; None while there is none."""
+    """Folder of the private Ray; None if there is none."""
     return None if _cluster is None or _cluster.private is None else _cluster.private.folder
 
 
 def forget_ray_logs() -> None:
-    """Remove what dead workers of a private Ray have logged. Takes moments; may be called at any time."""
+    """Remove the logs of dead workers of a private Ray. Takes little time; may be called at any time."""
     cluster = _cluster
     if cluster is not None and cluster.private is not None:
         forget_logs(cluster.private)
 
 
 def ray_lost() -> str:
-    """What a private Ray has lost, one of its own processes or the way to this one; empty while all is well."""
+    """The lost part of a private Ray, a process or its connection to this one; empty while nothing is lost."""
     cluster = _cluster
     if cluster is None or cluster.private is None:
         return ""
@@ -130,11 +128,11 @@ def ray_lost() -> str:
 
 
 def keep_signals() -> None:
-    """Put this program's signal handlers back in place after Ray has laid its own over them.
+    """Restore this program's signal handlers after Ray has replaced them.
 
-    Ray's native handler prints a stack at SIGTERM, which looks like a crash. Only the main thread may do this; from
-    others it does nothing. Where SIGTERM had no handler at all, it ends the program as `sys.exit` does, so that Ray
-    ends in an orderly way.
+    Ray's native handler prints a stack at SIGTERM, which looks like a crash. Only the main thread may set handlers; in
+    other threads this function does nothing. If SIGTERM had no handler, the new one ends the program as `sys.exit`
+    does, so that Ray ends in order.
     """
     if threading.current_thread() is not threading.main_thread():
         return
@@ -145,7 +143,8 @@ def keep_signals() -> None:
         if number == signal.SIGTERM and handler is signal.SIG_DFL:
             handler = _leave
         signal.signal(number, handler)
-        # Undoing asyncio's choice that a handled signal restarts system calls would surprise the loop's wake-up.
+        # signal.signal() undoes asyncio's setting that system calls restart after a signal; the loop's wake-up relies
+        # on it.
         signal.siginterrupt(number, False)
 
 
@@ -177,8 +176,8 @@ def _close_cluster(cluster: _Cluster) -> None:
 def _start_keeper(cluster: _Cluster, spec: LaboratorySpec) -> None:
     """Start Ray in a thread that lives as long as Ray does.
 
-    Linux ends Ray's processes when the *thread* that started them ends. A thread of an executor, or a main thread that
-    hands over, would take Ray with it.
+    Linux ends Ray's processes when the *thread* that started them ends. If a thread of an executor started Ray, or a
+    main thread that ends early, Ray would end with it.
     """
     cluster.keeper = threading.Thread(target=_keep, args=(cluster, spec), name="ray-keeper", daemon=True)
     cluster.keeper.start()
@@ -216,11 +215,13 @@ def _keep(cluster: _Cluster, spec: LaboratorySpec) -> None:
 
 
 def _watch(cluster: _Cluster) -> None:
-    """Until it is to be ended; whoever waits for an answer meanwhile learns by `ray_lost` whether one can come."""
+    """Monitor Ray until it is to be ended. Callers that wait for a reply use `ray_lost` to find out whether one can
+    arrive.
+    """
     while not cluster.stop.wait(LOOK_INTERVAL):
         if cluster.private is None or cluster.forgotten or dead_processes():
             continue
-        with contextlib.suppress(Exception):  # its directory is just dying: the next look finds that
+        with contextlib.suppress(Exception):  # its directory is just ending: the next check detects that
             cluster.forgotten = is_forgotten()
 
 
@@ -231,14 +232,14 @@ def _join(cluster: _Cluster) -> None:
 
 
 WATCH_INTERVAL = 1.0
-"""Between looks at what Ray has lost [s]."""
+"""Time between two checks for losses of Ray [s]."""
 
 
 async def watch_ray(died: Callable[[str], None]) -> None:
-    """Wait until a private Ray has lost one of its own processes or the way to this one, which may be never.
+    """Wait until a private Ray has lost one of its own processes or its connection to this one. May wait for ever.
 
     Args:
-        died: told once, in words for people, what is lost.
+        died: called once with a message that names the lost part.
     """
 
     while not (lost := ray_lost()):

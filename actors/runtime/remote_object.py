@@ -1,8 +1,10 @@
-"""A plain, blocking object (an arm, a balance, an optimiser) reached from the event loop: in a thread or in a process.
+"""A plain, blocking object (an arm, a balance, an optimiser) used from the event loop.
 
-Calls named urgent don't queue behind the one that is running: that is how a moving arm is stopped.
+- `LocalDevice` runs the object's methods in threads of this process, `RayDevice` in a Ray actor.
+- Urgent calls do not wait for the running call: this is how a moving arm is stopped.
+- `actor_class` makes each Ray actor class only once, because Ray keeps every class for the life of the program.
 
-Classes as Ray's actors, each made once: Ray remembers every class that it is given for as long as a program runs.
+Lost devices are not restarted by themselves: the caller does that with `revive`.
 """
 
 from __future__ import annotations
@@ -20,14 +22,14 @@ from actors.runtime.cluster_nodes import PinnedNode
 
 @functools.cache
 def actor_class(cls: Hashable, groups: tuple[tuple[str, int], ...]) -> Any:
-    """A class whose objects are actors that Ray neither restarts nor asks twice.
+    """Make a Ray actor class whose actors and calls Ray does not retry.
 
     Args:
         cls: a class that workers can import.
         groups: concurrency groups: name and number of threads.
 
     Returns:
-        What `.options(…).remote(…)` makes actors of.
+        The actor class; `.options(…).remote(…)` creates an actor.
     """
     import ray
 
@@ -35,61 +37,62 @@ def actor_class(cls: Hashable, groups: tuple[tuple[str, int], ...]) -> Any:
 
 
 LOOK_INTERVAL = 20.0
-"""Between looks whether a process that is asked something long is there at all [s]."""
+"""Time between two checks, during a long call, whether the process is still alive [s]."""
 
 LOOK_DEADLINE = 60.0
-"""A process that was there once, and says nothing for so long, is lost [s]."""
+"""A process that has replied before counts as lost if it does not reply for this time [s]."""
 
 START_DEADLINE = 120.0
-"""Longest time for a process to start [s]: machines may be busy. Deadlines of calls begin after it."""
+"""Longest time for a process to start [s]; a busy machine needs long. Deadlines of calls begin after it."""
 
 
 class DeviceLostError(LaboratoryError):
-    """The device's process died during a call, or doesn't answer: nobody knows how far the call came."""
+    """The device's process died during a call, or does not reply. It is unknown how far the call got."""
 
 
 class MachineLostError(DeviceLostError, BenchLostError):
-    """The device's machine is gone, so a new process won't do."""
+    """The device's machine is lost, so a new process cannot replace the old one."""
 
 
 class Device(Protocol):
-    """Calls an object's methods by name, one after the other."""
+    """Calls an object's methods by name, one after another."""
 
     @property
     def name(self) -> str:
-        """What people call it."""
+        """The name used in messages."""
         ...
 
     async def call(self, method: str, *args: Any, deadline: float, urgent: bool = False) -> Any:
-        """Call a method and await its answer.
+        """Call a method and await its result.
 
         Args:
             method: name of the object's method.
-            args: its arguments, values that travel.
-            deadline: longest time to wait [s], from the start of its process on.
-            urgent: don't queue behind other calls.
+            args: its arguments; they must be serializable.
+            deadline: longest wait [s], counted from the start of the device's process.
+            urgent: do not queue behind other calls.
 
         Raises:
-            DeviceLostError: its process died, or the deadline passed; MachineLostError: with its machine, or with Ray.
-            LaboratoryError: whatever of this kind the method raises.
+            DeviceLostError: the process died, or the deadline passed.
+            MachineLostError: the process's machine, or Ray, is lost.
+            LaboratoryError: raised by the method itself.
         """
         ...
 
     async def revive(self) -> bool:
-        """Make a new object in place of a lost one. Returns whether that was needed.
+        """Replace a lost object by a new one. Returns whether this was necessary.
 
         Raises:
-            MachineLostError: where it has to run there is no machine.
+            MachineLostError: the machine on which it has to run is lost.
         """
         ...
 
     async def close(self) -> None:
-        """End it."""
+        """End the object."""
         ...
 
 
 class LocalDevice:
-    """The object lives in this process; its calls run in threads. The twin of `RayDevice` for tests."""
+    """The object lives in this process; its calls run in threads. Replaces `RayDevice` in tests."""
 
     def __init__(self, name: str, make: Callable[[], Any]) -> None:
         self.name = name
@@ -108,7 +111,7 @@ class LocalDevice:
         return future.result()
 
     async def revive(self) -> bool:
-        """Nothing can be lost without the whole process."""
+        """Return False: the object cannot be lost without the whole process."""
         return False
 
     async def close(self) -> None:
@@ -118,15 +121,15 @@ class LocalDevice:
 
 
 class RayDevice:
-    """The object lives in a Ray actor: one thread for work, two for urgent calls. It is never restarted by Ray.
+    """The object lives in a Ray actor with one thread for work and two for urgent calls. Ray never restarts it.
 
     Args:
-        name: what people call it.
-        cls: the object's class, importable by workers.
+        name: the name used in messages.
+        cls: the object's class; workers must be able to import it.
         args: arguments of its constructor.
-        node: the node of a cluster that it must run on.
-        looked_after: while a call waits, look now and then whether the process is there at all, and give up sooner than
-            at the deadline if not. For objects whose answers take minutes now and then, and seconds as a rule.
+        node: the node of a cluster on which it must run.
+        looked_after: while a call waits, check from time to time whether the process responds; if not, give up before
+            the deadline. For objects that usually reply within seconds, but sometimes need minutes.
     """
 
     def __init__(
@@ -163,7 +166,7 @@ class RayDevice:
         waited = await self._waited(future, deadline)
         if not future.done() or future.cancelled():
             self._check_ray()
-            # It may hang for good; a new one is made before the next pour.
+            # It may be blocked for ever; a new one is created before the next pour.
             self._lost = True
             with contextlib.suppress(Exception):
                 ray.kill(self._actor)
@@ -181,10 +184,10 @@ class RayDevice:
             raise LaboratoryError(f"{self.name}: '{method}' failed: {error.cause!r}") from error
 
     async def _waited(self, future: asyncio.Future[Any], deadline: float) -> float:
-        """Wait for an answer until it is there, or not to be hoped for; how long that took [s].
+        """Wait until a reply has arrived or cannot be expected any more. Returns the time that this took [s].
 
-        The deadline begins when the process is there: its start has a deadline of its own. A busy machine needs more
-        time for it than a driver may take to answer.
+        The deadline begins when the process has started; its start has a separate deadline. A busy machine may need
+        more time for the start than a driver may take to reply.
         """
         clock = asyncio.get_running_loop().time
         started = clock()
@@ -201,17 +204,17 @@ class RayDevice:
         return clock() - started
 
     async def _answers(self, future: asyncio.Future[Any], patience: float) -> bool:
-        """Whether the process answers anything within a time [s], be it the call that is waited for."""
+        """Whether the process replies to any call, including the pending one, within a time [s]."""
         look = asyncio.wrap_future(self._actor.__ray_call__.remote(_pid).future())
         look.add_done_callback(_seen)
         done, _ = await asyncio.wait({future, look}, timeout=patience, return_when=asyncio.FIRST_COMPLETED)
         return bool(done)
 
     def abandon(self, reason: str) -> None:
-        """Whoever waits for an answer, or will ask, is told that none comes: Ray itself is gone.
+        """Fail all pending and future calls, because Ray itself is lost.
 
         Args:
-            reason: what has died, in words for people.
+            reason: the lost part, for messages.
         """
         self._abandoned = self._abandoned or reason
         for call in self._calls:
@@ -259,7 +262,7 @@ class RayDevice:
 
 
 def _seen(answer: asyncio.Future[Any]) -> None:
-    """Who asked may have been cancelled since, or have given up waiting: an error is then nobody's news."""
+    """Mark the result as retrieved: if the caller was cancelled or gave up, an error needs no report."""
     if not answer.cancelled():
         answer.exception()
 

@@ -1,6 +1,7 @@
-"""The pool's twins without Ray: the same protocol and the same results, bit for bit, by threads of this process.
+"""Pools of simulators without Ray: the same interface and bit-identical results, run by threads of this process.
 
-One simulates in its thread; the others have a process each that simulates for them (`processes`).
+`InProcessSimulatorPool` simulates in its thread. `actors.simulators.process_worker` derives a pool whose threads use
+one process each.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from sim_engine.scene import PourTask
 
 
 class Runner(Protocol):
-    """Runs jobs one after the other: a `JobRunner`, here or in another process."""
+    """Runs jobs one after another: a `JobRunner` in this or in another process."""
 
     def simulate(self, task: PourTask, cancelled: Callable[[], bool]) -> SimulatedPour:
         """See `JobRunner.simulate`."""
@@ -31,13 +32,13 @@ class Runner(Protocol):
 
 
 class ThreadedPool:
-    """`SimulatorPool` of runners, each of them used by one thread at a time.
+    """A `SimulatorPool` of runners; each is used by one thread at a time.
 
-    Limitations: there is no deadline, since a thread can't be ended from outside.
+    Limitations: there is no deadline, since a thread cannot be ended from outside.
 
     Args:
         runners: at least one.
-        separate: they simulate in processes of their own.
+        separate: whether they simulate in separate processes.
     """
 
     def __init__(self, runners: Sequence[Runner], *, separate: bool) -> None:
@@ -57,11 +58,11 @@ class ThreadedPool:
 
     @property
     def separate(self) -> bool:
-        """Whether they simulate in processes of their own."""
+        """Whether the runners simulate in separate processes."""
         return self._separate
 
     def statistics(self) -> PoolStatistics:
-        """What the pool has done so far."""
+        """Statistics of the pool so far."""
         return self._account.statistics()
 
     async def simulate(self, task: PourTask) -> SimulatedPour:
@@ -92,10 +93,10 @@ class ThreadedPool:
             self._idle.put(number)
 
     def _end(self) -> None:
-        self._runners[self._idle.get()].close()  # an idle one, and not put back: each of them once
+        self._runners[self._idle.get()].close()  # take an idle one and do not put it back, so that each is closed once
 
     async def close(self) -> None:
-        """Let cancelled jobs end and write the compiled kernels."""
+        """Wait for cancelled jobs to end, then write the compiled kernels."""
         if self._closed:
             return
         self._closed = True
@@ -104,12 +105,12 @@ class ThreadedPool:
 
 
 class InProcessSimulatorPool(ThreadedPool):
-    """`SimulatorPool` of one simulator. For tests, and for commands that simulate once.
+    """A `SimulatorPool` of one simulator. For tests, and for commands that simulate once.
 
-    Limitations: a crash of the simulator is a crash of this process.
+    Limitations: if the simulator crashes, this process crashes.
 
     Args:
-        make: makes the simulator, in the pool's thread.
+        make: creates the simulator, in the pool's thread.
     """
 
     def __init__(self, *, make: Callable[[], Simulator] = pour_simulator) -> None:

@@ -1,8 +1,10 @@
-"""A pool of simulators in processes of their own that survives its members' deaths.
+"""A pool of simulators in separate processes. It replaces processes that die and repeats their jobs.
 
-What a pool knows of one of its simulators: whether it is up, and the jobs that were sent to it.
+- `RaySimulatorPool` assigns jobs to workers.
+- `WorkerPool` starts the workers, replaces lost ones and ends them.
+- `Member` is one worker: its state, and the jobs that were sent to it (`SentJob`).
 
-The members of a pool: started, greeted, replaced when they are lost, and ended.
+The simulation itself runs in `actors.simulators.ray_worker`.
 """
 
 from __future__ import annotations
@@ -27,13 +29,13 @@ from sim_engine.scene import PourTask
 
 @dataclass(eq=False)
 class SimulationJob:
-    """A simulation that somebody waits for.
+    """A simulation that a caller waits for.
 
     Attributes:
         task: packed, without paths.
         meshes: Ray's references of its meshes.
-        future: gets the result, or the reason why there is none.
-        deaths: simulators that died over it.
+        future: receives the result, or the error.
+        deaths: number of simulators that died during this job.
     """
 
     task: PourTask
@@ -42,18 +44,18 @@ class SimulationJob:
     deaths: int = 0
 
     def fail(self, error: Exception) -> None:
-        """Say why there is no result."""
+        """Set the error as the outcome."""
         if not self.future.done():
             self.future.set_exception(error)
 
 
 @dataclass(eq=False)
 class SentJob:
-    """A job at a simulator.
+    """A job that was sent to a simulator.
 
     Attributes:
-        number: of this sending; no two have the same.
-        recalled: nobody wants this answer any more: cancelled, or given to another simulator.
+        number: unique number of this transmission.
+        recalled: the result is not needed any more, because the job was cancelled or given to another simulator.
     """
 
     job: SimulationJob
@@ -63,13 +65,13 @@ class SentJob:
 
 @dataclass(eq=False)
 class Member:
-    """A simulator actor. A number is used once, so that the dead are not taken for the living.
+    """A simulator actor. A number is used only once, so that a dead worker is never mistaken for a live one.
 
     Attributes:
-        greeted: done when its process is up, or will not be.
-        sent: jobs in the order in which it does them; the first one is under way.
+        greeted: done when its process is up, or has failed to start.
+        sent: jobs in the order in which they run; the first one is running.
         overdue: fires when the first job takes too long.
-        begun: when the first job began, by the event loop's clock [s].
+        begun: start of the first job, by the event loop's clock [s].
     """
 
     number: int
@@ -87,38 +89,38 @@ class Member:
 
     @property
     def spare(self) -> SentJob | None:
-        """The last job, if it can't have begun and is still wanted."""
+        """The last job, if it cannot have begun and is still needed."""
         return self.sent[-1] if len(self.sent) > 1 and not self.sent[-1].recalled else None
 
     def drop_timer(self) -> None:
-        """The first job is no longer timed."""
+        """Stop timing the first job."""
         if self.overdue is not None:
             self.overdue.cancel()
             self.overdue = None
 
 
 def look_away(answer: asyncio.Future[Any]) -> None:
-    """Take note of a late answer, so that asyncio does not complain that nobody did."""
+    """Mark a late result as retrieved, so that asyncio does not log it."""
     if not answer.cancelled():
         answer.exception()
 
 
 RESTART_PAUSE = 20.0
-"""After a member's process failed to start, another one is tried so much later [s]: the cause may be lasting."""
+"""Pause after a worker's process failed to start [s], because the cause may last."""
 
 _TELLING_PAUSE = 1.0
-"""Losses within so much time are reported together [s]: a lost node takes many with it."""
+"""Losses within this time are reported together [s]: a lost node loses many workers."""
 
 
 class WorkerPool:
-    """Keeps a number of simulator actors alive. Those that can't be placed (a node was lost) are waited for.
+    """Keeps a number of simulator actors alive. If some cannot be placed because a node is lost, it waits for them.
 
     Args:
-        size: number of members.
+        size: number of workers.
         start: starts an actor.
-        expected: versions that members must have; None where they can't differ.
-        changed: called when a member has come up, or can't.
-        tell: told of losses, in words for people.
+        expected: versions that workers must have; None if they cannot differ.
+        changed: called when a worker is up, or cannot start.
+        tell: called with a message about losses.
     """
 
     def __init__(
@@ -143,35 +145,35 @@ class WorkerPool:
 
     @property
     def up(self) -> list[Member]:
-        """Members whose processes have started."""
+        """Workers whose processes have started."""
         return [member for member in self._members.values() if member.greeting is not None]
 
     @property
     def hopeless(self) -> bool:
-        """Whether no member is up or starting."""
+        """Whether no worker is up or starting."""
         return not self._members
 
     def __contains__(self, member: Member) -> bool:
         return member.number in self._members
 
     async def greeted(self) -> list[Greeting]:
-        """What the members say of themselves; waits for those that are starting."""
+        """The greetings of the workers; waits for those that are starting."""
         if self._members:
             await asyncio.wait([member.greeted for member in self._members.values()])
         return [member.greeting for member in self.up if member.greeting is not None]
 
     def grow(self, size: int) -> None:
-        """Have at least so many members."""
+        """Increase the number of workers to at least `size`."""
         while self.size < size and not self._closed:
             self.size += 1
             self._add()
 
     def lose(self, member: Member, orphans: int) -> None:
-        """A member is gone, or has to go; a new one takes its place.
+        """Replace a worker that is lost or has to be ended.
 
         Args:
-            member: which.
-            orphans: how many jobs it leaves to others.
+            member: the worker.
+            orphans: number of its jobs that other workers take over.
         """
         self._remove(member)
         if not self._losses:
@@ -180,10 +182,10 @@ class WorkerPool:
         self._add()
 
     async def close(self, deadline: float) -> None:
-        """Have the members write their compiled kernels, then end their processes.
+        """Make the workers write their compiled kernels, then end their processes.
 
         Args:
-            deadline: longest time for the writing [s].
+            deadline: longest time for writing [s].
         """
         self._closed = True
         members = list(self._members.values())
@@ -207,7 +209,7 @@ class WorkerPool:
         member.greeted.add_done_callback(partial(self._greeted, member))
 
     def _greeted(self, member: Member, greeted: asyncio.Future[Greeting]) -> None:
-        """A member's process is up, or does not start."""
+        """A worker's process is up, or does not start."""
         error = None if greeted.cancelled() else greeted.exception()
         if member not in self:
             return
@@ -221,7 +223,7 @@ class WorkerPool:
         self._changed()
 
     def _refuse(self, member: Member, problem: str) -> None:
-        """A member that would fail again, or deceive; another one is tried later."""
+        """Reject a worker that would fail again or return different results; start another one later."""
         self._remove(member)
         if problem != self.problem:
             self.problem = problem
@@ -257,38 +259,38 @@ def _last_line(error: BaseException | None) -> str:
 
 
 DEADLINE = 1800.0
-"""Longest time for one job on one member [s]: half an hour means dead, not slow."""
+"""Longest time for one job on one worker [s]: a worker that needs half an hour counts as dead, not slow."""
 
 START_DEADLINE = 120.0
-"""Longest time that jobs wait while no member is up [s]."""
+"""Longest time that jobs wait while no worker is up [s]."""
 
 DRAIN_DEADLINE = 10.0
-"""Time a cancelled job has to stop [s]; then its member is replaced."""
+"""Time that a cancelled job has to stop [s]; after that its worker is replaced."""
 
 CLOSE_DEADLINE = 10.0
-"""Time a member has to write its kernels at the end [s]."""
+"""Time that a worker has to write its kernels at the end [s]."""
 
 AHEAD = 1
-"""Jobs that wait at a busy member, so that it begins the next one without asking."""
+"""Number of jobs queued at a busy worker, so that it begins the next one without a request."""
 
 
 class RaySimulatorPool:
-    """`SimulatorPool` over Ray actors. Jobs begin in the order in which they came, as far as members' deaths allow.
+    """`SimulatorPool` over Ray actors. Jobs begin in their order of arrival, as far as deaths of workers allow.
 
-    Each busy member has the next job with it already. Where a member runs out of work while another one still has a
-    job waiting, the job is taken back and given to the idle one. Simulations are idempotent, so a job whose member
-    died is done again by another one. Needs a running Ray (`actors.runtime.ray_runtime`), and is made inside an
-    event loop.
+    - Each busy worker has its next job queued. If a worker becomes idle while another one still has a job waiting, the
+      job is taken back and given to the idle one.
+    - Simulations are idempotent. A job whose worker died is repeated by another one.
+    - The pool needs a running Ray (`actors.runtime.ray_runtime`) and is created inside an event loop.
 
     Args:
-        size: number of members.
-        make: makes a member's simulator, inside its process.
+        size: number of workers.
+        make: creates a worker's simulator, inside its process.
         retries: how often a job is tried again after a death.
         deadline: longest time for one job [s].
-        cpus: cores that Ray counts for a member.
-        placement: Ray's options that say where members run.
-        expected: versions that members must have; None where they can't differ.
-        tell: told of losses, in words for people.
+        cpus: cores that Ray counts for a worker.
+        placement: Ray's options that place the workers.
+        expected: versions that workers must have; None if they cannot differ.
+        tell: called with a message about losses.
     """
 
     def __init__(
@@ -318,32 +320,32 @@ class RaySimulatorPool:
 
     @property
     def size(self) -> int:
-        """Number of members, those included that are waited for."""
+        """Number of workers, including those that are not up yet."""
         return self._crew.size
 
     @property
     def separate(self) -> bool:
-        """In processes of their own."""
+        """Whether simulators run in separate processes: always True."""
         return True
 
     def statistics(self) -> PoolStatistics:
-        """What the pool has done so far."""
+        """Statistics of the pool so far."""
         return self._account.statistics()
 
     def grow(self, size: int) -> None:
-        """Have at least so many members from now on."""
+        """Increase the number of workers to at least `size`."""
         self._crew.grow(size)
         self._account.resize(self._crew.size)
 
     async def pids(self) -> list[int]:
-        """Process ids of the members; waits for those that are starting."""
+        """Process ids of the workers; waits for those that are starting."""
         return [greeting.pid for greeting in await self._crew.greeted()]
 
     async def simulate(self, task: PourTask) -> SimulatedPour:
         """See `SimulatorPool.simulate`.
 
         Raises:
-            LaboratoryError: no simulator is up, and none comes up; or whatever the pool was abandoned with.
+            LaboratoryError: no simulator is up and none starts, or the error that the pool was abandoned with.
         """
         if self._closed:
             raise SimulationError("the pool of simulators is closed")
@@ -365,7 +367,7 @@ class RaySimulatorPool:
             raise
 
     def _dispatch(self) -> None:
-        """Give waiting jobs to members; where there are none, share out those that wait at busy members."""
+        """Assign waiting jobs to workers. If none waits, move jobs from busy workers to idle ones."""
         while self._waiting and (member := self._next_member()) is not None:
             self._send(self._waiting.popleft(), member)
         if not self._waiting:
@@ -373,7 +375,7 @@ class RaySimulatorPool:
         self._keep_hope()
 
     def _next_member(self) -> Member | None:
-        """The one that will come to another job first, as far as anybody knows."""
+        """The worker that is expected to begin another job first."""
         free = [member for member in self._crew.up if len(member.sent) <= AHEAD]
         return min(free, key=lambda member: (len(member.sent), member.begun), default=None)
 
@@ -397,7 +399,7 @@ class RaySimulatorPool:
         answer.add_done_callback(partial(self._answered, member, sent))
 
     def _begin(self, member: Member) -> None:
-        """A member's first job is under way."""
+        """Start timing a worker's first job."""
         self._account.begin(member.number)
         member.begun = self._loop.time()
         member.overdue = self._loop.call_later(self._deadline, self._overdue, member)
@@ -411,7 +413,7 @@ class RaySimulatorPool:
 
         error = answer.exception()
         if member not in self._crew:
-            return  # its jobs are with others
+            return  # its jobs are at other workers
         if isinstance(error, ray.exceptions.RayActorError):
             self._lose(member)
             return
@@ -435,7 +437,7 @@ class RaySimulatorPool:
         self._lose(member)
 
     def _give_up(self, job: SimulationJob) -> None:
-        """Nobody waits for it any more."""
+        """Give up a job whose caller does not wait any more."""
         self._account.cancelled += 1
         if job in self._waiting:
             self._waiting.remove(job)
@@ -451,7 +453,7 @@ class RaySimulatorPool:
             self._lose(member)
 
     def _lose(self, member: Member) -> None:
-        """A member is gone, or has to go: its jobs are for others. The one it was at has cost a life."""
+        """Replace a worker that is lost or has to be ended. Its jobs go to others; its running job counts one death."""
         self._account.deaths += 1
         self._end(member)
         orphans = [sent.job for sent in member.sent if not sent.recalled]
@@ -471,7 +473,7 @@ class RaySimulatorPool:
         self._dispatch()
 
     def _keep_hope(self) -> None:
-        """Jobs that wait while no member is up don't wait for ever, and not at all if none is even starting."""
+        """Limit the wait of jobs while no worker is up. If none is starting, they fail at once."""
         if not self._waiting or self._crew.up:
             if self._hopeless is not None:
                 self._hopeless.cancel()
@@ -482,7 +484,7 @@ class RaySimulatorPool:
             self._hopeless = self._loop.call_later(START_DEADLINE, self._fail_waiting)
 
     def _fail_waiting(self) -> None:
-        """This is the laboratory's fault, and says nothing about any simulation."""
+        """Fail waiting jobs with an error of the laboratory, not of their simulations."""
         self._hopeless = None
         reason = self._crew.problem or (
             f"no simulator was up for {START_DEADLINE:g} s; is there a free core, and memory, for one?"
@@ -491,10 +493,10 @@ class RaySimulatorPool:
             self._waiting.popleft().fail(LaboratoryError(reason))
 
     def abandon(self, error: LaboratoryError) -> None:
-        """All jobs fail, now and from now on: their simulators can't come back.
+        """Fail all present and future jobs, because their simulators cannot be restored.
 
         Args:
-            error: why.
+            error: the reason.
         """
         self._abandoned = error
         for member in self._crew.up:
@@ -505,7 +507,7 @@ class RaySimulatorPool:
             self._waiting.popleft().fail(error)
 
     async def close(self) -> None:
-        """Write the members' compiled kernels, and end their processes; jobs that are left have no result."""
+        """Write the workers' compiled kernels and end their processes; remaining jobs have no result."""
         if self._closed:
             return
         self._closed = True
@@ -524,14 +526,14 @@ class RaySimulatorPool:
 
 
 def _recall(member: Member, sent: SentJob) -> None:
-    """A job that has not begun never will; one that has begun notices between its steps."""
+    """Recall a job. If it has not begun, it never begins; if it has, it stops between two steps."""
     sent.recalled = True
     with contextlib.suppress(Exception):
         member.actor.recall.options(concurrency_group=CONTROL).remote(sent.number)
 
 
 def _settle(job: SimulationJob, answer: asyncio.Future[WorkerReply]) -> None:
-    """Give a job its result, or the reason why there is none."""
+    """Set a job's result, or the reason why there is none."""
     import ray
 
     error = answer.exception()

@@ -1,6 +1,7 @@
-"""Simulators in plain processes, for a command that a person waits for: they are there seconds before a Ray would be.
+"""Simulators in plain processes, for interactive commands: they start seconds faster than Ray.
 
-`python -m actors.simulators.process_worker FD` is such a process. It lives until its owner hangs up or dies.
+`ProcessSimulatorPool` is the pool. `python -m actors.simulators.process_worker FD` runs one simulator process; it runs
+until its owner closes the connection or dies.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from sim_engine.outcome import SimulatedPour
 from sim_engine.scene import PourTask
 
 LOOK = 0.1
-"""Between two looks whether a job is still wanted [s]."""
+"""Time between two checks whether a job is still needed [s]."""
 
 DEADLINE = 10.0
-"""Time that a process has to give a job up, and to write its kernels at the end [s]."""
+"""Time that a process has to stop a job, and to write its kernels at the end [s]."""
 
 
 class ProcessSimulatorPool(ThreadedPool):
@@ -30,7 +31,7 @@ class ProcessSimulatorPool(ThreadedPool):
 
     Args:
         size: number of processes.
-        make: makes a simulator, inside its process.
+        make: creates a simulator, inside its process.
     """
 
     def __init__(self, size: int, *, make: Callable[[], Simulator] = pour_simulator) -> None:
@@ -38,7 +39,7 @@ class ProcessSimulatorPool(ThreadedPool):
 
 
 class ProcessRunner:
-    """A `JobRunner` in a process of its own, made anew where it dies.
+    """A `JobRunner` in a separate process, which is replaced if it dies.
 
     Attributes:
         pid: of the process.
@@ -51,14 +52,14 @@ class ProcessRunner:
     def _start(self) -> None:
         self._child = ConnectedProcess(__name__)
         self.pid = self._child.pid
-        with contextlib.suppress(OSError):  # that it is gone is noticed with its first job
+        with contextlib.suppress(OSError):  # the end of the process is noticed with its first job
             self._child.connection.send(self._make)
 
     def simulate(self, task: PourTask, cancelled: Callable[[], bool]) -> SimulatedPour:
         """See `JobRunner.simulate`.
 
         Raises:
-            SimulationError: processes died over it, too.
+            SimulationError: every process that tried the job died.
         """
         last_words = ""
         for _ in range(RETRIES + 1):
@@ -85,23 +86,25 @@ class ProcessRunner:
             if cancelled():
                 self._child.connection.send(None)
                 if not self._child.connection.poll(DEADLINE):
-                    raise EOFError  # it hangs: as good as dead
+                    raise EOFError  # it does not respond, which counts as dead
                 break
         return self._child.connection.recv()
 
     def close(self) -> None:
-        """Hang up; a process that doesn't end by that is killed."""
+        """Close the connection; kill a process that does not end then."""
         self._child.connection.close()
         self._child.close(DEADLINE)
 
 
 def serve(connection: Connection) -> None:
-    """Simulate until the owner hangs up. Any message amid a job, or its end, gives the job up."""
+    """Simulate until the owner closes the connection. A message during a job, or the end of the connection, cancels the
+    job.
+    """
     runner = JobRunner(connection.recv())
     with contextlib.suppress(EOFError, OSError):
         while True:
             task = connection.recv()
-            if task is None:  # it came after the job's end
+            if task is None:  # it arrived after the job's end
                 continue
             try:
                 answer: Any = runner.simulate(task, connection.poll)
@@ -112,6 +115,6 @@ def serve(connection: Connection) -> None:
 
 
 if __name__ == "__main__":
-    import sim_engine.simulator  # noqa: F401 - takes half a second, and nobody has asked for anything yet
+    import sim_engine.simulator  # noqa: F401 - takes half a second, before the first request arrives
 
     serve(Connection(int(sys.argv[1])))

@@ -1,4 +1,8 @@
-"""The Ray actor around a `JobRunner`: one process, one Taichi, one job at a time."""
+"""The Ray actor around a `JobRunner`: one process, one Taichi, one job at a time.
+
+`SimulatorProcess` runs inside the actor; `simulator_actor` starts it. Restarts and retries belong to
+`actors.simulators.pool`.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +21,20 @@ from sim_engine.outcome import SimulatedPour
 from sim_engine.scene import PourTask
 
 NICENESS = 15
-"""How far simulators step back behind the arm's driver, the optimiser and whatever else wants a core [nice]."""
+"""Priority of simulators, below the arm's driver, the optimiser and other programs [nice]."""
 
 CONTROL = "control"
-"""Concurrency group of calls that don't queue behind a job."""
+"""Concurrency group of calls that do not queue behind a job."""
 
 
 @dataclass(frozen=True)
 class Greeting:
-    """What a simulator's process says of itself when it is up.
+    """A simulator process's description of itself when it is up.
 
     Attributes:
         pid: process id.
-        host: the machine's name and address, for people.
-        versions: of what decides its results.
+        host: the machine's name and address, for messages.
+        versions: of everything that affects its results.
     """
 
     pid: int
@@ -40,15 +44,17 @@ class Greeting:
 
 @dataclass(frozen=True)
 class WorkerReply:
-    """A result, and how long the process worked for it [s]."""
+    """A result, and the time that the process worked for it [s]."""
 
     result: SimulatedPour
     seconds: float
 
 
 class SimulatorProcess:
-    """What runs inside the actor. Ray's restarts are off: the pool replaces a dead member and retries its job itself,
-    since Ray would lose the calls that were queued and give no order to those it repeats."""
+    """The class that runs inside the actor.
+
+    Ray's restarts are off: the pool replaces a dead worker and retries its job. Ray itself would lose queued calls and
+    would not keep the order of those that it repeats."""
 
     def __init__(self, make: Callable[[], Simulator]) -> None:
         os.nice(NICENESS)
@@ -56,7 +62,7 @@ class SimulatorProcess:
         self._recalled: set[int] = set()
 
     def greet(self) -> Greeting:
-        """Answers as soon as the process is up."""
+        """Return the greeting as soon as the process is up."""
         import ray
 
         return Greeting(os.getpid(), f"{socket.gethostname()} ({ray.util.get_node_ip_address()})", versions())
@@ -65,7 +71,7 @@ class SimulatorProcess:
         """See `JobRunner.simulate`.
 
         Args:
-            number: by which the job is recalled; no two have the same.
+            number: unique number by which the job can be recalled.
             task: as `Packer.pack` made it.
             parcels: its meshes.
         """
@@ -77,25 +83,27 @@ class SimulatorProcess:
         return WorkerReply(result, time.monotonic() - begin)
 
     def recall(self, number: int) -> None:
-        """Nobody waits for that job any more: it ends between two steps, or never begins.
+        """Cancel a job that is not needed any more: it ends between two steps, or never begins.
 
-        Called beside a running job. Ray's own cancelling answers the caller at once, but lets a job that waited behind
-        another one run to its end.
+        This call runs concurrently with a job. Ray's own cancelling returns to the caller at once, but a job that
+        waited behind another one would still run to its end.
         """
         self._recalled.add(number)
 
     def close(self) -> None:
-        """Write the compiled kernels; a killed process would lose them, and the next one compile again."""
+        """Write the compiled kernels. If a process is killed, its kernels are lost and the next one compiles them
+        again.
+        """
         self._runner.close()
 
 
 def simulator_actor(make: Callable[[], Simulator], *, cpus: float, placement: Mapping[str, Any]) -> Any:
-    """Start an actor; returns its handle at once, before the process is up.
+    """Start an actor. Returns its handle at once, before the process is up.
 
     Args:
-        make: makes the simulator, inside the actor.
+        make: creates the simulator, inside the actor.
         cpus: cores that Ray counts for it.
-        placement: Ray's options that say where it runs.
+        placement: Ray's options that place it.
     """
     made = actor_class(SimulatorProcess, ((CONTROL, 1),))
     return made.options(num_cpus=cpus, **placement).remote(make)

@@ -1,6 +1,7 @@
-"""One pool of simulators for several who know nothing of each other: each gets its turn, whoever asks for most.
+"""One pool of simulators, shared fairly by several laboratories.
 
-Simulators that stay warm between laboratories: processes and compiled kernels are there before they are needed.
+`FairPool` gives each `Share` its turn, regardless of the number of its jobs. `WarmSimulators` keeps the pool open
+between laboratories, so that processes and compiled kernels are ready before they are needed.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ from sim_engine.outcome import SimulatedPour
 from sim_engine.scene import PourTask
 
 AHEAD = 2
-"""Jobs that the pool holds per simulator: one that runs and one that waits there, so that none stands idle."""
+"""Jobs that the pool holds per simulator: one that runs and one that waits, so that no simulator becomes idle."""
 
 
 class FairPool:
-    """Hands out shares of a pool. Jobs of one share keep their order; the shares take turns.
+    """Divides a pool into shares. Jobs of one share keep their order; the shares take turns.
 
     Args:
-        pool: is not closed by any share.
+        pool: the shared pool; closing a share does not close it.
     """
 
     def __init__(self, pool: SimulatorPool) -> None:
@@ -39,15 +40,15 @@ class FairPool:
 
     @property
     def pool(self) -> SimulatorPool:
-        """What is shared."""
+        """The shared pool."""
         return self._pool
 
     def share(self) -> Share:
-        """One more user of it."""
+        """Create a share for one more user."""
         return Share(self)
 
     async def simulate(self, task: PourTask, share: Share) -> SimulatedPour:
-        """Run a job in its share's turn. Cancelling the awaiting task cancels it."""
+        """Run a job in its share's turn. If the awaiting task is cancelled, the job is cancelled."""
         if self._turns or self._under_way >= AHEAD * self._pool.size:
             turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
             share.waiting.append(turn)
@@ -60,7 +61,7 @@ class FairPool:
                     share.waiting.remove(turn)
                     if not share.waiting and share in self._turns:
                         self._turns.remove(share)
-                else:  # its turn had come
+                else:  # the job was handed out meanwhile
                     self._under_way -= 1
                     self._next()
                 raise
@@ -87,7 +88,7 @@ class Share:
     """`SimulatorPool` for one of several users.
 
     Args:
-        fair: that gives turns.
+        fair: schedules the jobs.
     """
 
     def __init__(self, fair: FairPool) -> None:
@@ -96,12 +97,12 @@ class Share:
 
     @property
     def size(self) -> int:
-        """Members of the whole pool: where nobody else wants it, all of it."""
+        """Size of the whole pool: a share uses all of it while the others are idle."""
         return self._fair.pool.size
 
     @property
     def separate(self) -> bool:
-        """As the pool's are."""
+        """See `SimulatorPool.separate`."""
         return self._fair.pool.separate
 
     async def simulate(self, task: PourTask) -> SimulatedPour:
@@ -109,17 +110,17 @@ class Share:
         return await self._fair.simulate(task, self)
 
     async def close(self) -> None:
-        """The pool is somebody else's."""
+        """Do nothing: the pool belongs to `FairPool`'s owner."""
 
 
 class WarmSimulators:
-    """A pool that is opened once and shared, fairly, by all laboratories of this process.
+    """A pool that is opened once and shared fairly by all laboratories of this process.
 
     Args:
         simulators: size of the pool; 0: one per core.
         in_process: one simulator in this process, without Ray.
-        make: makes simulators, where they run.
-        tell: told of losses, in words for people.
+        make: creates simulators in their processes.
+        tell: called with a message about losses.
     """
 
     def __init__(
@@ -140,19 +141,19 @@ class WarmSimulators:
 
     @property
     def ready(self) -> bool:
-        """Whether it is open."""
+        """Whether the pool is open."""
         return self._fair is not None
 
     @property
     def size(self) -> int:
-        """Simulators; 0 before it is open."""
+        """Number of simulators; 0 before the pool is open."""
         return 0 if self._pool is None else self._pool.size
 
     async def open(self) -> None:
-        """Start them, unless that was done.
+        """Start the simulators, unless they are already started.
 
         Raises:
-            LaboratoryError: Ray doesn't start.
+            LaboratoryError: Ray does not start.
         """
         async with self._opening:
             if self._fair is not None:
@@ -178,7 +179,8 @@ class WarmSimulators:
         try:
             await asyncio.shield(starting)
         except asyncio.CancelledError:
-            await asyncio.wait({starting})  # it can't be cut short, and must not outlive the one who wanted it
+            # the start cannot be interrupted, and must not continue after its caller has ended
+            await asyncio.wait({starting})
             if starting.exception() is None:
                 await asyncio.to_thread(stop_ray)
             raise
@@ -186,20 +188,20 @@ class WarmSimulators:
         return RaySimulatorPool(simulator_count(self._spec), make=self._make, tell=self._tell)
 
     def share(self) -> Share:
-        """For one laboratory, for as long as it is open.
+        """Return a share for one laboratory, for as long as the laboratory is open.
 
         Raises:
-            LaboratoryError: it is not open.
+            LaboratoryError: the pool is not open.
         """
         if self._fair is None:
             raise LaboratoryError("the simulators are not up yet")
         return self._fair.share()
 
     def optimizer(self) -> Optimizer:
-        """Warm as well, and shared: one question after the other.
+        """Return the shared optimiser, which stays open, too. It handles one request after another.
 
         Raises:
-            LaboratoryError: it is not open.
+            LaboratoryError: the pool is not open.
         """
         if self._proposer is None:
             raise LaboratoryError("the optimiser is not up yet")
@@ -207,7 +209,7 @@ class WarmSimulators:
 
     @property
     def lost(self) -> str:
-        """Why they can't be used any more: what Ray has lost; empty while all is well."""
+        """The lost part of Ray, which makes the simulators unusable; empty while nothing is lost."""
         if self._pool is None or self._spec.in_process:
             return ""
         from actors.runtime.ray_runtime import ray_lost
@@ -215,7 +217,7 @@ class WarmSimulators:
         return ray_lost()
 
     async def tidy(self) -> None:
-        """Forget what laboratories that are closed have left behind, and give its memory back."""
+        """Release logs and memory left by laboratories that are closed."""
         await asyncio.to_thread(give_back)
         if self._pool is not None and not self._spec.in_process:
             from actors.runtime.ray_runtime import forget_ray_logs
@@ -223,7 +225,7 @@ class WarmSimulators:
             await asyncio.to_thread(forget_ray_logs)
 
     async def close(self) -> None:
-        """End them. May be called twice."""
+        """End the simulators. May be called twice."""
         async with self._opening:
             pool, self._pool, self._fair = self._pool, None, None
             if pool is None:

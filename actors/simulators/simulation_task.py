@@ -1,8 +1,7 @@
-"""One simulator as the pools use it: a plain class that translates between the engine and the laboratory's words.
+"""One simulator as the pools use it.
 
-Memory that a long-running program has freed, given back to the system.
-
-What a pool has done so far.
+`JobRunner` runs tasks of the laboratory on the engine. `PoolStatistics` and `Account` count the work of a pool.
+`give_back` returns freed memory to the system.
 """
 
 from __future__ import annotations
@@ -19,47 +18,49 @@ from sim_engine.outcome import SimulatedPour
 from sim_engine.scene import PourTask
 
 LONG_FIRST_JOB = 5.0
-"""CPU seconds of a process' first job above which its kernels may have been compiled for it. Loaded from the cache they
-cost a second or two; compiled, six to eight."""
+"""CPU time [s] of a process's first job above which its kernels may have been compiled. Loading them from the cache
+takes a second or two; compiling takes six to eight."""
 
 
 RETRIES = 2
-"""How often a job is tried again in another process after one died over it."""
+"""Number of repetitions of a job in other processes after one died during it."""
 
 
 class JobCancelledError(Exception):
-    """The job was given up because nobody waits for it any more."""
+    """The job was cancelled, because its result is not needed any more."""
 
 
 class Simulator(Protocol):
-    """What a job runner needs of the engine; `sim_engine.simulator.PourSimulator` is one."""
+    """The engine's interface for a job runner; `sim_engine.simulator.PourSimulator` implements it."""
 
     def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
         """Run one pour."""
         ...
 
     def close(self) -> None:
-        """End it; compiled kernels are kept for the next one."""
+        """Close it; compiled kernels are kept for the next one."""
         ...
 
 
 def pour_simulator() -> Simulator:
-    """The engine's own simulator. Importing and starting it compiles kernels: do it where it is used."""
+    """Create the engine's simulator. Importing and starting it compiles kernels, so call this in the process that uses
+    it.
+    """
     from sim_engine.simulator import PourSimulator
 
     return PourSimulator()
 
 
 class JobRunner:
-    """Runs jobs one after the other on one simulator.
+    """Runs jobs one after another on one simulator.
 
-    Kernels reach the cache when a simulator is closed. A process may be killed before that, and the next one on its
-    machine would compile them again: so after a long first job the simulator is closed once and made anew with the
-    next job, which costs a second.
+    Kernels are written to the cache when a simulator is closed. If a process is killed before that, the next one on its
+    machine compiles them again. Therefore the simulator is closed once after a long first job and created again with
+    the next job, which costs a second.
 
     Args:
-        make: makes the simulator, with the first job: a process that is never used compiles nothing.
-        long_first_job: CPU seconds from which a first job counts as long.
+        make: creates the simulator at the first job, so that an unused process compiles nothing.
+        long_first_job: CPU time above which a first job counts as long [s].
     """
 
     def __init__(
@@ -79,11 +80,11 @@ class JobRunner:
 
         Raises:
             InvalidActionError: the vessels touch, or the motion is impossible.
-            JobCancelledError: `cancelled` said so.
-            SimulationError: anything else that the engine raises.
+            JobCancelledError: `cancelled` returned True.
+            SimulationError: any other error of the engine.
         """
         if cancelled():
-            raise JobCancelledError  # while it waited behind another job
+            raise JobCancelledError  # cancelled while it waited behind another job
         begun = time.process_time()
         try:
             if self._simulator is None:
@@ -103,20 +104,20 @@ class JobRunner:
         return run
 
     def close(self) -> None:
-        """End the simulator, if there is one."""
+        """Close the simulator, if there is one."""
         simulator, self._simulator = self._simulator, None
         if simulator is not None:
             simulator.close()
 
 
 def give_back() -> bool:
-    """Have the C library return what it keeps of freed memory.
+    """Return freed memory, which the C library keeps, to the system.
 
-    A campaign's threads each take from an arena of their own, and glibc keeps what they free for itself: measured, some
-    14 MB after four recorded campaigns.
+    A campaign's threads each use a separate arena, and glibc keeps the memory that they free: about 14 MB were measured
+    after four recorded campaigns.
 
     Returns:
-        Whether there was anything to give back: False, too, where the C library is another one than glibc.
+        Whether memory was returned; always False for C libraries other than glibc.
     """
     try:
         trim = ctypes.CDLL(None).malloc_trim
@@ -127,14 +128,14 @@ def give_back() -> bool:
 
 @dataclass(frozen=True)
 class PoolStatistics:
-    """A pool's account.
+    """Statistics of a pool.
 
     Attributes:
-        jobs: answered, refusals included.
-        cancelled: given up because nobody waited any more.
-        deaths: members lost and replaced.
-        busy_s: wall seconds that members worked, summed over them; by their own clocks where they have told.
-        busy_fraction: of the members' time since the pool was opened.
+        jobs: finished, including refused ones.
+        cancelled: given up because the result was not needed any more.
+        deaths: workers lost and replaced.
+        busy_s: wall-clock time that workers worked, summed [s]; by their own clocks if they report it.
+        busy_fraction: fraction of the workers' time since the pool was opened.
     """
 
     jobs: int
@@ -146,7 +147,7 @@ class PoolStatistics:
 
 @dataclass
 class Account:
-    """Keeps a pool's statistics."""
+    """Counts a pool's statistics."""
 
     size: int
     jobs: int = 0
@@ -158,11 +159,11 @@ class Account:
     _since: dict[int, float] = field(default_factory=dict)
 
     def begin(self, member: int) -> None:
-        """A member was given a job."""
+        """Record that a worker was given a job."""
         self._since[member] = time.monotonic()
 
     def end(self, member: int, worked: float | None = None) -> None:
-        """It is idle again, or gone.
+        """Record that a worker is idle again or lost.
 
         Args:
             member: its number.
@@ -172,13 +173,13 @@ class Account:
         self._busy += elapsed if worked is None else worked
 
     def resize(self, size: int) -> None:
-        """From now on there are so many members."""
+        """Change the number of workers from now on."""
         now = time.monotonic()
         self._available += (now - self._resized) * self.size
         self.size, self._resized = size, now
 
     def statistics(self) -> PoolStatistics:
-        """As of now, jobs under way included."""
+        """Statistics up to now, including running jobs."""
         now = time.monotonic()
         busy = self._busy + sum(now - since for since in self._since.values())
         available = max(self._available + (now - self._resized) * self.size, 1e-9)

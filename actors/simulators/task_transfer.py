@@ -1,7 +1,7 @@
-"""Tasks on their way to another machine: meshes travel as bytes, since a path means nothing there.
+"""Transfer of tasks to other machines: meshes are sent as bytes, since a path is valid on one machine only.
 
-The sender packs, the receiver unpacks into its own cache directory. Both sides then have the same content, and all that
-is derived from it (distance grids, outcomes) has the same keys.
+`Packer` makes a task independent of files; `unpack` writes its meshes into the receiver's cache directory. Both
+machines then have the same content, so that everything derived from it (distance grids, outcomes) has the same keys.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from sim_engine.scene import PourTask
 from sim_engine.vessel.shapes import MeshShape, VesselSpec
 
 FOLDER = "meshes"
-"""In the cache directory: meshes that came from elsewhere."""
+"""Folder in the cache directory for meshes received from other machines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,8 @@ class SerializedMesh:
     """One mesh file.
 
     Attributes:
-        key: digest of the content, then the file's own name, which messages show: the path below `FOLDER`.
-        content: (n,) uint8; an array travels through shared memory without being copied.
+        key: digest of the content, then the file's own name for messages. It is the path below `FOLDER`.
+        content: (n,) uint8; an array is passed through shared memory without a copy.
     """
 
     key: Path
@@ -39,19 +39,22 @@ class SerializedMesh:
 
 
 class Packer:
-    """Makes tasks independent of this machine's files. A mesh is read once, when it is first seen."""
+    """Makes tasks independent of this machine's files. Each mesh is read once, at its first use."""
 
     def __init__(self) -> None:
         self._parcels: dict[MeshShape, SerializedMesh] = {}
 
     def pack(self, task: PourTask) -> tuple[PourTask, list[SerializedMesh]]:
-        """The task without paths, and the meshes that belong to it.
+        """Pack a task.
 
         Args:
-            task: as the campaign has it.
+            task: with paths of this machine.
+
+        Returns:
+            The task without paths, and its meshes.
 
         Raises:
-            SimulationError: a mesh can't be read.
+            SimulationError: a mesh cannot be read.
         """
         parcels: list[SerializedMesh] = []
 
@@ -76,14 +79,14 @@ class Packer:
 
 
 def unpack(task: PourTask, parcels: Sequence[SerializedMesh]) -> PourTask:
-    """A packed task with its meshes as files of this machine.
+    """Return a packed task with its meshes as files of this machine.
 
     Args:
         task: as `Packer.pack` made it.
         parcels: its meshes.
 
     Raises:
-        OSError: the cache directory can't be written.
+        OSError: the cache directory cannot be written.
     """
     if not parcels:
         return task
@@ -97,7 +100,7 @@ def unpack(task: PourTask, parcels: Sequence[SerializedMesh]) -> PourTask:
 
 
 def _laid_out(parcel: SerializedMesh) -> Path:
-    """The mesh as a file; others on this machine may be writing the same one."""
+    """Write the mesh to a file. Other processes of this machine may write the same one."""
     path = cache_directory() / FOLDER / parcel.key
     if not path.exists() or path.stat().st_size != parcel.content.size:
         path.parent.mkdir(parents=True, exist_ok=True)

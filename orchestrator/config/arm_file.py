@@ -16,7 +16,7 @@ import re
 from abc import abstractmethod
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from actors.arm.arm_interface import ArmLimits, Mount, Plane, Pose, RobotCell, Vector
+from actors.arm.arm_geometry import ArmLimits, Mount, Plane, Pose, RobotCell, Vector
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planning.kinematics import MODELS
 from actors.arm.simulated_arm import NumbersSpec

@@ -1,9 +1,9 @@
-"""The position-based solver. Taichi lives here and nowhere else."""
+"""The position-based solver. Taichi is used in this package only."""
 
 import os
 
-# Taichi greets on stdout at import, which is for results alone.
+# Taichi prints a header on stdout at import, but stdout is reserved for results.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "False")
 os.environ.setdefault("TI_LOG_LEVEL", "error")
-# Nor need it tell its maker's site that it is there: it would, from a thread, once a day.
+# Taichi would contact its maker's site once a day from a thread.
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")

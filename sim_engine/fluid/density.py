@@ -2,15 +2,16 @@
 
 Multipliers accumulate, and `step.py` accelerates them (Chebyshev).
 
-Walls enter as the kernel's integral over a half-space at the distance of their equivalent plane, so that liquid keeps
-half a spacing from them and feels their pressure. Part of the multipliers is kept from step to step (warm start), which
-helps to carry a resting column; iterations go on until the mean compression inside is small, so that deep vessels are
-solved as well as shallow ones.
+Walls enter as the kernel's integral over a half-space at the distance of their equivalent plane. Liquid therefore keeps
+half a spacing from them and is subject to their pressure. Part of the multipliers is kept from step to step (warm
+start), which helps to carry a resting column. Iterations continue until the mean compression inside is small, so that
+deep vessels are solved as well as shallow ones.
 
 Pairs are visited once and add to both of their particles. Such sums are written out (a = a + b): Taichi turns += on a
-field into an atomic operation, which made a pour four times slower. The root and the kernel's slope of a pair are taken
-once for each place of its particles: what measures densities keeps the slope for the displacements that follow. What
-pairs read and add to stands in fours, which the processor moves at a time: displacements take a third of the time then.
+field into an atomic operation, which made a pour four times slower. The root and the kernel's slope of a pair are
+computed once for each place of its particles: the density pass stores the slope for the following displacements. Values
+that pairs read and add to are stored in groups of four, which the processor moves together: displacements then take a
+third of the time.
 
 Source: Macklin & Müller 2013 (position based fluids); Macklin, Müller & Chentanez 2016 (accumulated multipliers); wall
 integral: after Bender et al. 2019 (volume maps), see `sim_engine/vessel/wall_correction.py`.
@@ -23,14 +24,16 @@ from sim_engine.fluid.neighbours import measure_pairs
 from sim_engine.fluid.state import SUPPORT, VESSELS
 
 PACKING = 1.012
-"""Kernel sum of bulk liquid of spacing d over its continuum value, measured on a cup at rest: with it the density there
-is 1.00, the compression that the iterations leave included."""
+"""Kernel sum of bulk liquid of spacing d over its continuum value, measured on a cup at rest. With it the density there
+is 1.00, including the compression that the iterations leave."""
 
 
 @ti.func
 def weigh_pairs(f: ti.template(), s, inv_h):
-    """The kernel and its slope of all listed pairs. Roots and polynomials of pairs that lie side by side in the lists
-    are taken eight at a time, apart from reading positions here and there."""
+    """The kernel and its slope of all listed pairs.
+
+    Roots and polynomials of pairs that are adjacent in the lists are computed eight at a time, apart from reading
+    scattered positions."""
     measure_pairs(f, s)
     for k in range(f.list_begin[s], f.list_end[s]):
         u = ti.max(1.0 - ti.sqrt(f.pair[k]) * inv_h, 0.0)
@@ -40,7 +43,7 @@ def weigh_pairs(f: ti.template(), s, inv_h):
 
 @ti.func
 def measure_first(f: ti.template(), s):
-    """Density of all particles and, for the whole step, what their constraints' gradients amount to."""
+    """Density of all particles and, for the whole step, the norms of their constraints' gradients."""
     d = f.spacing[s]
     inv_h = 1.0 / (SUPPORT * d)
     scale = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING * inv_h * inv_h
@@ -92,7 +95,7 @@ def measure(f: ti.template(), s):
 
 @ti.func
 def compression(f: ti.template(), s, i, volume, inv_h):
-    """ρ/ρ₀ of a particle with the walls' share, from the sum over its neighbours."""
+    """ρ/ρ₀ of a particle, including the walls' contribution, from the sum over its neighbours."""
     rho = f.density[i] * volume
     for b in ti.static(range(VESSELS)):
         q = f.phi[i][b] * inv_h - f.wall_shift[s]
@@ -103,7 +106,7 @@ def compression(f: ti.template(), s, i, volume, inv_h):
 
 @ti.func
 def multiply_first(f: ti.template(), s, rate):
-    """All multipliers after a step's first iteration; they begin with what is kept of the last step's.
+    """All multipliers after a step's first iteration; they begin with the kept part of the last step's.
 
     Returns:
         Mean of max(ρ/ρ₀ − 1, 0) over the particles that are not at the surface.
@@ -128,7 +131,7 @@ def multiply_first(f: ti.template(), s, rate):
 
 @ti.func
 def multiply(f: ti.template(), s, rate, momentum):
-    """Change of all multipliers in a later iteration: by the density, and on by a part of their last change.
+    """Change of all multipliers in a later iteration: by the density, plus a part of their last change.
 
     Returns:
         Mean of max(ρ/ρ₀ − 1, 0) over the particles that are not at the surface.
@@ -153,7 +156,7 @@ def multiply(f: ti.template(), s, rate, momentum):
 
 @ti.func
 def displace(f: ti.template(), s):
-    """Displacements that the last changes of all multipliers give."""
+    """Displacements due to the last changes of all multipliers."""
     d = f.spacing[s]
     h = SUPPORT * d
     inv_h = 1.0 / h
@@ -165,7 +168,8 @@ def displace(f: ti.template(), s):
             q = f.phi[i][b] * inv_h - f.wall_shift[s]
             if q < 1.0:
                 n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
-                # The exact gradient of the wall's share in C: any other does work on a resting liquid and stirs it.
+                # The exact gradient of the wall's contribution to C: any other one does work on a resting liquid and
+                # stirs it.
                 push = pi * wall_slope(q) * inv_h
                 move += push * n
                 f.push[i][b] = f.push[i][b] + push

@@ -1,4 +1,4 @@
-"""Taichi's start and end, and the arrays of one process. The only place that calls `ti.init`."""
+"""The engine: starts and ends Taichi, and holds the arrays of one process. Only this module calls `ti.init`."""
 
 import contextlib
 import io
@@ -21,7 +21,7 @@ with imports():
     from sim_engine.fluid.step import FACTS, LONGEST_STEP, Stepper
 
 POOLS = {"cpu": (50_000, 64), "cuda": (2_500_000, 1_024)}
-"""Particles and scenes that a process has room for, by backend; the largest scene has 50,000 particles."""
+"""Capacity of a process, by backend: particles and scenes. The largest scene has 50,000 particles."""
 
 FAULTS = {
     0: None,
@@ -32,9 +32,9 @@ FAULTS = {
 
 @ti.data_oriented
 class FluidEngine:
-    """Scenes' arrays, loaded and advanced from Python. One per process (`engine()`).
+    """The arrays of scenes, loaded and advanced from Python. One per process (`engine()`).
 
-    Scenes of one load are independent: what one does is bit for bit what it does alone.
+    Scenes of one load are independent: each gives bit for bit the results that it gives alone.
     """
 
     def __init__(self, backend: str = "cpu") -> None:
@@ -52,10 +52,10 @@ class FluidEngine:
         self._facts = np.zeros((0, len(FACTS)))
 
     def room_for(self, counts: Sequence[int]) -> int:
-        """How many of these scenes, given by their numbers of particles, fit into one load: the first so many.
+        """Number of these scenes, given by their numbers of particles, that fit into one load, counted from the first.
 
         Raises:
-            ValueError: not even the first does.
+            ValueError: not even the first one fits.
         """
         sums = np.cumsum(counts)
         fits = int(np.searchsorted(sums, self.pool, side="right"))
@@ -64,7 +64,7 @@ class FluidEngine:
         return min(fits, self.most_scenes)
 
     def load(self, setups: Sequence[SceneSetup]) -> None:
-        """Set up scenes in place of those there are.
+        """Set up scenes, which replace the loaded ones.
 
         Args:
             setups: as many as fit, see `room_for`.
@@ -173,19 +173,19 @@ class FluidEngine:
             homes[k] = ti.cast(f.home[i], ti.u8)
 
     def advance(self, until: float, scene: int = 0) -> None:
-        """Run one scene until its time reaches `until` [s] or a fault stops it."""
+        """Advance one scene until its time reaches `until` [s] or a fault stops it."""
         self.advance_many(np.full(scene + 1, until), scene, scene + 1)
 
     def advance_many(self, until: NDArray[np.float64], first: int = 0, end: int | None = None) -> None:
-        """Run scenes, each until its own time.
+        """Advance scenes, each until its own time.
 
         Args:
             until: [s] for every scene up to `end`.
-            first, end: only the scenes first … end − 1; all without an end.
+            first, end: only the scenes first … end − 1; all of them if there is no end.
         """
         end = self.scenes if end is None else end
         until = np.ascontiguousarray(until, np.float64)
-        while first < end:  # neighbours of one kind at once
+        while first < end:  # adjacent scenes of the same kind together
             thick = self._thick[first]
             last = first + 1
             while last < end and self._thick[last] == thick:
@@ -236,7 +236,7 @@ class FluidEngine:
         return float(self._facts[scene, FACTS.index(name)])
 
     def time(self, scene: int = 0) -> float:
-        """[s]."""
+        """Time of a scene [s]."""
         return self._fact("time", scene)
 
     def steps(self, scene: int = 0) -> int:
@@ -268,7 +268,10 @@ class _Pool(Generic[T]):
         self._size = 0
 
     def add(self, part: NDArray[T], known_as: object = None) -> int:
-        """Offset of an array in the pool. Two arrays that are `known_as` the same object are the same."""
+        """Add an array and return its offset in the pool.
+
+        Arrays that are `known_as` the same object are stored once.
+        """
         key = id(part if known_as is None else known_as)
         if key not in self._offsets:
             self._offsets[key] = self._size
@@ -277,7 +280,7 @@ class _Pool(Generic[T]):
         return self._offsets[key]
 
     def array(self) -> NDArray[T]:
-        """All of them."""
+        """The whole pool."""
         return np.ascontiguousarray(np.concatenate(self._parts))
 
 
@@ -289,7 +292,7 @@ def start(backend: str) -> None:
     """
     require_backend(backend)
     look_up_quickly()
-    # Taichi says on which architecture it starts, on stdout, which is for results alone.
+    # Taichi prints its architecture on stdout, which is reserved for results.
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
             arch=ti.cuda if backend == "cuda" else ti.cpu,
@@ -298,7 +301,7 @@ def start(backend: str) -> None:
             offline_cache_file_path=str(cache_directory() / "kernels"),
             log_level=ti.ERROR,
             enable_fallback=False,
-            # Its passes over one large kernel take two thirds of the time to compile it, and win nothing in a pour.
+            # These passes over one large kernel take two thirds of its compile time, and do not make a pour faster.
             cfg_optimization=False,
             # The columns of a scene's table are meant to be unrolled.
             unrolling_limit=0,
@@ -312,10 +315,10 @@ def engine(backend: str | None = None) -> FluidEngine:
     """The process' engine; the first call starts Taichi and allocates.
 
     Args:
-        backend: 'cpu' or 'cuda'; None: whichever runs, else the CPU.
+        backend: 'cpu' or 'cuda'; None: the running one, else the CPU.
 
     Raises:
-        BackendError: not there, or the process already runs the other one.
+        BackendError: it is not available, or the process already runs the other one.
     """
     global _engine
     if _engine is None:
@@ -327,7 +330,7 @@ def engine(backend: str | None = None) -> FluidEngine:
 
 
 def close_engine() -> None:
-    """End Taichi. This is also what writes compiled kernels to the cache."""
+    """End Taichi. This also writes compiled kernels to the cache."""
     global _engine
     if _engine is not None:
         _engine = None

@@ -3,10 +3,10 @@
 Wendland C2 in three dimensions with support h: W(q) = σ (1 − q)⁴ (1 + 4q), q = r/h, σ = 21 / (2π h³). It needs one
 square root per pair, its gradient is finite at r = 0, and it does not pair particles up.
 
-Source: Wendland 1995; Dehnen & Aly 2012 (no pairing instability). Wall integrals: ours, by integration.
+Source: Wendland 1995; Dehnen & Aly 2012 (no pairing instability). Wall integrals: derived here.
 
-Products of vectors in space, written out: Taichi's own ones, for any shape, make kernels a third larger, and their
-compiling and looking up that much slower.
+Products of vectors are written out. Taichi's own products are for any shape; they make kernels a third larger, and slow
+down compiling and cache look-up accordingly.
 """
 
 import math
@@ -19,7 +19,7 @@ SIGMA = 21.0 / (2.0 * math.pi)
 
 @ti.func
 def weight(u: ti.f32) -> ti.f32:
-    """W h³ / σ from u = max(1 − q, 0). Branch-free: listed pairs beyond h cost a misprediction each otherwise."""
+    """W h³ / σ from u = max(1 − q, 0). Branch-free: otherwise each listed pair beyond h costs a misprediction."""
     u2 = u * u
     return u2 * u2 * (5.0 - 4.0 * u)
 
@@ -32,7 +32,7 @@ def slope(u: ti.f32) -> ti.f32:
 
 @ti.func
 def decayed(x: ti.f32) -> ti.f32:
-    """1 − exp(−x) for x ≥ 0, to 1e-6: (Padé's [3/3] of e^(−x/16))^16. The library's exp takes one number at a time."""
+    """1 − exp(−x) for x ≥ 0, to 1e-6: (Padé's [3/3] of e^(−x/16))^16. The library's exp is scalar."""
     y = ti.min(x, 16.0) / 16.0
     y2 = y * y
     even, odd = 1.0 + 0.1 * y2, y * (0.5 + y2 / 120.0)
@@ -72,13 +72,13 @@ def attraction(u: ti.f32) -> ti.f32:
 
 @ti.func
 def attraction_turn(u: ti.f32) -> ti.f32:
-    """(d(size)/dq − size/q) / q² of that force: what its change along r has beside its change across."""
+    """(d(size)/dq − size/q) / q² of that force: the difference of its changes along r and across r."""
     return 64.0 * u * u * (5.0 * u - 3.0)
 
 
 @ti.func
 def bond(u: ti.f32) -> ti.f32:
-    """∫ attraction from q to 1: flat towards q = 0, so that nothing is gained by pairs that close up."""
+    """∫ attraction from q to 1: flat towards q = 0, so that pairs gain no energy by closing up."""
     u2 = u * u
     return u2 * u2 * (16.0 - u * (38.4 - u * (32.0 - u * (64.0 / 7.0))))
 
@@ -93,7 +93,7 @@ def wall_bond(u: ti.f32) -> ti.f32:
 
 @ti.func
 def wall_attraction(u: ti.f32) -> ti.f32:
-    """d(wall_bond)/du: what the half-space attracts with."""
+    """d(wall_bond)/du: the attraction of the half-space."""
     u2 = u * u
     series = 1.0 / 10.0 - u * (17.0 / 60.0 - u * (11.0 / 35.0 - u * (9.0 / 56.0 - u * (2.0 / 63.0))))
     return 64.0 * math.pi * u2 * u2 * u * series

@@ -1,18 +1,19 @@
-"""Neighbour lists: particles sorted by cell (counting sort), explicit half lists that last until one has moved too far.
+"""Neighbour lists, and passes over pairs without lists.
 
-Source: Green 2010 (counting sort on a grid); Verlet 1967 (lists with a skin).
+**Lists.** Particles are sorted by cell (counting sort). Explicit half lists remain valid until a particle has moved too
+far.
 
-Passes over pairs that reach far, without lists: eight pairs at a time.
+**Passes without lists**, for pairs within a long reach: eight pairs at a time. Particles take seats in the order of
+their cells; cells are ordered in columns. The later seats within reach of a particle are then the rest of its own
+column and a stretch of each of the four following columns. These numbers are adjacent in memory, so the processor
+reads, computes and adds them in groups of eight. Four in five particles of a stretch are too far away and add nothing;
+this costs less than listing the near ones and reading them one by one.
 
-Particles take seats in the order of their cells, cells in the order of columns. What lies within reach of a particle,
-behind it in that order, is then the rest of its own column and a stretch of each of the four columns behind it:
-numbers side by side in memory, which the processor reads, works out and adds to in eights. Four in five of a stretch's
-particles are too far away and add nothing; that is cheaper than to list who is near, and to fetch them one by one.
+A stretch is processed in whole groups of eight, so a pass has to ignore seats beyond the stretch's end. After the last
+seat of a scene there are eight empty ones.
 
-A stretch is gone through in whole eights, so a pass has to count nobody from the stretch's end on. Behind the last seat
-of a scene there are eight empty ones.
-
-Source: Green 2010 (counting sort on a grid); verlet lists in clusters, for the same reason: Páll & Hess 2013.
+Source: Green 2010 (counting sort on a grid); Verlet 1967 (lists with a skin); Páll & Hess 2013 (Verlet lists in
+clusters, for the same reason).
 """
 
 import taichi as ti
@@ -24,20 +25,21 @@ from sim_engine.outcome import ParticleState
 SPILLED = int(ParticleState.SPILLED)
 
 LAYERS = 3.0
-"""Cells are as wide and deep as lists reach, and so many times lower: what lies side by side in memory is a column, of
-which a search then takes little more than it needs."""
+"""Cells are as wide and deep as the lists' reach, and lower by this factor. A column is adjacent in memory, and a
+search then reads little more of it than it needs."""
 
 
 @ti.func
 def cover(f: ti.template(), s, reach):
-    """Cells of at least that width over all that moves and is in play: their lowest corner, edges and numbers."""
+    """Cover all moving particles with cells of at least this width: their lowest corner, edges and numbers."""
     low = ti.Vector([1e9, 1e9, 1e9])
     high = ti.Vector([-1e9, -1e9, -1e9])
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         if f.home[i] < SPILLED:
             low = ti.min(low, f.x[i])
             high = ti.max(high, f.x[i])
-    # The domain follows the liquid; if it spreads too far for the table, cells grow. With nobody left it is one cell.
+    # The domain follows the liquid; if it spreads too far for the table, cells become larger. Without particles it is
+    # one cell.
     low = ti.min(low, high)
     edge = ti.Vector([reach, reach, reach / LAYERS])
     size = ti.cast((high - low) / edge, ti.i32) + 1
@@ -49,7 +51,7 @@ def cover(f: ti.template(), s, reach):
 
 @ti.func
 def begin_cells(f: ti.template(), table, cells, begin):
-    """From how many are in each cell to where it begins, `begin` being the first; one more cell than there are."""
+    """Convert counts per cell to start indices, with `begin` as the first; there is one more entry than cells."""
     run = begin
     for c in range(table, table + cells + 1):
         count = f.cell_start[c]
@@ -59,7 +61,7 @@ def begin_cells(f: ti.template(), table, cells, begin):
 
 @ti.func
 def rebuild(f: ti.template(), s, skin):
-    """Sort the moving particles by cell, put the others last, and list all pairs within h + skin·d, each once."""
+    """Sort the moving particles by cell, with the others last, and list all pairs within h + skin·d, each once."""
     reach = (SUPPORT + skin) * f.spacing[s]
     low, edge, size = sort(f, s, reach)
     list_pairs(f, s, reach, low, edge, size)
@@ -67,10 +69,10 @@ def rebuild(f: ti.template(), s, skin):
 
 @ti.func
 def sort(f: ti.template(), s, reach):
-    """Put particles in the order of their cells, and those that move no more last.
+    """Sort particles in the order of their cells, with those that do not move any more last.
 
     Returns:
-        As `cover`. After it cell_start[c] is where cell c ends, so that it begins at cell_start[c − 1].
+        As `cover`. Afterwards cell_start[c] is the end of cell c, so that the cell begins at cell_start[c − 1].
     """
     begin = f.begin[s]
     end = begin + f.moving[s]
@@ -112,7 +114,7 @@ def sort(f: ti.template(), s, reach):
 
 @ti.func
 def list_pairs(f: ti.template(), s, reach, low, edge, size):
-    """List all pairs within `reach`, each at the one that comes first."""
+    """List all pairs within `reach`, each at its first particle."""
     begin = f.begin[s]
     table = f.cells_begin[s]
     entries = f.list_begin[s]
@@ -122,8 +124,8 @@ def list_pairs(f: ti.template(), s, reach, low, edge, size):
         xi = f.x[i]
         q = ti.cast((xi - low) / edge, ti.i32)
         f.first[i] = entries
-        # Every pair once, at the particle that comes first: what is left is the rest of the own column of cells and the
-        # columns behind it. Particles of the cells of a column lie side by side.
+        # Every pair is listed once, at its first particle: the candidates are the rest of the own column of cells and
+        # the following columns. Particles in the cells of a column are adjacent.
         c0 = ti.max(ti.cast((xi[2] - low[2] - reach) / edge[2], ti.i32), 0)
         c1 = ti.min(ti.cast((xi[2] - low[2] + reach) / edge[2], ti.i32), size[2] - 1)
         for a in range(q[0], ti.min(q[0] + 2, size[0])):
@@ -138,7 +140,7 @@ def list_pairs(f: ti.template(), s, reach, low, edge, size):
                     if column + c0 > table:
                         j0 = f.cell_start[column + c0 - 1]
                 for j in range(j0, f.cell_start[column + c1]):
-                    # Branch-free: write always, keep by counting on.
+                    # Branch-free: always write, and advance the count only for pairs to keep.
                     r = xi - f.x[j]
                     f.neighbour[entries] = j
                     entries += ti.cast(square(r) < reach2, ti.i32)
@@ -165,7 +167,7 @@ def take_seats(f: ti.template(), s, reach):
     """Seat the moving particles of a scene, and find each one's stretches for pairs within `reach`.
 
     Returns:
-        The first seat and the one behind the last.
+        The first seat and the one after the last.
     """
     begin = f.begin[s]
     end = begin + f.moving[s]
@@ -190,9 +192,9 @@ def take_seats(f: ti.template(), s, reach):
     behind = seats + f.moving[s]
     for k in range(behind, behind + EIGHT):
         f.seat[k] = ti.Vector([0.0, 0.0, 0.0])
-        f.lean[k] = ti.Vector([0.0, 0.0, 0.0])  # what a pour that diverged left there, times nothing, is no number
+        f.lean[k] = ti.Vector([0.0, 0.0, 0.0])  # a diverged pour may have left NaN there, and NaN times 0 is NaN
         f.missing[k] = 0.0
-    # cell_start[c] is where cell c ends now, so that it begins at cell_start[c − 1].
+    # cell_start[c] is now the end of cell c, so that the cell begins at cell_start[c − 1].
     for k in range(seats, behind):
         x = f.x[f.seated[k]]
         q = ti.cast((x - low) / edge, ti.i32)
@@ -218,5 +220,5 @@ def take_seats(f: ti.template(), s, reach):
 
 @ti.func
 def in_eights(count):
-    """The same number or the next one that eight divides; of a stretch that is empty nothing."""
+    """The number rounded up to a multiple of eight; 0 for an empty stretch."""
     return (ti.max(count, 0) + (EIGHT - 1)) & -EIGHT

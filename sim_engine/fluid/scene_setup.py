@@ -1,4 +1,4 @@
-"""What the engine needs to know of one scene, in numpy; light to import."""
+"""The engine's input for one scene, in numpy. This module has no slow imports."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from sim_engine.vessel.distance_grid import SignedDistanceGrid
 GRAVITY = 9.81
 
 POSE_STEP = 1e-3
-"""Rows of the pose table are so far apart [s]."""
+"""Interval between rows of the pose table [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class SolidWalls:
-    """A vessel as the solver sees it.
+    """A vessel as input of the solver.
 
     Attributes:
         grid: signed distance.
-        plane: distance of the plane that is as solid as the walls, at the grid's nodes [m].
+        plane: distance of the plane equivalent to the walls, at the grid's nodes [m].
         inside: 1 at the grid's nodes where a particle counts as inside.
         thickness: of the thinnest wall [m].
         rim: height of the lip in the vessel's frame [m].
@@ -46,17 +46,17 @@ class SceneSetup:
         density: of the liquid [kg/m³].
         parameters: θ_s.
         pourer, receiver: the vessels.
-        receiver_at: (3,) [m].
-        spill_level: below it and in no vessel a particle is spilled [m].
+        receiver_at: position of the receiver, (3,) [m].
+        spill_level: a particle below it and in no vessel is spilled [m].
         poses: (T, 7) of the pourer, `POSE_STEP` apart, from time 0 on.
-        settling: the lattice settles for so long before `start`, in the pose of that time [s].
-        start: time at which the pourer moves off [s].
-        drift: velocity that all liquid is given at `start`, (3,) [m/s].
+        settling: time for the lattice to settle before `start`, in the pose at `start` [s].
+        start: time at which the pourer begins to move [s].
+        drift: initial velocity of all liquid at `start`, (3,) [m/s].
         gravity: downwards [m/s²].
-        longest_step: [s]; gravity, spacing and speeds may shorten it further. None: the solver's own.
+        longest_step: [s]; gravity, spacing and speeds may shorten it further. None: the solver's default.
         viscosity: kinematic, of a liquid whose viscosity is simulated in SI [m²/s]; 0: θ's rate alone, walls slip.
         no_slip: whether such a liquid sticks to walls.
-        tension: surface tension in place of θ's cohesion [N/m].
+        tension: surface tension that replaces θ's cohesion [N/m].
         contact_angle: on both vessels [rad].
     """
 
@@ -81,7 +81,7 @@ class SceneSetup:
 
 
 def pose_at(poses: NDArray[np.float64], time: float) -> NDArray[np.float64]:
-    """The pose at a time, from the table of poses: place [m] and quaternion (w, x, y, z), not normalised, (7,).
+    """The pose at a time, from the table of poses: position [m] and quaternion (w, x, y, z), not normalised, (7,).
 
     Args:
         poses: see `SceneSetup`.

@@ -1,9 +1,8 @@
 """Arrays of the solver, apart from its algorithm. One set holds many scenes, which share one pool of particles.
 
-What is kept of every scene, written in one go.
-
-Taichi compiles a kernel for every field that Python writes to or reads from: for sixty fields that was a fifth of the
-time that a fresh machine took to answer.
+`FluidState` holds the arrays, `SceneTable` writes the constants of all scenes in one kernel. Taichi compiles a kernel
+for every field that Python writes or reads: for sixty fields this took a fifth of the time until a fresh machine
+responded.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,10 +17,10 @@ from sim_engine.fluid.strength import adhesion, cohesion_acceleration, eddy_rate
 
 @ti.data_oriented
 class SceneTable:
-    """Fields of one value a scene, or of one a vessel of a scene, as the columns of a table.
+    """Fields with one value per scene, or per vessel of a scene, as the columns of a table.
 
     Args:
-        fields: by name, of the shape (scenes,) numbers or vectors, of (scenes, vessels) numbers, vectors or matrices.
+        fields: by name: numbers or vectors of shape (scenes,); numbers, vectors or matrices of shape (scenes, vessels).
     """
 
     def __init__(self, fields: Mapping[str, ti.Field]) -> None:
@@ -53,10 +52,10 @@ class SceneTable:
         self._columns = k
 
     def rows(self, scenes: Sequence[Mapping[str, ArrayLike]]) -> NDArray[np.float64]:
-        """The table of some scenes, (scenes, columns); what is not named is 0.
+        """The table of some scenes, (scenes, columns); fields that are not named are 0.
 
         Args:
-            scenes: values by the field's name, with the shape of what the field has of one scene.
+            scenes: values by the field's name, in the field's shape for one scene.
 
         Raises:
             KeyError: no such field.
@@ -71,7 +70,7 @@ class SceneTable:
 
     @ti.func
     def write(self, s, rows: ti.template()):
-        """Give a scene what its row of the table says."""
+        """Set a scene's fields from its row of the table."""
         for field, k in ti.static(self.scalars):
             field[s] = rows[s, k]
         for field, i, k in ti.static(self.vectors):
@@ -85,10 +84,10 @@ class SceneTable:
 
 
 SUPPORT = 2.2
-"""Kernel support h over spacing d. At 2.0 liquid at rest was a crystal, too stiff for waves (sloshing 6 % fast)."""
+"""Kernel support h over spacing d. At 2.0 liquid at rest was crystalline, too stiff for waves (sloshing 6 % fast)."""
 
 NATURAL_WALL_DISTANCE = 0.44
-"""Spacings at which the unshifted wall integral holds liquid off a wall, measured on a cup at rest."""
+"""Distance, in spacings, at which the unshifted wall integral keeps liquid from a wall, measured on a cup at rest."""
 
 VESSELS = 2
 """Pourer (0) and receiver (1)."""
@@ -97,45 +96,48 @@ NEIGHBOURS = 72
 """Entries in the half lists per particle of a scene; about 18 are used."""
 
 EIGHT = 8
-"""So many numbers the processor takes at a time."""
+"""Numbers that the processor handles at a time."""
 
 STRETCHES = 5
-"""A seat's own column and four behind it."""
+"""Stretches of a seat: its own column and the four following ones."""
 
 LIST_RESERVE = 2_000
-"""Entries that one particle may add before the overflow check sees them; far above any packing."""
+"""Entries that one particle may add before the overflow check; far more than any packing needs."""
 
 CELLS, LEAST_CELLS = 8, 4_096
-"""Cells of a scene's table: so many per particle, and these besides. Liquid that spreads farther gets larger cells."""
+"""Cells of a scene's table: a number per particle, plus a constant. Liquid that spreads farther gets larger cells."""
 
 
 @ti.data_oriented
 class FluidState:
     """Particles, neighbour lists and per-scene scalars.
 
-    A scene s owns the particles from `begin[s]` to `begin[s] + particles[s]`; those still moving come first, sorted by
-    cell. Indices in lists and cells are those of the pool.
+    A scene s owns the particles from `begin[s]` to `begin[s] + particles[s]`; moving ones come first, sorted by cell.
+    Indices in lists and cells are those of the pool.
 
-    Attributes (i: particle):
+    Values of each particle:
+
+    Attributes:
         x, x0, v: position, position before the step [m], velocity [m/s].
         pressure, dp: accumulated density multiplier and its last change [m²].
         density: ρ/ρ₀.
-        phi, normal: distance of the equivalent plane of each vessel's walls [m] at the last look, linearised in
-            between; its gradient. Between steps phi is the signed distance.
-        push: normal displacement given by each wall in this step [m].
-        sag: how much lower each vessel's rim is for this particle [m], see `rims.py`.
+        phi, normal: distance [m] of the equivalent plane of each vessel's walls at the last look-up, linearised in
+            between, and its gradient. Between steps phi is the signed distance.
+        push: normal displacement by each wall in this step [m].
+        sag: how much lower each vessel's rim is for this particle [m], see `walls.py`.
         home: see `sim_engine.outcome.ParticleState`; `name`: index in the scene before any sorting.
-        cell: in which cell a particle is.
-        seated, seat, stretch: of `columns.py`: the particle in a seat, where it is in units of the reach, and among
-            whom its pairs are sought: from the first seat up to the one before the second, `STRETCHES` times a seat.
+        cell: index of the particle's cell.
+        seated, seat, stretch: of passes without lists (`neighbours.py`): the particle in a seat, its position in units
+            of the reach, and the stretches with its possible partners: from one seat up to the one before a second,
+            `STRETCHES` times a seat.
         bonds, missing, lean, pulled: of cohesion, by seat, see `tension.py`.
-        gradient, squares: of a pass over pairs, a vector and a number; of the density, what the constraint's gradients
-            amount to, Σ|∇C|².
+        gradient, squares: of a pass over pairs, a vector and a number; for the density, Σ|∇C|² of the constraint's
+            gradients.
         sums: Σ∇W and Σ|∇W|² of the neighbours, without their common factor.
-        place, move: position and scaled change of the multiplier; displacement [m], whose fourth means nothing.
+        place, move: position and scaled change of the multiplier; displacement [m], whose fourth component is unused.
         first, count, neighbour: neighbour lists (compressed rows), every pair once: at the particle sorted first.
-        pair, share: of each pair in the lists; numbers that lie side by side are worked out eight at a time. Of the
-            density, pair is the kernel's slope between the two, where they were when it was measured last.
+        pair, share: of each pair in the lists; adjacent numbers are computed eight at a time. For the density, pair is
+            the kernel's slope between the two particles at their last measured positions.
     """
 
     def __init__(self, scenes: int, pool: int) -> None:
@@ -165,50 +167,50 @@ class FluidState:
         seats = pool + EIGHT * scenes
         self.seated = ti.field(ti.i32, shape=seats)
         self.stretch = ti.Vector.field(2, ti.i32, shape=seats * STRETCHES)
-        apart = ti.Layout.SOA  # each coordinate of all seats side by side
+        apart = ti.Layout.SOA  # each coordinate of all seats is contiguous
         self.seat, self.lean, self.pulled = (ti.Vector.field(3, ti.f32, shape=seats, layout=apart) for _ in range(3))
         self.bonds, self.missing = (ti.field(ti.f32, shape=seats) for _ in range(2))
         self.cell_start = ti.field(ti.i32, shape=pool * CELLS + scenes * (LEAST_CELLS + 2))
 
         arrays = set(vars(self))
-        # Per scene: its place in the pools …
+        # Per scene: its range in the pools …
         self.begin = ti.field(ti.i32, shape=scenes)
         self.list_begin = ti.field(ti.i32, shape=scenes)
-        self.list_end = ti.field(ti.i32, shape=scenes)  # of the lists there are
+        self.list_end = ti.field(ti.i32, shape=scenes)  # end of the written part of the lists
         self.cells_begin = ti.field(ti.i32, shape=scenes)
         self.cells = ti.field(ti.i32, shape=scenes)
         # … constants of the liquid …
         self.particles = ti.field(ti.i32, shape=scenes)
         self.spacing = ti.field(ti.f32, shape=scenes)
         self.cohesion = ti.field(ti.f32, shape=scenes)  # scale of its accelerations [m/s²]
-        self.adhesion = ti.field(ti.f32, shape=scenes)  # of walls, in units of cohesion's; 0: 90° of contact angle
+        self.adhesion = ti.field(ti.f32, shape=scenes)  # of walls, in units of cohesion's; 0: contact angle of 90°
         self.viscosity = ti.field(ti.f32, shape=scenes)
-        self.eddies = ti.field(ti.f32, shape=scenes)  # rate of relaxation over that at which a pair parts
+        self.eddies = ti.field(ti.f32, shape=scenes)  # rate of relaxation over the rate at which a pair separates
         self.friction = ti.field(ti.f32, shape=scenes)
         self.kinematic = ti.field(ti.f32, shape=scenes)  # viscosity in SI [m²/s]; 0: `viscosity` alone
         self.no_slip = ti.field(ti.f32, shape=scenes)  # 1: such a liquid sticks to walls, 0: it slips
         self.gravity = ti.field(ti.f32, shape=scenes)  # downwards [m/s²]
         self.longest_step = ti.field(ti.f32, shape=scenes)  # [s]
-        self.lip_drop = ti.field(ti.f32, shape=scenes)  # rims are lower for particles at rest by so many spacings
-        self.wall_shift = ti.field(ti.f32, shape=scenes)  # walls act as if that much nearer, in supports h
-        self.wait = ti.field(ti.f32, shape=scenes)  # viscosity acts at such intervals [s]
-        self.pull_wait = ti.field(ti.f32, shape=scenes)  # and cohesion at these at most [s]
+        self.lip_drop = ti.field(ti.f32, shape=scenes)  # rims are lower for particles at rest, in spacings
+        self.wall_shift = ti.field(ti.f32, shape=scenes)  # walls act as if nearer by this distance, in supports h
+        self.wait = ti.field(ti.f32, shape=scenes)  # interval at which viscosity acts [s]
+        self.pull_wait = ti.field(ti.f32, shape=scenes)  # longest interval at which cohesion acts [s]
         self.poses_begin = ti.field(ti.i32, shape=scenes)  # first row in the table of poses
         self.table_step = ti.field(ti.f32, shape=scenes)  # of the pose table [s]
         self.table_length = ti.field(ti.i32, shape=scenes)
-        self.start = ti.field(ti.f64, shape=scenes)  # the pourer moves off [s]
+        self.start = ti.field(ti.f64, shape=scenes)  # time at which the pourer begins to move [s]
         self.drift = ti.Vector.field(3, ti.f32, shape=scenes)  # velocity of all liquid at the start [m/s]
         # Poses of the vessels at the end and at the beginning of the step: vessel frame → world.
         self.origin, self.origin0 = (ti.Vector.field(3, ti.f32, shape=(scenes, VESSELS)) for _ in range(2))
         self.turn, self.turn0 = (ti.Matrix.field(3, 3, ti.f32, shape=(scenes, VESSELS)) for _ in range(2))
         self.spill_level = ti.field(ti.f32, shape=scenes)  # below it and in no vessel: spilled [m]
-        # … and what changes with time.
+        # … and values that change with time.
         self.time = ti.field(ti.f64, shape=scenes)
         self.dt = ti.field(ti.f32, shape=scenes)
         self.fastest = ti.field(ti.f32, shape=scenes)  # speed of the fastest moving particle [m/s]
-        self.waited = ti.field(ti.f32, shape=scenes)  # since viscosity acted [s]
-        self.pull_waited = ti.field(ti.f32, shape=scenes)  # … and cohesion [s]
-        self.open = ti.field(ti.i32, shape=scenes)  # 1: a step has begun, and waits for cohesion
+        self.waited = ti.field(ti.f32, shape=scenes)  # time since viscosity acted [s]
+        self.pull_waited = ti.field(ti.f32, shape=scenes)  # … and since cohesion acted [s]
+        self.open = ti.field(ti.i32, shape=scenes)  # 1: a step has begun and waits for cohesion
         self.steps = ti.field(ti.i32, shape=scenes)
         self.iterations = ti.field(ti.i32, shape=scenes)
         self.passes = ti.field(ti.i32, shape=scenes)  # of conjugate gradients
@@ -223,15 +225,16 @@ class FluidState:
         self.grid_origin = ti.Vector.field(3, ti.f32, shape=(scenes, VESSELS))
         self.grid_spacing = ti.field(ti.f32, shape=(scenes, VESSELS))
         self.plane_offset = ti.field(ti.i32, shape=(scenes, VESSELS))  # … of equivalent distances, same size
-        self.arm = ti.field(ti.f32, shape=scenes)  # farthest that the pourer's grid reaches from its origin [m]
-        self.swing = ti.field(ti.f32, shape=(scenes, VESSELS))  # farthest that they carry a point in this step [m]
+        self.arm = ti.field(ti.f32, shape=scenes)  # largest distance of the pourer's grid from its origin [m]
+        # largest displacement of a point by the vessels in this step [m]
+        self.swing = ti.field(ti.f32, shape=(scenes, VESSELS))
         self.rim = ti.field(ti.f32, shape=(scenes, VESSELS))  # z of the lip in the vessel's frame [m]
         self.wall = ti.field(ti.f32, shape=(scenes, VESSELS))  # smallest thickness [m]
         self.table = SceneTable({name: field for name, field in vars(self).items() if name not in arrays})
 
 
 def of_parameters(setup: SceneSetup) -> dict[str, float]:
-    """What θ_s of a scene is to the methods, by field."""
+    """θ_s of a scene as values of the fields, by name."""
     theta, density, d = setup.parameters, setup.density, setup.spacing
     tension = theta.cohesion if setup.tension is None else setup.tension
     return {

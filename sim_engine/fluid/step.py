@@ -1,8 +1,11 @@
 """One time step, and the loop over steps. Serial within a scene; scenes run side by side.
 
-Step: move the pourer, predict, sweep against the walls, refresh neighbour lists if needed, look up wall distances, warm
-start, iterate the density constraint, sweep again, derive velocities, friction, viscosity and cohesion,
-lower rims, classify.
+Order of a step:
+
+1. move the pourer, predict positions, sweep against the walls;
+2. refresh neighbour lists if needed, look up wall distances;
+3. warm start, iterate the density constraint, sweep again;
+4. derive velocities, friction, viscosity and cohesion, lower rims, classify particles.
 
 Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 """
@@ -33,30 +36,30 @@ CFL = 1.5
 LONGEST_STEP = 4e-3
 PACE = 0.18
 """… and the longest step in units of √(d/g): in a longer one gravity presses layers together faster than the iterations
-part them."""
+separate them."""
 SHORTEST_STEP = 1e-4
 ITERATIONS = 2
-"""At least so many passes over the density constraint in a step …"""
+"""Least number of passes over the density constraint in a step; …"""
 TOLERANCE = 0.015
-"""… and more while the mean compression inside is above this: a deep vessel needs more than a shallow one, …"""
+"""… more while the mean compression inside exceeds this: a deep vessel needs more than a shallow one; …"""
 MOST_ITERATIONS = 30
-"""… but never more than so many."""
+"""… and the largest number of passes."""
 SKIN = 0.03
-"""Neighbour lists reach that many spacings beyond the support. A skin of 0.3 made lists last for three steps of calm
-liquid, and half as long again: every pass over them paid for it."""
+"""Reach of neighbour lists beyond the support, in spacings. With a skin of 0.3 lists lasted for three steps of calm
+liquid, but they were half as long again, which slowed every pass over them."""
 SMOOTHEST, ROUGHEST = 0.7, 3.7
-"""Eigenvalues of the iteration matrix between which Chebyshev's polynomials damp: ROUGHEST is the largest that occurs
-(dense packing, h = 2.2 d); a smaller SMOOTHEST gives longer strides, and noise at rest."""
+"""Range of eigenvalues of the iteration matrix that Chebyshev's polynomials damp. ROUGHEST is the largest that occurs
+(dense packing, h = 2.2 d); a smaller SMOOTHEST gives larger steps, and noise at rest."""
 CONTACT = 0.2
-"""Particles' centres keep that many spacings from solid; the density constraint keeps about half a spacing."""
+"""Distance of particles' centres from solid, in spacings; the density constraint keeps about half a spacing."""
 WARM = 0.3
-"""Share of the last step's multipliers that a step starts with. From one half on, deep liquid swings up: multipliers
-then answer to what was, not to what is (docs/how-it-works.md has the analysis)."""
+"""Fraction of the last step's multipliers with which a step starts. From one half on, oscillations grow in deep liquid,
+because the multipliers respond to the previous state (docs/how-it-works.md has the analysis)."""
 TREACLE = 0.7
-"""Before the start velocities shrink to this part in every step: a lattice settles without splashing."""
+"""Factor by which velocities shrink in every step before the start, so that a lattice settles without splashing."""
 
 FACTS = ("time", "fault", "steps", "iterations", "compression")
-"""What `Stepper.look` tells of a scene beside its particles; names of fields."""
+"""Names of the fields that `Stepper.look` returns for a scene in addition to its particles."""
 
 IN_POURER, IN_FLIGHT, RECEIVED, SPILLED, ESCAPED = (int(s) for s in ParticleState)
 
@@ -76,7 +79,7 @@ def rotation(q):
 
 @ti.func
 def received(f: ti.template(), cavities: ti.template(), s, x):
-    """1 if a point of the world lies in the receiver, or up to half a spacing above."""
+    """1 if a point of the world lies in the receiver, or up to half a spacing above it."""
     y = to_vessel(f, s, 1, x, False)
     inside = in_cavity(f, cavities, s, 1, y)
     if inside == 0:
@@ -94,7 +97,7 @@ class Stepper:
 
     @ti.func
     def place_pourer(self, s, time, poses: ti.template()):
-        """Pose of the pourer from the table, rows of which are `table_step` apart."""
+        """Pose of the pourer from the table, whose rows are `table_step` apart."""
         f = self.state
         u = ti.cast(ti.max(time, f.start[s]) / f.table_step[s], ti.f32)
         k = ti.min(ti.cast(u, ti.i32), f.table_length[s] - 2)
@@ -109,7 +112,7 @@ class Stepper:
 
     @ti.func
     def predict(self, s, dt, grids: ti.template(), thick: ti.template()):
-        """Ballistic prediction, stopped by walls; asks for new lists if someone has moved too far."""
+        """Ballistic prediction, stopped by walls. Requests new lists if a particle has moved too far."""
         f = self.state
         clear = CONTACT * f.spacing[s]
         limit = 0.45 * SKIN * f.spacing[s]
@@ -120,7 +123,7 @@ class Stepper:
             if ti.static(not thick):
                 v[2] -= f.gravity[s] * dt
             x = x0 + dt * v
-            # φ is that of the end of the last step: solid farther off than the way can't be met.
+            # φ is that of the end of the last step: solid farther away than the displacement cannot be reached.
             reach = STRETCH * dt * length(v) + 2.0 * clear
             for b in range(VESSELS):
                 if f.phi[i][b] < reach + STRETCH * f.swing[s, b]:
@@ -150,10 +153,10 @@ class Stepper:
 
     @ti.func
     def apply(self, s):
-        """Move by the displacements found; linearised wall contact.
+        """Move by the computed displacements; linearised wall contact.
 
-        `CONTACT` is kept at the step's end only: held to it in every iteration, the ring of particles in a corner never
-        came to rest.
+        `CONTACT` is enforced only at the step's end: if it was enforced in every iteration, the ring of particles in a
+        corner never came to rest.
         """
         f = self.state
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
@@ -173,9 +176,9 @@ class Stepper:
 
     @ti.func
     def solve_density(self, s, ratio):
-        """Chebyshev-accelerated Jacobi, from a share of the last step's multipliers on.
+        """Chebyshev-accelerated Jacobi iteration, which starts from a fraction of the last step's multipliers.
 
-        That share is not moved by on its own: the first iteration's displacements carry it, too.
+        This fraction causes no displacement by itself; the first iteration's displacements include it.
 
         Args:
             s: scene.
@@ -210,7 +213,7 @@ class Stepper:
 
     @ti.func
     def finish(self, s, dt, grids: ti.template()):
-        """Last look at the walls, friction, velocities."""
+        """Final look-up of the walls, friction, velocities."""
         f = self.state
         d = f.spacing[s]
         clear = CONTACT * d
@@ -241,7 +244,8 @@ class Stepper:
                         push += clear - phi
                         phi = clear
                     if push > 0.0 and phi < 1.5 * d:
-                        # Coulomb: the wall, which moves with the vessel's frame, holds back at most μ times its push.
+                        # Coulomb: the wall, which moves with the vessel's frame, holds back at most μ times its normal
+                        # displacement.
                         way = y - y0
                         along = way - dot(way, n) * n
                         slid = length(along)
@@ -262,9 +266,9 @@ class Stepper:
 
     @ti.func
     def classify(self, s, cavities: ti.template()):
-        """Where every moving particle is now, and how fast the fastest one.
+        """Classify every moving particle by its place, and find the largest speed.
 
-        Half a spacing above its opening plane still belongs to the receiver.
+        The space up to half a spacing above the opening plane counts as the receiver.
         """
         f = self.state
         compressed = ti.cast(0.0, ti.f32)
@@ -292,7 +296,7 @@ class Stepper:
 
     @ti.func
     def let_fall(self, s, dt):
-        """Particles out of play fall to the table, for pictures only."""
+        """Particles out of play fall to the table, for display only."""
         f = self.state
         for i in range(f.begin[s] + f.moving[s], f.begin[s] + f.particles[s]):
             if f.x[i][2] > 0.0:
@@ -311,7 +315,7 @@ class Stepper:
         poses: ti.template(),
         thick: ti.template(),
     ):
-        """One time step of one scene, up to cohesion, which has a kernel of its own: `conclude` does the rest."""
+        """One time step of one scene, up to cohesion, which has a separate kernel; `conclude` completes the step."""
         f = self.state
         longest = ti.min(f.longest_step[s], PACE * ti.sqrt(f.spacing[s] / ti.max(f.gravity[s], 1e-3)))
         dt = ti.min(ti.max(CFL * f.spacing[s] / (f.fastest[s] + 1e-6), SHORTEST_STEP), longest)
@@ -323,7 +327,7 @@ class Stepper:
         f.turn0[s, 0] = f.turn[s, 0]
         f.time[s] += dt
         self.place_pourer(s, f.time[s], poses)
-        # No point of the pourer's grid is carried farther than this in the step: a difference of two rotations
+        # Upper bound of the displacement of any point of the pourer's grid in the step: a difference of two rotations
         # stretches nothing by more than 1/√2 of its Frobenius norm.
         turned = f.turn[s, 0] - f.turn0[s, 0]
         f.swing[s, 0] = length(f.origin[s, 0] - f.origin0[s, 0]) + turned.norm() * (f.arm[s] / ti.sqrt(2.0))
@@ -347,7 +351,7 @@ class Stepper:
 
     @ti.func
     def conclude(self, s, cavities: ti.template(), thick: ti.template()):
-        """The rest of a time step."""
+        """Complete a time step."""
         f = self.state
         dt = f.dt[s]
         if f.time[s] < f.start[s]:
@@ -375,14 +379,16 @@ class Stepper:
         due: ti.types.ndarray(dtype=ti.i32, ndim=1),
         thick: ti.template(),
     ):
-        """Run each of the scenes s0 … s1 − 1 until its time reaches `until[s]` [s], a fault stops it, or cohesion is
-        due.
+        """Advance each of the scenes s0 … s1 − 1 until its time reaches `until[s]` [s], a fault stops it, or cohesion
+        is due.
 
-        Cohesion is due in the middle of a step: with `due[s]` 1 call `cohere`, and this again. Two kernels are compiled
-        in less time than one that has both, and who simulates without cohesion never compiles it.
+        Cohesion is due in the middle of a step: if `due[s]` is 1, call `cohere`, and then this kernel again. Two
+        kernels compile in less time than one with both parts, and simulations without cohesion never compile the
+        second.
 
-        Scenes are independent: on a GPU each has a thread, on a CPU they follow each other. All of them are `thick`,
-        liquids of a viscosity in SI, or none is: two kernels, so that the one knows nothing of the other.
+        Scenes are independent: on a GPU each has a thread, on a CPU they run one after another. Either all of them are
+        `thick`, liquids with a viscosity in SI, or none is. These are two kernels, so that neither contains code of the
+        other.
         """
         f = self.state
         for s in range(s0, s1):
@@ -392,7 +398,7 @@ class Stepper:
                     self.conclude(s, cavities, thick)
                 else:
                     self.step(s, grids, planes, cavities, poses, thick)
-                    # Too late is unstable: before it could be, not after.
+                    # Cohesion that acts too late is unstable, so it acts before the interval ends.
                     if f.cohesion[s] > 0.0 and f.pull_waited[s] + f.dt[s] > f.pull_wait[s]:
                         due[s] = 1
 

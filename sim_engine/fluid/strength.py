@@ -1,20 +1,20 @@
-"""How strong cohesion and viscosity are, and how often they act: numbers, without Taichi."""
+"""Strength of cohesion and viscosity, and the intervals at which they act. Numbers, without Taichi."""
 
 import math
 
 RANGE = 3.0
-"""Over spacing d."""
+"""Range of cohesion over spacing d."""
 SURFACE = 0.66
-"""Energy of what a spacing's square of a surface has by the sums of `tension`: scales cohesion to its tension. From
-the frequency of drops (`sim_engine.validation.capillarity`)."""
+"""Energy of a surface of one spacing squared by the sums of `tension`: scales cohesion to its tension. Measured by the
+frequency of drops (`sim_engine.validation.capillarity`)."""
 CAPILLARY = 0.56
-"""Cohesion acts at intervals of at most that part of the capillary time; at 0.9 of it drops heat up."""
+"""Longest interval of cohesion, as a fraction of the capillary time; at 0.9 of it drops heat up."""
 LONGEST_WAIT = 0.01
-"""Viscosity acts at least that often [s]."""
+"""Longest interval of viscosity [s]."""
 
 
 def pull_interval(tension: float, density: float, spacing: float) -> float:
-    """Longest time after which cohesion acts again: `CAPILLARY` of √(ρ d³ / (2π σ)) (Brackbill et al. 1992) [s].
+    """Longest interval of cohesion: `CAPILLARY` of √(ρ d³ / (2π σ)) (Brackbill et al. 1992) [s].
 
     Args:
         tension: σ [N/m].
@@ -25,7 +25,7 @@ def pull_interval(tension: float, density: float, spacing: float) -> float:
 
 
 def cohesion_acceleration(tension: float, density: float, spacing: float) -> float:
-    """What one unit of the energies' slopes accelerates a particle with, σ d² / SURFACE / (ρ d³ · RANGE d) [m/s²].
+    """Acceleration of a particle by one unit of the energies' slopes, σ d² / SURFACE / (ρ d³ · RANGE d) [m/s²].
 
     Args:
         tension: σ [N/m].
@@ -36,9 +36,9 @@ def cohesion_acceleration(tension: float, density: float, spacing: float) -> flo
 
 
 def adhesion(contact_angle: float, wall_distance: float) -> float:
-    """What walls attract particles with, in units of the energies' slopes; negative: they repel.
+    """Attraction of particles by walls, in units of the energies' slopes; negative values repel.
 
-    Layers that rest on a wall have the energy −σ cos θ per area of it, altogether.
+    All layers that rest on a wall have together the energy −σ cos θ per area of it.
 
     Args:
         contact_angle: θ [rad].
@@ -58,12 +58,12 @@ def _wall_bond(u: float) -> float:
 
 
 def eddy_rate(constant: float) -> float:
-    """Rate of relaxation over the rate at which a pair parts, from Smagorinsky's constant C."""
+    """Rate of relaxation over the rate at which a pair separates, from Smagorinsky's constant C."""
     return 5.0 * constant**2 * math.sqrt(15.0)
 
 
 def relax_interval(viscosity: float) -> float:
-    """Time after which viscosity acts again, at most `LONGEST_WAIT` and a tenth of its own time [s].
+    """Interval of viscosity, at most `LONGEST_WAIT` and a tenth of its own time [s].
 
     Args:
         viscosity: XSPH rate [1/s].

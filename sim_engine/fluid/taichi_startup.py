@@ -1,8 +1,7 @@
-"""What Taichi 1.7 does in every process and nobody here needs, left out.
+"""Removes work of Taichi 1.7 at start-up that is not needed here, without any change to computed results.
 
-Nothing of it touches what is computed. Each piece looks whether what it replaces is there; where it isn't, Taichi does
-as it always did. `DECANT_KERNEL_PLACES=1` leaves it as it is, for who changes a kernel and wants to be told where an
-error is.
+Each replacement first checks that its target exists; otherwise Taichi works as usual. `DECANT_KERNEL_PLACES=1` switches
+all replacements off. Use it to get the positions of errors while you change a kernel.
 """
 
 from __future__ import annotations
@@ -26,13 +25,13 @@ ENVIRONMENT_VARIABLE = "DECANT_KERNEL_PLACES"
 
 
 def as_it_is() -> bool:
-    """Whether Taichi is to be left alone."""
+    """Whether Taichi must be left unchanged."""
     return bool(os.environ.get(ENVIRONMENT_VARIABLE))
 
 
 @contextlib.contextmanager
 def uncollected() -> Iterator[None]:
-    """Without the garbage collector, which goes through a growing heap again and again and finds nothing."""
+    """Context without the garbage collector, which would search a growing heap repeatedly and find nothing."""
     collecting = gc.isenabled()
     gc.disable()
     try:
@@ -44,15 +43,14 @@ def uncollected() -> Iterator[None]:
 
 @contextlib.contextmanager
 def imports() -> Iterator[None]:
-    """In which Taichi, and modules with kernels, are imported quickly.
+    """Context in which Taichi, and modules with kernels, are imported quickly.
 
-    For every function Taichi looks whether it is written inside a class, and to find that line goes through all modules
-    there are.
+    For every function Taichi checks whether it is written inside a class. To find that line it searches all modules.
     """
     if as_it_is():
         yield
         return
-    # Of what serves source typed at a prompt, and what asks Taichi's maker for a newer version, the names will do.
+    # Empty modules replace the one for source typed at a prompt and the one that checks for a newer version.
     prompt, version = ModuleType("dill"), ModuleType("taichi._version_check")
     version.start_version_check_thread = _nothing  # type: ignore[attr-defined]
     for module in prompt, version:
@@ -62,13 +60,13 @@ def imports() -> Iterator[None]:
             yield
     finally:
         _replace(sys.modules.get("taichi.lang.kernel_impl"), "_inside_class", _quick_look)
-        if sys.modules.get("dill") is prompt:  # who wants that shall have it
+        if sys.modules.get("dill") is prompt:  # remove the replacement, so that a later import gets the real module
             del sys.modules["dill"]
 
 
 @contextlib.contextmanager
 def _lines_read() -> Iterator[None]:
-    """In which the line of a frame is read from where the frame says that it is."""
+    """Context in which the line of a frame is read from the frame's own file."""
     search = inspect.getframeinfo
     inspect.getframeinfo = _line_of  # type: ignore[assignment]
     try:
@@ -86,39 +84,39 @@ def _quick_look(look: Callable[[int], bool]) -> Callable[[int], bool]:
 
 
 def _line_of(frame: FrameType, context: int = 1) -> inspect.Traceback:
-    """As `inspect.getframeinfo` with one line of context."""
+    """Like `inspect.getframeinfo` with one line of context."""
     code = frame.f_code
     line = linecache.getline(code.co_filename, frame.f_lineno, frame.f_globals)
     return inspect.Traceback(code.co_filename, frame.f_lineno, code.co_name, [line], 0)
 
 
 def look_up_quickly() -> None:
-    """Keep Taichi from what takes most of the time in which even known kernels are looked up in its cache."""
+    """Remove the work that takes most of the time when compiled kernels are looked up in Taichi's cache."""
     if as_it_is():
         return
     with imports():
-        _part("matrix_ops")  # the first kernel would load it, less quickly
+        _part("matrix_ops")  # the first kernel would import it, more slowly
     expr, impl, kernel_impl, builder = (_part(n) for n in ("expr", "impl", "kernel_impl", "ast.ast_transformer_utils"))
-    # For each of the thousands of nodes of a kernel it looks for the method by its name, notes the place, …
+    # For each of a kernel's thousands of nodes Taichi finds the method by name, stores the position, …
     if hasattr(impl, "get_runtime") and isinstance(getattr(impl.get_runtime(), "src_info_stack", None), list):
         _replace(getattr(builder, "Builder", None), "__call__", functools.partial(_quick_builder, impl.get_runtime))
-    # … draws the line and carets of an error message, …
+    # … formats the line and carets of an error message, …
     _replace(getattr(builder, "ASTTransformerContext", None), "get_pos_info", lambda _: _nothing)
-    # … keeps the stack for each field, in case it will not be placed, …
+    # … stores the stack for each field, for the case that it is not placed, …
     for module in impl, _part("snode"):
         _replace(module, "get_traceback", lambda _: _nothing)
-    # … looks for a function's source anew wherever it is called, and breaks each of its lines at 9,999 characters.
+    # … searches a function's source again for every call, and wraps each of its lines at 9,999 characters.
     _replace(kernel_impl, "getsourcefile", functools.cache)
     _replace(kernel_impl, "getsourcelines", lambda search: functools.cache(functools.partial(_source, search)))
     _replace(kernel_impl, "textwrap", lambda _: _Text)
-    # For each integer it asks numpy for the range of its kind, …
+    # For each integer it queries the range of its type from numpy, …
     _replace(expr, "_check_in_range", lambda _: _in_range)
-    # … and what it makes of a kernel is full of cycles, none of which ends while it does.
+    # … and its objects for a kernel form cycles, none of which ends before the kernel is built.
     _replace(getattr(kernel_impl, "Kernel", None), "materialize", _uncollected_call)
 
 
 def _part(name: str) -> Any:
-    """A module of Taichi's language, if there is one of that name."""
+    """A module of Taichi's language, if one of that name exists."""
     try:
         return importlib.import_module(f"taichi.lang.{name}")
     except ImportError:
@@ -126,7 +124,7 @@ def _part(name: str) -> Any:
 
 
 def _replace(owner: object, name: str, by: Callable[[Any], object]) -> None:
-    """Put something in place of an attribute, once; nothing where it is not there."""
+    """Replace an attribute once; does nothing if it does not exist."""
     old = getattr(owner, name, None)
     if old is not None and (owner, name) not in _replaced:
         _replaced.add((owner, name))
@@ -141,7 +139,7 @@ def _nothing(*_: object, **__: object) -> str:
 
 
 def _quick_builder(runtime: Callable[[], Any], build: Callable[..., object]) -> Callable[..., object]:
-    """As Taichi's builder, which gets to see only what goes wrong."""
+    """Like Taichi's builder, which is then called only for errors."""
     methods: dict[type, Any] = {}
 
     def quick(self: Any, context: object, node: object) -> object:
@@ -164,7 +162,7 @@ def _quick_builder(runtime: Callable[[], Any], build: Callable[..., object]) -> 
 
 
 class _Raising:
-    """A builder that meets with a problem, whatever it builds."""
+    """A builder that raises, whatever it builds."""
 
     def __init__(self, problem: Exception) -> None:
         self._problem = problem
@@ -179,7 +177,7 @@ class _Raising:
 
 
 def _source(search: Callable[..., tuple[list[str], int]], function: Any) -> tuple[list[str], int]:
-    """Lines of a function and the number of the first; `inspect` goes through it token by token to find its end."""
+    """Lines of a function and the number of the first; `inspect` would read it token by token to find its end."""
     code = getattr(inspect.unwrap(function), "__code__", None)
     lines = linecache.getlines(code.co_filename) if isinstance(code, CodeType) else []
     if not isinstance(code, CodeType) or not lines:
@@ -187,7 +185,7 @@ def _source(search: Callable[..., tuple[list[str], int]], function: Any) -> tupl
     first = code.co_firstlineno - 1
     margin = _margin(lines[first])
     end = _last_line(code)
-    # Behind its last expression a function has brackets that close, if anything.
+    # After its last expression a function contains at most closing brackets.
     while end < len(lines) and lines[end].strip() and _margin(lines[end]) > margin:
         end += 1
     return lines[first:end], first + 1
@@ -204,13 +202,13 @@ def _last_line(code: CodeType) -> int:
 
 
 class _Text:
-    """What Taichi uses of `textwrap`."""
+    """The part of `textwrap` that Taichi uses."""
 
     dedent = staticmethod(textwrap.dedent)
 
     @staticmethod
     def fill(line: str, **options: Any) -> str:
-        """A line of source that is not to be broken."""
+        """Return a line of source unchanged."""
         if "\t" in line or len(line) > 200:
             return textwrap.fill(line, **options)
         return line.rstrip()

@@ -1,23 +1,24 @@
 """Cohesion: the surface's energy, its tension times its area, and that energy's exact gradient as the force.
 
-What a particle has of the surface follows from two sums over its neighbours: the attraction that does not cancel, a
-vector g (1 on a plane surface, 0 inside), and the share of bonds that it lacks, δ. Its energy is
+A particle's part of the surface follows from two sums over its neighbours: the attraction that does not cancel, a
+vector g (|g| = 1 on a plane surface, 0 inside), and the fraction of missing bonds, δ. Its energy is
 
     E_i = σ d² / SURFACE · (√(max(|g| − CALM, 0)² + (ALONE δ)² + BLUNT²) − BLUNT).
 
 The first part is the total variation of a smoothed indicator: a stress along the surface and none inside, so that the
-bulk feels Laplace's pressure alone. A plain pairwise attraction with the same tension presses twenty to thirty times
-harder, and particles under pressure are a soft glass, which creeps where a drop should oscillate. The second part is
-what keeps drops together: the first one alone costs nothing for a particle on its own, and evaporates. Forces are those
-of an energy, equal and opposite in pairs: they conserve momentum and heat nothing, if they act often enough.
+bulk is subject to Laplace's pressure alone. A plain pairwise attraction with the same tension presses twenty to thirty
+times harder. Particles under such pressure form a soft glass, which creeps instead of oscillating like a drop. The
+second part keeps drops together: with the first part alone a single particle has no energy, and drops evaporate. The
+forces derive from an energy, and are equal and opposite in pairs. They conserve momentum and do not heat the liquid, if
+they act often enough.
 
-Walls count as liquid: where they are wet there is no surface, where they are dry there is none either. To wet one costs
-no energy then, which is a contact angle of 90° (Young 1805). Any other one, θ, is the energy −σ cos θ per area of wet
-wall: particles are attracted (or repelled) by walls, in such a way that all layers within RANGE have that energy.
+Walls count as liquid, so neither wet nor dry walls have a surface. Wetting a wall then costs no energy, which is a
+contact angle of 90° (Young 1805). Any other angle θ is the energy −σ cos θ per area of wet wall: walls attract (or
+repel) particles so that all layers within RANGE have that energy together.
 
 Range: at 2.2 d, the density's support, drops of 2,000 particles are damped seven times as much as at 3 d.
 
-Source: ours; total variation as interfacial energy: Modica 1987; forces as exact gradients: Bonet & Lok 1999.
+Source: derived here; total variation as interfacial energy: Modica 1987; forces as exact gradients: Bonet & Lok 1999.
 """
 
 import taichi as ti
@@ -38,15 +39,15 @@ from sim_engine.fluid.state import STRETCHES, VESSELS
 from sim_engine.fluid.strength import RANGE
 
 ALONE = 3.0
-"""Weight of the bonds that are missing. At 1 drops lose their density, at 2 and range 2.8 oscillations decay faster."""
+"""Weight of the missing bonds. At 1 drops lose their density; at 2 and range 2.8 oscillations decay faster."""
 CALM = 0.1
-"""So much attraction is left over by the disorder of the bulk, which is no surface."""
+"""Remaining attraction due to the disorder of the bulk, which does not count as surface."""
 BLUNT = 0.3
-"""Rounds the energy off towards the bulk; the sharper, the shorter the intervals at which forces must act."""
+"""Rounds the energy off towards the bulk; a sharper transition requires shorter intervals between forces."""
 BONDED = 0.9
-"""Bonds of a particle that lacks none, over those of a continuum."""
+"""Bonds of a particle that lacks none, relative to those of a continuum."""
 LARGEST_PULL = 0.1
-"""Cohesion moves a particle by at most so many spacings at a time: a strong tension at fine spacing stays stable."""
+"""Largest displacement by cohesion at a time, in spacings: a strong tension at fine spacing stays stable."""
 
 WHOLE = BULK_BOND * RANGE**3
 PLANE = HALF_ATTRACTION * RANGE**3
@@ -54,10 +55,10 @@ PLANE = HALF_ATTRACTION * RANGE**3
 
 @ti.func
 def look_at_surface(f: ti.template(), s, seats, behind, inv_h):
-    """Sums over pairs, from which follows what each particle has of the surface.
+    """Sums over pairs, and from them each particle's part of the surface.
 
-    Leaves the energy's derivatives by the two sums: by the one over attractions in `lean`, by the one over bonds, which
-    is negative and kept without its sign, in `missing`.
+    Stores the energy's derivatives by the two sums: by the sum over attractions in `lean`; by the sum over bonds, which
+    is negative, with reversed sign in `missing`.
     """
     for k in range(seats, behind):
         i = f.seated[k]

@@ -1,62 +1,66 @@
-"""Viscosity in SI: gravity and Newton's friction over a step at once, implicitly, with walls that liquid sticks to.
+"""Viscosity: in SI for thick liquids, and by relaxation (XSPH) for liquids as thin as water.
 
-Sought are the velocities at which the liquid's kinetic energy, what gravity does to it and what friction takes balance:
+**Viscosity in SI** (`flow`): gravity and Newton's friction over a step together, implicitly, with no-slip walls. The
+solution is the velocities at which the liquid's kinetic energy, the work of gravity and the loss by friction balance:
 
-    (1 + dt L) v = v* + dt g,    L = −ν ∇² between particles, and the wall's drag on those beside it.
+    (1 + dt L) v = v* + dt g,    L = −ν ∇² between particles, plus the wall's drag on those next to it.
 
 Between particles, after Weiler et al. 2018,
 
     (L v)_i = Σ_j ν_ij 10 V (σ/h⁵) 20 u³ ((v_i − v_j)·e) e,    u = 1 − r/h, e = (x_i − x_j)/r:
 
-forces along the line of a pair that depend on how fast it parts: liquid that turns as a whole is left alone, momentum
-and angular momentum are kept, and a free surface is free of stress by itself. L is symmetric and not negative, so that
-any time step is stable; conjugate gradients solve it without a matrix, in a few passes over the neighbour lists.
+These forces act along the line of a pair and depend on its rate of separation. They vanish for rigid rotation, conserve
+momentum and angular momentum, and make a free surface free of stress without further conditions. L is symmetric and
+positive semidefinite, so any time step is stable. Conjugate gradients solve the system without a matrix, in a few
+passes over the neighbour lists.
 
-Walls. A layer of particles beside a wall sees the linear part of the boundary layer, from the wall, where liquid is at
-rest, to its own middle at a distance s. The stress there is μ u / s, and acts on a layer whose mass per area is ρ d:
+Walls. A layer of particles next to a wall represents the linear part of the boundary layer, from the wall, where liquid
+is at rest, to the layer's own middle at a distance s. The stress there is μ u / s, and acts on a layer whose mass per
+area is ρ d:
 
-    drag = ν / (d s) · (u along the wall, relative to it),    fading between ¾ and 1¼ spacings from the wall,
+    drag = ν / (d s) · (u along the wall, relative to it),    fading between ¾ and 1¼ spacings from the wall.
 
-which takes the same stress from a layer at d/2 as from particles that lie anywhere: ∫ drag s ds = ν u/s. A film of one
-layer has nothing above it to pull it along; gravity moves it by g e²/3ν in the mean (Nusselt 1916), and sparse
-particles stand for a film thinner than d: their drag is 3ν/e², with e from how many neighbours they have.
+A layer at d/2 and particles at other distances receive the same stress: ∫ drag s ds = ν u/s. A film of one layer has
+nothing above it to pull it along; gravity moves it by g e²/3ν on average (Nusselt 1916). Sparse particles represent a
+film thinner than d: their drag is 3ν/e², and e follows from their number of neighbours.
 
-What is not resolved keeps the viscosity of eddies (`viscosity.py`) where that is larger. A boundary layer that is
-thinner than d/2, √(πνt) < d/2 after a time t, takes more from the liquid than this.
+Unresolved motion keeps the eddy viscosity (see below) if that is larger. A boundary layer that is thinner than d/2,
+√(πνt) < d/2 after a time t, takes more momentum from the liquid than this model does.
 
 Source: Weiler, Koschier, Brand & Bender 2018, A physically consistent implicit viscosity solver for SPH fluids; walls
-and thin films: ours, as above.
+and thin films: derived here, as above.
 
-Viscosity: velocities relax towards the neighbours' mean (XSPH), at a given rate and at that of unresolved motion.
+**Relaxation** (`relax`): velocities relax towards the neighbours' mean (XSPH), at a given rate plus that of unresolved
+motion. Shear over a few spacings makes particles climb over each other, and the resulting motion scatters a stream,
+more with coarser particles. In a liquid such motion decays into eddies smaller than a spacing. Their viscosity is
+Smagorinsky's, ν = (C d)² |S| with C = 0.17 (Lilly, from Kolmogorov's spectrum; θ may have another value) and the strain
+rate |S| = √(2 S:S).
 
-Shear that is felt over a few spacings makes particles climb over each other; what they gain scatters a stream, the
-more the coarser they are. In a liquid such motion decays into eddies smaller than a spacing. Their viscosity is that
-of Smagorinsky, ν = (C d)² |S| with C = 0.17 (Lilly, from Kolmogorov's spectrum; θ may have another one) and the strain
-rate |S| = √(2 S:S). Of a pair it is taken from the rate e at which the two part, over their distance: over all
-directions the mean of e² is |S|²/15, and turning as a whole strains nobody. A relaxation at the rate k acts like a
-kinematic viscosity of k d²/5, so to the given rate is added 5 C² √15 |e|, whose viscosity vanishes as spacings do.
-
-Both are slow, and act only every few steps.
+For a pair it is computed from the rate e at which the two separate, divided by their distance: averaged over all
+directions e² is |S|²/15, and rigid rotation causes no strain. A relaxation at the rate k acts like a kinematic
+viscosity of k d²/5. Therefore 5 C² √15 |e|, whose viscosity vanishes with the spacing, is added to the given rate. Both
+are slow, and act only every few steps.
 
 Source: Schechter & Bridson 2012 (XSPH); Smagorinsky 1963, Lilly 1967; with particles: Dalrymple & Rogers 2006.
 
-What the packing of particles resists with, taken out of the velocities of thick liquids.
-
-Particles under pressure are a weak solid. The density constraint's displacements −Σ (λ_i + λ_j) V ∇W are the gradient
-of the multipliers λ only where the neighbours of a particle lie evenly around it; where shear has pushed them together
-along one direction and apart along another, they hold back the shear, by a few percent of the pressure and however slow
-it is. A gradient that is exact for linear λ, whatever the neighbours,
+**Packing resistance** (`yield_to_shear`): removed from the velocities of thick liquids. Particles under pressure are a
+weak solid. The density constraint's displacements −Σ (λ_i + λ_j) V ∇W are the gradient of the multipliers λ only if the
+neighbours of a particle are evenly distributed. If shear has pushed them together along one direction and apart along
+another, the displacements resist the shear by a few percent of the pressure, however slow the shear is. The following
+gradient is exact for linear λ and any arrangement of neighbours:
 
     ∇λ = M⁻¹ Σ (λ_j − λ_i) V ∇W,    M = Σ V (x_j − x_i) ⊗ ∇W,
 
-knows nothing of that. What the two differ by, divided by the time step and averaged over each particle's neighbours, is
-added to the velocities. Positions stay where the constraint has put them: it is what keeps particles apart.
+It does not contain this resistance. The difference of the two, divided by the time step and averaged over each
+particle's neighbours, is added to the velocities. Positions stay as the constraint has set them, because it keeps
+particles apart.
 
-Only inside: beside walls and the surface M is far from the identity, and the difference is none of the packing's alone;
-there, liquid at rest would be stirred. Without the average its short waves would heat the liquid: with it a liquid of
-100 mm²/s at rest jiggles at .02 m/s in place of .01. Momentum is not kept to the bit.
+The correction acts only inside. Next to walls and the surface M is far from the identity, and the difference has other
+causes; there it would stir liquid at rest. Without the average its short waves would heat the liquid: with it the
+velocity fluctuations of a liquid of 100 mm²/s at rest are 0.02 m/s instead of 0.01. Momentum is not conserved to the
+last bit.
 
-Source: ours; gradients that are exact for linear functions: Randles & Libersky 1996.
+Source: derived here; gradients that are exact for linear functions: Randles & Libersky 1996.
 """
 
 import taichi as ti
@@ -67,29 +71,31 @@ from sim_engine.fluid.state import SUPPORT, VESSELS
 from sim_engine.fluid.walls import to_vessel
 
 LAYERED = 1.14
-"""The sum over pairs is that of the continuum among particles in disorder, and 0.76 of it where they lie in layers
-that slide over each other, as they do beside walls: between the two."""
+"""The sum over pairs is that of the continuum among disordered particles, and 0.76 of it among layers that slide over
+each other, as next to walls. This factor is between the two."""
 PAIRS = LAYERED * 200.0 * SIGMA / SUPPORT**5
-"""Of a pair's coefficient: 10 V (σ/h⁵) 20 in units of 1/d²."""
+"""Coefficient of a pair: 10 V (σ/h⁵) 20 in units of 1/d²."""
 NEAREST = 0.25
-"""No particle is taken to be nearer to a wall than that many spacings."""
+"""Least distance of a particle from a wall, in spacings."""
 FADES, ENDS = 0.75, 1.25
-"""Between these distances, in spacings, the wall's drag goes over to nothing: ½ (FADES + ENDS) is one layer."""
+"""Distances in spacings between which the wall's drag decreases to zero: ½ (FADES + ENDS) is one layer."""
 ACCURACY = 2e-3
-"""Conjugate gradients end when what is left over is that part of what gravity does in a step (root mean squares) …"""
+"""Conjugate gradients end when the residual is this fraction of the velocity that gravity gives in a step (root mean
+squares) …
+"""
 COARSELY = 1e-4
-"""… or that part of the velocities themselves, where there is no gravity."""
+"""… or this fraction of the velocities themselves, if there is no gravity."""
 MOST_PASSES = 80
 STIFFEST = 0.4
-"""Longest step in units of d²/ν: pressure acts after viscosity, and a longer step would hide one from the other."""
+"""Longest step in units of d²/ν: pressure acts after viscosity, and in a longer step each would hide the other."""
 ALONE = SIGMA / SUPPORT**3
-"""Kernel sum of a particle on its own, W(0) d³ …"""
+"""Kernel sum of a single particle, W(0) d³ …"""
 BESIDE = 0.386
-"""… what its neighbours in a plane layer add to it …"""
+"""… the part that its neighbours in a plane layer add …"""
 ABOVE = 0.16
-"""… and what a layer above has, times its height in spacings."""
+"""… and the part of a layer above, times its height in spacings."""
 THINNEST = 0.15
-"""Films are taken to be no thinner than that many spacings."""
+"""Least thickness of films, in spacings."""
 
 
 @ti.func
@@ -98,14 +104,14 @@ def film(beside, above):
 
     Args:
         beside: kernel sum over its neighbours.
-        above: the same, each times how much farther from the wall it is, in spacings.
+        above: the same, each weighted by its additional distance from the wall, in spacings.
     """
     return ti.min(ti.max(beside / BESIDE, THINNEST), 1.0) + ti.min(ti.max(above / ABOVE, 0.0), 1.0)
 
 
 @ti.func
 def drag(distance, e):
-    """Of a wall on a particle, in units of ν/d².
+    """Drag of a wall on a particle, in units of ν/d².
 
     Args:
         distance: from the wall, in spacings.
@@ -123,7 +129,7 @@ def drag(distance, e):
 
 @ti.func
 def survey(f: ti.template(), s, dt):
-    """What the step needs to know of every particle: its viscosity (dp) and what walls hold it with (push)."""
+    """Values of every particle for the step: its viscosity (dp) and the drag of the walls (push)."""
     d = f.spacing[s]
     inv_h = 1.0 / (SUPPORT * d)
     closest = (0.1 * d) ** 2
@@ -153,7 +159,7 @@ def survey(f: ti.template(), s, dt):
         f.dx[i] = f.dx[i] - lean
     nu = f.kinematic[s]
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-        # A relaxation at the rate k is a viscosity of k d²/5.
+        # A relaxation at the rate k corresponds to a viscosity of k d²/5.
         strain = ti.sqrt(f.dp[i] / (f.squares[i] + 1e-9))
         f.dp[i] = ti.max(nu, 0.2 * f.eddies[s] * d * d * strain)
         for b in ti.static(range(VESSELS)):
@@ -193,7 +199,7 @@ def rub(f: ti.template(), s, dt, v: ti.template(), out: ti.template()):
 
 @ti.func
 def diagonal(f: ti.template(), s, dt):
-    """Mean of the diagonal of 1 + dt L at every particle (squares): what conjugate gradients divide by."""
+    """Mean of the diagonal of 1 + dt L at every particle (squares), by which conjugate gradients divide."""
     d = f.spacing[s]
     inv_h = 1.0 / (SUPPORT * d)
     scale = dt * PAIRS / (d * d) * 0.5 / 3.0
@@ -223,7 +229,7 @@ def flow(f: ti.template(), s, dt):
         v[2] -= fall
         f.v[i] = v
         size += square(v)
-    # What is left over of the equation, as a velocity, and the direction of the search.
+    # The residual of the equation, as a velocity, and the search direction.
     rub(f, s, dt, f.v, f.dx)
     lasting = ti.cast(0.0, ti.f32)
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
@@ -303,23 +309,23 @@ def relax(f: ti.template(), s, dt):
         f.squares[i] = f.squares[i] + total
         f.dx[i] = f.dx[i] + drift
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-        # A thin neighbourhood (a drip) relaxes more slowly: its weights don't add up to those of a full one.
+        # A sparse neighbourhood (a drip) relaxes more slowly: its weights sum to less than those of a full one.
         f.v[i] = f.v[i] + f.dx[i] / ti.max(f.squares[i], 1.0)
 
 
 NEIGHBOURHOOD, INSIDE = 0.6, 0.9
-"""A particle has some of the correction from det M = BESIDE on, and all of it from INSIDE on. From 0.4 on, liquid at
-rest boils."""
+"""A particle gets part of the correction from det M = NEIGHBOURHOOD on, and all of it from INSIDE on. If it begins at
+0.4, liquid at rest boils."""
 
 
 @ti.func
 def yield_to_shear(f: ti.template(), s, dt):
-    """Change all velocities; the multipliers are those that the step's density constraint ended with."""
+    """Change all velocities, by the final multipliers of the step's density constraint."""
     d = f.spacing[s]
     inv_h = 1.0 / (SUPPORT * d)
     scale = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING * inv_h * inv_h
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-        # M, symmetric, is in sums (xx, xy, xz, yy), squares (yz) and dp (zz).
+        # M, symmetric, is stored in sums (xx, xy, xz, yy), squares (yz) and dp (zz).
         f.sums[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
         f.squares[i] = 0.0
         f.dp[i] = 0.0

@@ -1,31 +1,30 @@
-"""Vessels as moving signed distance grids: lookup, swept contact, cavity membership.
+"""Vessels as moving signed distance grids: look-up, swept contact, cavity membership, and lowered rims.
 
-A film thinner than a spacing can't pass a lip as liquid does, so rims are lower for slow particles (`rims.py` says by
-how much and why): the grid is looked up a little higher, by an offset that grows from nothing over the uppermost
-spacings.
+**Swept contact.** The distance alone does not make a thin wall tight: a particle that steps over the middle of the wall
+is pushed out on the far side. Therefore every step is also swept. The particle's path in the vessel's own frame, which
+includes the vessel's motion, is traced through the grid and stops at solid.
 
-A thin wall can't hold water by its distance alone: a particle that steps over the middle of the wall is pushed out on
-the far side. So every step is also swept: the particle's path in the vessel's own frame (which includes the vessel's
-motion) is traced through the grid, and stops where it meets solid.
+**Lowered rims.** A layer of particles needs more head at a lip than liquid does, so rims are lower for slow particles:
+the grid is looked up a little higher, by an offset that grows from zero over the uppermost spacings.
 
-How much lower a rim is for a particle than in truth: what a layer of particles lacks in head at a lip.
-
-A film that runs over a lip under gravity is e = u²/g thick where it passes at the speed u (critical flow, Froude number
-1), and its middle is e/2 above the lip. Particles' centres come no nearer to solid than half a spacing: a film thinner
-than d passes with its middle at d/2, and needs (d − e)/2 more head than liquid does. So near a rim the solid is looked
-up that much higher, which sets it lower for this particle, straight down in the world, by
+A film that runs over a lip under gravity has the thickness e = u²/g at the speed u (critical flow, Froude number 1),
+and its middle is e/2 above the lip. Particles' centres stay at least half a spacing from solid. A film thinner than d
+passes with its middle at d/2, and needs (d − e)/2 more head than liquid does. Near a rim the solid is therefore looked
+up that much higher. This lowers it for this particle, straight down in the world, by
 
     lip_drop · max(d − u²/g, 0),    lip_drop = ½,
 
-u being the particle's speed relative to the vessel. Liquid at rest meets a lip half a spacing lower, and keeps what
-hydrostatics says; one that flows faster than √(g d) meets the lip as it is, and leaves where the lip is. To shorten the
-wall along itself, whatever the flow, made jets leave behind the true lip.
+where u is the particle's speed relative to the vessel. For liquid at rest the lip is half a spacing lower, and the
+retained volume agrees with hydrostatics. For liquid faster than √(g d) the lip is unchanged, and the liquid leaves at
+the true lip. Shortening the wall along itself, whatever the flow, made jets leave behind the true lip.
 
-A film of a thick liquid that runs down at the mean speed u is √(3νu/g) thick (Nusselt 1916), where that is more.
+A film of a thick liquid that runs down at the mean speed u has the thickness √(3νu/g) (Nusselt 1916), if that is
+larger.
 
-The lowering follows the speed within √(d/g), in which liquid passes a spacing, and no faster than `SLOWLY` allows.
+The lowering follows the speed within √(d/g), the time in which liquid passes a spacing, and not faster than `SLOWLY`
+allows.
 
-Source: ours; critical flow over a crest: Henderson 1966, Open Channel Flow, section 2.4.
+Source: derived here; critical flow over a crest: Henderson 1966, Open Channel Flow, section 2.4.
 """
 
 import taichi as ti
@@ -40,10 +39,10 @@ FAR = 1.0
 TRACE_STEPS = 24
 
 LIP_BLEND = 6.0
-"""The lowering of a rim builds up over so many spacings below it."""
+"""Height below a rim over which its lowering builds up, in spacings."""
 
 STRETCH = 1.0 + LARGEST_LIP_DROP / LIP_BLEND
-"""Largest gradient of the stretched distance: what is nearer than STRETCH times a way may be met on it."""
+"""Largest gradient of the stretched distance: solid within STRETCH times a displacement may be reached by it."""
 
 
 @ti.func
@@ -156,15 +155,15 @@ def in_cavity(f: ti.template(), cavities: ti.template(), s, b, y):
 
 @ti.func
 def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin, sag):
-    """Where a particle ends that wants to go from y0 to y1 (vessel frame): y1, or slid along the wall it meets.
+    """End of a particle's motion from y0 towards y1 (vessel frame): y1, or a point slid along the wall that it meets.
 
-    |∇φ| ≤ STRETCH, so that around each place there is a ball without solid. Where the balls around both ends cover the
-    way, as they do for what lies on a wall or runs along it, nothing is in between, and the end is set off the wall as
-    far as it has to be. Else the way is traced, first along itself, then along what is left of it in the wall's tangent
-    plane, in strides that never enter solid.
+    |∇φ| ≤ STRETCH, so each point has a ball around it without solid. The balls around both ends may cover the way, as
+    for particles that lie on a wall or move along it. Then nothing is in between, and the end is moved off the wall as
+    far as needed. Otherwise the way is traced: first along itself, then along its remaining part in the wall's tangent
+    plane, in steps that never enter solid.
 
     Args:
-        skin: distance kept from solid [m]; less where the particle is already closer.
+        skin: distance kept from solid [m]; less if the particle is already closer.
     """
     y = y0
     way = y1 - y0
@@ -212,7 +211,7 @@ def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin, sag):
 
 @ti.func
 def crossed(f: ti.template(), grids: ti.template(), s, b, y0, y1, sag):
-    """1 if a straight step in the vessel frame goes through the middle of a wall. Samples, apart from the sweep."""
+    """1 if a straight step in the vessel frame passes the middle of a wall; sampled, independent of the sweep."""
     way = y1 - y0
     far = length(way)
     gone = ti.cast(0.0, ti.f32)
@@ -231,15 +230,15 @@ def crossed(f: ti.template(), grids: ti.template(), s, b, y0, y1, sag):
 
 
 NEAR = 4.0
-"""Only particles within so many spacings of a wall have its rim lowered."""
+"""Distance from a wall within which a particle has the wall's rim lowered, in spacings."""
 
 SLOWLY = 0.05
-"""A rim moves by at most so many spacings a step. Centres keep a fifth of a spacing from solid, and so stay outside."""
+"""Largest movement of a rim per step, in spacings. Centres keep 0.2 spacings from solid, and so stay outside."""
 
 
 @ti.func
 def lower_rims(f: ti.template(), s, dt, thick: ti.template()):
-    """Change by how much each vessel's rim is lower for each particle, over dt."""
+    """Change the lowering of each vessel's rim for each particle, over dt."""
     d = f.spacing[s]
     gravity = ti.max(f.gravity[s], 1e-3)
     share = 1.0 - ti.exp(-dt * ti.sqrt(gravity / d))

@@ -1,1 +1,1 @@
-"""How anything declares a setting, a unit or an entry point."""
+"""Declarations of settings, units and plug-in groups."""

@@ -1,9 +1,10 @@
-"""What the sections of all files have in common: strict keys, required keys, values that may stand in another file.
+"""Common base of the sections of all files: strict keys, required keys, and values that may be in another file.
 
-Marks on declared fields, for records that hold on to what decided a run.
-
-`Annotated[Path, FREE]` on a field of a dataclass or a pydantic model says it where the field is declared; whoever makes
-a fingerprint reads it there (`marks_of`).
+- `Section` is a mapping in a file; `tagged`, `word_or` and `Choice` make its variants. `Problems` collects errors with
+  their positions.
+- Types such as `Count`, `Name` and `FilePath` validate single values.
+- `FieldMark`s state how a field enters a run's fingerprint: `Annotated[Path, FREE]` on a field of a dataclass or a
+  pydantic model. The fingerprint reads them with `marks_of`.
 """
 
 from __future__ import annotations
@@ -34,16 +35,16 @@ from pydantic_core import CoreSchema, PydanticCustomError, PydanticKnownError, c
 
 @dataclass(frozen=True)
 class FieldMark:
-    """What a field is to a run's fingerprint."""
+    """The role of a field in a run's fingerprint."""
 
     meaning: str
 
 
 FREE = FieldMark("decides no request")
-"""The field may change between two parts of a run: no request depends on it."""
+"""The field may change when a run is resumed: no request depends on it."""
 
 BY_CONTENT = FieldMark("a file that matters by its content")
-"""The field is the path of a file, which may move; what stands in the file matters."""
+"""The field is the path of a file, which may move; the file's content matters."""
 
 
 @functools.cache
@@ -70,7 +71,7 @@ class AtMost:
     """Pydantic annotation: an upper bound of a whole number, with the reason for it.
 
     Attributes:
-        le: largest value that is allowed.
+        le: largest allowed value.
         reason: completes 'at most 2,000: …'.
     """
 
@@ -103,10 +104,10 @@ PositivePourCount = Annotated[PositiveCount, _FEW_POURS]
 """Real pours, 1 or more."""
 
 SimulationCount = Annotated[Count, _FEW_SIMULATIONS]
-"""Simulations, iterations or parameters that are tried, 0 or more."""
+"""Number of simulations, iterations or parameters to try, 0 or more."""
 
 PositiveSimulationCount = Annotated[PositiveCount, _FEW_SIMULATIONS]
-"""Simulations, iterations or parameters that are tried, 1 or more."""
+"""Number of simulations, iterations or parameters to try, 1 or more."""
 
 
 LARGEST_SEED = 2**63 - 1
@@ -137,17 +138,17 @@ Switch = Annotated[bool, Strict()]
 """true or false."""
 
 Name = Annotated[str, Strict(), Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=60)]
-"""A name that is also good as a part of a file's name."""
+"""A name that is also valid as a part of a file name."""
 
 Text = Annotated[str, Strict(), Field(min_length=1)]
 
 
 @dataclass(frozen=True)
 class Choice:
-    """One of some words that are known once a file is read, such as the names of what is installed.
+    """One of a set of words that is known when a file is read, such as the names of installed plug-ins.
 
     Attributes:
-        words: gives them.
+        words: returns them.
     """
 
     words: Callable[[], Sequence[str]]
@@ -170,7 +171,7 @@ IN_FILE = FieldMark("a path, relative to the file that it is written in")
 
 
 def in_home(text: str) -> str:
-    """A path with the home directory for a leading `~`, as a shell writes it; other paths as they are.
+    """Replace a leading `~` in a path by the home directory, as a shell does; other paths are unchanged.
 
     Raises:
         ValueError: `~name` and there is no such user, or `~` and this user has no home directory.
@@ -198,28 +199,29 @@ FilePath = Annotated[Text, AfterValidator(_in_home), IN_FILE]
 
 
 class Problems(Protocol):
-    """Takes what is wrong with settings, and knows where in the file they stand."""
+    """Collects problems of settings, with their positions in the file."""
 
     def add(self, text: str, *at: str | int, key: bool = False, of: str = "") -> None:
-        """Note a problem, unless something is wrong there already.
+        """Add a problem, unless its position already has one.
 
         Args:
-            text: what is wrong, and what would be right.
-            at: keys from the section down to the place; none: the section itself.
+            text: the problem and its remedy.
+            at: keys from the section down to the position; none: the section itself.
             key: point at the key and not at its value.
-            of: a key that it is about: nothing is noted if something is wrong with it, or below it.
+            of: a key on which the problem depends: nothing is added if that key, or one below it, already has a
+                problem.
         """
 
     @property
     def any(self) -> bool:
-        """Whether something is wrong with these settings."""
+        """Whether these settings have a problem."""
 
 
 class Section(BaseModel):
     """A mapping in a file.
 
-    Every field is optional to pydantic, and the keys that must be there are named in `required`: so that a section
-    with one bad value still takes part in the checks of the others, and all errors of a file come at once.
+    Every field is optional for pydantic; `required` names the mandatory keys. Thus a section with one invalid value
+    still takes part in the checks of the others, and all errors of a file are reported at once.
     """
 
     model_config = ConfigDict(
@@ -227,20 +229,20 @@ class Section(BaseModel):
     )
 
     required: ClassVar[dict[str, str]] = {}
-    """Keys that must be given, each with an example."""
+    """Mandatory keys, each with an example."""
 
     recorded_as_given: ClassVar[bool] = False
-    """Whether a run's record leaves out what was left out, because some keys may not stand beside others."""
+    """Whether a run's record omits keys that were omitted, because some keys exclude others."""
 
     tag: ClassVar[str] = ""
-    """Key that tells the variants of a tagged union apart; empty for a section without variants."""
+    """Key that distinguishes the variants of a tagged union; empty for a section without variants."""
 
     variant: ClassVar[str] = ""
-    """What a section is a variant of that stands under a key of its own; so that keys of its siblings are known."""
+    """For a variant under its own key: the name of the group of variants, so that keys of its siblings are known."""
 
     @classmethod
     def unknown_tag(cls, word: str) -> str:
-        """Why no variant has this tag, if more can be said than which there are."""
+        """Why no variant has this tag, if the reason is more specific than the list of tags."""
         return ""
 
     @classmethod
@@ -249,16 +251,16 @@ class Section(BaseModel):
         return {field.alias or name: name for name, field in cls.model_fields.items()}
 
     def completed(self) -> Self:
-        """With what is meant by keys that are left out, for a run's record."""
+        """A copy with the implied values of omitted keys, for a run's record."""
         return self
 
     def value(self, key: str) -> Any:
-        """Value of a key as written in files; None where it was not given."""
+        """Value of a key as written in files; None if it was not given."""
         return getattr(self, self.written_keys()[key])
 
 
 MADE: dict[str, Any] = {"use_attribute_docstrings": False}
-"""For sections that are made from tables: no source is searched for their keys' meanings, which takes a second."""
+"""For sections made from tables: no source is searched for the keys' meanings, which takes a second."""
 
 S = TypeVar("S", bound=Section)
 
@@ -268,11 +270,11 @@ def _form(value: Any) -> str:
 
 
 def tagged(variants: Mapping[str, type[Section]], *, default: str = "") -> Any:
-    """One of several sections, told apart by the key that they call their `tag`: `{strategy: D3, …}`.
+    """One of several sections, distinguished by their `tag` key: `{strategy: D3, …}`.
 
     Args:
-        variants: by the word that the key has; two or more.
-        default: the variant that is meant where the key is missing; with none the key must be given.
+        variants: by the value of that key; two or more.
+        default: the variant used if the key is missing; without a default the key is mandatory.
     """
     if not variants:
         raise RuntimeError("Decant's own entry points are not registered; install it again (pip install -e .)")
@@ -287,7 +289,7 @@ def tagged(variants: Mapping[str, type[Section]], *, default: str = "") -> Any:
 
 
 def word_or(word: str, model: type[Section]) -> Any:
-    """A section, or a word in its place."""
+    """A section, or a word instead of it."""
 
     def form(value: Any) -> str:
         return "word" if isinstance(value, str) else "section"
@@ -309,7 +311,7 @@ class SchemaGenerator(GenerateJsonSchema):
         return self.generate_inner(schema["schema"])
 
     def default_schema(self, schema: Any) -> JsonSchemaValue:
-        """The schema with defaults that are plain values; those of whole sections say nothing."""
+        """The schema with plain default values; defaults that are whole sections are left out."""
         form = super().default_schema(schema)
         if isinstance(form.get("default"), (dict, list, type(None))):
             form.pop("default", None)

@@ -1,8 +1,8 @@
-"""Doors for people from outside: classes that an installed package adds to Decant, found by entry points.
+"""Plug-in registries: classes that an installed package adds to Decant through entry points.
 
-Decant's own strategies, objectives, balances, arms and sources of vessels are registered in the same way, in
-`pyproject.toml`. A door loads what is registered once, on first use; what can't be loaded is left out and kept with its
-package and the reason, so that a broken plug-in disturbs nobody who doesn't need it.
+Decant's own strategies, objectives, balances, arms and vessel sources are registered in the same way, in
+`pyproject.toml`. A `PluginRegistry` loads its group once, on first use. Entries that cannot be loaded are kept as
+`UnloadablePlugin` with their package and the reason, so that an invalid plug-in affects only users who need it.
 """
 
 from __future__ import annotations
@@ -20,36 +20,37 @@ T = TypeVar("T")
 
 
 class PluginError(DecantError, LookupError):
-    """Nothing usable is registered under a name: unknown, or of a plug-in that can't be loaded."""
+    """A name has no usable plug-in: it is unknown, or its plug-in cannot be loaded."""
 
 
 @dataclass(frozen=True)
 class UnloadablePlugin:
-    """A plug-in that can't be used."""
+    """A plug-in that cannot be used."""
 
     group: str
-    """Entry-point group that it is registered in."""
+    """Entry-point group in which it is registered."""
 
     name: str
-    """Name that it is registered under."""
+    """Name under which it is registered."""
 
     package: str
     """Distribution that registers it, with its version."""
 
     reason: str
-    """Why it can't be used, for the author of the package."""
+    """Why it cannot be used, for the author of the package."""
 
     def __str__(self) -> str:
         return f"plug-in '{self.name}' ({self.group}) of {self.package} can't be used: {self.reason}"
 
 
 class PluginRegistry(Generic[T]):
-    """What is registered in one entry-point group, by name.
+    """The plug-ins of one entry-point group, by name.
 
     Args:
         group: the entry-point group, such as `decant.balances`.
-        what: what one entry is, for messages: 'balance'.
-        accept: returns what was loaded if it is fit for the group; raises TypeError or ValueError saying why it is not.
+        what: the kind of an entry, for messages: 'balance'.
+        accept: returns the loaded object if it is valid for the group; else raises TypeError or ValueError with the
+            reason.
     """
 
     def __init__(self, group: str, what: str, accept: Callable[[object, str], T]) -> None:
@@ -59,17 +60,17 @@ class PluginRegistry(Generic[T]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of everything usable, sorted."""
+        """Names of all usable plug-ins, sorted."""
         return tuple(self._content[0])
 
     @property
     def all(self) -> dict[str, T]:
-        """Everything usable by name, sorted by name."""
+        """All usable plug-ins by name, sorted by name."""
         return dict(self._content[0])
 
     @property
     def broken(self) -> tuple[UnloadablePlugin, ...]:
-        """What is registered and can't be used."""
+        """Registered plug-ins that cannot be used."""
         return self._content[1]
 
     def package(self, name: str) -> str:
@@ -78,10 +79,10 @@ class PluginRegistry(Generic[T]):
         return self._content[2][name]
 
     def get(self, name: str) -> T:
-        """What is registered under a name.
+        """The plug-in registered under a name.
 
         Raises:
-            DoorError: nothing is, or it can't be loaded; the message names the package, or the nearest names.
+            PluginError: there is none, or it cannot be loaded; the message names the package, or the nearest names.
         """
         usable, broken, _ = self._content
         if name in usable:
@@ -94,7 +95,7 @@ class PluginRegistry(Generic[T]):
         raise PluginError(f"unknown {self._what} '{name}'; {hint}")
 
     def forget(self) -> None:
-        """Look again at what is installed, on the next use."""
+        """Search the installed packages again at the next use."""
         self.__dict__.pop("_content", None)
 
     @cached_property
@@ -105,13 +106,13 @@ class PluginRegistry(Generic[T]):
         for entry in sorted(entry_points(group=self.group), key=_decant_first):
             package = _package(entry)
             if entry.name in usable:
-                if packages[entry.name] != package:  # the same one may be on the path twice
+                if packages[entry.name] != package:  # the same package may be on the path twice
                     reason = f"{packages[entry.name]} has registered '{entry.name}' already"
                     broken.append(UnloadablePlugin(self.group, entry.name, package, reason))
                 continue
             try:
                 usable[entry.name] = _whole(self._accept(entry.load(), entry.name))
-            except Exception as error:  # whatever a stranger's module raises, Decant goes on
+            except Exception as error:  # a foreign module may raise any error; Decant continues
                 broken.append(UnloadablePlugin(self.group, entry.name, package, f"{type(error).__name__}: {error}"))
             else:
                 packages[entry.name] = package
@@ -119,10 +120,10 @@ class PluginRegistry(Generic[T]):
 
 
 def _whole(found: T) -> T:
-    """What was loaded, unless it is a class that leaves open what it has to say.
+    """Return a loaded object, unless it is a class with missing abstract members.
 
     Raises:
-        TypeError: it does; names what is missing.
+        TypeError: members are missing; the text names them.
     """
     if missing := sorted(getattr(found, "__abstractmethods__", ())) if isinstance(found, type) else []:
         raise TypeError(f"its class {found} lacks {', '.join(f'{name!r}' for name in missing)}")

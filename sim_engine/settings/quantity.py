@@ -1,7 +1,8 @@
-"""Quantities with units: '15 deg/s' → 0.2618 rad/s. A laboratory that mixes degrees and radians pays in glass.
+"""Quantities with units: '15 deg/s' → 0.2618 rad/s.
 
-Angle is a dimension of its own here: in pint's default registry it is a pure number, so that '15 Hz' would pass for
-an angular velocity.
+`parse_quantity` and the pydantic annotation `Quantity` require a unit in files, because confusing degrees with radians
+can break equipment. Angle is a separate dimension here: in pint's default registry it is a pure number, so that '15 Hz'
+would be accepted as an angular velocity.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ inch = 0.0254 * meter = in
 liter = 1e-3 * meter ** 3 = l = L
 percent = 0.01 = %
 """
-"""What a pouring laboratory needs; a short list loads in milliseconds and has no surprising members."""
+"""Units of a pouring laboratory; a short list loads in milliseconds and has no unexpected members."""
 
 FAMILIAR_UNITS = ("mm", "cm", "m", "in", "deg", "rad", "deg/s", "rad/s", "rpm", "deg/s^2", "rad/s^2", "s", "min", "ms",
                   "mL", "g", "kg", "mg", "g/s", "kg/m^3", "g/cm^3", "N/m", "mN/m", "Pa*s", "mPa*s", "cP", "1/s", "Hz",
@@ -75,17 +76,17 @@ KINDS = {
 }
 
 LONGEST = 80
-"""Characters of a quantity: patterns and units of longer ones are not worked out."""
+"""Longest text of a quantity [characters]: longer texts are not parsed."""
 
 _QUANTITY = re.compile(r"\s*([-+−]?(?:[0-9][0-9_]*\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*(.*?)\s*\Z", re.DOTALL)
 
 _TERM = r"(?:[^\W\d_]+|[°%]|1)(?:\s*(?:\^|\*\*)\s*-?\d)?"
 _UNIT = re.compile(rf"{_TERM}(?:\s*[*/·\s]\s*{_TERM})*")
-"""Products of units with exponents of one digit: the parser would work out '9**9**9' first."""
+"""Products of units with exponents of one digit: the parser would evaluate '9**9**9' first."""
 
 
 class QuantityError(ValueError):
-    """A text is not the quantity that is needed; the message says which would be."""
+    """A text is not the required quantity; the message gives a valid example."""
 
 
 @cache
@@ -100,9 +101,9 @@ def parse_quantity(value: Any, unit: str, example: str) -> float:
     """Magnitude of '40 deg/s' in a unit.
 
     Args:
-        value: as it stands in the file: text, or a bare number (an error unless `unit` is '1').
-        unit: SI unit that the number is wanted in.
-        example: a right quantity, for messages; its unit is the one that is suggested.
+        value: as written in the file: text, or a bare number (an error unless `unit` is '1').
+        unit: SI unit of the result.
+        example: a valid quantity, for messages; its unit is the suggested one.
 
     Raises:
         QuantityError: no unit, unknown unit, another dimension, or no number at all.
@@ -141,7 +142,7 @@ def _unit(text: str, kind: str, example: str) -> Any:
         if not _UNIT.fullmatch(text.replace("(", "").replace(")", "")):
             raise ValueError(text)
         return registry().parse_units(text)
-    except Exception:  # the parser of units is one of Python expressions, and raises whatever those raise
+    except Exception:  # the parser evaluates units as Python expressions, and raises any of their errors
         guess = did_you_mean(text, FAMILIAR_UNITS)
         meant = f"did you mean '{guess}'?" if guess else f"should be {kind}, for example '{example}'"
         raise QuantityError(f"unknown unit {text!r}; {meant}") from None
@@ -155,7 +156,7 @@ def _kind_of(source: Any) -> str:
 
 
 def format_quantity(value: float, unit: str, display: str) -> str:
-    """A quantity as a person would write it, or with all digits where the short text would not mean the same float."""
+    """A quantity as text, with all digits if the short text would not give the same float."""
     if unit == "1":
         return repr(value)
     factor = float(registry().convert(1.0, registry().parse_units(display), registry().parse_units(unit)))
@@ -167,7 +168,7 @@ def format_quantity(value: float, unit: str, display: str) -> str:
 
 
 FROM_FILE: dict[str, Any] = {"from": "file"}
-"""Validation context of what people wrote."""
+"""Validation context of values that users wrote."""
 
 
 @dataclass(frozen=True)
@@ -178,11 +179,11 @@ class Quantity:
 
     Attributes:
         unit: SI unit of the value; '1' for a plain number.
-        example: a right quantity; its unit is the one that messages suggest.
+        example: a valid quantity; its unit is the one that messages suggest.
         lower, upper: inclusive bounds in `unit`.
         positive: the value must be above 0.
         whole: it must be a whole number.
-        words: words that may stand in place of a quantity and are kept as they are.
+        words: allowed instead of a quantity, and kept unchanged.
     """
 
     unit: str
@@ -195,14 +196,14 @@ class Quantity:
 
     @property
     def display(self) -> str:
-        """Unit that people write."""
+        """Unit that users write."""
         return self.example.split(" ", 1)[1] if " " in self.example else self.unit
 
     def parse(self, value: Any) -> float | str:
         """The value in `unit`, or one of the words.
 
         Raises:
-            QuantityError: it is neither, or out of bounds.
+            QuantityError: it is neither of them, or out of bounds.
         """
         if isinstance(value, str) and value.strip() in self.words:
             return value.strip()
@@ -221,7 +222,7 @@ class Quantity:
         return min(max(number, self.lower), self.upper)
 
     def bounds(self) -> str:
-        """The bounds in the unit that people write."""
+        """The bounds in the unit that users write."""
         factor = 1.0
         unit = "" if self.display == "1" else f" {self.display}"
         if unit:

@@ -1,15 +1,13 @@
-"""Cohesion as a surface tension: a cube of liquid becomes a sphere, and a stretched drop oscillates, without gravity.
+"""Cases of cohesion as a surface tension, and of contact angles.
 
-The oscillation's frequency is Rayleigh's for the second mode of a free drop, ω² = 8σ / (ρR³), from which the tension
-follows. The time step is a tenth of the capillary limit √(ρ d³ / (2π σ)) (Brackbill et al. 1992).
+**Drops** without gravity: a cube of liquid becomes a sphere, and a stretched drop oscillates. The frequency is
+Rayleigh's for the second mode of a free drop, ω² = 8σ / (ρR³), from which the tension follows. The time step is a tenth
+of the capillary limit √(ρ d³ / (2π σ)) (Brackbill et al. 1992). Source: Rayleigh 1879; cube to sphere: Akinci et al.
+2013.
 
-Source: Rayleigh 1879; cube to sphere: Akinci et al. 2013.
-
-Contact angles: how high a puddle stands.
-
-Its edge's pull σ(1 − cos θ) balances the pressure of its weight, ½ρg e²: e = 2 √(σ/ρg) sin ½θ.
-
-Source: de Gennes, Brochard-Wyart and Quéré 2004, Capillarity and Wetting Phenomena, section 2.2.
+**Puddles**: the height of a puddle at a contact angle θ. Its edge's pull σ(1 − cos θ) balances the pressure of its
+weight, ½ρg e²: e = 2 √(σ/ρg) sin ½θ. Source: de Gennes, Brochard-Wyart and Quéré 2004, Capillarity and Wetting
+Phenomena, section 2.2.
 """
 
 from __future__ import annotations
@@ -35,11 +33,11 @@ TENSION = 0.0728
 FREQUENCY = math.sqrt(8.0 * TENSION / (DENSITY * RADIUS**3)) / (2.0 * math.pi)
 """10.9 Hz."""
 STRETCH = 1.15
-"""Along z at first; across by its inverse square root."""
+"""Initial stretch along z; the other directions shrink by its inverse square root."""
 WATCHED = 0.2
-"""[s]."""
+"""Observed time [s]."""
 CAPILLARY = 0.1
-"""Longest step, over the capillary limit."""
+"""Longest time step, relative to the capillary limit."""
 
 
 def capillary_step(d: float, tension: float) -> float:
@@ -55,11 +53,12 @@ def _lattice(d: float, count: int) -> Floats:
 
 
 def surface_radii(points: Floats, directions: int = 300) -> Floats:
-    """Distance from the mass centre to the surface in evenly spread directions: of the farthest particle near each.
+    """Distance from the mass centre to the surface in evenly spread directions: that of the farthest particle near
+    each.
 
     Args:
         points: (N, 3) [m].
-        directions: how many.
+        directions: number of directions.
 
     Returns:
         Shape (directions,) [m]; half a spacing short of the liquid's surface.
@@ -75,10 +74,10 @@ def surface_radii(points: Floats, directions: int = 300) -> Floats:
 
 
 def cube_to_sphere(particles: int, parameters: SimulationParameters) -> list[Measurement]:
-    """Let a cube go without gravity.
+    """Release a cube without gravity.
 
     Args:
-        particles: N, roughly.
+        particles: N, approximately.
         parameters: θ; its tension is replaced by water's.
     """
     from sim_engine.fluid.engine import engine
@@ -104,14 +103,14 @@ def cube_to_sphere(particles: int, parameters: SimulationParameters) -> list[Mea
 
 
 def oscillation(particles: int, parameters: SimulationParameters) -> tuple[list[Measurement], list[Series], float]:
-    """Let a stretched drop go without gravity.
+    """Release a stretched drop without gravity.
 
     Args:
-        particles: N, roughly.
+        particles: N, approximately.
         parameters: θ; its tension is replaced by water's.
 
     Returns:
-        Measurements, curves and the tension that the frequency means [N/m].
+        Measurements, curves and the tension that corresponds to the frequency [N/m].
     """
     from sim_engine.fluid.engine import engine
 
@@ -127,7 +126,7 @@ def oscillation(particles: int, parameters: SimulationParameters) -> tuple[list[
         x = engine().particles()[0].astype(float)
         spread = np.mean((x - x.mean(axis=0)) ** 2, axis=0)
         stretch[k] = (spread[2] - 0.5 * (spread[0] + spread[1])) / spread.sum()
-    # A drop that never passes the sphere creeps back and does not oscillate: there is no frequency to measure.
+    # A drop that never passes the sphere creeps back without oscillation, so it has no frequency.
     frequency = decay = math.nan
     if stretch.min() < 0.0:
         frequency, decay = fit_oscillation(times - times[0], stretch, FREQUENCY)
@@ -164,7 +163,7 @@ def same_tension(tensions: dict[int, float]) -> Measurement:
 
 
 def droplet_figure(curves: list[Series]) -> Figure:
-    """All resolutions beside the undamped oscillation."""
+    """Curves of all resolutions and of the undamped oscillation."""
     t = np.linspace(0.0, WATCHED, 300)
     theory = curves[0].y[0] * np.cos(2.0 * math.pi * FREQUENCY * t)
     reference = Series("theory, undamped", tuple(t.tolist()), tuple(theory.tolist()), "reference")
@@ -176,13 +175,13 @@ ABOUT = (
     "length is 2.7 mm. Coarser than that there is one layer of particles, whatever the contact angle."
 )
 VOLUME, WATER_TENSION, LAID = 20e-6, 0.0728, 0.004
-"""Of the puddle [m³], [N/m]; its height at first [m]."""
+"""Volume of the puddle [m³], its tension [N/m], and its initial height [m]."""
 VISCOSITY = 1e-4
-"""Kinematic; it calms the puddle and has no part in its height [m²/s]."""
+"""Kinematic viscosity; it calms the puddle and does not affect its height [m²/s]."""
 
 
 def height(angle: float) -> float:
-    """Of a wide puddle of this contact angle [rad] at rest [m]."""
+    """Height of a wide puddle of this contact angle [rad] at rest [m]."""
     return 2.0 * math.sqrt(WATER_TENSION / (DENSITY * GRAVITY)) * math.sin(0.5 * angle)
 
 
@@ -190,7 +189,7 @@ def puddle(particles: int, angle: float) -> tuple[float, float, int]:
     """Height of a puddle after 2 s.
 
     Args:
-        particles: N, roughly.
+        particles: N, approximately.
         angle: contact angle [rad].
 
     Returns:

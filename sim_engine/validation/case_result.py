@@ -1,4 +1,4 @@
-"""What a case reports: measured quantities beside their references, and the curves that a figure shows."""
+"""Results of a case: measured quantities with their references, and the curves of its figure."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class Measurement:
-    """One measured quantity and what is asked of it.
+    """One measured quantity and its criterion.
 
     Attributes:
-        name: what was measured, in words.
+        name: of the quantity, in words.
         value: SI.
         unit: SI unit; '1' for pure numbers.
-        reference: value that theory or experiment gives; None if there is none.
-        lower, upper: the quantity passes between them; both infinite: it is reported, not judged.
+        reference: value from theory or experiment; None if there is none.
+        lower, upper: the quantity passes between them; if both are infinite, it is reported without a criterion.
         criterion: those bounds in words.
         particles: N of the run.
     """
@@ -32,16 +32,16 @@ class Measurement:
 
     @property
     def judged(self) -> bool:
-        """Whether anything is asked of it."""
+        """Whether it has a criterion."""
         return self.lower > -math.inf or self.upper < math.inf
 
     @property
     def passed(self) -> bool:
-        """Whether it lies within its bounds. A value that is not a number passes nothing, not even when unjudged."""
+        """Whether it lies within its bounds. NaN never passes, even without a criterion."""
         return self.lower <= self.value <= self.upper
 
     def as_json(self) -> dict[str, Any]:
-        """JSON-ready mapping; open bounds, and values that could not be measured, are None."""
+        """JSON-ready mapping; infinite bounds, and values that could not be measured, are None."""
         return {
             "name": self.name,
             "value": self.value if math.isfinite(self.value) else None,
@@ -80,7 +80,7 @@ def at_least(name: str, value: float, limit: float, *, particles: int, unit: str
 def reported(
     name: str, value: float, *, particles: int, unit: str = "1", reference: float | None = None
 ) -> Measurement:
-    """A quantity that is shown and not judged."""
+    """A quantity that is reported without a criterion."""
     return Measurement(name, value, unit, reference, -math.inf, math.inf, "reported", particles)
 
 
@@ -91,9 +91,10 @@ class Series:
     Attributes:
         name: legend.
         x, y: SI.
-        kind: how it is drawn: 'measured' curves differ in colour; a 'reference' is dashed, or points if it has few. It
-            has the colour of the curve whose name begins as its own up to a comma, and is black if none does.
-        panel: figures of several panels: which one.
+        kind: style: 'measured' curves differ in colour; a 'reference' is dashed, or drawn as points if it has few. It
+            takes the colour of the curve whose name begins with its own name up to a comma, and is black if there is
+            none.
+        panel: number of the panel, in figures of several panels.
         spread: standard deviation at each point, drawn as a band; empty: none.
     """
 
@@ -107,12 +108,12 @@ class Series:
 
 @dataclass(frozen=True)
 class Figure:
-    """Curves that belong into one picture, by panel.
+    """Curves of one figure, by panel.
 
     Attributes:
         titles, x_labels, y_labels: one of each per panel.
         series: curves.
-        log_x: whether the horizontal axes are logarithmic: all of them, or one by one.
+        log_x: whether the horizontal axes are logarithmic: one value for all, or one for each.
     """
 
     titles: tuple[str, ...]
@@ -127,9 +128,9 @@ class CaseResult:
     """Outcome of one case.
 
     Attributes:
-        measurements: what was measured.
+        measurements: measured quantities.
         figure: its curves, if it has any.
-        cpu_s: CPU seconds of the process while it ran, compilation of kernels included if they were not cached.
+        cpu_s: CPU time of the process while it ran [s], including the compilation of kernels that were not cached.
     """
 
     measurements: tuple[Measurement, ...]
@@ -138,5 +139,5 @@ class CaseResult:
 
     @property
     def passed(self) -> bool:
-        """Whether every judged quantity passed."""
+        """Whether every quantity with a criterion passed."""
         return all(m.passed for m in self.measurements)

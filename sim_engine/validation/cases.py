@@ -1,4 +1,4 @@
-"""The cases by name: what each is about, and at which resolutions it runs in short and in full."""
+"""The cases by name: their descriptions, and their resolutions in the quick and the full run."""
 
 from __future__ import annotations
 
@@ -19,24 +19,25 @@ from sim_engine.validation import whole_pours as pours
 from sim_engine.validation.case_result import CaseResult, Figure, Measurement, Series, at_least
 
 PLAIN = SimulationParameters(cohesion=0.0, viscosity=1.0, friction=0.0)
-"""θ of the cases: what their references assume. Water's own viscosity is not felt in a cup, a liquid has no dry
-friction, and tension acts on drips only; a little XSPH viscosity stands for what a finer solver would resolve."""
+"""θ of the cases, as their references assume. Water's own viscosity has no effect in a cup, a liquid has no dry
+friction, and tension acts on drips only. A little XSPH viscosity replaces the effects that a finer solver would
+resolve."""
 
 LOAD = 200e-6
-"""What the cups hold [m³]."""
+"""Load of the cups [m³]."""
 
 SEEDS = 5
-"""So many loads of each are taken together where single ones scatter as much as a criterion allows."""
+"""Number of loads that are averaged if single ones scatter as much as a criterion allows."""
 
 
 @dataclass(frozen=True)
 class CaseEffort:
-    """How much to spend.
+    """The amount of computation.
 
     Attributes:
         full: all resolutions and seeds; else the quick subset.
-        pours: random pours against walls; None: what the effort implies.
-        progress: long cases tell it how many of their simulations are done, and how many there are.
+        pours: random pours against walls; None: according to `full`.
+        progress: called by long cases with the number of finished simulations and their total.
     """
 
     full: bool = False
@@ -49,8 +50,8 @@ class Case:
     """One case.
 
     Attributes:
-        name: for the command line.
-        title: for tables and pages.
+        name: on the command line.
+        title: in tables and pages.
         about: setup, reference and source, in a sentence or two.
         work: runs it.
     """
@@ -61,7 +62,7 @@ class Case:
     work: Callable[[PourSimulator, CaseEffort], tuple[list[Measurement], Figure | None]]
 
     def run(self, simulator: PourSimulator, effort: CaseEffort) -> CaseResult:
-        """Run it and take the CPU time. A solver that stops with a fault is a criterion that is not met."""
+        """Run the case and measure its CPU time. A solver that stops with a fault counts as a failed criterion."""
         begun = time.process_time()
         try:
             measurements, figure = self.work(simulator, effort)
@@ -72,7 +73,7 @@ class Case:
 
 
 def describe(parameters: SimulationParameters) -> str:
-    """θ but for its number of particles, as people read it."""
+    """θ without its number of particles, as text."""
     infos = SimulationParameters.info()
     shown = [
         f"{name.replace('_', ' ')} {value:g} {infos[name].unit}".removesuffix(" 1")
@@ -89,7 +90,7 @@ def _at_rest(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measure
         measurements, figure = at_rest.at_rest(n, PLAIN)
         found += measurements
         curves += figure.series
-    # the limit is drawn once
+    # the limit is drawn only once
     unique = {(s.name, s.kind): s for s in curves}
     return found, replace(figure, series=tuple(unique.values()))
 
@@ -331,7 +332,7 @@ def case(name: str) -> Case:
     """A case by its name.
 
     Raises:
-        KeyError: there is none; the message names those there are.
+        KeyError: it does not exist; the message names the existing ones.
     """
     for candidate in CASES:
         if candidate.name == name:

@@ -1,6 +1,7 @@
-"""The solver without a pour around it: one vessel, still or on a given path, and nothing else in the world.
+"""Runs of the solver without a pour: one vessel, at rest or on a given path, and nothing else.
 
-Containers that are not vessels, as distance grids made by hand: a box that is open at the top, a cup with a hole.
+`run` advances the solver; `box` and `holed_cup` make containers that are not vessels, as analytic distance grids: a box
+that is open at the top, a cup with a hole.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ DENSITY = 998.0
 """Density of water [kg/m³]."""
 
 NO_RIM = 1e3
-"""Height of a rim that nothing ever reaches [m]."""
+"""Height of a rim that is never reached [m]."""
 
 NOTHING = SignedDistanceGrid(
     origin=np.zeros(3),
@@ -32,21 +33,21 @@ NOTHING = SignedDistanceGrid(
     values=np.ones((2, 2, 2), dtype=np.float32),
     cavity=np.zeros((2, 2, 2), dtype=np.uint8),
 )
-"""The solver knows two vessels; where a case needs fewer, this is the other."""
+"""The solver has two vessels; in cases with fewer, this is the other one."""
 
 FAR_AWAY = np.array([0.0, 0.0, -1e3])
 
 
 @dataclass(frozen=True)
 class Container:
-    """A vessel as the solver sees it.
+    """A vessel as input of the solver.
 
     Attributes:
         grid: signed distance and cavity.
         inside: 1 at the grid's nodes where a particle counts as inside.
         wall: smallest thickness [m].
-        rim: height of the lip; `NO_RIM` for a tank that nothing is poured from [m].
-        open: 1 at the nodes that liquid may reach from inside, where that is more than `inside`: a hole's.
+        rim: height of the lip; `NO_RIM` for a tank without pouring [m].
+        open: 1 at the nodes that liquid may reach from inside, if they are more than `inside`: those of a hole.
     """
 
     grid: SignedDistanceGrid
@@ -57,7 +58,7 @@ class Container:
 
     @classmethod
     def of(cls, vessel: Vessel) -> Container:
-        """A vessel's."""
+        """The container of a vessel."""
         return cls(vessel.grid, inside_mask(vessel.grid), vessel.wall_thickness, vessel.rim_height)
 
     def plane(self, support: float) -> NDArray[np.float32]:
@@ -93,25 +94,25 @@ def run(
     no_slip: bool = True,
     contact_angle: float = NEUTRAL,
 ) -> Iterator[int]:
-    """Load a scene and run it to each of some times.
+    """Load a scene and run it to each of the given times.
 
     Args:
         positions: (N, 3) in the world [m].
         spacing: d [m].
-        container: the one vessel.
-        parameters: θ; its number of particles is not looked at.
+        container: the only vessel.
+        parameters: θ; its number of particles is ignored.
         times: increasing [s].
         poses: the vessel's, one per `POSE_STEP` from time 0 on; None: it stands at the origin.
         settling: time before 0 in which the first pose holds [s].
         spill_level: below it and outside the vessel a particle leaves the solver [m].
         gravity: downwards [m/s²].
-        longest_step: in place of the solver's own [s].
+        longest_step: replaces the solver's own [s].
         viscosity: kinematic [m²/s]; 0: θ's rate alone.
         no_slip: whether a liquid of such a viscosity sticks to the vessel.
         contact_angle: on the vessel [rad].
 
     Yields:
-        The index of each time when it has been reached: then the engine may be looked at.
+        The index of each time when it has been reached; the engine's state may then be read.
 
     Raises:
         ArithmeticError: the solver stopped with a fault.
@@ -166,11 +167,11 @@ def stir(add: Callable[[Floats], Floats]) -> None:
 
 
 MARGIN = 0.01
-"""From the inside to the grid's faces; solid there, so that nothing gets out [m]."""
+"""Distance from the inside to the grid's faces; solid there, so that nothing leaves [m]."""
 
 
 def box(length: float, width: float, height: float, spacing: float) -> Container:
-    """A tank from x = 0 to `length`, y = ±width/2, floor at z = 0; solid all around, open at the top.
+    """A tank from x = 0 to `length`, y = ±width/2, with its bottom at z = 0; solid all around, open at the top.
 
     Args:
         length, width: inside [m].
@@ -232,7 +233,7 @@ def block(low: Floats, high: Floats, count: int, seed: int) -> tuple[Floats, flo
 
     Args:
         low, high: corners of the volume that the liquid fills, shape (3,) each [m].
-        count: wanted number of particles.
+        count: desired number of particles.
         seed: of the jitter.
 
     Returns:

@@ -1,9 +1,9 @@
-"""Whether the spillage depends on the number of particles: nineteen pours, each held against its limit.
+"""Dependence of the spillage on the number of particles: nineteen pours, each compared with its limit.
 
-The pours were chosen before any of them was used to judge a change of the solver: seven that showed how much spillage
-depended on the number of particles, twelve more to cover receivers, speeds and distances. Liquid: 200 mL of water from
-a straight glass (R 40 mm, H 100 mm) that turns about its lip from a step, and holds; no surface tension, little
-viscosity.
+The pours were chosen before any of them was used to evaluate a change of the solver: seven that showed how much the
+spillage depended on the number of particles, and twelve more to cover receivers, speeds and distances. Liquid: 200 mL
+of water from a straight glass (R 40 mm, H 100 mm) that turns about its lip from a step, and holds; no surface tension,
+little viscosity.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class ConvergencePour:
     """One of the pours.
 
     Attributes:
-        receiver: stands `HEIGHTS` below the lip.
+        receiver: its name; its rim is `HEIGHTS` below the lip.
         speed: of the turn [deg/s].
         distance: of the lip from the receiver's axis [mm].
         angle: at which the turn stops [deg].
@@ -56,17 +56,17 @@ class ConvergencePour:
 
     @property
     def name(self) -> str:
-        """For tables."""
+        """Name in tables."""
         stop = "" if self.angle == 120.0 else f" to {self.angle:g}°"
         return f"{self.receiver.name} {self.speed:g} °/s{stop}, {self.distance:g} mm"
 
     def task(self, parameters: SimulationParameters, seed: int) -> PourTask:
-        """To simulate."""
+        """The task of its simulation."""
         scene = Scene(self.name, POURER, self.receiver, Liquid(mass=0.1996))
         return PourTask(scene, self.action(HEIGHTS[self.receiver.name]), parameters, seed)
 
     def action(self, height: float) -> Action:
-        """A step in speed, a hold, no return."""
+        """The action: a step in speed, a hold, no return."""
         return Action(
             angular_velocity=self.speed * DEG,
             max_angle=self.angle * DEG,
@@ -107,7 +107,7 @@ POURS = FOUND + CHOSEN
 def spillage(
     simulator: PourSimulator, pour: ConvergencePour, parameters: SimulationParameters, seed: int
 ) -> tuple[float, float]:
-    """Spilled over poured of one pour, and the CPU seconds that it took."""
+    """Spilled over poured of one pour, and its CPU time [s]."""
     outcome = simulator.simulate(pour.task(parameters, seed)).outcome
     if outcome.invalid is not None:
         raise ArithmeticError(f"{pour.name}, {parameters.particles} particles: {outcome.invalid}")
@@ -135,13 +135,13 @@ LIMITS: dict[str, float] = {
     "narrow 75 °/s to 100°, 60 mm": 0.019,
     "narrow 115 °/s, 45 mm": 0.928,
 }
-"""Spillage of the pours with the finest particles that were simulated, from `benchmarks/convergence.py`."""
+"""Spillage of the pours with the finest simulated particles, from `benchmarks/convergence.py`."""
 
 TOLERANCES = {500: (0.03, math.inf)}
-"""Largest mean and single distance from the limit by number of particles; elsewhere .02 and .04."""
+"""Largest mean and single distance from the limit by number of particles; for other numbers 0.02 and 0.04."""
 
 QUICK = (FOUND[1], FOUND[4], FOUND[5])
-"""For a first look."""
+"""The pours of the quick run."""
 
 
 def convergence(
@@ -151,13 +151,13 @@ def convergence(
     seeds: int,
     parameters: SimulationParameters,
 ) -> tuple[list[Measurement], Figure]:
-    """Spillage at some resolutions against its limit.
+    """Spillage at some resolutions, compared with its limit.
 
     Args:
         simulator: of this process.
         chosen: some of `POURS`.
         numbers: of particles, increasing.
-        seeds: how many each.
+        seeds: number of seeds for each.
         parameters: θ; its number of particles is replaced.
     """
     measurements: list[Measurement] = []

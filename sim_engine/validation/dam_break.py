@@ -1,13 +1,14 @@
-"""Dam break: the front of a collapsing column, against the experiment of Martin and Moyce.
+"""Dam break: the front of a collapsing column, compared with the experiment of Martin and Moyce.
 
-A column of width a and height 2a in a channel, laid as a lattice, is let go at once. T = t √(2g/a), Z = front / a. The
-front is the mean over strips of the channel of the farthest particle, plus half a spacing.
+A column of width a and height 2a in a channel, initially a lattice, is released at once. T = t √(2g/a), Z = front / a.
+The front is the mean over strips of the channel of the farthest particle, plus half a spacing.
 
-Source: Martin & Moyce 1952, Phil. Trans. R. Soc. A 244, n² = 2, a = 2.25 in and 1.125 in (digitised). The experiment's
-gate takes time to go, so that its fronts start late by a time that nobody measured: fronts are compared after the one
-delay that fits best, which is reported, as is the error without it. The slope for T > 1.9 needs none. The channel's
-floor rubs a little (`FLOOR`), in place of the boundary layer that slows the small tank: that is the only friction in
-these cases, and the slope without it is reported, too.
+Source: Martin & Moyce 1952, Phil. Trans. R. Soc. A 244, n² = 2, a = 2.25 in and 1.125 in (digitised).
+
+The experiment's gate takes time to open, so its fronts start late by an unmeasured time. Fronts are therefore compared
+after the delay that fits best; the delay and the error without it are reported. The slope for T > 1.9 needs no delay. A
+small friction of the channel's bottom (`FLOOR`) replaces the boundary layer that slows the small tank. It is the only
+friction in these cases, and the slope without it is reported, too.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ MEASURED: dict[float, tuple[tuple[float, float], ...]] = {
         (4.592, 5.841), (4.961, 6.271), (5.316, 6.717),
     ),
 }  # fmt: skip
-"""(T, Z) by the column's width a [m]."""
+"""Measured (T, Z) by the column's width a [m]."""
 
 FROM, LATE = 1.2, 1.9
-"""Compared from this T on; slopes from this one."""
+"""Smallest T of the comparison of fronts, and of slopes."""
 STRIPS = 5
 WIDTH = 10.0
 """Width of the channel, in spacings."""
@@ -53,12 +54,12 @@ def slope(T: Floats, Z: Floats) -> float:
 
 
 def dam_break(width: float, layers: int, parameters: SimulationParameters) -> tuple[list[Measurement], list[Series]]:
-    """Let one column collapse.
+    """Release one column.
 
     Args:
         width: a, one of `MEASURED` [m].
         layers: spacings in a.
-        parameters: θ; its number of particles is not looked at.
+        parameters: θ; its number of particles is ignored.
     """
     reference = np.array(MEASURED[width])
     T, Z, particles = front(width, layers, parameters.model_copy(update={"friction": FLOOR}), float(reference[-1, 0]))
@@ -102,13 +103,13 @@ def dam_break(width: float, layers: int, parameters: SimulationParameters) -> tu
 
 
 def front(width: float, layers: int, parameters: SimulationParameters, last: float) -> tuple[Floats, Floats, int]:
-    """Course of the front.
+    """Position of the front over time.
 
     Args:
         width: a [m].
         layers: spacings in a.
-        parameters: θ; its number of particles is not looked at.
-        last: T up to which it is followed.
+        parameters: θ; its number of particles is ignored.
+        last: largest T of the simulation.
 
     Returns:
         T and Z, shape (80,) each, and N.
@@ -135,5 +136,5 @@ def front(width: float, layers: int, parameters: SimulationParameters, last: flo
 
 
 def dam_figure(curves: list[Series]) -> Figure:
-    """Fronts and experiments."""
+    """Curves of the fronts and the experiments."""
     return Figure(("Dam break",), ("T = t √(2g/a)",), ("Z = front / a",), tuple(curves))

@@ -1,19 +1,18 @@
-"""Liquid at rest in a cup: how high it stands, how dense it is inside, and whether it is really at rest.
+"""Hydrostatic cases: liquid at rest in a cup, and the volume that a slowly tilted cup retains.
 
-200 mL in a straight cup of radius 40 mm stand 39.8 mm high. The height is taken twice from the mass centre (which
-averages over all particles and needs no notion of a surface), the density from the Voronoi cells of the inner
-particles: the solver's own kernel sum would only say that the solver believes itself.
+**At rest.** 200 mL in a straight cup of radius 40 mm stand 39.8 mm high. The height is twice that of the mass centre,
+which averages over all particles and needs no definition of the surface. The density is computed from the Voronoi cells
+of the inner particles, because the solver's own kernel sum would only confirm its own assumption.
 
-Slow-tilt retention: a cup that is tilted slowly keeps what lies below the horizontal plane through its lip.
+**Slow tilt.** A cup that is tilted slowly retains the volume below the horizontal plane through its lip. The turn is
+fast up to one degree before the liquid reaches the lip, while nothing can leave. From there on its speed is `SPEED`,
+with a stop at every angle that is read. The liquid still lags: when a turn at 3 °/s stops, a real cup holds 6 to 8 % of
+its brimful volume more than at rest. The last of it leaves slowly, since the flow over a lip falls with the head to the
+power 5/2. Each stop lasts until the remaining outflow is half the tolerance by the tilting-cup equation with the
+discharge coefficient of a sharp weir.
 
-The turn begins fast, up to one degree before the liquid reaches the lip, where nothing can leave yet; from there on it
-goes at `SPEED`, with a stop at every angle that is read. Even so the liquid lags: at 3 °/s a real cup still holds 6 to
-8 % of its brimful volume more than at rest when the turn stops, and the last of it leaves slowly (the flow over a lip
-falls with the head to the power 5/2). So each stop lasts until the tilting-cup equation, with the discharge coefficient
-of a sharp weir, says that what is left to flow is half the tolerance.
-
-Particles' centres stand off the walls and the lip is lowered for them (`sim_engine.fluid.walls`); the geometry that
-they are compared with is the true one.
+Particles' centres keep a distance from the walls and the lip is lowered for them (`sim_engine.fluid.walls`); their
+reference is the true geometry.
 """
 
 from __future__ import annotations
@@ -44,18 +43,18 @@ HEIGHT = VOLUME / (math.pi * RADIUS**2)
 CUP = cylinder("cup", inner_radius=RADIUS, inner_height=0.10)
 
 INNER = 2.0
-"""A particle is an inner one that many spacings from walls and surface: the kernel's support."""
+"""Distance of an inner particle from walls and surface, in spacings: the kernel's support."""
 
 WINDOW = np.arange(1.0, 1.201, 0.02)
-"""What is judged is a mean over these times [s]."""
+"""Times over which evaluated values are averaged [s]."""
 
 
 def mean_density(points: Floats, inner: NDArray[np.bool_], d: float) -> float:
-    """ρ/ρ₀ of some of the particles: what each stands for, d³, over the mean volume of their Voronoi cells.
+    """ρ/ρ₀ of some of the particles: the volume of each, d³, over the mean volume of their Voronoi cells.
 
     Args:
         points: all of them, (N, 3) [m].
-        inner: which ones to take, (N,); their cells must be closed by neighbours.
+        inner: selected ones, (N,); their cells must be closed by neighbours.
         d: spacing [m].
     """
     cells = Voronoi(points)
@@ -68,7 +67,7 @@ def mean_density(points: Floats, inner: NDArray[np.bool_], d: float) -> float:
 
 
 def at_rest(particles: int, parameters: SimulationParameters, seed: int = 1) -> tuple[list[Measurement], Figure]:
-    """Fill the cup, let it stand for a second, look at it for a fifth.
+    """Fill the cup, let it stand for a second, and measure for a fifth of a second.
 
     Args:
         particles: N.
@@ -140,7 +139,7 @@ SLIM_CUP = cylinder("slim cup", inner_radius=SLIM_RADIUS, inner_height=0.115)
 
 
 def tall_column(particles: int, parameters: SimulationParameters) -> list[Measurement]:
-    """A slim cup that is nearly full stands still for a second: many layers of particles, where pressure adds up.
+    """A slim, nearly full cup stands still for a second: it has many layers of particles, whose pressures add up.
 
     Args:
         particles: N.
@@ -181,19 +180,19 @@ def tall_column(particles: int, parameters: SimulationParameters) -> list[Measur
 
 ANGLES = tuple(math.radians(a) for a in (60.0, 70.0, 80.0))
 SPEED = math.radians(3.0)
-"""From where liquid can leave on [rad/s]."""
+"""Speed of the turn from the angle at which liquid can leave [rad/s]."""
 APPROACH = math.radians(30.0)
-"""Before that [rad/s]."""
+"""Speed of the turn before [rad/s]."""
 BEFORE = math.radians(1.0)
 READING = 0.3
-"""What is kept is a mean over this time [s]."""
+"""Time over which the retained volume is averaged [s]."""
 LONGEST_REST = 15.0
-"""At one angle [s]."""
+"""Longest stop at one angle [s]."""
 TOLERANCE = 0.02
 """Largest error, as a fraction of the brimful volume."""
 
 LIP_HEIGHT = 0.3
-"""Height of the pivot above the world's origin; spilled liquid is taken out well below the cup [m]."""
+"""Height of the pivot above the world's origin; spilled liquid is removed well below the cup [m]."""
 
 
 def straight_cup() -> Vessel:
@@ -208,7 +207,7 @@ def conical_cup() -> Vessel:
 
 
 def mesh_jug() -> Vessel:
-    """An oval jug with a spout, from a mesh file: no surface of revolution, no level rim."""
+    """An oval jug with a spout, from a mesh file: neither a surface of revolution nor a level rim."""
     import trimesh
 
     inner = np.array([(0.0, 0.004), (0.034, 0.004), (0.034, 0.06), (0.036, 0.09), (0.036, 0.10)])
@@ -236,7 +235,7 @@ def spill_angle(vessel: Vessel, volume: float) -> float:
 
 
 def slow_turn(vessel: Vessel, volume: float, angles: tuple[float, ...]) -> tuple[PourMotion, list[float]]:
-    """Fast to just before the liquid reaches the lip, then slowly, with a stop at each angle.
+    """A motion that turns fast to just before the liquid reaches the lip, then slowly, with a stop at each angle.
 
     Returns:
         The motion, and the times at which the readings begin [s].
@@ -270,15 +269,15 @@ def slow_tilt(
     angles: tuple[float, ...] = ANGLES,
     seeds: int = 1,
 ) -> tuple[list[Measurement], list[Series]]:
-    """Tilt a cup slowly and read what it keeps.
+    """Tilt a cup slowly and read its retained volume.
 
     Args:
         vessel: the cup.
         volume: of the load [m³]; it should spill before the first angle.
         particles: N.
         parameters: θ; its number of particles is replaced.
-        angles: at which to read, increasing [rad].
-        seeds: means over so many loads, from other initial positions each.
+        angles: of the readings, increasing [rad].
+        seeds: number of loads, with different initial positions, over which the result is averaged.
     """
     from sim_engine.fluid.engine import engine
     from sim_engine.fluid.scene_setup import POSE_STEP
@@ -328,5 +327,5 @@ def slow_tilt(
 
 
 def retention_figure(curves: list[Series]) -> Figure:
-    """All cups in one picture."""
+    """Curves of all cups in one figure."""
     return Figure(("Slow-tilt retention",), ("tilt [°]",), ("kept [mL]",), tuple(curves))

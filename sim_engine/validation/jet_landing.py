@@ -1,7 +1,8 @@
-"""Where a jet lands, whatever the number of particles: the receiver is set aside, and all that falls past is caught.
+"""Landing position of a jet at any number of particles: the receiver is moved aside, and all passing particles are
+recorded.
 
-The standard cup and load, turned from a step at 30 and at 90 °/s to 120°. Every particle is followed through the height
-60 mm below the lip. The reference is the finest resolution.
+The standard cup and load, turned from a step at 30 and at 90 °/s to 120°. Every particle is recorded when it passes the
+height 60 mm below the lip. The reference is the finest resolution.
 """
 
 from __future__ import annotations
@@ -24,20 +25,20 @@ Floats = NDArray[np.float64]
 SPEEDS = (30.0, 90.0)
 """Speeds of the turn [deg/s]."""
 FALL = 0.06
-"""The jet is looked at so far below the lip [m]."""
+"""Height below the lip at which the jet is recorded [m]."""
 ASIDE = 0.25
-"""The receiver is set aside by so much [m]."""
+"""Displacement of the receiver [m]."""
 DISTANCE = 90.0
 """Distance of the lip from where the receiver's axis would be [mm]."""
 TOLERANCE = 1e-3
 """Tolerance of the median and of the spread [m]."""
 PARTS = 4
-"""The pour's course is looked at in so many parts of the same volume."""
+"""Number of parts of equal volume into which the pour is divided."""
 
 
 @dataclass(frozen=True)
 class Landing:
-    """Everything that fell through the height, in order of time; arrays (M,).
+    """All particles that passed the height, in order of time; arrays (M,).
 
     Attributes:
         times: [s].
@@ -58,23 +59,23 @@ class Landing:
 
     @property
     def spread(self) -> float:
-        """Between the 10 % and the 90 % quantile of the distance from the lip [m]."""
+        """Distance between the 10 % and the 90 % quantile of the distance from the lip [m]."""
         low, high = np.quantile(self.away, (0.1, 0.9))
         return float(high - low)
 
     def over_time(self) -> Floats:
-        """Median distance in each of `PARTS` parts of the pour, of the same volume, (PARTS,) [m]."""
+        """Median distance in each of `PARTS` parts of the pour of equal volume, (PARTS,) [m]."""
         return np.array([np.median(part) for part in np.array_split(self.away, PARTS)])
 
 
 def landing(simulator: PourSimulator, speed: float, parameters: SimulationParameters, seeds: int = 1) -> Landing:
-    """Let a jet fall past a receiver that has been set aside.
+    """Record a jet that passes a receiver moved aside.
 
     Args:
         simulator: of this process.
         speed: of the turn [deg/s].
         parameters: θ.
-        seeds: so many pours, from other initial positions each, are taken together.
+        seeds: number of pours, with different initial positions, that are combined.
     """
     pours = [_of_one(simulator, speed, parameters, seed) for seed in range(1, seeds + 1)]
     times = np.concatenate([pour.times for pour in pours])
@@ -86,7 +87,7 @@ def landing(simulator: PourSimulator, speed: float, parameters: SimulationParame
 
 
 def _of_one(simulator: PourSimulator, speed: float, parameters: SimulationParameters, seed: int) -> Landing:
-    """Of one pour; by frame, not in the order of time."""
+    """Landing of one pour; by frame, not in the order of time."""
     pour = ConvergencePour(CONE, speed, DISTANCE)
     scene = Scene("landing", POURER, CONE, Liquid(mass=0.1996))
     task = PourTask(scene, pour.action(FALL), parameters, seed, record_rate=50.0, pose_error=PoseError(y=ASIDE))
@@ -109,14 +110,14 @@ def _of_one(simulator: PourSimulator, speed: float, parameters: SimulationParame
 def compared(
     simulator: PourSimulator, numbers: tuple[int, ...], finest: int, parameters: SimulationParameters, seeds: int = 1
 ) -> tuple[list[Measurement], Figure]:
-    """Landing at some resolutions against that of the finest.
+    """Landing at some resolutions, compared with the finest.
 
     Args:
         simulator: of this process.
         numbers: of particles.
         finest: number of particles of the reference.
         parameters: θ; its number of particles is replaced.
-        seeds: so many pours of each are taken together.
+        seeds: number of pours that are combined for each.
     """
     measurements: list[Measurement] = []
     curves: list[Series] = []

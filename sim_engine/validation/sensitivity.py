@@ -1,11 +1,13 @@
-"""What each simulation parameter does to the spillage: one turned at a time, around the defaults, in three pours.
+"""Effect of each simulation parameter on the spillage: one is varied at a time, around the defaults, in three pours.
 
-Nothing is judged. For every parameter and pour: the widest part of its range in which spillage only rises or only
-falls, as far as the seeds' noise allows to tell, by how much, and how steeply. Spillage is monotone over an interval if
-an isotonic (least-squares monotone) fit leaves residuals that the noise explains: χ² below its 95 % quantile.
+There is no criterion. For every parameter and pour the result is the widest part of its range in which the spillage
+only rises or only falls within the seeds' noise, with the change and the slope there. Spillage is monotone over an
+interval if the residuals of an isotonic (least-squares monotone) fit are consistent with the noise: χ² below its 95 %
+quantile.
 
-Source: of the fit, Barlow, Bartholomew, Bremner & Brunk, Statistical Inference under Order Restrictions (1972).
-Limitations: one at a time: what two parameters do together is not seen; a slope is the mean over the interval.
+Source of the fit: Barlow, Bartholomew, Bremner & Brunk, Statistical Inference under Order Restrictions (1972).
+
+Limitations: interactions of two parameters are not covered; a slope is the mean over the interval.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from sim_engine.vessel.shapes import cylinder
 Floats = NDArray[np.float64]
 
 PARTICLES = (250.0, 4_000.0)
-"""Range of the number of particles that is walked through: beyond it minutes are spent on a pour."""
+"""Examined range of the number of particles: beyond it a pour takes minutes."""
 
 CONFIDENCE = 0.95
 
@@ -54,18 +56,18 @@ def _pour(speed: float, x_offset: float) -> Action:
 
 
 POURS = {"slow": _pour(20, 0.100), "standard": _pour(30, 0.105), "fast": _pour(100, 0.120)}
-"""200 mL into a tumbler that stands somewhat too far away, so that each spills some."""
+"""200 mL into a tumbler that stands slightly too far away, so that each pour spills some."""
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What one parameter does to one pour.
+    """Effect of one parameter on one pour.
 
     Attributes:
         values: of the parameter, increasing, SI.
         means, deviations: of the spillage spilled / poured, over seeds.
-        direction: 1 if spillage rises with it, −1 if it falls, 0 if nothing is seen beyond the noise.
-        lower, upper: where that holds.
+        direction: 1 if spillage rises with it, −1 if it falls, 0 if no effect exceeds the noise.
+        lower, upper: interval of this direction.
         change, change_error: of the spillage from `lower` to `upper`, and its standard error.
         slope, slope_error: in 1 / (unit of the parameter), by least squares; for particles, per doubling.
     """
@@ -85,12 +87,12 @@ class Sensitivity:
 
 
 def grid(info: ParameterInfo, default: float, count: int) -> tuple[float, ...]:
-    """Values of a parameter to try: both ends of its range, the default, and more where the default lies.
+    """Values of a parameter to try: both ends of its range, the default, and more values near the default.
 
     Args:
         info: its bounds.
         default: its default.
-        count: how many, at least 3.
+        count: number of values, at least 3.
     """
     places = np.linspace(0.0, 1.0, count)
     if info.name == "particles":
@@ -105,7 +107,7 @@ def grid(info: ParameterInfo, default: float, count: int) -> tuple[float, ...]:
 
 
 def analyse(parameter: str, pour: str, values: Floats, samples: list[Floats], smallest: float) -> Sensitivity:
-    """Where spillage is monotone in a parameter, and how steep.
+    """The interval in which spillage is monotone in a parameter, and its slope.
 
     Args:
         parameter, pour: names.
@@ -116,7 +118,7 @@ def analyse(parameter: str, pour: str, values: Floats, samples: list[Floats], sm
     means = np.array([s.mean() for s in samples])
     variances = np.array([s.var(ddof=1) for s in samples])
     counts = np.array([len(s) for s in samples])
-    # few seeds tell a variance badly: half of it is taken from all values together
+    # few seeds estimate a variance badly, so half of it is pooled over all values
     errors = np.sqrt((0.5 * variances + 0.5 * variances.mean()) / counts + smallest**2)
     if _explained(means - np.average(means, weights=errors**-2), errors):
         direction, first, last = 0, 0, len(values) - 1
@@ -142,7 +144,7 @@ def analyse(parameter: str, pour: str, values: Floats, samples: list[Floats], sm
 
 
 def _explained(residuals: Floats, errors: Floats) -> bool:
-    """Whether noise alone leaves such residuals."""
+    """Whether noise alone can cause such residuals."""
     from scipy.stats import chi2
 
     limit = chi2.ppf(CONFIDENCE, max(len(residuals) - 1, 1))
@@ -150,7 +152,7 @@ def _explained(residuals: Floats, errors: Floats) -> bool:
 
 
 def _widest(means: Floats, errors: Floats) -> tuple[int, int, int]:
-    """Direction, first and last point of the longest stretch with a monotone fit; of equals, of the largest change."""
+    """Direction, first and last point of the longest interval with a monotone fit; among equals, the largest change."""
     from scipy.optimize import isotonic_regression
 
     found = []
@@ -176,12 +178,12 @@ def _line(x: Floats, y: Floats, errors: Floats) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Extent:
-    """How much is simulated.
+    """Extent of the simulations.
 
     Attributes:
-        particles: N, where it is not what is turned.
-        values: of each parameter.
-        seeds: at each value.
+        particles: N, unless it is the varied parameter.
+        values: number of values of each parameter.
+        seeds: number of seeds at each value.
         pours: names out of `POURS`.
         parameters: names; empty: all.
     """
@@ -200,11 +202,11 @@ QUICK = Extent(particles=300, values=3, seeds=2, pours=("fast",))
 def sensitivity(
     simulator: PourSimulator, extent: Extent, progress: Callable[[int, int], None] | None = None
 ) -> tuple[list[Measurement], Figure]:
-    """Turn every parameter in every pour.
+    """Vary every parameter in every pour.
 
     Args:
-        extent: how much.
-        progress: told how many simulations are done, and how many there are.
+        extent: of the simulations.
+        progress: called with the number of finished simulations and their total.
     """
     base = SimulationParameters(particles=extent.particles)
     known = {n: i for n, i in SimulationParameters.info().items() if not i.nuisance}
@@ -250,7 +252,7 @@ def _jobs(
 def _spreads(
     base: SimulationParameters, spilled: dict[tuple[str, SimulationParameters], list[float]], extent: Extent
 ) -> list[Measurement]:
-    """What the defaults spill in each pour."""
+    """Spillage of the defaults in each pour."""
     found = []
     for pour in extent.pours:
         seeds = np.array(spilled.get((pour, base), [math.nan, math.nan]))
@@ -283,12 +285,12 @@ def _measurements(found: list[Sensitivity], extent: Extent) -> list[Measurement]
 
 @dataclass(frozen=True)
 class ParameterEffect:
-    """One line of a page: what a parameter does to a pour.
+    """One line of a page: the effect of a parameter on a pour.
 
     Attributes:
         where: the interval, with its unit.
         effect: one of `WORDS`.
-        change, error: of the spillage over the interval; the error as it is shown.
+        change, error: of the spillage over the interval; the error as displayed.
     """
 
     parameter: str
@@ -300,7 +302,7 @@ class ParameterEffect:
 
 
 def effects(records: Sequence[Mapping[str, Any]]) -> list[ParameterEffect]:
-    """What parameters do, from the measurements as a page keeps them (`Measurement.as_json`)."""
+    """Effects of parameters, from the measurements as a page stores them (`Measurement.as_json`)."""
     found = []
     for record in records:
         match = _CHANGE.fullmatch(str(record["name"]))
@@ -313,7 +315,7 @@ def sensitivity_figure(found: list[Sensitivity], base: SimulationParameters) -> 
     """A panel for each parameter, a curve for each pour, with the standard deviation of its seeds as a band.
 
     Args:
-        base: where each parameter is held while another is turned.
+        base: value of each parameter while another one is varied.
     """
     infos = SimulationParameters.info()
     names = [name for name in infos if any(one.parameter == name for one in found)]

@@ -1,10 +1,11 @@
-"""Sloshing: the frequency of the first lateral mode in a straight cup, and how fast it dies.
+"""Sloshing: the frequency of the first lateral mode in a straight cup, and its decay.
 
 The cup stands until the liquid is at rest, is pushed aside by `PUSH` within about half a period, and stands again. The
 velocities are projected on the flow of the first mode, u = ∇(J₁(k r) cos θ cosh(k z)), which is orthogonal to the flows
-of all others, and the projection is fitted by a damped oscillation. Theory (linear, without viscosity):
-ω² = g k tanh(k H) with k = 1.8412 / R, the first zero of J₁'. The decay is the solver's own: water's would take many
-seconds.
+of all others. A damped oscillation is fitted to the projection.
+
+Theory (linear, without viscosity): ω² = g k tanh(k H) with k = 1.8412 / R, the first zero of J₁'. The decay is the
+solver's own: water's would take many seconds.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ FREQUENCY = math.sqrt(GRAVITY * WAVE_NUMBER * math.tanh(WAVE_NUMBER * HEIGHT)) /
 """3.30 Hz."""
 
 REST, PUSH_TIME, PUSH = 1.0, 0.15, 0.006
-"""The push begins after this time [s], takes that long [s] and goes that far [m]."""
+"""Start of the push [s], its duration [s] and its distance [m]."""
 WATCHED = 1.6
-"""Time after the push [s]."""
+"""Observed time after the push [s]."""
 
 
 def _damped(t: Floats, offset: float, amplitude: float, decay: float, frequency: float, phase: float) -> Floats:
@@ -46,7 +47,7 @@ def fit_oscillation(t: Floats, y: Floats, guess: float) -> tuple[float, float]:
     Args:
         t: times from 0 on, shape (T,) [s].
         y: values, shape (T,).
-        guess: frequency to begin with [Hz].
+        guess: initial frequency [Hz].
 
     Returns:
         NaNs if there is no such fit.
@@ -86,7 +87,7 @@ def first_mode(x: Floats, y: Floats, z: Floats) -> Floats:
 
 
 def sloshing(particles: int, parameters: SimulationParameters) -> tuple[list[Measurement], list[Series]]:
-    """Push the cup, watch the liquid.
+    """Push the cup and measure the liquid's oscillation.
 
     Args:
         particles: N.
@@ -127,7 +128,7 @@ def sloshing(particles: int, parameters: SimulationParameters) -> tuple[list[Mea
 
 
 def sloshing_figure(curves: list[Series]) -> Figure:
-    """All resolutions beside the undamped oscillation of theory."""
+    """Curves of all resolutions and of the undamped oscillation of theory."""
     t = np.linspace(0.0, WATCHED, 300)
     size = max(abs(v) for v in curves[0].y)
     sign = math.copysign(1.0, curves[0].y[int(np.argmax(np.abs(curves[0].y)))])

@@ -1,7 +1,7 @@
-"""Torricelli: a cup drains through a hole in its floor, T = (A / (C_d A₀)) √(2H / g), with C_d between 0.61 and 1.
+"""Torricelli: a cup drains through a hole in its bottom, T = (A / (C_d A₀)) √(2H / g), with C_d between 0.61 and 1.
 
-The cup stands closed until the liquid is at rest; then the floor has a hole. √V falls linearly with time, and its slope
-between 0.8 and 0.2 of the load gives C_d, free of how the flow begins and of the last drops.
+The cup stands closed until the liquid is at rest; then the hole is opened. √V falls linearly with time, and its slope
+between 0.8 and 0.2 of the load gives C_d, independent of the start of the flow and of the last drops.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def torricelli(particles: int, parameters: SimulationParameters) -> tuple[list[M
 
 
 def steadiness(discharges: dict[int, float]) -> Measurement:
-    """How much C_d changes from the coarsest to the finest."""
+    """Change of C_d from the coarsest to the finest resolution."""
     coarse, fine = min(discharges), max(discharges)
     change = abs(discharges[fine] / discharges[coarse] - 1.0)
     name = f"change of C_d from N = {coarse:,}"
@@ -94,7 +94,7 @@ def steadiness(discharges: dict[int, float]) -> Measurement:
 
 
 def torricelli_figure(curves: list[Series]) -> Figure:
-    """All resolutions between the two bounds."""
+    """Curves of all resolutions between the two bounds."""
     bounds = []
     for discharge in (1.0, SHARP):
         t = np.linspace(0.0, FASTEST / discharge, 60)

@@ -1,10 +1,10 @@
-"""Viscous liquids on walls: down a tube, down an incline, as a film that drains, as a puddle that spreads.
+"""Cases of viscous liquids on walls, and the solver's own viscosity.
 
-What is exact about them: the flow in a tube (Hagen 1839, Poiseuille 1846) and down an incline (Nusselt 1916), where
-gravity and the wall's friction are in balance; the film that is left on a wall (Jeffreys 1930), e = √(νz/gt) below its
-upper edge; the radius of a puddle, .894 (g V³ t / 3ν)^⅛ (Huppert 1982), once it is flat.
-
-The cases of liquids with a viscosity in SI, and how large the solver's own viscosity is.
+- Exact references: the flow in a tube (Hagen 1839, Poiseuille 1846) and down an incline (Nusselt 1916), where gravity
+  and the wall's friction are in balance.
+- A film that drains from a wall (Jeffreys 1930): e = √(νz/gt) below its upper edge.
+- A puddle that spreads, of radius 0.894 (g V³ t / 3ν)^⅛ (Huppert 1982), once it is flat.
+- The standard pour of thicker liquids, and the decay of vortices, which measures the solver's own viscosity.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def down_a_tube(
     Args:
         layers: spacings in the radius.
         viscosity: kinematic [m²/s].
-        parameters: θ; its number of particles is not looked at.
+        parameters: θ; its number of particles is ignored.
         radius: of the tube [m].
     """
     from sim_engine.fluid.engine import engine
@@ -135,12 +135,12 @@ INCLINE = math.radians(20.0)
 def down_an_incline(
     layers: int, viscosity: float, parameters: SimulationParameters, thickness: float = 0.01
 ) -> tuple[list[Measurement], list[Series]]:
-    """A film on a plane of 20°; looked at in the middle of it, away from its edges and from the channel's sides.
+    """A film on a plane of 20°, measured in its middle, away from its edges and from the channel's sides.
 
     Args:
         layers: spacings in the film.
         viscosity: kinematic [m²/s].
-        parameters: θ; its number of particles is not looked at.
+        parameters: θ; its number of particles is ignored.
         thickness: of the film [m].
     """
     from sim_engine.fluid.engine import engine
@@ -196,9 +196,9 @@ def left_on_a_wall(
     """A film inside a vertical tube drains.
 
     Args:
-        layers: spacings in the film at first.
+        layers: initial spacings in the film.
         viscosity: kinematic [m²/s].
-        parameters: θ; its number of particles is not looked at.
+        parameters: θ; its number of particles is ignored.
         height, radius: of the tube [m].
     """
     from sim_engine.fluid.engine import engine
@@ -233,7 +233,7 @@ def left_on_a_wall(
 
 
 def jeffreys(time: float, first: float, height: float, radius: float, viscosity: float) -> float:
-    """What is left of a film after a time, over what it was: e = min(first, √(νz/gt)) at z below its upper edge."""
+    """Remaining over initial volume of a film after a time: e = min(first, √(νz/gt)) at z below its upper edge."""
     z = (np.arange(2_000) + 0.5) / 2_000 * height
     e = np.minimum(first, np.sqrt(viscosity * z / (GRAVITY * time)))
     return float(np.sum(e * (2.0 * radius - e)) / (2_000 * first * (2.0 * radius - first)))
@@ -242,7 +242,7 @@ def jeffreys(time: float, first: float, height: float, radius: float, viscosity:
 def spreading(
     particles: int, viscosity: float, parameters: SimulationParameters, volume: float = 250e-6
 ) -> tuple[list[Measurement], list[Series]]:
-    """A cylinder of liquid is let go on a plane: a viscous dam break.
+    """Release a cylinder of liquid on a plane: a viscous dam break.
 
     Args:
         particles: N.
@@ -263,7 +263,7 @@ def spreading(
     for _ in run(start + at, d, plain, parameters, times, viscosity=viscosity):
         x = engine().particles()[0].astype(float) - at
         r = np.sort(np.hypot(x[:, 0], x[:, 1]))
-        # a puddle's profile (1 − r²/R²)^⅓ has its mean square of r at R²·3/7
+        # a puddle's profile (1 − r²/R²)^⅓ has the mean square of r at R²·3/7
         radii.append(math.sqrt(float(np.mean(r**2)) * 7.0 / 3.0))
     wanted = 0.894 * (GRAVITY * volume**3 * times / (3.0 * viscosity)) ** 0.125
     late = times > 0.5
@@ -281,7 +281,7 @@ def spreading(
 
 
 def _mm2(viscosity: float) -> str:
-    """A kinematic viscosity as people read it; mm²/s are centistokes."""
+    """A kinematic viscosity as text; mm²/s are centistokes."""
     return f"{1e6 * viscosity:.0f} mm²/s"
 
 
@@ -305,17 +305,17 @@ CUP = (
 )
 
 SIDE, VOLUME = 0.07, 200e-6
-"""Of the tank in which the solver's own viscosity is measured [m], [m³]."""
+"""Side [m] and volume [m³] of the tank in which the solver's own viscosity is measured."""
 
 
 def own_viscosity(particles: int, viscosity: float, speed: float) -> tuple[float, float, int]:
-    """Viscosity at which four vortices side by side die away in a tank whose walls are slippery.
+    """Viscosity from the decay of four vortices side by side in a tank with slip walls.
 
-    Taylor and Green's vortices: u = (sin kx cos ky, −cos kx sin ky) U, k = 2π/side, decay as exp(−2νk²t), whatever U.
+    Taylor and Green's vortices: u = (sin kx cos ky, −cos kx sin ky) U, k = 2π/side, decay as exp(−2νk²t), for any U.
 
     Args:
         particles: N.
-        viscosity: kinematic, that the liquid is given; 0: none [m²/s].
+        viscosity: kinematic, of the liquid; 0: none [m²/s].
         speed: U [m/s].
 
     Returns:
@@ -348,7 +348,7 @@ def own_viscosity(particles: int, viscosity: float, speed: float) -> tuple[float
 
 
 def floor(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
-    """What the solver adds to the viscosity that a liquid is given, by spacing and speed."""
+    """Viscosity that the solver adds to that of a liquid, by spacing and speed."""
     speed = 0.2
     found: list[Measurement] = []
     curves: list[Series] = []
@@ -420,15 +420,15 @@ PEER: dict[float, tuple[float, ...]] = {
     1e-4: (0.985, 0.922, 0.796, 0.632, 0.462, 0.296, 0.149, 0.043),
     1e-3: (0.987, 0.933, 0.822, 0.671, 0.501, 0.339, 0.195, 0.090),
 }
-"""Left in the pourer at `TIMES` by kinematic viscosity [m²/s]: SPlisHSPlasH 2.19 (DFSPH, volume maps, viscosity of
-Weiler et al. 2018 in the liquid and on walls), 2,000 and 1,000 particles, `benchmarks/peer.py`. For water it
-has less by at most .015: .1 Pa s change next to nothing there."""
+"""Fraction left in the pourer at `TIMES` by kinematic viscosity [m²/s]: SPlisHSPlasH 2.19 (DFSPH, volume maps,
+viscosity of Weiler et al. 2018 in the liquid and on walls), 2,000 and 1,000 particles, `benchmarks/peer.py`. Its
+fractions for water are smaller by at most 0.015; 0.1 Pa s has almost no effect there."""
 TIMES = (2.1, 2.3, 2.5, 2.7, 2.9, 3.1, 3.3, 3.5)
 FAR = 0.05
 
 
 def cup(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
-    """The standard pour of thicker and thicker liquids."""
+    """The standard pour with increasingly viscous liquids."""
     found: list[Measurement] = []
     curves: list[Series] = []
     scene = Scene(
@@ -471,4 +471,4 @@ CASES: tuple[tuple[str, str, str, Work], ...] = (
     ("wetting", "Contact angle", wetting.ABOUT, wetting.wetting),
     ("thick-outflow", "Outflow of thick liquids", CUP, cup),
 )
-"""Name, title, what it is about, and what runs it, in short or in full."""
+"""Name, title, description, and the function that runs it, in the quick or the full run."""

@@ -1,8 +1,8 @@
-"""Walls hold: random pours out of and into thin-walled vessels, at any speed, and nothing may cross a wall.
+"""Tightness of walls: in random pours out of and into thin-walled vessels, at any speed, nothing may cross a wall.
 
 Draws: walls of 1 to 4 mm, straight and conical vessels, 15 to 180 °/s with accelerations up to a step, 500 particles
-and more, tilts to 170°. Draws in which the vessels touch, or a wall is too thin for its
-vessel's size, are not pours and are drawn again.
+and more, tilts to 170°. If the vessels touch, or a wall is too thin for its vessel's size, the draw is not a pour and
+is repeated.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from sim_engine.vessel.shapes import ProfileShape, VesselError, VesselSpec
 from sim_engine.vessel.vessel import build_vessel
 
 ATTEMPTS = 40
-"""Draws after which a pour that can be made must have turned up."""
+"""Largest number of draws until one is a possible pour."""
 
 
 @dataclass(frozen=True)
 class Escapes:
-    """What random pours came to: how many were made, and those that let something through or failed."""
+    """Results of random pours: their number, and those that leaked or failed."""
 
     pours: int
     particles: int
@@ -51,7 +51,7 @@ def random_vessel(rng: np.random.Generator, name: str, radius: tuple[float, floa
 
 
 def random_task(rng: np.random.Generator, most_particles: int) -> PourTask:
-    """A pour, perhaps one in which the vessels touch."""
+    """A pour, in which the vessels may touch."""
     pourer = random_vessel(rng, "thin cup", (0.025, 0.04))
     receiver = random_vessel(rng, "thin glass", (0.03, 0.045))
     load = float(rng.uniform(0.3, 0.8)) * build_vessel(pourer).capacity
@@ -78,7 +78,7 @@ def _one(rng: np.random.Generator, most_particles: int) -> PourOutcome:
     for _ in range(ATTEMPTS):
         try:
             task = random_task(rng, most_particles)
-            # One simulator each: hundreds of vessels need not stay in memory.
+            # One simulator each: hundreds of vessels must not stay in memory.
             return PourSimulator().simulate(task).outcome
         except (VesselError, InvalidSceneError):
             continue
@@ -89,8 +89,8 @@ def random_pours(pours: int, most_particles: int, seed: int = 1) -> Escapes:
     """Simulate random pours.
 
     Args:
-        pours: how many.
-        most_particles: N is drawn between 500 and this, evenly in its logarithm.
+        pours: number of pours.
+        most_particles: N is drawn between 500 and this, uniformly in its logarithm.
         seed: of the draws.
     """
     outcomes = [_one(np.random.default_rng([seed, k]), most_particles) for k in range(pours)]
@@ -105,7 +105,7 @@ def random_pours(pours: int, most_particles: int, seed: int = 1) -> Escapes:
 
 
 def walls(pours: int, most_particles: int, seed: int = 1) -> list[Measurement]:
-    """Random pours, judged."""
+    """Random pours with their criteria."""
     found = random_pours(pours, most_particles, seed)
     return [
         reported(f"particles in {pours} random pours", found.particles, particles=most_particles),

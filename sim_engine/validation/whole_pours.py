@@ -1,9 +1,9 @@
-"""Whole pours: the standard pour's outflow against its limit, what is delivered, seeds, and the free jet.
+"""Whole pours: the standard pour's outflow against its limit, delivered fraction, seeds, and the free jet.
 
 The standard pour: 200 mL in a straight cup (R 40 mm, H 100 mm) turned at 30 °/s, from a step, to 120° about the inner
-lip. Fractions still in the pourer are those of infinitely fine particles: SPlisHSPlasH (DFSPH, volume maps, 2,000 to
-10,000) and Decant with two different corrections of the lip (1,000 to 20,000), each extrapolated linearly in the
-spacing, agree within .003. At 2,000 particles the former still has .035 to .05 less.
+lip. The reference fractions in the pourer are those of infinitely fine particles. SPlisHSPlasH (DFSPH, volume maps,
+2,000 to 10,000) and Decant with two different corrections of the lip (1,000 to 20,000), each extrapolated linearly in
+the spacing, agree within 0.003. At 2,000 particles SPlisHSPlasH still has 0.035 to 0.05 less.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def outflow(
         simulator: of this process.
         particles: N.
         parameters: θ; its number of particles is replaced.
-        seeds: how many; one of 2,000 particles differs from their mean by .0015.
+        seeds: number of seeds; one of 2,000 particles differs from their mean by 0.0015.
     """
     runs = [pour(simulator, particles, parameters, seed) for seed in range(1, seeds + 1)]
     lefts = np.mean([left_at(run, TIMES) for run in runs], axis=0)
@@ -88,7 +88,7 @@ def outflow(
 
 
 def outflow_figure(curves: list[Series]) -> Figure:
-    """All resolutions in one picture."""
+    """Curves of all resolutions in one figure."""
     return Figure(
         ("Outflow of the standard pour",),
         ("time [s]",),
@@ -100,12 +100,12 @@ def outflow_figure(curves: list[Series]) -> Figure:
 def delivered(
     simulator: PourSimulator, particles: int, parameters: SimulationParameters, seeds: int
 ) -> list[Measurement]:
-    """How much of the standard pour arrives, over seeds, and how much that varies.
+    """Fraction of the standard pour that arrives, and its variation over seeds.
 
     Args:
         particles: N.
         parameters: θ; its number of particles is replaced.
-        seeds: how many.
+        seeds: number of seeds.
     """
     outcomes = [pour(simulator, particles, parameters, seed).outcome for seed in range(1, seeds + 1)]
     arrived = np.array([o.received for o in outcomes])
@@ -147,10 +147,10 @@ def repeatability(simulator: PourSimulator, particles: int, parameters: Simulati
 def free_jet(
     simulator: PourSimulator, particles: int, parameters: SimulationParameters
 ) -> tuple[list[Measurement], Figure]:
-    """How the mass centre of parcels of the jet falls.
+    """The fall of the mass centre of parcels of the jet.
 
-    A parcel is everything that is in free flight through a slab of height; it is followed for a tenth of a second, and
-    a parabola is fitted to the height of its mass centre. What acts between its particles cannot move it.
+    A parcel is the liquid in free flight within a slab of height. It is followed for a tenth of a second, and a
+    parabola is fitted to the height of its mass centre. Forces between its particles cannot move it.
 
     Args:
         particles: N.

@@ -1,1 +1,1 @@
-"""Vessels: from a profile or a mesh to a solid, its distance grid, its cavity and its lip."""
+"""Vessels: solid, distance grid, cavity and lip, from a profile or a mesh."""

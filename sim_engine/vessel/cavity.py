@@ -1,11 +1,11 @@
-"""The cavity: what a rain of liquid would fill, up to the brim.
+"""The cavity of a vessel: the volume that rain would fill up to the brim.
 
-For every free place let its level be the lowest height that a way from it to the outside must climb to. Liquid stands
-where the level is higher than the place itself. Horizontal slices fall into a few connected parts each, so the levels
-are found on the small graph of those parts. Handles, feet and dents need no special treatment: they hold no pool, or a
-smaller one than the cavity.
+Each free node has a level: the lowest height to which a path from it to the outside must rise. Liquid stands where the
+level is higher than the node itself. Horizontal slices consist of a few connected parts each, so the levels are found
+on the small graph of those parts. Handles, feet and dents need no special treatment: they hold no pool, or a smaller
+one than the cavity.
 
-Limitations: air that an overhang would trap counts as liquid; holes narrower than the grid's spacing are not seen.
+Limitations: air that an overhang would trap counts as liquid; holes narrower than the grid's spacing are not detected.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class CavityFill:
 
     Attributes:
         pool: its nodes, shape of the grid.
-        brim: first slice at which it runs over; 0 without a pool.
+        brim: first slice at which it overflows; 0 without a pool.
         outside: nodes that drain below the brim, shape of the grid.
         enclosed: nodes in voids that no liquid reaches.
-        drained: nodes surrounded by solid in their slice that hold nothing all the same, because it runs out below.
+        drained: nodes surrounded by solid in their slice that hold no liquid, because it runs out below.
         drain: lowest slice with such a node; −1 without any.
     """
 
@@ -89,7 +89,7 @@ def flood(free: NDArray[np.bool_]) -> CavityFill:
 
 
 def _levels(open_parts: set[Part], neighbours: dict[Part, set[Part]]) -> dict[Part, int]:
-    """Level of every part from which a way leads outside (Dijkstra's method with the highest slice as length)."""
+    """Level of every part that has a path to the outside (Dijkstra's method with the highest slice as length)."""
     levels: dict[Part, int] = {}
     queue = [(part[0], part) for part in open_parts]
     heapq.heapify(queue)
@@ -132,13 +132,13 @@ def _nodes(labels: NDArray[np.int32], parts: set[Part]) -> NDArray[np.bool_]:
 
 
 def brim_height(found: CavityFill, free: NDArray[np.bool_], layout: GridLayout, hits: Crossings) -> float:
-    """Exact height of the brim: the lowest saddle of the rim between the last dry slice and the first that runs over.
+    """Exact height of the brim: the lowest saddle of the rim between the last dry slice and the first that overflows.
 
     Args:
         found: with a pool.
         free: as given to `flood`.
         layout: of the grid.
-        hits: where columns cross the surface.
+        hits: crossings of columns with the surface.
 
     Returns:
         z [m].
@@ -167,7 +167,7 @@ def brim_height(found: CavityFill, free: NDArray[np.bool_], layout: GridLayout, 
 
 
 def floor_height(found: CavityFill, layout: GridLayout, hits: Crossings) -> float:
-    """Lowest z of the pool: where its columns meet the solid below them [m]."""
+    """Lowest z of the pool, where its columns meet the solid below them [m]."""
     wet = found.pool.any(axis=2)
     lowest = layout.origin[2] + layout.spacing * np.argmax(found.pool, axis=2)
     floor = np.full(wet.shape, -math.inf)

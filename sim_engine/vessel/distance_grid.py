@@ -1,4 +1,4 @@
-"""Signed distance on a regular grid: what the solver's walls, the contact check and the quadrature sample."""
+"""Signed distance on a regular grid, used by the solver's walls, the contact check and the quadrature."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class SignedDistanceGrid:
         return x, y, z
 
     def _locate(self, points: Floats) -> tuple[NDArray[np.int64], Floats, Floats]:
-        """Flat index of the cell's first node (N,), place within the cell (N, 3), distance to the box (N,)."""
+        """Flat index of the cell's first node (N,), position within the cell (N, 3), distance to the box (N,)."""
         limits = np.array(self.shape) - 1
         scaled = (np.asarray(points, dtype=float) - self.origin) / self.spacing
         clamped = np.clip(scaled, 0.0, limits)
@@ -94,7 +94,7 @@ class SignedDistanceGrid:
         return result
 
     def lower_bound(self, points: Floats) -> Floats:
-        """A distance that the solid is at least away: like `sample`, but safe beyond the grid too.
+        """A lower bound of the distance to the solid: like `sample`, but valid beyond the grid too.
 
         There, `sample` may be too large by twice the distance to the box; the solid keeps `MARGIN` from its faces.
 

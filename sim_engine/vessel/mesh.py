@@ -1,6 +1,7 @@
-"""Vessels from mesh files: solid, cavity, brim, opening and lip, kept in the cache by content.
+"""Vessels from mesh files.
 
-Reading a vessel's mesh: formats, units, axes, and the reasons to refuse it.
+`read_mesh` checks formats, units, axes and closedness. `build_mesh_vessel` computes solid, cavity, brim, opening and
+lip, and keeps them in the cache by content.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ SMALLEST, LARGEST = 0.020, 0.500
 """Largest extent of a plausible vessel [m]."""
 MOST_FACES = 1_000_000
 LARGEST_FILE = 300_000_000
-"""As much as so many triangles take where they are written as text [bytes]."""
+"""Largest size of a file [bytes]; the same number of triangles as text needs as much."""
 
 
 def check_size(shape: MeshShape) -> None:
-    """Refuse a file that is too large to be read, before it is.
+    """Refuse a file that is too large, before it is read.
 
     Raises:
-        VesselError: it is.
-        OSError: there is none.
+        VesselError: it is too large.
+        OSError: it does not exist.
     """
     size = shape.path.stat().st_size
     if size > LARGEST_FILE:
@@ -53,7 +54,7 @@ def read_mesh(shape: MeshShape) -> tuple[Floats, Integers]:
 
     Raises:
         VesselError: unreadable, not closed, or of an implausible size.
-        OSError: the file can't be read.
+        OSError: the file cannot be read.
     """
     import trimesh
 
@@ -63,7 +64,7 @@ def read_mesh(shape: MeshShape) -> tuple[Floats, Integers]:
     content = shape.path.read_bytes()
     try:
         loaded = trimesh.load(io.BytesIO(content), file_type=kind, process=True)
-    except Exception as problem:  # trimesh's readers raise whatever the broken byte led to
+    except Exception as problem:  # trimesh's readers raise various errors for damaged files
         raise VesselError(f"{shape.path.name}: not a readable {kind.upper()} file ({problem})") from problem
     if isinstance(loaded, trimesh.Scene):
         loaded = loaded.to_mesh() if len(loaded.geometry) else None
@@ -134,13 +135,13 @@ def to_z(up: str) -> Floats:
     """Rotation that turns an axis of the mesh, such as '-y', to z."""
     target = np.zeros(3)
     target["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
-    # the new x axis is the mesh's next axis in turn, so that a mesh with z up stays as it is
+    # the new x axis is the mesh's next axis in cyclic order, so that a mesh with z up is unchanged
     x = np.roll(np.abs(target), 1)
     return np.stack([x, np.cross(target, x), target])
 
 
 FORMAT_VERSION = 2
-"""Raised whenever the same mesh would give other arrays."""
+"""Incremented whenever the same mesh would give other arrays."""
 
 SMALLEST_SHARE = 0.03
 """Smallest cavity as a share of the bounding box: less is a dent."""
@@ -159,7 +160,7 @@ def build_mesh_vessel(spec: VesselSpec, *, use_cache: bool = True) -> Vessel:
             try:
                 return _unpack(spec, stored)
             except (KeyError, ValueError, IndexError, TypeError):
-                cache.discard(key)  # written by something else, or damaged: compute it again
+                cache.discard(key)  # written by another program, or damaged: compute it again
     vessel = _measure(spec, spec.shape)
     if use_cache:
         cache.store_arrays(key, _pack(vessel))
@@ -217,7 +218,7 @@ def _measure(spec: VesselSpec, shape: MeshShape) -> Vessel:
     meridians = trace_meridians(grid, vertices[faces], floor, rim, wall)
     crest = float(meridians[:, -1, 2].min())
     if 0.0 < crest - rim < 0.5 * layout.spacing:
-        rim = crest  # columns straddle a rounded crest; the meridians run over it
+        rim = crest  # columns pass on both sides of a rounded crest; the meridians run over it
     points, cell = lattice(spec, grid, floor, rim, QUADRATURE_POINTS)
     return Vessel(
         spec=spec,
@@ -237,8 +238,8 @@ def _measure(spec: VesselSpec, shape: MeshShape) -> Vessel:
 def wall_thickness(vertices: Floats, faces: Integers) -> float:
     """Smallest thickness of the solid's walls [m].
 
-    Rays go inwards from points spread over the surface; those that leave through a face roughly parallel to where they
-    entered have crossed a wall. The second percentile of their lengths leaves out the odd sliver.
+    Rays go inwards from points spread over the surface. Rays that leave through a face roughly parallel to their entry
+    face have crossed a wall. The second percentile of their lengths ignores single slivers.
 
     Args:
         vertices: shape (V, 3) [m].
@@ -261,7 +262,7 @@ def wall_thickness(vertices: Floats, faces: Integers) -> float:
 def _check_one_body(
     vertices: Floats, faces: Integers, inside: NDArray[np.bool_], layout: GridLayout, shape: MeshShape
 ) -> None:
-    """Refuse several things in one file. Bodies that overlap or touch, such as a handle of its own, are one."""
+    """Refuse several objects in one file. Bodies that overlap or touch, such as a separate handle, count as one."""
     from scipy import ndimage
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -285,7 +286,7 @@ def _check_one_body(
 
 
 def _check_cavity(found: CavityFill, shape: MeshShape, spacing: float, vertices: Floats, bottom: float) -> None:
-    """Refuse what holds no liquid, with the most likely reason."""
+    """Refuse a shape that holds no liquid, with the most likely reason."""
     box = float(np.prod(np.ptp(vertices, axis=0)))
     least = SMALLEST_SHARE * box
     cell = spacing**3

@@ -1,11 +1,12 @@
-"""Signed distance of a closed triangle mesh on a grid: exact near the surface, carried outwards elsewhere.
+"""Signed distance of a closed triangle mesh on a grid: exact near the surface, propagated outwards elsewhere.
 
 1. Sign: winding number along the grid's vertical columns, so overlapping closed bodies (a handle pushed into a wall)
-   count as one solid.
+  count as one solid.
 2. Within 2 spacings of a triangle: exact distance to the nearest triangle.
 3. Farther: distance to one of the surface points next to the grid's nodes, so it is never too small. Up to 8 spacings
-   it is the nearest one at every second node and the best of the neighbours' between (too large by up to a quarter
-   spacing where the nearest point jumps); beyond, the one that a feature transform names (up to a spacing too large).
+  every second node has the nearest of these points. The nodes between take the best of their neighbours' points, too
+  large by up to a quarter spacing where the nearest point jumps. Beyond 8 spacings a feature transform selects the
+  point (up to a spacing too large).
 """
 
 from __future__ import annotations
@@ -26,10 +27,12 @@ BAND = 2.0
 """Half width of the exact band [spacings]."""
 
 MIDDLE = 8.0
-"""Up to here the nearest surface point is looked for [spacings]; farther, near an axis, that takes minutes."""
+"""Largest distance at which the nearest surface point is searched [spacings]; farther, near an axis, this takes
+minutes.
+"""
 
 SEEDS = 0.9
-"""Nodes that carry the distance outwards lie within this of the surface [spacings]; √3/2 leaves none of it out."""
+"""Nodes within this distance of the surface propagate it [spacings]; √3/2 omits no part of the surface."""
 
 CHUNK = 1_000_000
 """Pairs of a triangle and a node handled at once."""
@@ -37,7 +40,7 @@ CHUNK = 1_000_000
 
 @dataclass(frozen=True)
 class Crossings:
-    """Where the grid's vertical columns cross the surface: column indices i, j and heights z [m], each (C,)."""
+    """Crossings of the grid's vertical columns with the surface: column indices i, j and heights z [m], each (C,)."""
 
     i: Integers
     j: Integers
@@ -88,7 +91,7 @@ def _pairs(low: Integers, high: Integers) -> Iterator[tuple[Integers, Integers]]
 
 
 def crossings(vertices: Floats, faces: Integers, layout: GridLayout) -> tuple[Crossings, NDArray[np.bool_]]:
-    """Where columns cross the surface, and which nodes lie inside the solid.
+    """Crossings of columns with the surface, and the nodes inside the solid.
 
     Args:
         vertices: shape (V, 3) [m].
@@ -102,7 +105,7 @@ def crossings(vertices: Floats, faces: Integers, layout: GridLayout) -> tuple[Cr
         VesselError: some column enters the solid without leaving it: the surface is not closed.
     """
     for attempt in range(4):
-        # Columns stand a hair beside the nodes, so that none runs exactly along an edge of an aligned mesh.
+        # Columns are slightly displaced from the nodes, so that none runs exactly along an edge of an aligned mesh.
         jitter = layout.spacing * 1e-5 * np.array([np.sqrt(2.0) + attempt, np.sqrt(3.0) + 0.7 * attempt])
         found, sign = _cross_columns(vertices, faces, layout, layout.origin[:2] + jitter)
         nx, ny, nz = layout.shape
@@ -124,13 +127,13 @@ def _cross_columns(
     high = np.floor((flat.max(axis=1) - origin) / layout.spacing).astype(np.int64)
     a, b, c = flat[:, 0], flat[:, 1], flat[:, 2]
     twice = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    high[twice == 0.0] = low[twice == 0.0] - 1  # seen edge on
+    high[twice == 0.0] = low[twice == 0.0] - 1  # parallel to the column
     parts = []
     for face, column in _pairs(low, high):
         p = origin + layout.spacing * column
         weights = []
         for k in range(3):
-            # Both triangles of an edge must compute the same number for it: always from its lower vertex index.
+            # Both triangles of an edge must compute the same value for it: always from its lower vertex index.
             first, second = faces[face, (k + 1) % 3], faces[face, (k + 2) % 3]
             swap = first > second
             q, r = vertices[np.minimum(first, second), :2], vertices[np.maximum(first, second), :2]
@@ -195,7 +198,8 @@ def signed_distance(
 
     square, closest = _band(vertices, faces, layout)
     shape = layout.shape
-    # Faces buried in the solid where bodies overlap are not a surface: keep what has the other side within two nodes.
+    # Faces inside the solid where bodies overlap are not a surface: keep faces that have the other side within two
+    # nodes.
     cube = np.ones((3, 3, 3), dtype=bool)
     near = ndimage.binary_dilation(inside, cube, iterations=2) & ndimage.binary_dilation(~inside, cube, iterations=2)
     exact = np.isfinite(square).reshape(shape) & near
@@ -203,7 +207,7 @@ def signed_distance(
     index = ndimage.distance_transform_edt(~seeds, return_distances=False, return_indices=True)
     flat = np.ravel_multi_index(tuple(index), shape)
     nearest = flat.reshape(shape).astype(np.int32)
-    # The nearest seed need not carry the nearest point (it may only stand out towards the node): a tree finds that.
+    # The nearest seed need not have the nearest point, since it may only protrude towards the node: a tree finds it.
     carriers = np.flatnonzero(seeds)
     coarse = (slice(None, None, 2),) * 3
     rough = _square_distance(nearest[coarse], closest, layout, coarse)
@@ -219,7 +223,7 @@ def signed_distance(
 def _square_distance(
     index: NDArray[np.int32], closest: NDArray[np.float32], layout: GridLayout, part: tuple[slice, ...]
 ) -> NDArray[np.float32]:
-    """Squared distance of a part of the nodes to the surface points that the nodes in `index` carry [m²]."""
+    """Squared distance of some nodes to the surface points of the nodes in `index` [m²]."""
     point = closest[index]
     for axis, count in enumerate(layout.shape):
         coordinate = (layout.origin[axis] + layout.spacing * np.arange(count))[part[axis]].astype(np.float32)

@@ -1,6 +1,6 @@
-"""The opening of a meshed vessel: its centre and width, and the curves over its lip.
+"""The surface of a meshed vessel: its opening, the curves over its lip, and sample points.
 
-Points on a triangle mesh: dense along its sharp edges, even by area elsewhere. The same points at every call.
+Sample points are dense along sharp edges and even by area elsewhere, and the same at every call.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ RIM_POINTS = 24
 """Points of a meridian over the rim, up to the crest."""
 
 CREST_TILT = math.radians(5.0)
-"""The lip's point of a direction is the rim's highest one after so small a tilt: a flat rim's inner edge."""
+"""Tilt that selects the lip's point of a direction, the rim's highest one after it: the inner edge of a flat rim."""
 
 
 def _directions(count: int) -> Floats:
@@ -50,7 +50,7 @@ def measure_opening(grid: SignedDistanceGrid, corners: Floats, rim: float, wall:
 
     Returns:
         The centroid of the cavity's section half a wall below the brim, (2,) [m], and the radius of the largest circle
-        that fits there, wherever its centre [m].
+        that fits there, with any centre [m].
     """
     top = int(np.flatnonzero(grid.cavity.any(axis=(0, 1)))[-1])
     i, j = np.nonzero(grid.cavity[:, :, top])
@@ -105,7 +105,7 @@ def _over_the_rim(ray: Floats, inner: Floats, last: float, corners: Floats, rim:
     """The inner wall's point at `last` and the points above the rim up to its crest, (directions, points, 3) [m]."""
     reach = np.linspace(1e-6, 2.5 * max(wall, 1e-3), RIM_POINTS)
     r = inner[:, None] + reach
-    # Rims may rise above their lowest point away from a spout, handles too; only the rim itself is wanted.
+    # Rims may be higher than their lowest point away from a spout, and so may handles; only the rim itself is needed.
     ceiling = rim + 0.25
     start = r[:, :, None] * ray[:, None] + np.array([0.0, 0.0, ceiling])
     fall, _ = cast_rays(
@@ -177,7 +177,7 @@ def sample_surface(vertices: Floats, faces: Integers, count: int) -> Floats:
     Args:
         vertices: shape (V, 3) [m].
         faces: shape (F, 3).
-        count: how many, at least 10.
+        count: number of points, at least 10.
 
     Returns:
         Shape (count, 3) [m].
@@ -196,7 +196,7 @@ def sample_surface(vertices: Floats, faces: Integers, count: int) -> Floats:
         parts.append(start[along[0]] + along[1][:, None] * (end - start)[along[0]])
     _, area = normals_and_areas(vertices, faces)
     chosen, place = _even(area, count - on_edges)
-    # `place` runs evenly through the triangle that it fell into; a second, golden-ratio sequence spreads it in 2-D.
+    # `place` is evenly distributed in its triangle; a second, golden-ratio sequence spreads it in 2-D.
     second = np.arange(len(chosen)) * 0.618033988749895 % 1.0
     root = np.sqrt(place)
     u, v = 1.0 - root, second * root
@@ -206,7 +206,7 @@ def sample_surface(vertices: Floats, faces: Integers, count: int) -> Floats:
 
 
 def _even(weights: Floats, count: int) -> tuple[Integers, Floats]:
-    """Evenly spaced draws from consecutive intervals: which one (count,), and the place in it in [0, 1] (count,)."""
+    """Evenly spaced draws from consecutive intervals: interval (count,) and position in it in [0, 1] (count,)."""
     total = np.cumsum(weights)
     target = (np.arange(count) + 0.5) / count * total[-1]
     chosen = np.minimum(np.searchsorted(total, target), len(weights) - 1)

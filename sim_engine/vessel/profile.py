@@ -1,8 +1,8 @@
 """Vessels of revolution: from an inner profile (r, z) to a solid, its exact distance and its cavity.
 
-The outer surface is the true normal offset of the inner one by the wall (the boundary of all that lies within one wall
-of the cavity, corners rounded), continued straight down from the inner floor's level to a flat underside. The rim is
-flat. So a bowl gets a foot, a cylinder stays one, and the wall is nowhere thinner than stated.
+The outer surface is the true normal offset of the inner one by the wall: the boundary of all points within one wall of
+the cavity, with rounded corners. From the inner floor's level it continues straight down to a flat underside. The rim
+is flat. Thus a bowl gets a foot, a cylinder remains one, and the wall is nowhere thinner than stated.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from sim_engine.vessel.shapes import ProfileShape, VesselError
 Floats = NDArray[np.float64]
 
 TOLERANCE = 1e-6
-"""Lengths below this are rounding [m]."""
+"""Lengths below this are due to rounding [m]."""
 
 SMALLEST, LARGEST = 0.010, 1.0
 """Plausible outer height and diameter of a vessel [m]."""
 
 THINNEST = 0.0003
-"""Thinnest wall or floor [m]: below it the shape is more likely in the wrong unit than so delicate."""
+"""Thinnest wall or floor [m]: a thinner one is more likely an error of the unit."""
 
 
 def _mm(point: Floats) -> str:
@@ -37,7 +37,7 @@ def check_profile(shape: ProfileShape) -> Floats:
         The inner profile, shape (n, 2), (r, z) above the inner floor [m].
 
     Raises:
-        VesselError: with the reason and what would be right.
+        VesselError: with the reason and the remedy.
     """
     inner = np.array(shape.inner, dtype=float).reshape(-1, 2)
     if len(inner) < 2:
@@ -105,7 +105,7 @@ def _check_crossings(inner: Floats) -> None:
     for i in range(len(a) - 2):
         p, q, r, s = a[i], b[i], a[i + 2 :], b[i + 2 :]
         across = (side(p, q, r) * side(p, q, s) <= 0.0) & (side(r, s, p) * side(r, s, q) <= 0.0)
-        # two parallel pieces of one line have zero sides throughout and need their extents compared
+        # for two parallel pieces of one line all sides are zero, so their extents are compared
         overlap = np.all(
             np.maximum(np.minimum(r, s), np.minimum(p, q)) <= np.minimum(np.maximum(r, s), np.maximum(p, q)), axis=1
         )
@@ -130,7 +130,8 @@ def outer_profile(inner: Floats, wall: float, floor: float) -> Floats:
         Shape (m, 2), (r, z) above the inner floor, z from −floor up to the rim [m].
     """
     height = float(inner[-1, 1])
-    # The wall goes on in its direction beyond the rim before it is cut flat: a flared wall keeps its thickness there.
+    # The wall continues in its direction beyond the rim before it is cut flat, so a flared wall keeps its thickness
+    # there.
     direction = inner[-1] - inner[-2]
     beyond = inner[-1] + direction / np.linalg.norm(direction) * 2.0 * wall
     points = np.vstack([inner, [max(beyond[0], 0.0), beyond[1]]])
@@ -187,7 +188,7 @@ def solid_polygon(inner: Floats, outer: Floats) -> Floats:
 
 
 def contains(polygon: Floats, r: Floats, z: Floats) -> NDArray[np.bool_]:
-    """Whether points lie inside a closed polygon in the (r, z) half plane (even–odd rule); any shape."""
+    """Whether points lie inside a closed polygon in the (r, z) half plane (even–odd rule). Arrays of any shape."""
     inside = np.zeros(np.broadcast(r, z).shape, dtype=bool)
     for (r1, z1), (r2, z2) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         if z1 == z2:
@@ -198,9 +199,10 @@ def contains(polygon: Floats, r: Floats, z: Floats) -> NDArray[np.bool_]:
 
 
 def distance(polygon: Floats, r: Floats, z: Floats) -> Floats:
-    """Signed distance [m] from points (r, z) of one shape to the solid; negative inside. Exact for the revolved solid.
+    """Signed distance [m] from points (r, z), arrays of equal shape, to the solid; negative inside. Exact when
+    revolved.
 
-    The nearest point of a surface of revolution lies in the half plane of the asking point.
+    The nearest point of a surface of revolution lies in the same half plane as the query point.
     """
     shape = np.broadcast(r, z).shape
     nearest = np.full(shape, np.inf)
@@ -226,7 +228,7 @@ def revolve(polygon: Floats, segments: int = 96) -> tuple[Floats, NDArray[np.int
 
     Args:
         polygon: first and last point on the axis, shape (n, 2) [m].
-        segments: corners of the polygon that stands for a circle.
+        segments: corners of the polygon that approximates a circle.
 
     Returns:
         Vertices (V, 3) [m] and faces (F, 3).

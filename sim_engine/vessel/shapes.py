@@ -1,8 +1,9 @@
-"""Where a vessel's shape comes from: a profile, a mesh file, or what a package adds.
+"""Sources of a vessel's shape: a profile, a mesh file, or a plug-in.
 
-Small, hashable values that travel to any process.
+Small, hashable values that are valid in any process.
 
-What is wrong with a vessel, in words for the person who described it.
+`VesselSpec` is a vessel by name and `Shape`; `VESSELS` is the registry of shapes. `VesselError` reports an invalid
+vessel to the user who described it. `sim_engine.vessel.vessel.build_vessel` computes the geometry.
 """
 
 from __future__ import annotations
@@ -22,26 +23,26 @@ from sim_engine.settings.plugin_registry import PluginError, PluginRegistry
 LengthUnit = Literal["m", "cm", "mm", "in"]
 
 NARROWEST = 2e-4
-"""Radii of drawn profiles are kept above this [m]: a cup has no inside out."""
+"""Smallest radius of drawn profiles [m], since a negative radius is impossible."""
 
 
 class Shape(BaseModel):
-    """A source of vessels: a small value that says where a shape comes from, and makes a vessel of it.
+    """A source of vessels: a small value that defines a shape and builds a vessel from it.
 
-    A further one is a class derived from this, registered at the door `decant.vessels` under its `kind`. It has an
-    `outline` if it is a surface of revolution, else it has `build`.
+    To add one, derive a class from this one and register it in `decant.vessels` under its `kind`. It has an `outline`
+    if it is a surface of revolution, else it has `build`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: str = ""
-    """Which source; a literal in each class, and its name at the door."""
+    """The source; a literal in each class, and its name in the registry."""
 
     def outline(self) -> ProfileShape | None:
-        """Its profile, if it is a surface of revolution; exact distances and quadrature follow from that.
+        """Its profile, if it is a surface of revolution; exact distances and quadrature follow from it.
 
         Raises:
-            VesselError: the settings make no vessel; says what would be right.
+            VesselError: the settings define no vessel; the text states valid ones.
         """
         return None
 
@@ -50,17 +51,21 @@ class Shape(BaseModel):
         return self.model_dump_json().encode()
 
     def build(self, spec: VesselSpec, *, use_cache: bool) -> Any:
-        """The `sim_engine.vessel.vessel.Vessel`, where there is no outline; see `build_vessel`."""
-        # Not abstract: a shape has this or an outline. The door refuses one that has neither, so nobody comes here.
+        """The `sim_engine.vessel.vessel.Vessel`, for a shape without an outline; see `build_vessel`."""
+        # Not abstract: a shape has this or an outline. The registry refuses shapes with neither, so this is
+        # unreachable.
         raise NotImplementedError
 
 
 class ProfileShape(Shape):
-    """Surface of revolution. `inner` runs from the axis at the inner floor to the rim, as (r, z) points [m], z measured
-    from the inner floor's lowest point; the wall is `wall` thick outwards and `floor` thick below.
+    """Surface of revolution.
 
-    `radius_deviations` has a row for each independent way in which it may be off: how far outwards each point then is,
-    one standard deviation [m]. `height_deviation` is that of the rim's height, all points moving in proportion [m]."""
+    `inner` runs from the axis at the inner floor to the rim, as (r, z) points [m], z measured from the inner floor's
+    lowest point; the wall is `wall` thick outwards and `floor` thick below.
+
+    `radius_deviations` describes the uncertainty: each row is an independent mode, the outward displacement of each
+    point for one standard deviation [m]. `height_deviation` is that of the rim's height, all points moving in
+    proportion [m]."""
 
     kind: Literal["profile"] = "profile"
     inner: tuple[tuple[float, float], ...]
@@ -75,11 +80,11 @@ class ProfileShape(Shape):
 
     @property
     def uncertain(self) -> bool:
-        """Whether it is known how far it may be off."""
+        """Whether its uncertainty is known."""
         return bool(self.radius_deviations) or self.height_deviation > 0.0
 
     def drawn(self, rng: random.Random) -> ProfileShape:
-        """A shape that it may as well have, certain itself: a normal number for each way in which it may be off."""
+        """A shape drawn from the uncertainty, itself certain: one normal number for each mode."""
         moved = [0.0] * len(self.inner)
         for row in self.radius_deviations:
             by = rng.gauss(0.0, 1.0)
@@ -92,12 +97,12 @@ class ProfileShape(Shape):
         return ProfileShape(inner=tuple(inner), wall=self.wall, floor=self.floor)
 
     def free_fields(self) -> frozenset[str]:
-        """Fields that decide no request: how far it may be off, where nobody said so."""
+        """Fields that do not affect any request: the uncertainty, if it is not given."""
         return frozenset() if self.uncertain else frozenset({"radius_deviations", "height_deviation"})
 
 
 class MeshShape(Shape):
-    """A closed mesh of the vessel's solid (STL, OBJ, PLY, GLB). `unit` None: metres if the size is plausible then.
+    """A closed mesh of the vessel's solid (STL, OBJ, PLY, GLB). `unit` None: metres if the size is then plausible.
 
     `up` is the mesh axis that points out of the opening.
     """
@@ -111,13 +116,13 @@ class MeshShape(Shape):
         """See `Shape.content`: the file's bytes, not its path.
 
         Raises:
-            OSError: it can't be read.
+            OSError: it cannot be read.
         """
         return f"mesh {self.unit} {self.up}".encode() + self.path.read_bytes()
 
     def build(self, spec: VesselSpec, *, use_cache: bool) -> Any:
         """See `Shape.build`."""
-        # Named by text: meshes are built of vessels, and vessels of shapes.
+        # Named by text to avoid a circular import: the mesh module imports vessels, which import shapes.
         return resolve_name("sim_engine.vessel.mesh:build_mesh_vessel")(spec, use_cache=use_cache)
 
 
@@ -134,11 +139,11 @@ def _shape(loaded: object, name: str) -> type[Shape]:
 
 
 VESSELS: PluginRegistry[type[Shape]] = PluginRegistry("decant.vessels", "source of vessels", _shape)
-"""All sources of vessels that are installed."""
+"""All installed sources of vessels."""
 
 
 def _of_its_kind(value: Any) -> Any:
-    """A shape as it was written down, by its kind."""
+    """Convert a written shape, by its kind."""
     if not isinstance(value, dict):
         return value
     try:
@@ -148,7 +153,7 @@ def _of_its_kind(value: Any) -> Any:
 
 
 class VesselSpec(BaseModel):
-    """A vessel by name and origin of its shape."""
+    """A vessel by its name and the source of its shape."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -157,15 +162,15 @@ class VesselSpec(BaseModel):
 
     @property
     def uncertain(self) -> bool:
-        """Whether it is known how far its shape may be off."""
+        """Whether the uncertainty of its shape is known."""
         outline = self.shape.outline()
         return outline is not None and outline.uncertain
 
     def drawn(self, seed: int) -> VesselSpec:
-        """The vessel with a shape that it may as well have; itself where nobody said how far it may be off.
+        """The vessel with a shape drawn from its uncertainty; the vessel itself if that is not given.
 
         Args:
-            seed: the same one gives a vessel the same shape, in whatever scene it stands.
+            seed: the same seed gives a vessel the same shape in every scene.
         """
         outline = self.shape.outline()
         if outline is None or not outline.uncertain:
@@ -176,7 +181,7 @@ class VesselSpec(BaseModel):
         """Hash of everything that determines the geometry (the mesh file's bytes, not its path): the cache key.
 
         Raises:
-            OSError: a file of it can't be read.
+            OSError: one of its files cannot be read.
         """
         return hashlib.sha256(self.shape.content()).hexdigest()[:24]
 
@@ -194,4 +199,4 @@ def cylinder(
 
 
 class VesselError(DecantError, ValueError):
-    """A vessel that can't be built or used; the message says why and what would be right."""
+    """A vessel that cannot be built or used; the message gives the reason and the remedy."""

@@ -1,8 +1,8 @@
-"""A vessel as the rest of the simulator sees it: solid, distance grid, cavity, opening and lip.
+"""The geometry of a vessel for the rest of the simulator: solid, distance grid, cavity, opening and lip.
+
+`build_vessel` makes a `Vessel` from a `VesselSpec`.
 
 Vessel frame: z up along the vessel's axis, the underside at z = 0, x = y = 0 at the centre of the opening.
-
-From a vessel's spec to a vessel: `build_vessel`.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from sim_engine.vessel.shapes import ProfileShape, VesselError, VesselSpec
 Floats = NDArray[np.float64]
 
 QUADRATURE_POINTS = 120_000
-"""Points that `Vessel.cavity_points` aims at."""
+"""Number of points that `Vessel.cavity_points` aims at."""
 
 
 LATTICE_TURN = 0.3820
-"""Angle between the quadrature's rows and a mesh's axes, far from every fraction of a right angle [rad]."""
+"""Angle between the quadrature's rows and a mesh's axes, not close to a simple fraction of a right angle [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Vessel:
         capacity: volume of the cavity below the rim, upright [m³].
         wall_thickness: smallest thickness of the solid [m].
         meridians: curves on the cavity's surface from its bottom to the lip's crest, in half planes through the axis at
-            equal angles from +x, shape (directions, points, 3) [m]. Liquid that leaves crosses one of them.
+            equal angles from +x, shape (directions, points, 3) [m]. Leaving liquid crosses one of them.
     """
 
     spec: VesselSpec
@@ -65,7 +65,7 @@ class Vessel:
         return self.spec.name
 
     def lip_point(self, direction: float = 0.0) -> Floats:
-        """The inner lip's point in a horizontal direction: where liquid leaves when the vessel tips that way.
+        """The inner lip's point in a horizontal direction, at which liquid leaves if the vessel tips that way.
 
         Args:
             direction: angle from +x in the xy plane [rad].
@@ -87,7 +87,7 @@ class Vessel:
         """Points on the solid's surface for contact checks: a third on its sharp edges, the others even by area.
 
         Args:
-            count: how many, at least 10.
+            count: number of points, at least 10.
 
         Returns:
             Shape (count, 3) [m]; the same points at every call.
@@ -104,10 +104,10 @@ class Vessel:
     def cavity_points(self) -> tuple[Floats, float]:
         """Midpoint quadrature of the cavity below the rim, upright.
 
-        The lattice is cubic up to the stretch in z that lets the floor's and the rim's planes fall between its layers.
+        The lattice is cubic, except for a stretch in z that puts the floor's and the rim's planes between its layers.
 
         Returns:
-            Points, shape (M, 3) [m], and the volume that each stands for [m³]; together they make the capacity.
+            Points, shape (M, 3) [m], and the volume of each [m³]; their sum is the capacity.
         """
         return self._quadrature
 
@@ -127,7 +127,7 @@ def lattice(
         grid: for the others.
         inner_floor: [m].
         rim_height: [m].
-        count: roughly how many points.
+        count: approximate number of points.
 
     Returns:
         Points, shape (M, 3) [m], and the volume of one lattice cell [m³].
@@ -150,7 +150,7 @@ def lattice(
         inside = profiles.contains(polygon, np.hypot(x[:, None], y)[..., None], z)
         i, j, k = np.nonzero(inside)
         return np.column_stack([x[i], y[j], z[k]]), step * step * thickness
-    # turned about z, so that no row of points runs along a flat wall and falls in or out of the cavity as a whole
+    # turned about z, so that no row of points runs along a flat wall and enters or leaves the cavity as a whole
     reach = np.hypot(half[0], half[1])
     steps = (np.arange(-np.ceil(reach), np.ceil(reach)) + 0.5) * step
     grid_points = np.stack(np.meshgrid(steps, steps, z, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -161,10 +161,10 @@ def lattice(
 
 
 def in_cavity(grid: SignedDistanceGrid, points: Floats) -> NDArray[np.bool_]:
-    """Whether free points belong to the cavity rather than to the outside or the solid.
+    """Whether free points belong to the cavity, rather than to the outside or the solid.
 
-    A point counts when the node next to it does, or, close to a wall where that node may lie in solid, when the node
-    next to where the wall's normal leads does.
+    A point counts if the node next to it does. Close to a wall that node may be in solid; then the point counts if the
+    node next to it along the wall's normal does.
 
     Args:
         grid: of the vessel.
@@ -187,7 +187,7 @@ def in_cavity(grid: SignedDistanceGrid, points: Floats) -> NDArray[np.bool_]:
 
 
 def check_holds(vessel: Vessel, volume: float) -> None:
-    """Refuse a load that the vessel can't hold.
+    """Refuse a load that the vessel cannot hold.
 
     Args:
         vessel: the pourer, or the receiver of all of it.
@@ -203,7 +203,7 @@ def check_holds(vessel: Vessel, volume: float) -> None:
 
 
 DIRECTIONS = 72
-"""Half planes in which a vessel's meridians are kept."""
+"""Half planes in which a vessel's meridians are stored."""
 
 
 def build_vessel(spec: VesselSpec, *, use_cache: bool = True) -> Vessel:
@@ -211,15 +211,15 @@ def build_vessel(spec: VesselSpec, *, use_cache: bool = True) -> Vessel:
 
     Args:
         spec: the vessel's name and shape.
-        use_cache: keep a mesh's distance grid in the cache directory, and take it from there when the mesh is known.
-            Profiles are quick and are always computed.
+        use_cache: keep a mesh's distance grid in the cache directory, and read it from there for a known mesh. Profiles
+            are fast and are always computed.
 
     Returns:
         The vessel in its own frame (z up, underside at z = 0, opening centred on the axis).
 
     Raises:
-        VesselError: the shape is not a vessel; the message says why and what would be right.
-        OSError: a file of it can't be read.
+        VesselError: the shape is not a vessel; the message gives the reason and the remedy.
+        OSError: one of its files cannot be read.
     """
     outline = spec.shape.outline()
     if outline is not None:

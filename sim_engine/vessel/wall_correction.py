@@ -1,12 +1,12 @@
-"""How solid a wall looks from inside a vessel: the distance of the plane that would be as solid.
+"""Wall correction: the distance of the plane that has the same kernel integral as the vessel's walls.
 
-The density constraint sees a wall as the kernel's integral over a half-space at the wall's signed distance. In a
+The density constraint uses a wall as the kernel's integral over a half-space at the wall's signed distance. In a
 concave corner there is more solid than that: particles were pressed into it until they touched both walls, and jumped
-between them as the nearer one changed. At an edge there is less: a hole in a floor seemed narrower than it is. Here the
-kernel is integrated over all that is not cavity, and turned into the distance of a plane with the same integral, which
-has no such jumps. Walls count as infinitely thick, whatever lies behind them.
+between them as the nearer one changed. At an edge there is less: a hole in a floor acted as if it was narrower. This
+module integrates the kernel over everything outside the cavity and converts the result into the distance of a plane
+with the same integral, which has no such jumps. Walls count as infinitely thick, whatever is behind them.
 
-Source: after Bender et al. 2019 (volume maps); the detour by an equivalent plane is ours.
+Source: after Bender et al. 2019 (volume maps); the conversion to an equivalent plane is new here.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from sim_engine.vessel.distance_grid import SignedDistanceGrid
 Floats = NDArray[np.float64]
 
 EDITION = 1
-"""Of what `equivalent_distance` computes; raised with any change to it, so that nothing kept from before is used."""
+"""Version of `equivalent_distance`; increased with any change to it, so that older cached results are not used."""
 
 PLACES = 64
-"""So many results of `equivalent_distance` are kept on disk, of about 1 MB each. A new one goes where its digest says,
-in place of what is there: vessels that are drawn anew for each simulation don't fill the disk."""
+"""Number of results of `equivalent_distance` kept on disk, of about 1 MB each. The digest of a new result selects its
+place, where it replaces the old one: vessels drawn for each simulation do not fill the disk."""
 
 
 def half_space(q: Floats) -> Floats:
@@ -37,7 +37,7 @@ def half_space(q: Floats) -> Floats:
 
 
 def _fast_length(n: int) -> int:
-    """The next number from n on that has no other factors than 2, 3 and 5."""
+    """The smallest number ≥ n that has no prime factors other than 2, 3 and 5."""
     while True:
         rest = n
         for factor in (2, 3, 5):
@@ -49,9 +49,9 @@ def _fast_length(n: int) -> int:
 
 
 def _convolved(values: Floats, kernel: Floats) -> Floats:
-    """Sums over the kernel where all of it lies inside the values; scipy, which has that, takes long to load.
+    """Convolution at positions where the whole kernel lies inside the values; scipy has one, but imports slowly.
 
-    Single precision: what comes of it is kept in that.
+    Single precision, in which the result is stored.
 
     Args:
         values: (a, b, c).
@@ -69,7 +69,7 @@ def _convolved(values: Floats, kernel: Floats) -> Floats:
 
 
 def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """A mask with the six neighbours of every node in it."""
+    """A mask extended by the six neighbours of every node in it."""
     grown = mask.copy()
     for axis in range(3):
         line, grown_line = np.moveaxis(mask, axis, 0), np.moveaxis(grown, axis, 0)
@@ -79,17 +79,17 @@ def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def inside_mask(grid: SignedDistanceGrid) -> NDArray[np.uint8]:
-    """Where a particle counts as inside the vessel, on the grid's nodes.
+    """Nodes of the grid at which a particle counts as inside the vessel.
 
-    The cavity, continued into the wall up to its middle: a particle that leans on the wall stays inside. It is kept in
-    the cache directory.
+    These are the cavity and the wall up to its middle: a particle that leans on the wall stays inside. The result is
+    kept in the cache directory.
     """
     digest = hashlib.sha256(repr(grid.shape).encode() + grid.values.tobytes() + grid.cavity.tobytes()).hexdigest()
     name = f"inside-{digest[:24]}"
     known = load_arrays(name)
     if known is not None and "inside" in known and known["inside"].shape == grid.shape:
         return np.ascontiguousarray(known["inside"], np.uint8)
-    from scipy import ndimage  # brings a sixth of a second of imports
+    from scipy import ndimage  # takes a sixth of a second to import
 
     nearest = ndimage.distance_transform_edt(grid.values <= 0.0, return_distances=False, return_indices=True)
     inside = np.ascontiguousarray(grid.cavity[tuple(nearest)].astype(np.uint8))
@@ -102,13 +102,13 @@ def equivalent_distance(
 ) -> NDArray[np.float32]:
     """Distance of the equivalent plane at the grid's nodes; less than the signed distance in a corner, more at an edge.
 
-    It is kept in the cache directory.
+    The result is kept in the cache directory.
 
     Args:
         grid: signed distance and cavity.
         inside: 1 at nodes in the cavity, continued into the wall up to its middle.
-        rim_height: of the lip in the vessel's frame [m]. Within one to two supports of it, and outside the cavity,
-            the result is the signed distance: there the wall ends, or is seen from the other side.
+        rim_height: of the lip in the vessel's frame [m]. Within one to two supports of it, and outside the cavity, the
+            result is the signed distance: there the wall ends, or the node is on its other side.
         support: h of the kernel [m].
 
     Returns:
@@ -117,7 +117,7 @@ def equivalent_distance(
     step = grid.spacing
     if not inside.any() or not (grid.axes()[2] < rim_height - support).any():
         return grid.values
-    near = _grown(inside > 0)  # only beside the cavity is anything else than the signed distance wanted
+    near = _grown(inside > 0)  # only next to the cavity does the result differ from the signed distance
     about = repr((EDITION, np.__version__, grid.shape, step, grid.origin.tolist(), rim_height, support))
     digest = hashlib.sha256(about.encode() + grid.values.tobytes() + inside.tobytes()).digest()
     name = f"plane-{digest[0] % PLACES:02}"
@@ -131,7 +131,7 @@ def equivalent_distance(
 
 
 def _kept_planes(name: str, digest: bytes, count: int) -> NDArray[np.float32] | None:
-    """What is stored under a name, if it has this digest."""
+    """The array stored under a name, if it has this digest."""
     known = load_arrays(name)
     if known is None or not {"digest", "plane"} <= known.keys() or known["digest"].tobytes() != digest:
         return None
@@ -145,10 +145,10 @@ def _planes(
     rim_height: float,
     support: float,
 ) -> NDArray[np.float32]:
-    """As `equivalent_distance`, worked out, for a vessel that has a cavity below its rim.
+    """Compute `equivalent_distance` for a vessel that has a cavity below its rim.
 
     Args:
-        near: nodes in the cavity and beside it.
+        near: nodes in the cavity and next to it.
     """
     step = grid.spacing
     reach = int(np.ceil(support / step))

@@ -1,4 +1,7 @@
-"""What people measure of a turned vessel, and what it says about its profile."""
+"""Measurements of a vessel of revolution, and their predictions from its profile.
+
+`Radii`, `FillTable` and `TiltTable` implement `sim_engine.vessel_acquisition.outline_fit.Evidence`.
+"""
 
 from __future__ import annotations
 
@@ -17,12 +20,12 @@ SLICES = 240
 
 @dataclass(frozen=True, eq=False)
 class Radii:
-    """Inner radii at heights: callipers, a photograph, points.
+    """Inner radii at heights, from callipers, a photograph or points.
 
     Attributes:
         heights: above the inner floor, shape (n,) [m].
-        observed: radii there, shape (n,) [m].
-        deviations: of them, shape (n,) [m].
+        observed: radii at these heights, shape (n,) [m].
+        deviations: standard deviations of the radii, shape (n,) [m].
     """
 
     name: str
@@ -38,14 +41,14 @@ class Radii:
 
 @dataclass(frozen=True, eq=False)
 class FillTable:
-    """Volumes below levels, as a ruler and a balance tell them.
+    """Volumes below levels, measured with a ruler and a balance.
 
     Attributes:
         levels: above the inner floor, shape (n,) [m].
         observed: volumes, shape (n,) [m³].
         ruler: standard deviation of a level [m].
         balance: standard deviation of a volume [m³].
-        radius: about how wide the vessel is, for what a wrong level does to a volume [m].
+        radius: approximate radius of the vessel, which converts an error of level into one of volume [m].
     """
 
     levels: Floats
@@ -67,7 +70,7 @@ class FillTable:
 
 @dataclass(frozen=True, eq=False)
 class TiltTable:
-    """What is left in a vessel that was brimful, tilted slowly and held.
+    """Volumes left in a vessel that was brimful, tilted slowly and held.
 
     Attributes:
         tilts: from upright, in (0, π/2], shape (n,) [rad].
@@ -84,7 +87,7 @@ class TiltTable:
 
     @property
     def deviations(self) -> Floats:
-        """See `Evidence.deviations`; what a wrong angle does is read off the table itself."""
+        """See `Evidence.deviations`; the effect of an error of angle is computed from the table itself."""
         if len(self.tilts) < 2:
             return np.full(len(self.tilts), self.balance)
         slope = np.gradient(self.observed, self.tilts)
@@ -96,20 +99,20 @@ class TiltTable:
 
 
 def held_when_tilted(heights: Floats, radii: Floats, tilt: float) -> float:
-    """Volume that a turned vessel retains at a tilt by hydrostatics [m³].
+    """Volume that a vessel of revolution retains at a tilt by hydrostatics [m³].
 
-    In a slice of radius r the liquid is the disc's part beyond a chord: the free surface stands at the height of the
+    In a slice of radius r the liquid is the part of the disc beyond a chord. The free surface is at the height of the
     lowest barrier on the way out, which is the lip, or a neck below it.
 
     Args:
         heights: ascending from 0, shape (k,) [m].
-        radii: there, shape (k,) [m].
+        radii: at these heights, shape (k,) [m].
         tilt: in (0, π/2] [rad].
     """
     z = heights[-1] * (np.arange(SLICES) + 0.5) / SLICES
     r = np.interp(z, heights, radii)
     cos, sin = np.cos(tilt), np.sin(tilt)
-    # heights of the wall's lowest line, from the floor to the lip; the barrier is the highest of what comes later
+    # heights of the wall's lowest line, from the floor to the lip; the barrier is the maximum of the following heights
     line = heights * cos - radii * sin
     lowest = int(np.argmin(line))
     barrier = lowest + int(np.argmax(line[lowest:]))

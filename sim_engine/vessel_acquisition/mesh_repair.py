@@ -1,7 +1,7 @@
-"""A mesh as it comes from a scanner or a CAD program, made into the closed solid that a vessel has to be.
+"""Repairs a mesh from a scanner or a CAD program, so that it is the closed solid that a vessel has to be.
 
-Its unit is found out, crumbs are dropped, holes are closed, a sheet without thickness is thickened outwards, and parts
-that cross each other are joined. Several vessels in one file are refused.
+It determines the unit, drops small loose parts, closes holes, thickens a sheet without thickness outwards, and joins
+parts that cross each other. Several vessels in one file are refused.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 SMALLEST, LARGEST = 0.030, 0.400
-"""Largest extents that vessels on a bench have [m]."""
+"""Smallest and largest plausible extent of vessels on a bench [m]."""
 
 CRUMB = 0.02
-"""Share of the surface below which a loose part is a crumb."""
+"""Share of the surface below which a loose part is dropped."""
 
 HOLE = 0.6
-"""Share of the longest boundary below which an edge is a hole to be closed, where the mesh is a sheet."""
+"""For a sheet: share of the longest boundary below which a boundary is a hole to be closed."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class RepairedMesh:
         vertices: (V, 3) [m].
         faces: normals outwards, (F, 3).
         unit: of the file's numbers.
-        notes: what was done to it, in words.
+        notes: descriptions of the repairs.
     """
 
     vertices: Floats
@@ -49,16 +49,16 @@ class RepairedMesh:
 
 
 def mended(path: Path, *, unit: LengthUnit | None, wall: float | None) -> RepairedMesh:
-    """Read a mesh and mend it.
+    """Read a mesh and repair it.
 
     Args:
         path: STL, OBJ, PLY or GLB.
-        unit: of its numbers; None: found out by its size.
-        wall: thickness that a sheet is given [m].
+        unit: of its numbers; None: determined by its size.
+        wall: thickness given to a sheet [m].
 
     Raises:
-        VesselError: it can't be made a solid; says what would help.
-        OSError: the file can't be read.
+        VesselError: it cannot be made a solid; the text gives a remedy.
+        OSError: the file cannot be read.
     """
     import trimesh
 
@@ -68,7 +68,7 @@ def mended(path: Path, *, unit: LengthUnit | None, wall: float | None) -> Repair
     check_size(MeshShape(path=path))
     try:
         mesh = trimesh.load(io.BytesIO(path.read_bytes()), file_type=kind, force="mesh", process=True)
-    except Exception as problem:  # trimesh's readers raise whatever the broken byte led to
+    except Exception as problem:  # trimesh's readers raise various errors for damaged files
         raise VesselError(f"{path.name}: not a readable {kind.upper()} file ({problem})") from problem
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise VesselError(f"{path.name}: no triangles in it; if it has points only, use --points")
@@ -96,14 +96,14 @@ def mended(path: Path, *, unit: LengthUnit | None, wall: float | None) -> Repair
 
 
 def likely_unit(extent: float, path: Path) -> LengthUnit:
-    """The unit in which a vessel's numbers make sense.
+    """The unit in which a vessel's size is plausible.
 
     Args:
         extent: largest extent of it, in that unit.
         path: of its file, for messages.
 
     Raises:
-        VesselError: none does, or several do.
+        VesselError: no unit is plausible, or several are.
     """
     fitting: list[LengthUnit] = [u for u in ("mm", "cm", "m", "in") if SMALLEST <= extent * UNITS[u] <= LARGEST]
     if len(fitting) == 1:
@@ -136,7 +136,7 @@ def _boxes_meet(a: Floats, b: Floats) -> bool:
 
 
 def _closed(mesh: Any, path: Path, wall: float | None, notes: list[str]) -> Any:
-    """Holes filled; where one boundary is as long as an opening, the mesh is a sheet, and is thickened."""
+    """Fill holes; if one boundary is as long as an opening, the mesh is a sheet, and is thickened."""
     import trimesh
 
     before = len(mesh.faces)
@@ -147,7 +147,7 @@ def _closed(mesh: Any, path: Path, wall: float | None, notes: list[str]) -> Any:
     if not loops:
         raise VesselError(f"{path.name}: some edges belong to more than two faces; repair it with a mesh program")
     lengths = np.array([_length(mesh.vertices, loop) for loop in loops])
-    # an opening is as long as a circle that is at least a third of the mesh wide
+    # an opening is at least as long as a circle with a third of the mesh's width as its diameter
     opening = lengths.max() > np.pi * np.sort(mesh.extents)[1] / 3.0 and not _is_solid_with_hole(mesh, loops)
     small = [loop for loop, length in zip(loops, lengths, strict=True) if not opening or length < HOLE * lengths.max()]
     mesh = _filled(mesh, small)
@@ -166,7 +166,7 @@ def _closed(mesh: Any, path: Path, wall: float | None, notes: list[str]) -> Any:
 
 
 def _is_solid_with_hole(mesh: Any, loops: Sequence[Integers]) -> bool:
-    """Whether a large hole is a piece missing in a solid: its faces look both towards and away from the axis."""
+    """Whether a large hole is a missing piece of a solid: its faces point both towards and away from the axis."""
     centre = mesh.bounds.mean(axis=0)
     across = mesh.triangles_center[:, :] - centre
     axis = int(np.argmax(np.abs([np.ptp(mesh.vertices[np.concatenate(list(loops))], axis=0)]).min(axis=0) < 0))
@@ -184,7 +184,7 @@ def _boundaries(mesh: Any) -> list[Integers]:
     onward: dict[int, int] = {}
     for a, b in mesh.edges.tolist():
         if (min(a, b), max(a, b)) in single:
-            onward[b] = a  # against the faces' own sense, so that what fills the hole looks the same way
+            onward[b] = a  # opposite to the faces' own order, so that the filling faces the same side
     loops = []
     while onward:
         first, then = onward.popitem()
@@ -205,7 +205,7 @@ def _length(vertices: Floats, loop: Integers) -> float:
 
 
 def _filled(mesh: Any, loops: Sequence[Integers]) -> Any:
-    """Each loop closed by a fan about its middle."""
+    """Close each loop by a fan about its middle."""
     import trimesh
 
     if not loops:
@@ -220,7 +220,7 @@ def _filled(mesh: Any, loops: Sequence[Integers]) -> Any:
 
 
 def _thickened(mesh: Any, wall: float) -> Any:
-    """A sheet and its offset, sewn together at the rim. The sheet's own side stays as it is."""
+    """A sheet and its offset, joined at the rim. The sheet's own side is unchanged."""
     import trimesh
 
     trimesh.repair.fix_winding(mesh)
@@ -242,7 +242,7 @@ def _joined(vertices: Floats, faces: Integers, path: Path, notes: list[str]) -> 
     """One manifold solid of parts that may cross each other.
 
     Raises:
-        VesselError: it is still no solid.
+        VesselError: it is still not a solid.
     """
     import manifold3d
 

@@ -1,10 +1,12 @@
-"""The inner profile of a turned vessel from several kinds of evidence at once, with what is uncertain about it.
+"""The inner profile of a vessel of revolution from several kinds of evidence, with its uncertainty.
 
-The radius r(z) at heights between floor and rim is a Gaussian process; each piece of evidence says something about it
-with a standard deviation: a radius at a height, the volume below a level, what a tilted vessel still holds. The
-profile is the most likely one given all of them (Gauss–Newton), its covariance that of the linearised problem.
+The radius r(z) at heights between floor and rim is a Gaussian process. Each piece of evidence constrains it with a
+standard deviation: a radius at a height, the volume below a level, the volume that a tilted vessel retains. The profile
+is the most likely one given all of them (Gauss–Newton); its covariance is that of the linearised problem.
+`find_outline` returns a `FittedOutline`.
 
 Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2 and 3.4 (Laplace).
+
 Limitations: a surface of revolution whose inner wall nowhere turns back below itself; the floor is flat or rises
 towards the wall as r(z) does.
 """
@@ -24,61 +26,61 @@ from sim_engine.vessel.shapes import NARROWEST, ProfileShape, VesselError
 Floats = NDArray[np.float64]
 
 NODES = 48
-"""Heights at which the radius is sought."""
+"""Number of heights at which the radius is estimated."""
 
 CROWDING = 1.5
-"""Power by which they crowd towards the floor, where profiles bend."""
+"""Power by which they are concentrated near the floor, where profiles bend."""
 
 LENGTHS = (0.15, 0.4, 1.2)
-"""Lengths over which a profile changes, as shares of the way from floor to rim; the evidence chooses."""
+"""Length scales of a profile's changes, as fractions of the height; the evidence selects one."""
 
 BENDS = (0.01, 0.06, 0.3)
-"""Standard deviations of the radius about its mean, as shares of that mean; likewise."""
+"""Standard deviations of the radius about its mean, as fractions of that mean; likewise."""
 
 LEVEL = 0.5
-"""Standard deviation of that mean before anything is known, as a share of the first guess."""
+"""Prior standard deviation of that mean, as a fraction of the first guess."""
 
 KEPT = 0.9
-"""Share of the radii's variance that a vessel's file keeps."""
+"""Fraction of the radii's variance that a vessel's file keeps."""
 
 ITERATIONS = 30
 
 
 class Evidence(Protocol):
-    """Something that was measured of a vessel."""
+    """A measurement of a vessel."""
 
     @property
     def name(self) -> str:
-        """For people: 'callipers'."""
+        """Name in messages: 'callipers'."""
         ...
 
     @property
     def observed(self) -> Floats:
-        """What was measured, shape (n,)."""
+        """The measured values, shape (n,)."""
         ...
 
     @property
     def deviations(self) -> Floats:
-        """Standard deviations of that, shape (n,)."""
+        """Standard deviations of the values, shape (n,)."""
         ...
 
     def predict(self, heights: Floats, radii: Floats) -> Floats:
-        """What would be measured of a profile, shape (n,).
+        """The values predicted from a profile, shape (n,).
 
         Args:
             heights: above the inner floor, ascending from 0 to the rim, shape (k,) [m].
-            radii: there, shape (k,) [m].
+            radii: at these heights, shape (k,) [m].
         """
         ...
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How one piece of evidence agrees with the profile that was found.
+    """Agreement of one piece of evidence with the fitted profile.
 
     Attributes:
         count: of measurements.
-        rms: of the differences, in standard deviations of the measurements; about 1 where these were stated well.
+        rms: of the differences, in standard deviations of the measurements; about 1 if these were stated correctly.
     """
 
     name: str
@@ -131,9 +133,11 @@ class FittedOutline:
         return float(np.sqrt(np.trapezoid(self.deviations**2, self.heights) / self.heights[-1]))
 
     def shape(self, tolerance: float = 5e-5) -> ProfileShape:
-        """As a vessel's file has it: as few points as stay within a tolerance [m] of the curve and of its deviations.
+        """The shape as a vessel's file contains it: as few points as possible within a tolerance [m] of the curve and
+        its deviations.
 
-        Those are the covariance's leading eigenvectors, so many that `KEPT` of the variance is in them at each height.
+        The deviations are the leading eigenvectors of the covariance, as many as contain `KEPT` of the variance at each
+        height.
         """
         from sim_engine.vessel.profile import simplified
 
@@ -164,9 +168,9 @@ class FittedOutline:
 def find_outline(
     height: float, evidence: Sequence[Evidence], wall: float, floor: float, *, height_deviation: float
 ) -> FittedOutline:
-    """The most likely profile given everything that was measured.
+    """The most likely profile given all measurements.
 
-    Where the measurements scatter more than was given, the uncertainty grows accordingly.
+    If the measurements scatter more than stated, the uncertainty grows accordingly.
 
     Args:
         height: from the inner floor to the rim [m].
@@ -176,7 +180,7 @@ def find_outline(
         height_deviation: standard deviation of the height [m].
 
     Raises:
-        VesselError: nothing was measured, or nothing fits it.
+        VesselError: there are no measurements, or no profile fits them.
     """
     if not evidence or sum(len(piece.observed) for piece in evidence) == 0:
         raise VesselError("nothing says how wide the vessel is; give diameters, a photograph, points or a fill table")
@@ -205,8 +209,8 @@ class _Solution:
 
     Attributes:
         residual: observed − predicted, in standard deviations.
-        determined: how many numbers the measurements have determined.
-        likelihood: logarithm of the evidence, but for a constant.
+        determined: number of degrees of freedom that the measurements have determined.
+        likelihood: logarithm of the evidence, up to a constant.
     """
 
     radii: Floats
@@ -228,7 +232,7 @@ class _Problem:
 
         Args:
             length, bend: see `LENGTHS` and `BENDS`.
-            gaps: between nodes, on the way from floor to rim, shape (k, k).
+            gaps: between nodes, along the height from floor to rim, shape (k, k).
         """
         scaled = np.sqrt(5.0) * gaps / length
         kernel = (1.0 + scaled + scaled**2 / 3.0) * np.exp(-scaled)
@@ -307,7 +311,7 @@ def volume_below(heights: Floats, radii: Floats, levels: Floats) -> Floats:
 
     Args:
         heights: ascending from 0, shape (k,) [m].
-        radii: there, shape (k,) [m]; straight between.
+        radii: at these heights, shape (k,) [m]; linear in between.
         levels: between 0 and the rim, shape (n,) [m].
 
     Returns:

@@ -1,13 +1,15 @@
-"""The outline of a turned vessel from one photograph of its side.
+"""The outline of a vessel of revolution from one photograph of its side.
 
-The vessel stands out from a plain background. Its silhouette is cut out at Otsu's threshold, the axis is the line
-about which it is most alike on both sides, and one known length gives the scale. The wall is taken off normal to the
-outline.
+The vessel stands in front of a plain background. Its silhouette is segmented with Otsu's threshold. The axis is the
+line of best symmetry, and one known length gives the scale. The wall is subtracted normal to the outline.
 
 Source: Otsu, A threshold selection method from gray-level histograms, IEEE Trans. Syst. Man Cybern. 9 (1979).
-Limitations: no perspective: taken from ten vessel's widths away it is below one per cent; the rim seen as an ellipse,
-or a lens that bends straight edges, is not corrected. Clear glass on a bright background has no silhouette: put paper
-inside.
+
+Limitations:
+
+- No perspective is modelled: from a distance of ten vessel widths its error is below one per cent.
+- The rim seen as an ellipse, and a lens that bends straight edges, are not corrected.
+- Clear glass on a bright background has no silhouette: put paper inside.
 """
 
 from __future__ import annotations
@@ -24,33 +26,33 @@ from sim_engine.vessel_acquisition.measurements import Radii
 Floats = NDArray[np.float64]
 
 LOPSIDED = 0.02
-"""Largest difference of a row's two halves from those of the mean row, as a share of the width: more is a handle."""
+"""Largest asymmetry of a row, as a fraction of the largest width; above it there is a handle."""
 
 UPRIGHT = 5e-4
-"""Lean of an axis that passes for upright [rad]."""
+"""Largest lean of an axis that counts as upright [rad]."""
 
 MOST_LEAN = 0.06
-"""Largest lean that is looked for [rad]: a camera held by hand."""
+"""Largest lean that is searched [rad]: that of a hand-held camera."""
 
 ENOUGH = 300
-"""Pixels of a vessel's height and width that its lean is found with: pictures of a telephone have ten times as many."""
+"""Pixels of a vessel's height and width used to find its lean; pictures of a telephone have ten times as many."""
 
 LEAST_ROWS = 60
-"""Rows that a silhouette needs."""
+"""Least number of rows of a silhouette."""
 
 PIXEL = 1.0
-"""Standard deviation of an edge [pixels]: blur, and a threshold that is a little off."""
+"""Standard deviation of an edge [pixels], from blur and an inaccurate threshold."""
 
 SCALE_DEVIATION = 0.005
-"""Standard deviation of the scale, as a share: the known length, perspective."""
+"""Relative standard deviation of the scale, from the known length and perspective."""
 
 ROWS_KEPT = 60
-"""Rows that count: neighbouring ones err together."""
+"""Number of independent rows: the errors of neighbouring ones are correlated."""
 
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Outer radii of a vessel on a photograph.
+    """Outer radii of a vessel in a photograph.
 
     Attributes:
         heights: above the underside, ascending, shape (n,) [m].
@@ -68,7 +70,7 @@ class Silhouette:
 
 
 def silhouette(grey: Floats, known: Literal["height", "width"], length: float) -> Silhouette:
-    """Cut the vessel out of a picture.
+    """Segment the vessel in a picture.
 
     Args:
         grey: brightness, rows from the top, shape (rows, columns).
@@ -76,7 +78,7 @@ def silhouette(grey: Floats, known: Literal["height", "width"], length: float) -
         length: that length [m].
 
     Raises:
-        VesselError: there is no single turned vessel that stands out.
+        VesselError: the picture does not show a single, distinct vessel of revolution.
     """
     lean = _lean(grey)
     left, right = _cut_out(grey if abs(lean) <= UPRIGHT else _turned(grey, lean))
@@ -91,9 +93,9 @@ def silhouette(grey: Floats, known: Literal["height", "width"], length: float) -
 
 
 def _lean(grey: Floats) -> float:
-    """By how much the axis leans [rad]: turned upright, the vessel is the same on both sides.
+    """The lean of the axis [rad]: after it is removed, the vessel is symmetric.
 
-    The line through the middles of the rows would do for a cup, but not for a bowl: its sides are so far apart that a
+    The line through the middles of the rows would work for a cup, but not for a bowl: its sides are so far apart that a
     row meets them at different heights.
     """
     from scipy.optimize import minimize_scalar
@@ -105,7 +107,7 @@ def _lean(grey: Floats) -> float:
     def crooked(angle: float) -> float:
         try:
             left, right = _cut_out(_turned(small, angle))
-        except VesselError:  # turned so far it leaves the picture
+        except VesselError:  # at this rotation it leaves the picture
             return float(len(small))
         middles = (left + right)[len(left) // 8 : -(len(left) // 8)] / 2.0
         return float(np.abs(middles - np.median(middles)).mean())
@@ -119,7 +121,7 @@ def _lean(grey: Floats) -> float:
 
 
 def _turned(grey: Floats, lean: float) -> Floats:
-    """The picture with a leaning axis upright."""
+    """The picture, rotated so that its axis is upright."""
     from scipy import ndimage
 
     return np.asarray(ndimage.rotate(grey, -np.degrees(lean), reshape=False, order=1, mode="nearest"))
@@ -173,7 +175,7 @@ def _cut_out(grey: Floats) -> tuple[Floats, Floats]:
 
 
 def _edges(grey: Floats, body: NDArray[np.bool_], rows: NDArray[np.int64], level: float) -> tuple[Floats, Floats]:
-    """Columns of a silhouette's left and right edges, between pixels where brightness crosses the threshold."""
+    """Columns of a silhouette's left and right edges, interpolated where brightness crosses the threshold."""
     left, right = np.empty(len(rows)), np.empty(len(rows))
     for i, row in enumerate(rows):
         columns = np.flatnonzero(body[row])
@@ -183,15 +185,15 @@ def _edges(grey: Floats, body: NDArray[np.bool_], rows: NDArray[np.int64], level
 
 
 def _part(inside: float, outside: float, level: float) -> float:
-    """How far from the last pixel inside to the first one outside the threshold is crossed."""
+    """Position of the threshold between the last pixel inside and the first one outside."""
     return float(np.clip((inside - level) / (inside - outside), 0.0, 1.0)) if inside != outside else 0.5
 
 
 def radii_within(outer: Silhouette, wall: float, floor: float) -> Radii:
-    """What a silhouette says about the inner profile.
+    """The inner profile according to a silhouette.
 
     Args:
-        wall: thickness, taken off normal to the outline [m].
+        wall: thickness, subtracted normal to the outline [m].
         floor: thickness [m].
 
     Raises:

@@ -1,22 +1,19 @@
-"""A vessel from points on its surface, as scanners and depth cameras give them.
+"""A vessel from points on its surface, as scanners and depth cameras measure them.
 
-The axis is where the points of every height lie on circles about it best. Where points of both the inner and the outer
-surface were seen, they are told apart by their distance from it. A vessel that is not round becomes a mesh (`surface`).
+**Scans** (`scan_of`). The axis is the line about which the points of every height are closest to circles. If points of
+both the inner and the outer surface were measured, their distance from the axis distinguishes them. Limitations: along
+a ray from the axis each surface is met at most once (no handle, no bulge that hides another part), and the vessel
+stands roughly upright. Remove points of the table beforehand.
 
-Limitations: seen from its axis every surface is met once at most (no handle, no bulge that hides another part), and the
-vessel stands roughly upright. Points of the table have to be cut away beforehand.
+**Meshes** (`mesh_of`). A vessel that is not round becomes a mesh: the radius by direction and height, and the wall.
 
-A mesh of a vessel that is not round, from points: the radius by direction and height, with the wall beside it.
-
-The vessel in a depth image: what a depth camera sees of its outside, from one place, as points.
-
-The table is the plane that most pixels lie in; it says where up is. What stands on it, hangs together in the picture
-and does not touch its border is the vessel. Of that the near half is kept: beyond its axis the camera looks at the
-inside of the far wall.
+**Depth images** (`points_on_table`). A depth camera measures the vessel's outside from one position. The table is the
+plane that contains most pixels; it defines the vertical. The vessel is the connected region that stands on it and does
+not touch the picture's border. Only its near half is kept: beyond its axis the camera measures the inside of the far
+wall. Limitations: a pinhole camera without distortion; the vessel stands alone on a flat table, except for objects that
+touch the picture's border. Clear glass and shining metal give no depth.
 
 Source: Fischler & Bolles, Random sample consensus, Comm. ACM 24 (1981), for the plane.
-Limitations: a pinhole camera without distortion; the vessel stands on a flat table, alone in the picture but for what
-touches its border. Clear glass and shining metal have no depth that could be seen.
 """
 
 from __future__ import annotations
@@ -34,22 +31,22 @@ Floats = NDArray[np.float64]
 
 LEAST_POINTS = 300
 LAYERS = 40
-"""Heights at which circles are fitted."""
+"""Number of heights at which circles are fitted."""
 
 FEW_POINTS, MOST_POINTS = 2_500, 12_000
-"""Points that the axis is looked for with, and with which it is found."""
+"""Numbers of points used to search for the axis, and to compute it."""
 
 APART = 0.0012
-"""Two surfaces are told apart from this distance on [m]."""
+"""Least distance at which two surfaces are distinguished [m]."""
 
 ROUND = 0.0006
-"""A vessel is round where its radius varies less than this around it [m], or less than its points scatter."""
+"""A vessel is round if its radius varies around it by less than this [m], or by less than its points scatter."""
 
 LEAST_DEVIATION = 5e-5
-"""No scanner is better than this [m]."""
+"""Least standard deviation of a scanner [m]."""
 
 FOOT = 0.06
-"""Share of the height in which a floor, a foot or a rim is left out of the circles."""
+"""Fraction of the height in which a floor, a foot or a rim is excluded from the circles."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ class Layer:
 
     Attributes:
         z: mean height [m].
-        inner, outer: radius of each surface; None where it was not seen [m].
+        inner, outer: radius of each surface; None if it was not measured [m].
         scatter: standard deviation of the points about it [m].
         count: of points.
     """
@@ -79,8 +76,8 @@ class Scan:
         height: from the underside to the rim [m].
         layers: from below.
         scatter: of the points about the surface of revolution, median over the layers [m].
-        out_of_round: how much the radius varies around it, standard deviation [m].
-        seen: which surfaces.
+        out_of_round: standard deviation of the radius around the vessel [m].
+        seen: which surfaces were measured.
     """
 
     points: Floats
@@ -92,7 +89,7 @@ class Scan:
 
     @property
     def round(self) -> bool:
-        """Whether it passes for a surface of revolution."""
+        """Whether it counts as a surface of revolution."""
         return self.out_of_round <= max(ROUND, 0.5 * self.scatter)
 
 
@@ -103,8 +100,8 @@ def scan_of(
 
     Args:
         points: z up, shape (n, 3) [m].
-        surface: which one was seen; 'auto': both where there are two, else the outer one.
-        underside: its height, where it is known better than by the lowest of them [m].
+        surface: the measured surface; 'auto': both if there are two, else the outer one.
+        underside: its height, if it is known more accurately than from the lowest points [m].
 
     Raises:
         VesselError: too few points, or no axis.
@@ -122,7 +119,7 @@ def scan_of(
     extent = float(np.hypot(chosen[:, 0], chosen[:, 1]).max())
 
     def spread(values: Floats, of: Floats) -> float:
-        """Mean scatter of the layers' radii, in shares of the size, after a shift and a lean."""
+        """Mean scatter of the layers' radii relative to the size, after a shift and a lean."""
         return _scatter(_moved(of, values, size)) / size
 
     def sought(start: Any, of: Floats, step: float) -> Any:
@@ -130,7 +127,7 @@ def scan_of(
         options: Any = {"xatol": 1e-5, "fatol": 1e-8, "initial_simplex": simplex}
         return minimize(spread, start, args=(of,), method="Nelder-Mead", options=options)
 
-    # a cloud from one side has its axis behind it: begin at several places
+    # the axis of a cloud from one side is behind it, so start at several positions
     aside = 0.5 * extent / size
     begins = ((0.0, 0.0), (-aside, 0.0), (aside, 0.0), (0.0, -aside), (0.0, aside))
     tried = sorted((sought((x, y, 0.0, 0.0), few, 0.04) for x, y in begins), key=lambda each: float(each.fun))
@@ -154,7 +151,7 @@ def scan_of(
 
 
 def _moved(points: Floats, values: Floats, size: float) -> Floats:
-    """Shifted by values[:2] and leant by values[2:], both small; [size] and [rad]."""
+    """Shifted by values[:2] and tilted by values[2:], both small; [size] and [rad]."""
     x, y, lean_x, lean_y = values
     axis = np.array([lean_x, lean_y, 1.0]) / np.sqrt(1.0 + lean_x**2 + lean_y**2)
     first = np.cross([0.0, 1.0, 0.0], axis)
@@ -164,16 +161,16 @@ def _moved(points: Floats, values: Floats, size: float) -> Floats:
 
 
 def _ends(points: Floats, scatter: float) -> tuple[float, float]:
-    """Heights of the underside and of the rim [m]: the outermost points themselves are those measured worst.
+    """Heights of the underside and of the rim [m]. The outermost points themselves are the least accurate.
 
     Args:
-        points: on their axis.
+        points: about their axis.
         scatter: of a point, standard deviation [m].
     """
     found = []
     for z in (points[:, 2], -points[:, 2]):
         first, second = np.quantile(z, [0.01, 0.02])
-        flat = second - first < scatter  # many points at one height: these are the tail of a plane's
+        flat = second - first < scatter  # many points at one height: these are the tail of a plane's distribution
         found.append(float(2.0 * first - second + (1.7 * scatter if flat else 0.0)))
     return found[0], -found[1]
 
@@ -191,9 +188,10 @@ def _edges(low: float, high: float) -> Floats:
 
 
 def _scatter(points: Floats) -> float:
-    """Mean standard deviation of the layers' radii, each of one or of two surfaces [m]; of layers of six points on.
+    """Mean standard deviation of the layers' radii, each of one or of two surfaces [m]; for layers of at least six
+    points.
 
-    Where the radii of a layer have a wide gap with enough of them on both sides, they are cut at the widest one.
+    If the radii of a layer have a wide gap with enough of them on both sides, they are split at the widest one.
     """
     z, radii = points[:, 2], np.hypot(points[:, 0], points[:, 1])
     layer = np.searchsorted(_edges(z.min(), z.max()), z, side="right") - 1
@@ -203,7 +201,7 @@ def _scatter(points: Floats) -> float:
     used = counts[layer] >= 6
     if not used.any():
         return float("inf")
-    wide = 2.0 * radii.max()  # one sorting for both: of layers, and of the radii in each
+    wide = 2.0 * radii.max()  # one sort for both: layers, and the radii in each
     both = np.sort(wide * layer[used] + radii[used])
     layer = np.repeat(np.arange(LAYERS + 1), np.where(counts >= 6, counts, 0))
     radii = both - wide * layer
@@ -224,7 +222,7 @@ def _scatter(points: Floats) -> float:
 
 
 def surfaces(radii: Floats) -> list[Floats]:
-    """The radii of one or of two surfaces, from inside; what is farther out, or made of few points, is a handle."""
+    """The radii of one or of two surfaces, from inside; radii farther out, or of few points, belong to a handle."""
     ordered = np.sort(radii)
     parts = np.split(ordered, 1 + np.flatnonzero(np.diff(ordered) > APART))
     return [part for part in parts if len(part) >= max(len(ordered) // 8, 3)][:2] or [ordered]
@@ -248,7 +246,7 @@ def _layers(points: Floats, surface: str) -> tuple[list[Layer], Literal["inner",
 
 
 def _out_of_round(points: Floats, layers: list[Layer]) -> float:
-    """Standard deviation of the radius around the vessel, what is due to the points' own scatter taken off [m]."""
+    """Standard deviation of the radius around the vessel, without the part due to the points' own scatter [m]."""
     z = np.array([layer.z for layer in layers])
     r = np.array([float((la.inner if la.outer is None else la.outer) or 0.0) for la in layers])
     inside = (points[:, 2] >= z[0]) & (points[:, 2] <= z[-1])
@@ -270,10 +268,10 @@ def _out_of_round(points: Floats, layers: list[Layer]) -> float:
 
 
 def radii_of(scan: Scan, wall: float, floor: float) -> Radii:
-    """What a round scan says about the inner profile; of an outer surface the wall is taken off normal to it.
+    """The inner profile according to a round scan; for an outer surface the wall is subtracted normal to it.
 
     Args:
-        wall, floor: thickness [m]. Where the inner surface was seen the wall is not needed.
+        wall, floor: thickness [m]. If the inner surface was measured, the wall is not needed.
     """
     z = np.array([layer.z for layer in scan.layers])
     if scan.seen == "outer":
@@ -291,7 +289,7 @@ def radii_of(scan: Scan, wall: float, floor: float) -> Radii:
 
 
 def wall_between(scan: Scan) -> float | None:
-    """Thickness of the wall where both surfaces were seen: median over the layers [m]."""
+    """Thickness of the wall if both surfaces were measured: median over the layers [m]."""
     both = [la.outer - la.inner for la in scan.layers if la.inner is not None and la.outer is not None]
     return float(np.median(both)) if both else None
 
@@ -299,24 +297,24 @@ def wall_between(scan: Scan) -> float | None:
 Integers = NDArray[np.int64]
 
 MOST_DIRECTIONS, LEAST_DIRECTIONS = 48, 16
-"""Directions in which the radius is given; there are two thirds as many heights."""
+"""Number of directions in which the radius is given; there are two thirds as many heights."""
 
 IN_A_CELL = 20
-"""Points that should fall to each direction and height."""
+"""Desired number of points for each direction and height."""
 
 
 def mesh_of(scan: Scan, wall: float | None, floor: float | None) -> tuple[Floats, Integers]:
     """A closed mesh of a vessel that is not round.
 
     Args:
-        wall: thickness [m]; None: as far apart as the two surfaces were seen.
+        wall: thickness [m]; None: the measured distance of the two surfaces.
         floor: thickness [m]; None: as the wall.
 
     Returns:
         Vertices (V, 3) [m] and faces (F, 3), normals outwards; the inner floor at z = 0.
 
     Raises:
-        VesselError: more than a quarter of its surface was not seen, or nothing says how thick the wall is.
+        VesselError: more than a quarter of its surface was not measured, or the wall's thickness is unknown.
     """
     margin = FOOT * scan.height
     points = scan.points[(scan.points[:, 2] >= margin) & (scan.points[:, 2] <= scan.height)]
@@ -353,7 +351,7 @@ def mesh_of(scan: Scan, wall: float | None, floor: float | None) -> tuple[Floats
 
 
 def _whole(grid: Floats) -> Floats:
-    """A surface over heights and directions without its gaps (NaN), a little smoothed."""
+    """A surface over heights and directions with its gaps (NaN) filled, slightly smoothed."""
     from scipy import ndimage
     from scipy.interpolate import griddata
 
@@ -394,17 +392,17 @@ def _between(inner: Floats, outer: Floats, levels: Floats, floor: float) -> tupl
 
 
 DRAWS = 400
-"""Planes that are tried."""
+"""Number of planes that are tried."""
 
 ON_TABLE = 0.004
-"""Distance from the plane in which a pixel lies in it [m]: three deviations of a common camera."""
+"""Distance from the plane within which a pixel belongs to it [m]: three deviations of a common camera."""
 
 STEEP = 0.9
 """Smallest cosine between the table's normal and the picture's upward direction: the camera looks down by 25° at most,
 since from higher up it sees too much of the inside."""
 
 JUMP = 0.012
-"""Difference of depth between neighbours that is an edge [m]."""
+"""Difference of depth between neighbouring pixels that counts as an edge [m]."""
 
 LEAST_PIXELS = 400
 
@@ -413,7 +411,7 @@ def points_on_table(depth: Floats, focal: float, centre: tuple[float, float] | N
     """The near half of the vessel's outer surface.
 
     Args:
-        depth: along the camera's axis, rows from the top, shape (rows, columns) [m]; 0 where nothing was seen.
+        depth: along the camera's axis, rows from the top, shape (rows, columns) [m]; 0 for pixels without depth.
         focal: focal length [pixels].
         centre: column and row of the camera's axis; None: the picture's middle.
 
@@ -432,8 +430,8 @@ def points_on_table(depth: Floats, focal: float, centre: tuple[float, float] | N
     points = np.stack([(u - column) / focal * depth, depth, (row - v) / focal * depth], axis=-1)
     up, level = _table(points[seen])
     above = np.where(seen, points @ up - level, 0.0)
-    # Behind an edge are pixels of neither side, which float between; beside a silhouette the last ones are drawn back.
-    # Those below the rim are kept: its height is told by them.
+    # Behind an edge there are pixels that belong to neither side; at a silhouette the last ones are too far back.
+    # Pixels below the rim are kept, because they determine its height.
     jump = depth - minimum_filter(np.where(seen, depth, np.inf), 3)
     jump = np.maximum(jump, maximum_filter(depth, (1, 3)) - depth)
     body, count = label(seen & (above > ON_TABLE) & (jump < JUMP), structure=np.ones((3, 3)))
@@ -456,7 +454,7 @@ def points_on_table(depth: Floats, focal: float, centre: tuple[float, float] | N
 
 
 def _table(points: Floats) -> tuple[Floats, float]:
-    """Unit normal and level of the plane that most points lie in, among those that are about level."""
+    """Unit normal and level of the plane that contains most points, among roughly horizontal ones."""
     rng = np.random.default_rng(0)
     few = points[rng.integers(len(points), size=min(len(points), 20_000))] if len(points) else points
     if len(few) < LEAST_PIXELS:
@@ -473,7 +471,7 @@ def _table(points: Floats) -> tuple[Floats, float]:
             best, up, level = held, normal, float(a @ normal)
     if best < 0.05 * len(few):
         raise VesselError("no table is seen that the vessel stands on; take it from 5° to 25° above the level")
-    # the plane of least squares through what lies in it
+    # the least-squares plane through its points
     held_points = points[np.abs(points @ up - level) < ON_TABLE]
     middle = held_points.mean(axis=0)
     refined = np.linalg.eigh(np.cov((held_points - middle).T))[1][:, 0]

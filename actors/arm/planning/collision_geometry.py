@@ -1,4 +1,4 @@
-"""What takes up room: the pourer's outermost points, its distance from the receiver, the arm's links as capsules."""
+"""Collision geometry: the pourer's outermost points, its distance from the receiver, and links as capsules."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from sim_engine.vessel.vessel import Vessel
 FloatArray = NDArray[np.float64]
 
 COARSE, FINE = 10e-3, 2e-3
-"""Way of any point of the pourer between two poses that are looked at, far from and near to the receiver [m]."""
+"""Largest displacement of any point of the pourer between two checked poses, far from and near to the receiver [m]."""
 
 LINKS = (("upper arm", 1, 2, 0.08), ("forearm", 3, 4, 0.06), ("wrist", 4, 5, 0.06), ("wrist", 5, 6, 0.06),
          ("wrist", 6, 7, 0.05), ("gripper", 7, 8, 0.04))  # fmt: skip
-"""Name, ends as `link_points` counts (8 is the TCP), radius [m]: rough, and the gripper's a guess at a slim one."""
+"""Name, ends as `link_points` counts (8 is the TCP), radius [m]. Radii are rough; the gripper's is for a slim one."""
 
 _hulls: WeakKeyDictionary[Vessel, FloatArray] = WeakKeyDictionary()
 
 
 def hull(vessel: Vessel) -> FloatArray:
-    """Corners of a vessel's convex hull, shape (V, 3) [m]: no point of it reaches farther."""
+    """Corners of a vessel's convex hull, shape (V, 3) [m]: no point of the vessel lies outside."""
     if vessel not in _hulls:
         corners = vessel.solid_vertices
         if vessel.spec.shape.outline() is None:
@@ -42,8 +42,8 @@ def hull(vessel: Vessel) -> FloatArray:
 def _outermost_rings(corners: FloatArray) -> NDArray[np.bool_]:
     """Which corners (V, 3) of a body of revolution, made of whole rings, are on its convex hull.
 
-    The half section's upper chain by Andrew's monotone chain, seen from the axis: of rings at one height the widest
-    alone, and none that lies within the cone of two others.
+    The upper chain of the half section, by Andrew's monotone chain, seen from the axis. Of rings at one height only the
+    widest is kept, and no ring that lies within the cone of two others.
     """
     radius, height = np.round(np.hypot(corners[:, 0], corners[:, 1]), 12), corners[:, 2]
     chain: list[tuple[float, float]] = []
@@ -66,12 +66,12 @@ def _bent_in(below: tuple[float, float], middle: tuple[float, float], above: tup
 
 @dataclass(frozen=True)
 class Nearest:
-    """Where two things come nearest to each other.
+    """Position of the smallest distance between two objects.
 
     Attributes:
-        distance: [m]; negative where they overlap.
-        index: of the stretch's sample.
-        name: of the link, for those.
+        distance: [m]; negative if they overlap.
+        index: of the path's sample.
+        name: of the link, for links.
     """
 
     distance: float
@@ -80,14 +80,14 @@ class Nearest:
 
 
 def nearest_to_receiver(stretch: SampledPath, until: float, pourer: Vessel, receiver: Vessel) -> Nearest:
-    """Where the pourer comes nearest to the receiver.
+    """Smallest distance between the pourer and the receiver.
 
-    No point of the pourer moves by more than `FINE` between two poses that are looked at near the receiver, so that it
-    may be nearer by at most half of that in between.
+    Near the receiver, no point of the pourer moves by more than `FINE` between two checked poses. In between, the
+    pourer may therefore be nearer by at most half of that.
 
     Args:
-        stretch: of the path.
-        until: time from which on no new poses come [s].
+        stretch: the path.
+        until: time after which no new poses occur [s].
         pourer, receiver: geometry.
     """
     last = int(np.searchsorted(stretch.times, until + 1e-9))
@@ -95,9 +95,9 @@ def nearest_to_receiver(stretch: SampledPath, until: float, pourer: Vessel, rece
     way = way_of(poses, pourer)
     coarse = thinned(way, COARSE)
     away = clearance(pourer, receiver, poses[coarse])
-    # between two poses that are a way w apart nothing can come nearer than the nearer one less w/2
+    # between two poses that differ by a displacement w, no point comes nearer than the nearer pose's distance − w/2
     least = np.minimum(away[:-1], away[1:]) - 0.5 * np.diff(way[coarse])
-    # what is farther off than a vessel's grid reaches is known to be no nearer than that, not how far
+    # beyond the range of a vessel's grid only a lower bound of the distance is known
     known = least - np.maximum(np.minimum(away[:-1], away[1:]) - MARGIN, 0.0)
     doubtful = (known < stretch.spec.limits.clearance) | (least < float(away.min()))
     dense = thinned(way, FINE)
@@ -110,7 +110,7 @@ def nearest_to_receiver(stretch: SampledPath, until: float, pourer: Vessel, rece
 
 
 def nearest_links(stretch: SampledPath, receiver: Vessel) -> tuple[Nearest, Nearest]:
-    """Where a link of the arm comes nearest to the table, and to the receiver as a cylinder."""
+    """Smallest distances of the arm's links from the table, and from the receiver as a cylinder."""
     points = stretch.links
     world = cell_transforms(stretch.spec).world.inverse
     table, cup = [], []

@@ -1,8 +1,10 @@
-"""Between the frames of a pour (`actors.arm.arm_settings`): where the flange has to be for a pourer's pose, and back.
+"""Transformations between the frames of a pour (`actors.arm.arm_interface`), and rotations in numpy.
 
-Rotations as matrices, vectors and quaternions (w first), of one or many, with numpy alone.
+- `flange_poses` converts poses of the pourer to poses of the flange, `pourer_transforms` converts joints to poses of
+  the pourer.
+- Rotations are matrices, vectors and quaternions (w first), of one or many.
 
-scipy has them too, and takes a third of a second to import: too long for those who only check a file.
+scipy has rotations too, but it takes a third of a second to import, which is too long for checking a file.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_interface import Pose
+from actors.arm.arm_geometry import Pose
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planning.kinematics import MODELS, forward
 from sim_engine.collision import rotations
@@ -24,13 +26,13 @@ FloatArray = NDArray[np.float64]
 
 
 def about(axis: str, angle: float) -> FloatArray:
-    """Matrix (3, 3) of a turn by `angle` [rad] about 'x', 'y' or 'z'."""
+    """Matrix (3, 3) of a rotation by `angle` [rad] about 'x', 'y' or 'z'."""
     k = "xyz".index(axis)
     return from_vector(np.eye(3)[k] * angle)
 
 
 def from_vector(vector: Sequence[float] | FloatArray) -> FloatArray:
-    """Matrix (3, 3) of a rotation vector: along the axis, as long as the angle [rad] (Rodrigues' formula)."""
+    """Matrix (3, 3) of a rotation vector, whose length is the angle [rad] (Rodrigues' formula)."""
     v = np.asarray(vector, dtype=float)
     angle = float(np.linalg.norm(v))
     x, y, z = v / angle if angle > 0.0 else v
@@ -41,9 +43,9 @@ def from_vector(vector: Sequence[float] | FloatArray) -> FloatArray:
 
 
 def to_quaternions(rotation: FloatArray) -> FloatArray:
-    """Unit quaternions (T, 4) of matrices (T, 3, 3); which of the two signs is not said.
+    """Unit quaternions (T, 4) of matrices (T, 3, 3); their signs are arbitrary.
 
-    Each from the largest of its own four components, so that nothing is divided by what is nearly nothing. Source:
+    Each is computed from the largest of its own four components, which avoids division by values near zero. Source:
     Shepperd, Quaternion from rotation matrix, J. Guidance and Control 1 (1978).
     """
     r = rotation
@@ -63,7 +65,7 @@ def to_quaternions(rotation: FloatArray) -> FloatArray:
 
 
 def between(a: FloatArray, b: FloatArray, shares: FloatArray) -> FloatArray:
-    """Quaternions (N, 4) on the shortest turn from a to b, both (4,), at `shares` of its angle, 0 … 1 (N,)."""
+    """Quaternions (N, 4) on the shortest rotation from a to b, both (4,), at `shares` of its angle, 0 … 1 (N,)."""
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     cosine = float(a @ b)
     if cosine < 0.0:
@@ -90,29 +92,29 @@ class Transforms:
     position: FloatArray
 
     def __matmul__(self, inner: Transforms) -> Transforms:
-        """`inner`, given in this frame, seen from where this one is given."""
+        """Compose: `inner` is given in this frame, the result in this frame's parent."""
         return Transforms(self.rotation @ inner.rotation, self.apply(inner.position))
 
     def apply(self, points: FloatArray) -> FloatArray:
-        """Points of this frame, shape (..., 3), seen from where it is given [m]."""
+        """Transform points (..., 3) of this frame to its parent frame [m]."""
         moved: FloatArray = (self.rotation @ points[..., None])[..., 0] + self.position
         return moved
 
     @property
     def inverse(self) -> Transforms:
-        """What undoes it."""
+        """The inverse transformation."""
         back = np.swapaxes(self.rotation, -1, -2)
         return Transforms(back, -(back @ self.position[..., None])[..., 0])
 
 
 def transform_of(pose: Pose) -> Transforms:
-    """A pose with a rotation vector as a frame."""
+    """Convert a pose with a rotation vector."""
     return Transforms(from_vector([pose.rx, pose.ry, pose.rz]), np.array([pose.x, pose.y, pose.z]))
 
 
 @dataclass(frozen=True, eq=False)
 class CellTransforms:
-    """What stays where it is during a pour.
+    """Frames that are constant during a pour.
 
     Attributes:
         base: in the room's frame.
@@ -129,7 +131,7 @@ class CellTransforms:
 
 @lru_cache(maxsize=32)
 def cell_transforms(spec: UrArmSpec) -> CellTransforms:
-    """The fixed frames of a cell."""
+    """The constant frames of a cell."""
     tool = transform_of(spec.tool)
     mount = about("x", spec.mount.tilt) @ about("z", spec.mount.turn)  # first turned about its own z, then tilted
     return CellTransforms(
@@ -141,7 +143,7 @@ def cell_transforms(spec: UrArmSpec) -> CellTransforms:
 
 
 def flange_poses(poses: FloatArray, spec: UrArmSpec) -> Transforms:
-    """Where the flange has to be in the base's frame.
+    """Poses of the flange in the base's frame.
 
     Args:
         poses: of the pourer in the world, shape (T, 7): x y z [m], qw qx qy qz.
@@ -152,17 +154,17 @@ def flange_poses(poses: FloatArray, spec: UrArmSpec) -> Transforms:
 
 
 def pourer_transforms(joints: FloatArray, spec: UrArmSpec) -> Transforms:
-    """Where the pourer is in the room's frame for joints (T, 6) [rad]."""
+    """Poses of the pourer in the room's frame for joints (T, 6) [rad]."""
     return flange_transforms(joints, spec) @ cell_transforms(spec).pourer
 
 
 def flange_transforms(joints: FloatArray, spec: UrArmSpec) -> Transforms:
-    """Where the flange is in the room's frame for joints (T, 6) [rad]."""
+    """Poses of the flange in the room's frame for joints (T, 6) [rad]."""
     return cell_transforms(spec).base @ Transforms(*forward(joints, MODELS[spec.model]))
 
 
 def quaternions(rotation: FloatArray) -> FloatArray:
-    """Unit quaternions (T, 4), w first, of rotation matrices (T, 3, 3); the first has w ≥ 0, then without jumps."""
+    """Unit quaternions (T, 4), w first, of rotation matrices (T, 3, 3), without jumps; the first has w ≥ 0."""
     q = to_quaternions(rotation)
     with_last = np.sum(q[1:] * q[:-1], axis=-1)
     sign = np.cumprod(np.where(with_last < 0.0, -1.0, 1.0))
@@ -172,17 +174,18 @@ def quaternions(rotation: FloatArray) -> FloatArray:
 
 
 def pourer_motion(joints: FloatArray, times: FloatArray, spec: UrArmSpec, *, grip_tilt: float = 0.0) -> SampledMotion:
-    """What an arm's encoders say the pourer did.
+    """The motion of the pourer according to an arm's encoders.
 
     Args:
         joints: shape (T, 6) [rad].
         times: of the readings, shape (T,), increasing from 0 [s].
         spec: of the arm and its cell.
-        grip_tilt: the pourer sits in the fingers turned by so much about its own y axis, hence more tilted, about the
-            tool centre point [rad]. An arm can't know it: for the hidden reality of a virtual bench.
+        grip_tilt: error of grip: the pourer is rotated in the gripper by this angle about its own y axis through the
+            tool centre point, and therefore tilted more [rad]. An arm cannot measure it; it belongs to the ground truth
+            of a virtual bench.
 
     Returns:
-        The pourer in the world.
+        The pourer's motion in the world.
     """
     cell = cell_transforms(spec)
     grip = cell.tool.inverse @ cell.pourer

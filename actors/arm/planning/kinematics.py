@@ -1,11 +1,11 @@
-"""Forward and inverse kinematics of whole paths: the closed forms of
-`actors.emulators.ur_controller.robot_kinematics` on arrays.
+"""Forward and inverse kinematics of whole paths: the closed forms of `actors.emulators.ur_controller.robot_kinematics`
+on arrays.
 
-The virtual controller works out one pose every 2 ms; a planner a thousand at once, and keeps apart the postures that a
-pose can be reached in. Both have the robots' lengths from one table, and tests hold them against each other.
+The virtual controller computes one pose every 2 ms. A planner computes a thousand at once, and distinguishes the
+postures in which a pose can be reached. Both take the robots' lengths from one table; tests compare their results.
 
-A *posture* is one of eight ways to reach a pose: which side of the base's axis the shoulder is on, which way the wrist
-and which way the elbow is bent. A path that keeps clear of singularities stays in one.
+A *posture* is one of eight ways to reach a pose. It is defined by the side of the base's axis on which the shoulder is,
+and by the directions in which wrist and elbow are bent. A path that avoids singularities stays in one posture.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ FloatArray = NDArray[np.float64]
 POSTURES = 8
 
 _SINGULAR_WRIST = 1e-6
-"""Below this |sin q5| joints 4 and 6 turn about the same axis; joint 6 is then taken as 0."""
+"""Below this |sin q5| joints 4 and 6 rotate about the same axis; joint 6 is then set to 0."""
 
 
 def forward(q: FloatArray, m: RobotModel) -> tuple[FloatArray, FloatArray]:
-    """Where the flange is.
+    """Pose of the flange.
 
     Args:
         q: joints, shape (..., 6) [rad].
@@ -54,7 +54,7 @@ def forward(q: FloatArray, m: RobotModel) -> tuple[FloatArray, FloatArray]:
 
 
 def inverse(rotation: FloatArray, position: FloatArray, m: RobotModel) -> FloatArray:
-    """All postures that put the flange there.
+    """All postures that reach a pose of the flange.
 
     Args:
         rotation: of the flange, shape (T, 3, 3).
@@ -62,8 +62,8 @@ def inverse(rotation: FloatArray, position: FloatArray, m: RobotModel) -> FloatA
         m: the robot.
 
     Returns:
-        Shape (T, 8, 6) [rad], each joint in −π … π, NaN where the pose is out of reach. Along a path a posture keeps
-        its number: 4·shoulder + 2·wrist + elbow.
+        Shape (T, 8, 6) [rad], each joint in −π … π, NaN if the pose is out of reach. Along a path a posture keeps its
+        number: 4·shoulder + 2·wrist + elbow.
     """
     out = np.full((len(position), POSTURES, 6), np.nan)
     for number, (q1, q5, q6, q234, u, v) in enumerate(_wrists(rotation, position, m)):
@@ -79,8 +79,10 @@ def inverse(rotation: FloatArray, position: FloatArray, m: RobotModel) -> FloatA
 
 
 def _wrists(rotation: FloatArray, position: FloatArray, m: RobotModel) -> Iterator[tuple[FloatArray, ...]]:
-    """Four ways to hold the wrist: q1, q5, q6, q2 + q3 + q4, and where elbow and shoulder have to bring wrist 1, in
-    the arm's plane from the shoulder [m]; each of shape (T,), NaN where the wrist can't be."""
+    """The four wrist postures.
+
+    Each is given by q1, q5, q6, q2 + q3 + q4 and the position to which elbow and shoulder have to bring wrist 1, in the
+    arm's plane from the shoulder [m]. All have shape (T,) and are NaN if the wrist cannot reach the pose."""
     r = rotation
     w = position - m.d6 * r[:, :, 2]
     radius = np.hypot(w[:, 0], w[:, 1])
@@ -101,7 +103,7 @@ def _wrists(rotation: FloatArray, position: FloatArray, m: RobotModel) -> Iterat
 
 
 def posture(q: FloatArray, m: RobotModel) -> int:
-    """Number of the posture that joints (6,) are in, as `inverse` counts."""
+    """Number of the posture of joints (6,), as `inverse` counts."""
     rotation, position = forward(q[None], m)
     solutions = inverse(rotation, position, m)[0]
     apart = np.abs(np.angle(np.exp(1j * (solutions - q)))).max(axis=-1)
@@ -109,10 +111,10 @@ def posture(q: FloatArray, m: RobotModel) -> int:
 
 
 def singularities(q: FloatArray, m: RobotModel) -> FloatArray:
-    """How far joints are from losing a direction, shape (..., 3): shoulder, elbow, wrist; 0 is singular.
+    """Distance of joints from singularities, shape (..., 3): shoulder, elbow, wrist; 0 is singular.
 
     Elbow and wrist: |sin| of their angle. Shoulder: distance of the wrist from the plane through the base's axis and
-    along joint 2's, over the length of both links.
+    along joint 2's, divided by the length of both links.
     """
     q23 = q[..., 1] + q[..., 2]
     u = m.a2 * np.cos(q[..., 1]) + m.a3 * np.cos(q23) + m.d5 * np.sin(q23 + q[..., 3])
@@ -121,9 +123,9 @@ def singularities(q: FloatArray, m: RobotModel) -> FloatArray:
 
 
 def beyond_reach(rotation: FloatArray, position: FloatArray, m: RobotModel) -> FloatArray:
-    """By how much poses lie out of reach, shape (T, 8) [m], in every posture as `inverse` counts; 0 within reach.
+    """Distance of poses beyond the reach, shape (T, 8) [m], in every posture as `inverse` counts; 0 within reach.
 
-    Negative where a pose is too near for the arm to fold or, inside the base's own cylinder, to get the wrist there.
+    Negative if a pose is too near for the arm to fold or, inside the base's own cylinder, for the wrist to get there.
     """
     distances = np.stack([np.hypot(u, v) for *_, u, v in _wrists(rotation, position, m)], axis=-1)
     too_far = distances - abs(m.a2) - abs(m.a3)
@@ -137,8 +139,8 @@ def beyond_reach(rotation: FloatArray, position: FloatArray, m: RobotModel) -> F
 def link_points(q: FloatArray, m: RobotModel) -> FloatArray:
     """Points along the arm's middle line, shape (..., 8, 3) [m].
 
-    Shoulder, upper arm's begin and end, forearm's begin and end, wrist 1, wrist 2, flange. Upper arm and forearm run
-    beside each other: the upper arm outside by about d4, the forearm by a quarter of that.
+    Shoulder, both ends of the upper arm, both ends of the forearm, wrist 1, wrist 2, flange. Upper arm and forearm run
+    side by side: the upper arm is farther out by about d4, the forearm by a quarter of that.
     """
     s1, c1 = np.sin(q[..., 0]), np.cos(q[..., 0])
     zero = np.zeros_like(s1)

@@ -1,6 +1,8 @@
-"""What forbids a path, in words for the person who can change it: all of it at once, before anything moves.
+"""Checks of an arm's settings and of its paths. All problems are reported at once, before anything moves.
 
-Whether an arm's settings make sense in themselves: asked when a laboratory's file is read, before any pour.
+- `check_limits` and `outside` check the settings when a laboratory's file is read, before any pour.
+- The other functions check a path; each problem is a message for the user who can change it.
+- `recheck` checks a path again immediately before it is executed.
 """
 
 from __future__ import annotations
@@ -11,7 +13,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_interface import JOINT_NAMES, PathReport
+from actors.arm.arm_geometry import JOINT_NAMES
+from actors.arm.arm_interface import PathReport
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.collision_geometry import Nearest, hull, nearest_links, nearest_to_receiver
@@ -24,14 +27,14 @@ from sim_engine.vessel.distance_grid import MARGIN
 from sim_engine.vessel.vessel import Vessel
 
 UPRIGHT = math.radians(3.0)
-"""How far a pourer that waits or travels may lean [rad]: it is full."""
+"""Largest tilt of a pourer that waits or is carried [rad], because it is full."""
 
 PARTS = ("shoulder", "elbow", "wrist")
-"""As `singularities` counts."""
+"""Order of the parts in `singularities`."""
 
 
 def check_limits(spec: UrArmSpec) -> list[str]:
-    """What is wrong with the settings of an arm; empty if nothing is. Texts name the keys of a laboratory's file."""
+    """Problems of an arm's settings; empty if there are none. Messages name the keys of a laboratory's file."""
     limits = spec.limits
     low, high = np.array(limits.box_low), np.array(limits.box_high)
     if np.any(low >= high):
@@ -72,7 +75,7 @@ def _receiver(spec: UrArmSpec) -> list[str]:
     if not (low[0] <= x <= high[0] and low[1] <= y <= high[1]):
         problems.append(f"cell.receiver: ({x:.3f}, {y:.3f}) m lies outside limits.box, seen from above")
     for number, plane in enumerate(spec.limits.planes, 1):
-        # a plane that lies flat may well pass above where the receiver stands
+        # a horizontal plane may pass above the receiver's position
         if abs(plane.normal[2]) < 0.5 and float(np.dot(plane.normal, spec.cell.receiver)) < plane.offset:
             problems.append(f"cell.receiver: ({x:.3f}, {y:.3f}, {z:.3f}) m lies beyond plane {number} of limits.planes")
     if z < spec.cell.table - 1e-6:
@@ -123,7 +126,7 @@ def _home(spec: UrArmSpec) -> list[str]:
 
 
 def outside(point: np.ndarray[tuple[int], np.dtype[np.float64]], spec: UrArmSpec) -> list[str]:
-    """Where a point of the room's frame, shape (3,) [m], is not where it may be: box, planes, table."""
+    """Violations of box, planes and table at a point of the room's frame, shape (3,) [m]."""
     texts = []
     for axis, value, low, high in zip("xyz", point, spec.limits.box_low, spec.limits.box_high, strict=True):
         if not low <= value <= high:
@@ -140,29 +143,29 @@ def outside(point: np.ndarray[tuple[int], np.dtype[np.float64]], spec: UrArmSpec
 FloatArray = NDArray[np.float64]
 
 SLACK = 1e-6
-"""Relative: a path planned at a limit may lie above it by rounding."""
+"""Relative tolerance: rounding may put a path that is planned at a limit above it."""
 
 THROUGH = 0.02
-"""Nearer to a singularity than this a path goes through it, as far as speeds are concerned."""
+"""Below this distance from a singularity a path counts as passing through it when speeds are checked."""
 
 LARGEST_STEP = math.radians(15.0)
-"""The largest step of a joint between two waypoints [rad]: more is not a path but a jump."""
+"""The largest step of a joint between two waypoints [rad]; a larger one is a jump."""
 
 
 def check_stretch(stretch: SampledPath, pourer: Vessel, receiver: Vessel) -> list[str]:
-    """What is wrong with a stretch, other than the distance of the pourer from the receiver."""
+    """Problems of a path, except the distance of the pourer from the receiver."""
     points = hull(pourer)
     problems = [*_tilts(stretch), *_places(stretch, points)]
     if stretch.unreached is not None:
         return [*_speeds(stretch, points), *problems]
     problems = [*_ranges(stretch), *_singular(stretch), *problems, *_links(stretch, receiver)]
     if stretch.margins.min() < THROUGH:
-        return problems  # joints then race, but that is not what to mend
+        return problems  # joints then move too fast, but that is not the cause
     return [*_joint_speeds(stretch), *_speeds(stretch, points), *problems]
 
 
 def check_clearance(stretch: SampledPath, until: float, pourer: Vessel, receiver: Vessel) -> tuple[Nearest, list[str]]:
-    """Where the pourer comes nearest to the receiver until a time [s], and what is wrong with that."""
+    """Smallest distance of the pourer from the receiver until a time [s], and the problems with it."""
     nearest = nearest_to_receiver(stretch, until, pourer, receiver)
     least = stretch.spec.limits.clearance
     if nearest.distance >= least:
@@ -181,12 +184,12 @@ def check_clearance(stretch: SampledPath, until: float, pourer: Vessel, receiver
 
 
 def check_reach(unreached: SampledPath) -> str:
-    """What to say about a stretch of which some poses can't be reached in the posture of home."""
+    """Message about a path of which some poses cannot be reached in the posture of home."""
     home = posture(np.array(unreached.spec.home), unreached.model)
     assert unreached.unreached is not None
     beyond = beyond_reach(unreached.unreached.rotation, unreached.unreached.position, unreached.model)
     worst = _first_worst(np.abs(beyond[:, home]))
-    # a way that can't be made has no pace yet
+    # an impossible path has no times yet
     when = "on the way from home" if unreached.name == "approach" else unreached.when(worst)
     distance = 1e3 * float(beyond[worst, home])
     another = (
@@ -200,7 +203,7 @@ def check_reach(unreached: SampledPath) -> str:
 
 
 def check_way(racing: RacingJointError, spec: UrArmSpec) -> str:
-    """What to say about a way from home through a singularity."""
+    """Message about a way from home through a singularity."""
     direction = math.degrees(spec.cell.direction)
     facing = math.degrees(math.remainder(spec.cell.direction + racing.heading, 2.0 * math.pi))
     turned = math.degrees(racing.turn)
@@ -218,13 +221,13 @@ def check_way(racing: RacingJointError, spec: UrArmSpec) -> str:
 
 
 def report(stretches: list[SampledPath], clearance: float, pourer: Vessel, deviation: float) -> PathReport:
-    """What was found out about a whole path.
+    """Results of the checks of a whole path.
 
     Args:
         stretches: approach, pour, retreat.
         clearance: smallest distance of pourer and receiver [m].
         pourer: geometry.
-        deviation: of the tilt from what was asked for [rad].
+        deviation: of the tilt from the requested one [rad].
     """
     joint_speeds = np.array([s.joint_speeds.max(axis=0) for s in stretches]).max(axis=0)
     points = hull(pourer)
@@ -249,12 +252,12 @@ def report(stretches: list[SampledPath], clearance: float, pourer: Vessel, devia
 
 
 def recheck(path: JointPath, spec: UrArmSpec) -> None:
-    """Look at a path again right before it is executed, without knowing what it is for.
+    """Check a path again immediately before it is executed, without information about its purpose.
 
-    Ranges, joint speeds and jumps; tool centre point and the pourer's underside against box, planes and table.
+    Checks ranges, joint speeds and jumps; tool centre point and the pourer's underside against box, planes and table.
 
     Raises:
-        InvalidActionError: it must not be executed; with everything that is wrong.
+        InvalidActionError: the path must not be executed; the text lists all problems.
     """
     times, joints = path.times, path.joints
     if times.ndim != 1 or len(times) < 2 or joints.shape != (len(times), 6):
@@ -281,7 +284,7 @@ def refusal(problems: list[str]) -> str:
 
 
 def _first_worst(values: FloatArray) -> int:
-    """Where the largest value is reached first: a hold keeps it to within rounding."""
+    """First index of the largest value; during a hold the value stays constant to within rounding."""
     most = float(values.max())
     return int(np.argmax(values >= most - 1e-6 * abs(most) - 1e-9))
 
@@ -310,7 +313,7 @@ def _joint_speeds(s: SampledPath) -> Iterator[str]:
 
 
 def _slower(s: SampledPath, limit: str | None) -> str:
-    """What to do about something too fast; `limit`: key of the laboratory's file that could allow it, if one can."""
+    """The remedy for an excessive speed; `limit`: key of the laboratory's file that could allow it, if there is one."""
     lower = "angular_velocity or return_velocity" if s.name == "pour" else "approach_speed"
     return f"lower {lower}" + ("" if limit is None else f", or raise arm.limits.{limit}")
 
@@ -359,7 +362,7 @@ def _speeds(s: SampledPath, points: FloatArray) -> Iterator[str]:
 
 def _tilts(s: SampledPath) -> Iterator[str]:
     worst = _first_worst(s.tilts)
-    # on its way the pourer is full: what a pour may is not what an approach may
+    # on the approach the pourer is full, so a smaller limit holds than during a pour
     most = UPRIGHT if s.name == "approach" else s.spec.limits.tilt
     if s.tilts[worst] > most * (1.0 + SLACK):
         yield (
@@ -370,7 +373,7 @@ def _tilts(s: SampledPath) -> Iterator[str]:
 
 
 def _places(s: SampledPath, points: FloatArray) -> Iterator[str]:
-    """Box, planes and table, for the TCP and points (V, 3) of the pourer."""
+    """Violations of box, planes and table by the TCP and points (V, 3) of the pourer."""
     limits = s.spec.limits
     for k, axis in enumerate("xyz"):
         for sign, bound, word in ((1.0, limits.box_low[k], "least"), (-1.0, limits.box_high[k], "most")):
@@ -388,7 +391,7 @@ def _places(s: SampledPath, points: FloatArray) -> Iterator[str]:
 
 
 def _beyond(s: SampledPath, normal: FloatArray, offset: float, points: FloatArray) -> Iterator[tuple[str, int, float]]:
-    """What would leave normal · point ≥ offset the farthest: its name, sample, and normal · point [m]."""
+    """The point that violates normal · point ≥ offset most: its name, sample, and normal · point [m]."""
     tool = s.tool @ normal
     if tool.min() < offset:
         yield "the tool", _first_worst(-tool), float(tool.min())
@@ -400,7 +403,9 @@ def _beyond(s: SampledPath, normal: FloatArray, offset: float, points: FloatArra
 
 
 def _support(s: SampledPath, normal: FloatArray, points: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Smallest normal · point of the pourer's points (V, 3) at every sample [m], and which point; each (N,)."""
+    """Smallest normal · point of the pourer's points (V, 3) at every sample [m], and the index of that point; each
+    (N,).
+    """
     along = (normal @ s.pourer.rotation) @ points.T
     return s.pourer.position @ normal + along.min(axis=1), along.argmin(axis=1)
 

@@ -1,4 +1,7 @@
-"""From a pour's motion to joints over time: approach, pour, retreat, checked as a whole before the first movement."""
+"""Plans a pour: from its motion to joints over time.
+
+Approach, pour and retreat are checked before the first movement.
+"""
 
 from __future__ import annotations
 
@@ -37,32 +40,32 @@ from sim_engine.vessel.vessel import Vessel
 FloatArray = NDArray[np.float64]
 
 ANGLE_ERROR, PLACE_ERROR = np.radians(0.1), 3e-4
-"""How far linear joints between two waypoints may leave the pose that is wanted [rad], [m]."""
+"""Largest deviation from the required pose between two waypoints, where joints are linear [rad], [m]."""
 
 FINEST = 8
-"""So many times the usual waypoints are tried before saying that joints can't follow the motion."""
+"""Largest refinement of the waypoints before the planner reports that joints cannot follow the motion."""
 
 MOST_WAYPOINTS = 1_200
-"""The most waypoints of a pour: they travel to the controller as a program."""
+"""Largest number of waypoints of a pour, because they are sent to the controller as a program."""
 
 OVER = 0.02
-"""Height above the receiver, beside `ArmLimits.clearance`, at which the pourer is carried over it [m]."""
+"""Height above the receiver, in addition to `ArmLimits.clearance`, at which the pourer is carried over it [m]."""
 
 UNTILT_ACCELERATION = STEEPEST / 10.0
-"""Into and out of the turn back upright that a pour without a return ends with [rad/s²]."""
+"""Acceleration of the return to upright after a pour that ends tilted [rad/s²]."""
 
 
 def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Vessel) -> PourPath:
-    """Joints for a whole pour.
+    """Plan the joints for a whole pour.
 
-    The arm goes from home to the pour's first pose in straight lines, the pourer upright: directly, or where that
-    is forbidden up, across the receiver's rim and down. It pours in the posture that it waits in (a change of posture
-    would have to pass a singularity with a full vessel), and goes back the way it came; a pour that ends tilted is
-    brought upright first.
+    The arm moves from home to the pour's first pose in straight lines with the pourer upright: directly, or, if that is
+    forbidden, up, across the receiver's rim and down. It pours in the posture of home, since a change of posture would
+    pass a singularity with a full vessel. It returns along the approach. A pour that ends tilted is brought upright
+    first.
 
-    Steps in speed, and accelerations above `pace.STEEPEST`, become ramps of that (`pace.followable`): each such turn
-    ends speed / STEEPEST later, and what follows is as much later. `PathReport.deviation` says how far the tilt is then
-    from the one asked for.
+    Steps in speed, and accelerations above `trajectory.STEEPEST`, become ramps of that acceleration
+    (`trajectory.followable`). Each such turn ends speed / STEEPEST later, and later phases are delayed by the same
+    time. `PathReport.deviation` is the resulting difference from the requested tilt.
 
     Args:
         motion: as `sim_engine.motion.plan_motion` makes it.
@@ -70,11 +73,11 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
         pourer, receiver: geometry of the scene's vessels.
 
     Returns:
-        The path, with what was found out about it.
+        The path, with the results of its checks.
 
     Raises:
-        InvalidActionError: it must not or can't be executed; the text lists everything that was found wrong.
-        UnreachablePlaceError: likewise, and no other pour that begins in the same place can.
+        InvalidActionError: the path is forbidden or impossible; the text lists all problems.
+        UnreachablePlaceError: likewise, and so is every other pour that begins at the same place.
     """
     problems = check_limits(spec)
     if problems:
@@ -91,11 +94,11 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
         during = SampledPath.of("pour", pour, spec, phases)
     except OutOfReachError as error:
         during = SampledPath.beyond("pour", pour_times(made), error.poses, spec, phases)
-        problems = [check_reach(during)]  # which is why the approach failed too, if it did
+        problems = [check_reach(during)]  # if the approach failed too, this is its cause
     problems += check_stretch(during, pourer, receiver)
     # hold, return and retreat pass through poses that tilt and approach have passed through
     nearest, texts = check_clearance(during, made.phases[0].end, pourer, receiver)
-    if approached >= spec.limits.clearance or nearest.index > 0:  # its first pose is the approach's last
+    if approached >= spec.limits.clearance or nearest.index > 0:  # its first pose is the last one of the approach
         problems += texts
     if pour is not None and not problems and not _follows(pour, made, spec):
         problems.append(
@@ -129,11 +132,11 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
 def _approach(
     start: tuple[float, ...], spec: UrArmSpec, pourer: Vessel, receiver: Vessel
 ) -> tuple[JointPath | None, float, tuple[str, ...]]:
-    """The way there with the fewest problems, the shortest of those, its clearance [m], and its problems.
+    """The approach with the fewest problems, and the shortest of those, its clearance [m], and its problems.
 
     Args:
-        start: pose of the pourer in the world that the pour begins with. Pours at one place share it, so that the way
-            there is worked out and looked at once for all of them.
+        start: first pose of the pourer in the world. Pours at one place share it, so that the approach is planned and
+            checked only once for all of them.
         spec: of the arm and its cell.
         pourer, receiver: geometry.
     """
@@ -164,7 +167,7 @@ def _approach(
 
 
 def _pour(motion: PourMotion, near: FloatArray, spec: UrArmSpec) -> JointPath:
-    """As few waypoints as follow the motion within the errors allowed."""
+    """Follow the motion within the allowed errors, with as few waypoints as possible."""
     finer = 1
     while True:
         times = pour_times(motion, finer)
@@ -184,7 +187,7 @@ def _follows(path: JointPath, motion: PourMotion, spec: UrArmSpec) -> bool:
 
 
 def _retreat(motion: PourMotion, approach: JointPath, pour: JointPath, spec: UrArmSpec) -> JointPath:
-    """Upright first, if the pour ends tilted; then the way back."""
+    """First to upright, if the pour ends tilted; then back along the approach."""
     times = approach.times[-1] - approach.times[::-1]
     back = JointPath(times, approach.joints[::-1])
     first, last = (float(motion.tilt(np.array([t]))[0]) - motion.tilt_error for t in (0.0, motion.duration))

@@ -1,6 +1,8 @@
-"""When an arm is where: accelerations that joints can make, and times at which a path is written down.
+"""Time parameterisation of paths, and densely sampled paths for the checks.
 
-A part of an executed pour, sampled densely, with what its checks look at.
+- `followable` limits a motion to accelerations that joints can make. `pour_times` and `trapezoid` choose the times of
+  waypoints.
+- `SampledPath` is a part of a planned pour, with the values that its checks use.
 """
 
 from __future__ import annotations
@@ -21,20 +23,23 @@ from sim_engine.motion import Phase, PourMotion, Segment, turn
 FloatArray = NDArray[np.float64]
 
 STEEPEST = math.radians(1000.0)
-"""Largest acceleration of a tilt [rad/s²]: what a wrist that holds a full vessel follows closely; stands for steps."""
+"""Largest acceleration of a tilt [rad/s²]. A wrist that holds a full vessel follows it closely; it replaces steps in
+speed.
+"""
 
 TILT_STEP = math.radians(1.0)
-"""Largest turn between two waypoints [rad]: on a circle of 100 mm the chord is then 4 μm off."""
+"""Largest rotation between two waypoints [rad]: on a circle of 100 mm radius the chord deviates by 4 μm."""
 
 RAMP_ERROR = math.radians(0.01)
-"""Largest difference between an accelerated turn and its chords [rad]."""
+"""Largest difference between an accelerated rotation and its chords [rad]."""
 
 
 def followable(motion: PourMotion, steepest: float = STEEPEST) -> PourMotion:
-    """The motion as joints can make it: no steps in speed, no acceleration above `steepest`.
+    """The motion as joints can follow it: without steps in speed or accelerations above `steepest`.
 
-    A turn that asks for more keeps its speed and its ends and gets ramps of `steepest`: it lags behind by half a ramp,
-    ends one ramp (speed / steepest) later, and everything after it is as much later. Other motions stay as they are.
+    A turn that exceeds this limit keeps its speed and its ends and gets ramps of `steepest`. It lags by half a ramp and
+    ends one ramp (speed / steepest) later; everything after it is delayed by the same time. Other motions are
+    unchanged.
 
     Args:
         motion: as `sim_engine.motion.plan_motion` makes it: every phase a turn from rest to rest, or a hold.
@@ -75,11 +80,11 @@ def _hardest(segments: tuple[Segment, ...]) -> float:
 
 
 def pour_times(motion: PourMotion, finer: int = 1) -> FloatArray:
-    """Times of a pour's waypoints, shape (T,) [s]: all ends of segments and phases, and as many between as needed.
+    """Times of a pour's waypoints, shape (T,) [s]: all ends of segments and phases, and as many in between as needed.
 
     Args:
         motion: a followable one.
-        finer: so many times more than that.
+        finer: multiplies the number of waypoints.
     """
     ends = {0.0, *(p.start for p in motion.phases), *(p.end for p in motion.phases)}
     pieces = [np.array(sorted(ends))]
@@ -90,7 +95,7 @@ def pour_times(motion: PourMotion, finer: int = 1) -> FloatArray:
         )
         pieces.append(s.start + np.linspace(0.0, s.duration, finer * max(math.ceil(count), 1) + 1))
     times = np.sort(np.concatenate(pieces))
-    # ends that were computed in two ways differ in the last bits; the phases' own stay
+    # ends that were computed in two ways differ in the last bits; the phases' own ends are kept
     distinct = np.concatenate([[True], np.diff(times) > 1e-6])
     kept: FloatArray = times[distinct]
     for end in ends:
@@ -99,11 +104,11 @@ def pour_times(motion: PourMotion, finer: int = 1) -> FloatArray:
 
 
 def trapezoid(length: float, speed: float, acceleration: float, step: float) -> tuple[FloatArray, FloatArray]:
-    """From rest to rest along a length: times and distances, about every `step` seconds and at the ramps' ends.
+    """Motion from rest to rest along a length: times and distances, about every `step` seconds and at the ramps' ends.
 
     Args:
         length: > 0.
-        speed: at most.
+        speed: largest.
         acceleration: and deceleration.
         step: [s].
     """
@@ -129,15 +134,15 @@ Phases = tuple[tuple[str, float, float], ...]
 
 @dataclass(frozen=True, eq=False)
 class SampledPath:
-    """Approach, pour or retreat.
+    """Approach, pour or retreat, sampled densely.
 
     Attributes:
         name: one of these.
-        times: (N,) of waypoints, and of middles between them [s].
-        joints: (N, 6) [rad]; of no meaning where `unreached`.
+        times: (N,) of waypoints, and of midpoints between them [s].
+        joints: (N, 6) [rad]; meaningless if `unreached` is set.
         spec: of the arm and its cell.
         phases: of a pour: name, start and end [s]; empty otherwise.
-        unreached: flange in the base's frame, for poses that the arm can't take: some have one all the same.
+        unreached: flange in the base's frame, if the arm cannot reach some of the poses.
     """
 
     name: str
@@ -149,7 +154,7 @@ class SampledPath:
 
     @classmethod
     def of(cls, name: str, path: JointPath, spec: UrArmSpec, phases: Phases = ()) -> SampledPath:
-        """A path with middles between its waypoints: joints are linear in between, poses all but."""
+        """A path with midpoints between its waypoints: joints are linear in between, poses nearly so."""
         times = np.sort(np.concatenate([path.times, 0.5 * (path.times[1:] + path.times[:-1])]))
         return cls(name, times, path.at(times), spec, phases)
 
@@ -157,7 +162,7 @@ class SampledPath:
     def beyond(
         cls, name: str, times: FloatArray, poses: FloatArray, spec: UrArmSpec, phases: Phases = ()
     ) -> SampledPath:
-        """Poses of the pourer in the world (N, 7) of which some can't be reached."""
+        """Poses of the pourer in the world (N, 7), some of which cannot be reached."""
         return cls(name, times, np.zeros((len(times), 6)), spec, phases, flange_poses(poses, spec))
 
     @cached_property
@@ -174,18 +179,18 @@ class SampledPath:
 
     @cached_property
     def flange(self) -> Transforms:
-        """Room frame."""
+        """Pose of the flange in the room's frame."""
         base = cell_transforms(self.spec).base
         return flange_transforms(self.joints, self.spec) if self.unreached is None else base @ self.unreached
 
     @cached_property
     def tool(self) -> FloatArray:
-        """TCP, room frame, shape (N, 3) [m]."""
+        """Position of the TCP in the room's frame, shape (N, 3) [m]."""
         return self.flange.apply(cell_transforms(self.spec).tool.position)
 
     @cached_property
     def pourer(self) -> Transforms:
-        """Room frame."""
+        """Pose of the pourer in the room's frame."""
         return self.flange @ cell_transforms(self.spec).pourer
 
     @cached_property
@@ -221,11 +226,11 @@ class SampledPath:
 
     @cached_property
     def margins(self) -> FloatArray:
-        """From singularities: shoulder, elbow, wrist, shape (N, 3)."""
+        """Distances from singularities: shoulder, elbow, wrist, shape (N, 3)."""
         return singularities(self.joints, self.model)
 
     def point_speeds(self, points: FloatArray) -> FloatArray:
-        """Speeds of the fastest of the TCP and points (V, 3) of the pourer between samples, shape (N − 1,) [m/s]."""
+        """Largest speed of the TCP and of points (V, 3) of the pourer between samples, shape (N − 1,) [m/s]."""
         turn, shift = np.diff(self.pourer.rotation, axis=0), np.diff(self.pourer.position, axis=0)
         moved = np.sqrt(np.square(turn @ points.T + shift[:, :, None]).sum(axis=1).max(axis=1))
         tool = np.linalg.norm(np.diff(self.tool, axis=0), axis=-1)
@@ -233,7 +238,7 @@ class SampledPath:
         return speeds
 
     def when(self, index: int) -> str:
-        """A moment in words: '0.81 s into the tilt'."""
+        """The time of a sample as text: '0.81 s into the tilt'."""
         t = float(self.times[index])
         for name, start, end in self.phases:
             if t <= end + 1e-6:

@@ -1,4 +1,4 @@
-"""Carrying a full, upright pourer: straight lines, gently, and following poses in one posture of the arm."""
+"""Transfer motions of a full, upright pourer along straight lines, and joints that follow poses in one posture."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from actors.arm.planning.trajectory import trapezoid
 FloatArray = NDArray[np.float64]
 
 TOOL_ACCELERATION = 0.5
-"""Acceleration of a pourer on its way [m/s²]. Its liquid then leans by 3 deg, twice that while it swings."""
+"""Acceleration of a pourer that is carried [m/s²]. Its liquid leans by 3 deg, and twice as far while it swings."""
 
 TOOL_SPEED = 0.4
-"""Speed of a pourer on its way [m/s], where the limits allow it."""
+"""Speed of a pourer that is carried [m/s], if the limits allow it."""
 
 STEP = 0.02
-"""Between two waypoints on the way [s]."""
+"""Time between two waypoints [s]."""
 
 
 MOST_TURNS = 3.0
-"""Turns of a joint along a line, at its fastest: one that passes near a singularity would make tens or thousands."""
+"""Most turns of a joint along a line, at its fastest. Near a singularity it would make tens or thousands."""
 
 LONGEST = 60.0
-"""The longest time of a line that a joint turns so much for [s]."""
+"""Longest duration of a line on which a joint rotates that much [s]."""
 
 
 class RacingJointError(Exception):
-    """A line leads through a singularity: a joint would turn so much there that the way takes minutes.
+    """A line leads through a singularity: a joint would rotate so much there that the way takes minutes.
 
     Attributes:
-        joint: which, from 0.
-        heading: of the pourer where the line begins, about the world's vertical [rad]; 0 is that of a pour.
+        joint: its index from 0.
+        heading: of the pourer at the line's start, about the world's vertical [rad]; 0 is that of a pour.
         turn: of the pourer along the line [rad].
-        seconds: that the line would take.
+        seconds: duration of the line.
     """
 
     def __init__(self, joint: int, heading: float, turn: float, seconds: float) -> None:
@@ -49,7 +49,7 @@ class RacingJointError(Exception):
 
 
 class OutOfReachError(Exception):
-    """Poses that an arm can't take in the posture it is in.
+    """Poses that an arm cannot reach in its present posture.
 
     Attributes:
         poses: (T, 7) of the pourer in the world.
@@ -64,15 +64,15 @@ def follow(poses: FloatArray, near: FloatArray, spec: UrArmSpec) -> FloatArray:
     """Joints that take the pourer through poses without jumps, in the posture of home.
 
     Args:
-        poses: of the pourer in the world, shape (T, 7); the first one near to where `near` has it.
-        near: joints before the first pose, shape (6,) [rad], for their full turns.
+        poses: of the pourer in the world, shape (T, 7); the first one is close to the pose of `near`.
+        near: joints before the first pose, shape (6,) [rad], which determine the full turns.
         spec: of the arm and its cell.
 
     Returns:
         Shape (T, 6) [rad]; joints may leave their ranges.
 
     Raises:
-        OutOfReachError: some can't be reached.
+        OutOfReachError: some poses cannot be reached.
     """
     model = MODELS[spec.model]
     flange = flange_poses(poses, spec)
@@ -83,13 +83,13 @@ def follow(poses: FloatArray, near: FloatArray, spec: UrArmSpec) -> FloatArray:
 
 
 def home_pose(spec: UrArmSpec) -> FloatArray:
-    """Pose of the pourer in the world while the arm waits, shape (7,)."""
+    """Pose of the pourer in the world at the home pose, shape (7,)."""
     frame = cell_transforms(spec).world.inverse @ pourer_transforms(np.array([spec.home]), spec)
     return np.concatenate([frame.position[0], quaternions(frame.rotation)[0]])
 
 
 def routes(start: FloatArray, end: FloatArray, over: float) -> list[list[FloatArray]]:
-    """Ways from one pose of the upright pourer to another, the shortest first: straight; up, across and down.
+    """Routes from one pose of the upright pourer to another, the shortest first: straight; up, across and down.
 
     Args:
         start, end: shape (7,).
@@ -102,10 +102,10 @@ def routes(start: FloatArray, end: FloatArray, over: float) -> list[list[FloatAr
 
 
 def travel(knots: list[FloatArray], near: FloatArray, spec: UrArmSpec) -> JointPath:
-    """Along straight lines from knot to knot, at rest at each.
+    """Move along straight lines from knot to knot, at rest at each.
 
-    The slowest of these decides each line's pace: approach speed and acceleration of the fastest joint, tool speed and
-    acceleration, tilt speed where the pourer also turns about the vertical.
+    The slowest of these limits sets the time of each line: approach speed and acceleration of the fastest joint; tool
+    speed and acceleration; tilt speed, if the pourer also rotates about the vertical.
 
     Args:
         knots: poses of the pourer in the world, each of shape (7,).
@@ -113,7 +113,7 @@ def travel(knots: list[FloatArray], near: FloatArray, spec: UrArmSpec) -> JointP
         spec: of the arm and its cell.
 
     Raises:
-        OutOfReachError: some pose can't be reached.
+        OutOfReachError: some pose cannot be reached.
         RacingJointError: a line passes a singularity.
     """
     times, joints = [np.zeros(1)], [near[None]]
@@ -140,7 +140,7 @@ def _line(
     second = np.abs(np.diff(joints, n=2, axis=0)).max() * (len(s) - 1) ** 2
     reach = float(np.linalg.norm(cell_transforms(spec).pourer.position)) + 0.1
     way = distance + angle * reach
-    # half of the joints' acceleration is kept for what a bent way asks for at full speed
+    # half of the joints' acceleration is reserved for the curvature of the joint path at full speed
     half = 0.5 * spec.approach_acceleration
     speed = min(
         min(spec.limits.tool_speed, TOOL_SPEED) / way,

@@ -1,6 +1,8 @@
-"""What `decant doctor` makes of what a controller says: pure, one line for each thing, with what to do about it.
+"""Commissioning checks of a UR controller for `decant doctor`: one line for each fact, with its remedy.
 
-Whether the settings of a laboratory's file and those of the controller agree: tool, mount, payload, home, limits.
+- The checks named `…_check` compare the laboratory's file with the controller: tool, mount, payload, home, limits.
+- `judge` makes all lines from the values that `actors.arm.ur.controller_readout` has read.
+- `UrDiagnostics` is the `ArmDiagnostics` of UR arms.
 """
 
 from __future__ import annotations
@@ -8,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from actors.arm.arm_interface import JOINT_NAMES, Pose
+from actors.arm.arm_geometry import JOINT_NAMES, Pose
 from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord, UrArmSpec
 from actors.arm.ur.controller_readout import PORTS, SCRIPTS, SLIDER, Exchange, Findings, ReadoutError, look_at
 from actors.arm.ur.primary_interface import RobotState
@@ -16,19 +18,21 @@ from actors.arm.ur.worker_messages import why_not_ready
 from actors.interfaces import DeviceCheck, State
 
 TOOL_TOLERANCE, TURN_TOLERANCE = 1e-3, math.radians(0.5)
-"""How far the controller's TCP may be from the file's [m], [rad]."""
+"""Largest difference between the controller's TCP and the file's [m], [rad]."""
 
 PAYLOAD_TOLERANCE, CENTRE_TOLERANCE = 0.1, 0.02
-"""How far its payload [kg] and its payload's centre [m] may be."""
+"""Largest differences of payload [kg] and payload centre [m]."""
 
 MOUNT_TOLERANCE, GRAVITY = math.radians(15.0), 9.81
-"""How far up may be from where the file says [rad]: the tool's accelerometer is not a level. [m/s²]"""
+"""Largest angle between the measured and the configured vertical [rad], because the tool's accelerometer is not a
+level. Gravity [m/s²].
+"""
 
 HOME_TOLERANCE = math.radians(1.0)
 
 
 def tool_check(spec: UrArmSpec, state: RobotState) -> DeviceCheck:
-    """Whether the controller's TCP is the file's."""
+    """Compare the controller's TCP with the file's."""
     there = Pose(*state.tool)
     away, turned = distance(spec.tool, there), turn(spec.tool, there)
     if away <= TOOL_TOLERANCE and turned <= TURN_TOLERANCE:
@@ -43,7 +47,7 @@ def tool_check(spec: UrArmSpec, state: RobotState) -> DeviceCheck:
 
 
 def mount_check(spec: UrArmSpec, state: RobotState, exchange: Exchange) -> DeviceCheck:
-    """Whether up is where the file says: the tool feels it."""
+    """Compare the vertical that the tool's accelerometer measures with the file's mount."""
     from scipy.spatial.transform import Rotation
 
     felt = exchange.acceleration
@@ -68,7 +72,7 @@ def mount_check(spec: UrArmSpec, state: RobotState, exchange: Exchange) -> Devic
 
 
 def payload_check(spec: UrArmSpec, exchange: Exchange) -> DeviceCheck:
-    """Whether the controller's payload is the file's."""
+    """Compare the controller's payload with the file's."""
     if exchange.payload is None or exchange.payload_centre is None:
         return DeviceCheck("payload", "warn", "not told", "compare payload and centre with the teach pendant yourself")
     away = math.dist(exchange.payload_centre, spec.payload_centre)
@@ -85,7 +89,7 @@ def payload_check(spec: UrArmSpec, exchange: Exchange) -> DeviceCheck:
 
 
 def home_check(spec: UrArmSpec, state: RobotState) -> DeviceCheck:
-    """Whether the arm stands where it waits."""
+    """Check whether the arm stands at its home pose."""
     away = [abs(a - b) for a, b in zip(state.joints, spec.home, strict=True)]
     worst = max(range(6), key=away.__getitem__)
     if away[worst] <= HOME_TOLERANCE:
@@ -99,7 +103,7 @@ def home_check(spec: UrArmSpec, state: RobotState) -> DeviceCheck:
 
 
 def limit_checks(spec: UrArmSpec, state: RobotState) -> list[DeviceCheck]:
-    """Whether the file stays within the controller's limits."""
+    """Check that the file's limits are within the controller's."""
     checks = []
     if state.joint_speeds:
         slowest = min(state.joint_speeds)
@@ -128,12 +132,12 @@ def limit_checks(spec: UrArmSpec, state: RobotState) -> list[DeviceCheck]:
 
 
 def distance(a: Pose, b: Pose) -> float:
-    """Between two frames' origins [m]."""
+    """Distance between two frames' origins [m]."""
     return math.dist((a.x, a.y, a.z), (b.x, b.y, b.z))
 
 
 def turn(a: Pose, b: Pose) -> float:
-    """Between two frames' directions [rad]."""
+    """Angle between two frames' orientations [rad]."""
     from scipy.spatial.transform import Rotation
 
     turned = Rotation.from_rotvec([a.rx, a.ry, a.rz]).inv() * Rotation.from_rotvec([b.rx, b.ry, b.rz])
@@ -147,19 +151,19 @@ def _point(pose: Pose) -> str:
 ANSWERS = "is this a UR controller? If it is, and has booted, it hangs: restart it"
 
 GOOD_ROUND_TRIP, GOOD_GAP, LONGEST_GAP = 10e-3, 60e-3, 0.2
-"""Limits of RTDE's timing [s]: from there a warning; from `LONGEST_GAP` no pour should be tried."""
+"""Limits of RTDE's timing [s]. Above them the check warns; above `LONGEST_GAP` pours should not be attempted."""
 
 KNOWN_SOFTWARE: dict[int, tuple[int, int]] = {3: (14, 15), 5: (6, 17)}
-"""Minor versions, by major one, that the client library is tested with by its makers."""
+"""Minor versions, by major version, with which the authors of the client library have tested it."""
 
 
 @dataclass(frozen=True)
 class UrDiagnostics(ArmDiagnostics):
-    """A UR controller that was looked at.
+    """Diagnostics of a UR controller.
 
     Attributes:
-        spec: what the laboratory's file says.
-        found: what the controller says.
+        spec: settings of the laboratory's file.
+        found: values of the controller.
     """
 
     spec: UrArmSpec | None = None
@@ -167,7 +171,7 @@ class UrDiagnostics(ArmDiagnostics):
 
     @classmethod
     def at(cls, spec: UrArmSpec) -> UrDiagnostics:
-        """Ask the controller everything."""
+        """Read everything from the controller."""
         found = look_at(spec.address)
         return cls(
             checksum="" if found.state is None else found.state.checksum,
@@ -196,14 +200,14 @@ class UrDiagnostics(ArmDiagnostics):
 def judge(
     spec: UrArmSpec, found: Findings, record: SafetyRecord | None, *, accept: str, virtual: bool = False
 ) -> list[DeviceCheck]:
-    """One line for everything that was found.
+    """One line for each fact that was read.
 
     Args:
-        spec: what the file says.
-        found: what the controller says.
-        record: the safety settings that were accepted; None if none were.
+        spec: settings of the laboratory's file.
+        found: values of the controller.
+        record: the accepted safety settings; None if there are none.
         accept: the command that accepts them.
-        virtual: nobody has to.
+        virtual: whether the arm is virtual and needs no acceptance.
     """
     if not found.address:
         return [
@@ -387,7 +391,7 @@ def _checksum(found: Findings, record: SafetyRecord | None, accept: str, *, virt
 
 
 def _motion(exchange: Exchange) -> list[DeviceCheck]:
-    """Whether a motion could begin now: the decision of the driver itself."""
+    """Whether a motion could begin now, by the driver's own decision."""
     values = [exchange.values.get(name) for name in ("robot_mode", "safety_mode", "runtime_state", SLIDER)]
     if any(value is None for value in values):
         return [DeviceCheck("motion", "warn", "not told", "look at the teach pendant whether the arm is ready")]

@@ -1,9 +1,10 @@
-"""What a UR controller says of itself when nobody steers it: read over plain sockets, one port at a time.
+"""Reads the state of a UR controller over plain sockets, one port at a time. Used by `decant doctor`.
 
-Nothing here can move the arm or change a setting: questions on the dashboard, the robot's state from the primary port,
-values over RTDE. It works in states in which a driver can't connect, which is when people want to know why.
+It sends queries to the dashboard, reads the robot's state from the primary port and values over RTDE. None of these can
+move the arm or change a setting. They also work in states in which a driver cannot connect, so that the user can find
+the cause.
 
-What `decant doctor` reads from a UR controller. Nothing moves, nothing is set.
+`look_at` returns `Findings`; `actors.arm.ur.commissioning` evaluates them.
 """
 
 from __future__ import annotations
@@ -43,28 +44,28 @@ QUESTIONS = (
     "safetystatus",
     "programState",
 )
-"""Asked on the dashboard; none of them does anything."""
+"""Queries on the dashboard; none of them changes anything."""
 
 SLIDER = "target_speed_fraction"
 STATUS = ("robot_mode", "safety_mode", "runtime_state", SLIDER)
-"""Values over RTDE that decide whether the arm can move."""
+"""RTDE values that determine whether the arm can move."""
 
 ROUND_TRIPS = 20
 
 
 class ReadoutError(LaboratoryError):
-    """A port says nothing, or nothing that can be understood."""
+    """A port does not respond, or its response cannot be understood."""
 
 
 @dataclass(frozen=True)
 class Exchange:
-    """What RTDE tells, and how well the network carries it.
+    """Values read over RTDE, and the quality of the network connection.
 
     Attributes:
         version: of the controller's software.
-        payload: [kg], None if it doesn't tell.
-        payload_centre: in the flange's frame [m], None if it doesn't tell.
-        round_trip: median time from question to answer [s].
+        payload: [kg], None if it is not reported.
+        payload_centre: in the flange's frame [m], None if it is not reported.
+        round_trip: median time from request to response [s].
         slowest: longest of them [s].
         rate: packages received per second, of `wanted` [Hz].
         gap: longest time between two packages [s].
@@ -82,12 +83,12 @@ class Exchange:
 
     @property
     def acceleration(self) -> tuple[float, ...] | None:
-        """What the tool feels, in its own frame [m/s²]: upwards at rest; None if the controller doesn't tell."""
+        """Acceleration that the tool measures, in its own frame [m/s²]: upwards at rest; None if it is not reported."""
         return self.values.get("actual_tool_accelerometer")
 
 
 def port_problem(address: str, port: int, patience: float = 2.0) -> str | None:
-    """Why a port can't be reached; None if it is open."""
+    """Why a port cannot be reached; None if it is open."""
     try:
         with socket.create_connection((address, port), timeout=patience):
             return None
@@ -100,10 +101,10 @@ def port_problem(address: str, port: int, patience: float = 2.0) -> str | None:
 
 
 def ask_dashboard(address: str, questions: Sequence[str] = QUESTIONS, patience: float = 3.0) -> dict[str, str]:
-    """Answers of the dashboard, by question.
+    """Responses of the dashboard, by query.
 
     Raises:
-        SurveyError: it doesn't answer.
+        ReadoutError: it does not respond.
     """
     try:
         with Dashboard(address, patience) as dashboard:
@@ -113,14 +114,14 @@ def ask_dashboard(address: str, questions: Sequence[str] = QUESTIONS, patience: 
 
 
 def read_state(address: str, patience: float = 3.0) -> RobotState:
-    """The robot's state, once all its parts have come.
+    """The robot's state, once all its parts have arrived.
 
     Args:
         address: of the controller.
-        patience: longest wait [s]; the checksum and the limits, which may be missing, are waited for half of it.
+        patience: longest wait [s]; at most half of it is spent on the checksum and the limits, which may be missing.
 
     Raises:
-        SurveyError: no state came, or one that can't be read.
+        ReadoutError: no state arrived, or it cannot be read.
     """
     begin, rest, parts = time.monotonic(), b"", dict[int, bytes]()
     needed, welcome = {primary.JOINTS, primary.CARTESIAN}, {primary.SAFETY, primary.CONFIGURATION}
@@ -145,16 +146,16 @@ def read_state(address: str, patience: float = 3.0) -> RobotState:
 
 
 def read_exchange(address: str, rate: float = 125.0, seconds: float = 1.0, patience: float = 3.0) -> Exchange:
-    """Values over RTDE, round trips, and how evenly packages arrive.
+    """Values over RTDE, round-trip times, and the regularity of packages.
 
     Args:
         address: of the controller.
-        rate: packages asked for [Hz].
-        seconds: for how long they are counted.
-        patience: longest wait for an answer [s].
+        rate: requested rate of packages [Hz].
+        seconds: time for which they are counted.
+        patience: longest wait for a response [s].
 
     Raises:
-        SurveyError: it doesn't answer, or not in a way that can be understood.
+        ReadoutError: it does not respond, or its response cannot be understood.
     """
     try:
         with socket.create_connection((address, RTDE), timeout=patience) as connection:
@@ -164,7 +165,7 @@ def read_exchange(address: str, rate: float = 125.0, seconds: float = 1.0, patie
 
 
 class _Rtde:
-    """Questions and answers on one connection."""
+    """Requests and responses on one connection."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection = connection
@@ -230,7 +231,7 @@ def _exchange(talk: _Rtde, rate: float, seconds: float) -> Exchange:
 
 
 def _known(talk: _Rtde, names: Sequence[str], rate: float) -> dict[str, str]:
-    """Those of the values asked for that this controller has, with their types; they are sent from now on."""
+    """The requested values that this controller has, with their types; it sends them from now on."""
     while True:
         answer = talk.ask(rtde.SETUP_OUTPUTS, struct.pack(">d", rate) + ",".join(names).encode("ascii"))
         kinds = rtde.names(answer[1:])
@@ -243,17 +244,17 @@ def _known(talk: _Rtde, names: Sequence[str], rate: float) -> dict[str, str]:
 
 
 PATIENT_GAP = 0.1
-"""Between two packages over RTDE [s]; beyond it they are looked at once more."""
+"""Longest normal time between two RTDE packages [s]; beyond it they are measured once more."""
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What was read from a controller; None where it couldn't be.
+    """Values read from a controller; None if one could not be read.
 
     Attributes:
-        address: that the name stands for; '' if it stands for none.
-        ports: why each can't be reached, None where it can.
-        dashboard: answers by question.
+        address: to which the name resolves; '' if it does not.
+        ports: why each cannot be reached; None if it can.
+        dashboard: responses by query.
     """
 
     address: str
@@ -265,7 +266,7 @@ class Findings:
 
     @property
     def software(self) -> tuple[int, ...]:
-        """Version of the controller's software; empty if it isn't known."""
+        """Version of the controller's software; empty if unknown."""
         if self.exchange is not None:
             return self.exchange.version
         told = re.search(r"(\d+)\.(\d+)\.(\d+)", (self.dashboard or {}).get("PolyscopeVersion", ""))
@@ -273,12 +274,12 @@ class Findings:
 
     @property
     def serial(self) -> str:
-        """Serial number of the robot; '' if it isn't known."""
+        """Serial number of the robot; '' if unknown."""
         return (self.dashboard or {}).get("get serial number", "")
 
     @property
     def model(self) -> str:
-        """As in laboratory files; '' if it isn't known."""
+        """Name of the model in laboratory files; '' if unknown."""
         name = (self.dashboard or {}).get("get robot model", "").lower()
         if not name or not self.software:
             return ""
@@ -286,7 +287,7 @@ class Findings:
 
 
 def look_at(host: str) -> Findings:
-    """Ask the controller everything.
+    """Read everything from the controller.
 
     Args:
         host: its address or name.
@@ -308,7 +309,8 @@ def look_at(host: str) -> Findings:
     if ports[RTDE] is None:
         with _noting(problems):
             exchange = read_exchange(address)
-            if exchange.gap > PATIENT_GAP:  # a hiccup of this computer, or the rule? The better of two tells
+            # a gap may be caused by this computer, so measure twice and keep the better result
+            if exchange.gap > PATIENT_GAP:
                 exchange = min(exchange, read_exchange(address), key=lambda e: e.gap)
     return Findings(address, ports, dashboard, state, exchange, tuple(problems))
 

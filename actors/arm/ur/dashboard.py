@@ -1,4 +1,4 @@
-"""The dashboard's lines over a plain socket: also the way to stop a program when everything else hangs."""
+"""The dashboard interface over a plain socket. It can also stop a program when the other interfaces do not respond."""
 
 from __future__ import annotations
 
@@ -6,22 +6,24 @@ import socket
 
 PORT = 29999
 PATIENCE = 1.5
-"""Longest wait for a connection or an answer [s]."""
+"""Longest wait for a connection or a response [s]."""
 
 
 class DashboardError(Exception):
-    """It can't be reached, or refuses."""
+    """The dashboard cannot be reached, or refuses a command."""
 
 
 class Dashboard:
-    """One connection; a context manager. Made anew for each purpose: one from before a switch of control is of no use.
+    """One connection; a context manager.
+
+    Open a new one for each purpose: a connection from before a switch between local and remote control does not work.
 
     Args:
         address: of the controller.
-        patience: for each answer [s].
+        patience: for each response [s].
 
     Raises:
-        DashboardError: nobody is there.
+        DashboardError: the dashboard cannot be reached.
     """
 
     def __init__(self, address: str, patience: float = PATIENCE) -> None:
@@ -33,7 +35,7 @@ class Dashboard:
             raise DashboardError(f"dashboard of {address}:{PORT}: {error}") from error
 
     def ask(self, line: str) -> str:
-        """Send a line. Returns the answer.
+        """Send a line. Returns the response.
 
         Raises:
             DashboardError: there is none.
@@ -48,10 +50,10 @@ class Dashboard:
         return answer.decode("utf-8", "replace").strip()
 
     def demand(self, line: str, expected: str) -> None:
-        """Send a command that must be answered by something.
+        """Send a command and check its response.
 
         Raises:
-            DashboardError: it is answered otherwise, with the answer.
+            DashboardError: the response differs; the text contains it.
         """
         answer = self.ask(line)
         if not answer.lower().startswith(expected.lower()):
@@ -66,10 +68,10 @@ class Dashboard:
 
 
 def stop_program(address: str, patience: float = PATIENCE) -> None:
-    """End whatever program runs.
+    """Stop the running program, whatever it is.
 
     Raises:
-        DashboardError: it can't be reached.
+        DashboardError: the dashboard cannot be reached.
     """
     with Dashboard(address, patience) as dashboard:
         dashboard.demand("stop", "Stopped")

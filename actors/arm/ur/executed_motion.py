@@ -1,6 +1,7 @@
-"""What an arm did, from what was read of it, and how well it followed its path. Pure.
+"""The executed motion, computed from readings, and the times of stops.
 
-Stops that were asked for, from any thread, and whether the arm was seen to stand.
+- `executed_path` and `best_lag` compute the measured path and its errors. They use no clock and no connection.
+- `Stops` records stop requests from any thread, and whether the arm was seen to stand still (`StopTimes`).
 """
 
 from __future__ import annotations
@@ -17,22 +18,22 @@ from actors.arm.planning.kinematics import MODELS, forward
 from actors.arm.ur.worker_messages import MotionOutcome, Sample
 
 LONGEST_LAG = 0.3
-"""Searched for the lag that explains most of the difference [s]."""
+"""Largest lag that is searched to explain the difference between path and readings [s]."""
 
 
 def executed_path(
     samples: list[Sample], path: JointPath, spec: UrArmSpec, *, completed: bool, slider: float = 1.0
 ) -> ExecutedPath:
-    """What was read, on the path's own clock.
+    """The readings on the path's own clock.
 
-    The controller's program tells in every package how far on the path it is, so that both clocks are joined without
-    asking when a package arrived here.
+    The controller's program sends its time on the path in every package. Both clocks are therefore related without the
+    arrival times of packages.
 
     Args:
         samples: in the order of their times.
-        path: that was to be followed.
+        path: the planned path.
         spec: of the arm.
-        completed: False if it was stopped on the way.
+        completed: False if it was stopped before its end.
         slider: lowest position of the speed slider.
     """
     stamps = np.array([t for t, _, _ in samples])
@@ -56,7 +57,7 @@ def executed_path(
 
 
 def best_lag(times: FloatArray, joints: FloatArray, path: JointPath) -> float:
-    """By how much the path has to be delayed to be most like what was read [s]."""
+    """The delay of the path that fits the readings best [s]."""
     low, high = 0.0, LONGEST_LAG
     for _ in range(4):
         candidates = np.linspace(low, high, 31)
@@ -88,11 +89,11 @@ def _tracking(times: FloatArray, joints: FloatArray, path: JointPath, spec: UrAr
 
 @dataclass(frozen=True)
 class StopTimes:
-    """How soon a stop took effect, from the call on.
+    """Delays of a stop, measured from the call.
 
     Attributes:
-        answered: until the program was seen to have taken the order [s]; None if other means stopped it.
-        standing: until the arm was seen to stand [s].
+        answered: until the program was seen to accept the order [s]; None if it was stopped by other means.
+        standing: until the arm was seen to stand still [s].
     """
 
     answered: float | None
@@ -100,11 +101,11 @@ class StopTimes:
 
 
 class Stops:
-    """Shared by the thread that moves the arm and those that stop it.
+    """Stop state, shared by the thread that moves the arm and those that stop it.
 
     Attributes:
         count: of stops so far.
-        unseen: the last motion ended without the arm being seen to stand.
+        unseen: the last motion ended without the arm being seen to stand still.
     """
 
     def __init__(self) -> None:
@@ -114,55 +115,55 @@ class Stops:
         self.count = 0
         self.unseen = False
 
-    # ---- who moves
+    # ---- for the moving thread
 
     def begin(self) -> None:
-        """A motion begins."""
+        """Record the start of a motion."""
         with self._changed:
             self._under_way, self._outcome, self.unseen = True, None, False
 
     def came_to(self, outcome: MotionOutcome) -> None:
-        """What the motion came to."""
+        """Record the outcome of the motion."""
         with self._changed:
             self._outcome = outcome
             self.unseen = outcome.moved and outcome.standing is None
 
     def lost(self) -> None:
-        """Nobody knows what the motion came to."""
+        """Record that the outcome of the motion is unknown."""
         self.unseen = True
 
     def end(self) -> None:
-        """The motion is over."""
+        """Record the end of the motion."""
         with self._changed:
             self._under_way = False
             self._changed.notify_all()
 
     def wait_for_one(self, since: int, seconds: float) -> bool:
-        """Wait, unless another stop is asked for. Returns whether one was."""
+        """Wait, unless another stop is requested. Returns whether one was."""
         with self._changed:
             return self._changed.wait_for(lambda: self.count != since, max(seconds, 0.0))
 
-    # ---- who stops
+    # ---- for the stopping threads
 
     @property
     def under_way(self) -> bool:
-        """A motion is under way, or announced."""
+        """Whether a motion is running or announced."""
         return self._under_way
 
     def ask(self) -> int:
-        """A stop is asked for. Returns how many that makes."""
+        """Record a stop request. Returns the number of stops so far."""
         with self._changed:
             self.count += 1
             self._changed.notify_all()
             return self.count
 
     def wait_for_end(self, seconds: float) -> bool:
-        """Wait for the motion to be over. Returns whether it is."""
+        """Wait for the end of the motion. Returns whether it has ended."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._under_way, seconds)
 
     def times(self, asked: float) -> StopTimes | None:
-        """How soon the last motion ended after a moment [s of `time.monotonic`]; None if nothing had moved."""
+        """Delays of the stop that was requested at a time [s of `time.monotonic`]; None if nothing had moved."""
         outcome = self._outcome
         if outcome is None or outcome.standing is None:
             return None

@@ -1,6 +1,7 @@
-"""One motion, from the upload of its program to rest: the loop that lets it go on, and looks at what it does.
+"""Executes one motion, from the upload of its program to rest, and makes a stopped robot ready again.
 
-The way back from a stop to a robot that could move, and doesn't. A person has seen to the cause before.
+- `MotionMonitor` sends the heartbeat that lets the program continue, and monitors the motion.
+- `recover` unlocks a robot after a stop. The operator must have removed the cause before.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from actors.arm.arm_interface import JOINT_NAMES
+from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
 from actors.arm.ur.primary_interface import Primary, PrimaryError
 from actors.arm.ur.rtde_client import AT_REST, RtdeClient
@@ -35,23 +36,23 @@ from actors.arm.ur.worker_messages import (
 )
 
 AT_START = 0.01
-"""Joints may be so far from a path's first point [rad]: that is aligned slowly before the path begins."""
+"""Largest distance of the joints from a path's first point [rad]; the program first removes it slowly."""
 
 AT_END = 0.01
-"""Joints may be so far from a path's last point [rad] for it to count as completed."""
+"""Largest distance of the joints from a path's last point [rad] for the path to count as completed."""
 
 SAME_TOOL, SAME_PAYLOAD = 1e-4, 1e-3
-"""Differences that count as none, of tool [m], [rad] and payload [kg], [m]."""
+"""Differences that count as equal: tool [m], [rad] and payload [kg], [m]."""
 
 UPLOAD_TIME, STANDING_TIME = 5.0, 3.0
-"""Longest wait for a program to say that it is ready, and for the arm to stand [s of the clock]."""
+"""Longest wait for a program to report that it is ready, and for the arm to stand still [s of the clock]."""
 
 OVERTIME = 10.0
-"""How much longer than planned a path may take [s of controller time]."""
+"""Longest delay of a path beyond its planned duration [s of controller time]."""
 
 BEAT_INTERVAL, TELL_INTERVAL, LOOK_INTERVAL = 0.02, 0.05, 0.002
 OWNER_SILENCE = 3.0
-"""After which a driver that says nothing is taken for dead [s of the clock]."""
+"""Time without a sign of life after which the driver counts as dead [s of the clock]."""
 
 _KINDS = {3: "protective stop", 5: "safeguard", 6: "emergency stop", 7: "emergency stop"}
 """Kinds of stops by safety mode; "safety" for all others."""
@@ -63,9 +64,9 @@ class MotionMonitor:
     Args:
         client: to the controller.
         address: of the controller, for its other ports.
-        motion: which.
-        tell: told some twenty times a second where it is.
-        owner_seen: when the driver last said that it lives [s of `time.monotonic`].
+        motion: the motion.
+        tell: called about twenty times a second with the progress.
+        owner_seen: time of the driver's last sign of life [s of `time.monotonic`].
     """
 
     def __init__(
@@ -90,12 +91,12 @@ class MotionMonitor:
         self._answered: float | None = None
 
     def order_stop(self) -> None:
-        """Stop; from any thread."""
+        """Order a stop; may be called from any thread."""
         self._ordered.set()
         self._client.order_stop(self._motion.number)
 
     def run(self) -> MotionOutcome:
-        """The whole motion.
+        """Execute the whole motion.
 
         Raises:
             TroubleError: refused before anything moved.
@@ -142,10 +143,10 @@ class MotionMonitor:
         except PrimaryError as error:
             raise TroubleError("lost", str(error)) from None
 
-    # ---- before the go
+    # ---- before the start
 
     def _until_ready(self, primary: Primary) -> str:
-        """Wait for the program, and read back what it set. Returns why it must not go on, or ''."""
+        """Wait for the program, and read back its settings. Returns why it must not continue, or ''."""
         motion, settings = self._motion, self._motion.settings
         end = time.monotonic() + UPLOAD_TIME
         while True:
@@ -170,7 +171,7 @@ class MotionMonitor:
                 return "the program did not start on the controller"
             time.sleep(LOOK_INTERVAL)
 
-    # ---- after it
+    # ---- after the start
 
     def _until_end(self, primary: Primary) -> MotionOutcome:
         motion, arrived = self._motion, 0.0
@@ -201,7 +202,8 @@ class MotionMonitor:
             time.sleep(LOOK_INTERVAL)
 
     def _stopped_by_safety(self, reading: DataPackage) -> MotionOutcome:
-        # A safeguard stop would go on by itself once it is released, a protective stop at somebody's 'play'.
+        # After a safeguard stop the program would resume when the safeguard is reset, after a protective stop at
+        # 'play'.
         kind = _KINDS.get(reading.safety_mode, "safety")
         text = SAFETY_MODES.get(reading.safety_mode, "") if reading.safety_mode != NORMAL else ""
         text = text or f"the robot is {ROBOT_MODES.get(reading.robot_mode, 'not running')}"
@@ -225,7 +227,7 @@ class MotionMonitor:
         )
 
     def _broken_off(self, kind: str, text: str) -> MotionOutcome:
-        """End the program, whatever it is doing, and see the arm stand."""
+        """End the program in any state, and wait until the arm stands still."""
         self._client.order_stop(self._motion.number)
         end = time.monotonic() + STANDING_TIME
         asked = False
@@ -260,7 +262,7 @@ class MotionMonitor:
             self._slider,
         )
 
-    # ---- each turn
+    # ---- each iteration
 
     def _look(self) -> DataPackage:
         self._beat()
@@ -298,7 +300,7 @@ def _show(values: tuple[float, ...]) -> str:
 
 
 def _elsewhere(joints: tuple[float, ...], wanted: tuple[float, ...]) -> str:
-    """How far joints are from where they should be, in words; '' if they are there."""
+    """Difference of the joints from the required ones, as text; '' if they agree."""
     errors = [abs(a - b) for a, b in zip(joints, wanted, strict=True)]
     worst = max(range(6), key=errors.__getitem__)
     if errors[worst] <= AT_START:
@@ -312,7 +314,7 @@ def _not_remote(address: str) -> str:
             answer = dashboard.ask("is in remote control")
     except DashboardError as error:
         raise TroubleError("lost", str(error)) from None
-    # The older generation knows no such thing, and says so.
+    # The older generation does not know this command, and its response says so.
     return "the robot is in local control; switch it to remote control" if answer.lower() == "false" else ""
 
 
@@ -327,7 +329,7 @@ _IDLE = 5
 
 
 def recover(client: RtdeClient, address: str, scale: float) -> str:
-    """Unlock, switch on, release the brakes: whatever is needed.
+    """Unlock, switch on, release the brakes: as needed.
 
     Args:
         client: to the controller.
@@ -335,10 +337,10 @@ def recover(client: RtdeClient, address: str, scale: float) -> str:
         scale: controller seconds per second of the clock.
 
     Returns:
-        What was done, for people.
+        A description of the actions taken.
 
     Raises:
-        TroubleError: what has to be done by hand first.
+        TroubleError: names the manual action that is needed first.
     """
     done = []
     try:
@@ -352,7 +354,7 @@ def recover(client: RtdeClient, address: str, scale: float) -> str:
                 "refused", "the safety system reports a fault; restart it at the pendant, after its cause was found"
             )
         with Dashboard(address) as dashboard:
-            # A program that is only held would go on, and the next one that is uploaded would be thrown away.
+            # A paused program would resume, and the next uploaded program would be discarded.
             dashboard.demand("stop", "Stopped")
             dashboard.ask("close popup")
             dashboard.ask("close safety popup")

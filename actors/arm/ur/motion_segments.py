@@ -1,8 +1,10 @@
-"""A motion and what to call its parts; what to say about one that was broken off. Pure.
+"""Motion segments: a pour's phases, the way back after a stop, and small steps for setting up.
 
-From wherever an arm was stopped back to where it waits: along the paths that were checked, slowly. Pure.
+- `MotionSegment` is a path with names for its phases and messages about its interruption.
+- `upright_way` and `way_home` lead slowly from where an arm was stopped back to home, along the checked paths.
+- `jog_path` makes small steps, checked and limited, as paths like any other.
 
-Small steps for setting up: checked, limited, as paths like any other. Pure.
+These functions are pure: nothing here moves an arm.
 """
 
 from __future__ import annotations
@@ -12,7 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from actors.arm.arm_interface import JOINT_NAMES, ArmRefusedError, ArmStoppedError, Joints
+from actors.arm.arm_geometry import JOINT_NAMES, Joints
+from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath, PourPath
 from actors.arm.planning.frames import cell_transforms, flange_transforms, pourer_transforms
@@ -22,13 +25,13 @@ from actors.arm.ur.urscript_writer import checked
 from actors.arm.ur.worker_messages import MotionOutcome
 
 OFF_PATH = 0.1
-"""Joints farther than that from every point of a path are not on it [rad]: something has moved the arm."""
+"""Joints farther than this from every point of a path are not on it [rad]; the arm was moved by other means."""
 
 HARDLY = 0.01
-"""Joints so near to a point are there [rad]."""
+"""Joints closer than this to a point count as at that point [rad]."""
 
 RAMP = 0.6
-"""Time to get up to speed, and down again [s]."""
+"""Time to accelerate, and to decelerate [s]."""
 
 _GRID = 0.02
 
@@ -40,14 +43,14 @@ def leans(joints: FloatArray, spec: UrArmSpec) -> FloatArray:
 
 
 def rejoin(path: JointPath, joints: FloatArray) -> tuple[float, float]:
-    """Where on a path an arm stands.
+    """The position of an arm on a path.
 
     Args:
         path: any.
         joints: (6,) [rad].
 
     Returns:
-        Time of the nearest point of the path [s], and how far the joint that is farthest is from it [rad].
+        Time of the nearest point of the path [s], and the largest distance of any joint from it [rad].
     """
     begin, along = path.joints[:-1], np.diff(path.joints, axis=0)
     squares = np.einsum("ij,ij->i", along, along)
@@ -60,18 +63,18 @@ def rejoin(path: JointPath, joints: FloatArray) -> tuple[float, float]:
 
 
 def upright_way(path: PourPath, joints: FloatArray, spec: UrArmSpec) -> tuple[JointPath, FloatArray]:
-    """From a stopped pour to an upright pourer: back the way it came, or on if the pourer was coming up already.
+    """From a stopped pour to an upright pourer: back along the path, or forward if the pourer was already returning.
 
     Args:
         path: that was being executed.
         joints: (6,) where the arm stands [rad].
-        spec: how fast.
+        spec: its speeds.
 
     Returns:
         The way, from rest to rest, and the pourer's tilt at its times [rad].
 
     Raises:
-        ArmRefusedError: the arm doesn't stand on the path.
+        ArmRefusedError: the arm does not stand on the path.
     """
     here, apart = rejoin(path.pour, joints)
     if apart > OFF_PATH:
@@ -89,12 +92,12 @@ def upright_way(path: PourPath, joints: FloatArray, spec: UrArmSpec) -> tuple[Jo
 
 
 def way_home(path: PourPath, joints: FloatArray, spec: UrArmSpec) -> JointPath:
-    """From anywhere on the way to a pour or from it, upright, to where the arm waits.
+    """From any upright point of the approach or the retreat to home.
 
     Args:
         path: that was being executed.
         joints: (6,) where the arm stands [rad].
-        spec: how fast.
+        spec: its speeds.
 
     Raises:
         ArmRefusedError: the arm stands on neither way.
@@ -118,7 +121,7 @@ def way_home(path: PourPath, joints: FloatArray, spec: UrArmSpec) -> JointPath:
 
 
 def _between(times: FloatArray, here: float, there: float) -> FloatArray:
-    """A path's times from one to another, in the order they are passed."""
+    """A path's times from one to another, in the order in which they are passed."""
     low, high = min(here, there), max(here, there)
     inner = times[(times > low) & (times < high)]
     chosen = np.concatenate([[low], inner, [high]])
@@ -126,7 +129,7 @@ def _between(times: FloatArray, here: float, there: float) -> FloatArray:
 
 
 def _paced(points: FloatArray, tilts: FloatArray, costs: FloatArray) -> tuple[JointPath, FloatArray]:
-    """Points passed one after the other, each stretch in its time [s] at most, with a soft begin and end."""
+    """Pass points one after another, each part within at most its time [s], with a smooth start and end."""
     along = np.concatenate([[0.0], np.cumsum(costs)])
     whole = float(along[-1])
     ramp = min(RAMP, max(whole, 1e-3))
@@ -146,15 +149,15 @@ def _astray(where: str, apart: float, remedy: str) -> str:
 
 
 UPRIGHT = 0.02
-"""Tilts below this aren't worth a word [rad]."""
+"""Tilts below this are not mentioned in messages [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
 class MotionSegment:
-    """One motion, and what to call it.
+    """One motion, with the names of its phases.
 
     Attributes:
-        path: to be followed.
+        path: the path.
         phases: (name, start, end) [s].
         tilts: of the pourer at the path's times [rad].
     """
@@ -165,10 +168,10 @@ class MotionSegment:
 
     @classmethod
     def of(cls, name: str, path: JointPath, spec: UrArmSpec) -> MotionSegment:
-        """A way of one phase.
+        """A segment of one phase.
 
         Raises:
-            ArmRefusedError: it is not a path.
+            ArmRefusedError: the path is invalid.
         """
         path = checked(path)
         return cls(path, ((name, 0.0, path.duration),), leans(path.joints, spec))
@@ -178,7 +181,7 @@ class MotionSegment:
         """A pour's tilt, hold and return.
 
         Raises:
-            ArmRefusedError: it is not a path.
+            ArmRefusedError: the path is invalid.
         """
         if path.tilts.shape != path.pour.times.shape or not path.phases:
             raise ArmRefusedError("a pour's path has a tilt for each of its times, and phases")
@@ -190,15 +193,15 @@ class MotionSegment:
         return self.phases[0][0]
 
     def phase(self, time: float) -> str:
-        """What goes on at a time [s]."""
+        """The phase at a time [s]."""
         return next((name for name, _, end in self.phases if time < end), self.phases[-1][0])
 
     def tilt(self, time: float) -> float:
-        """Tilt of the pourer then [rad]."""
+        """Tilt of the pourer at a time [rad]."""
         return float(np.interp(time, self.path.times, self.tilts))
 
     def tilt_left(self, outcome: MotionOutcome) -> float:
-        """Tilt of the pourer where the arm was stopped [rad]: it braked for a while after the path's clock stopped."""
+        """Tilt of the pourer after a stop [rad]; the arm still braked for a while after the path's clock stopped."""
         if outcome.standing is not None:
             time, apart = rejoin(self.path, np.array(outcome.joints))
             if apart <= HARDLY:
@@ -206,7 +209,7 @@ class MotionSegment:
         return self.tilt(outcome.clock)
 
     def stopped(self, outcome: MotionOutcome, executed: ExecutedPath) -> ArmStoppedError:
-        """What to tell of a motion that was broken off."""
+        """The error for an interrupted motion."""
         phase, tilt = self.phase(outcome.clock), self.tilt_left(outcome)
         tilted = f", the pourer tilted by {np.degrees(tilt):.0f}°" if tilt > UPRIGHT else ""
         return ArmStoppedError(
@@ -216,7 +219,7 @@ class MotionSegment:
         )
 
     def last_seen(self, clock: float) -> str:
-        """What to tell of a motion that was lost from sight."""
+        """The message about a motion whose connection was lost."""
         return (
             f"Last seen during {self.phase(clock)}, {clock:.2f} s after its begin, the pourer tilted by "
             f"{np.degrees(self.tilt(clock)):.0f}°; the program on the controller ends by its watchdog"
@@ -235,17 +238,17 @@ _POINTS = 101
 
 
 def jog_path(spec: UrArmSpec, joints: Joints, axis: str, amount: float, speed: float) -> JointPath:
-    """A step from where the arm stands.
+    """One step from the arm's present pose.
 
     Args:
         spec: limits and tool.
-        joints: where it stands [rad].
+        joints: present ones [rad].
         axis: see `UrArm.jog`.
         amount: [rad] or [m].
         speed: [rad/s] or [m/s].
 
     Raises:
-        ArmRefusedError: too far, too fast, out of reach, or out of where the arm may be.
+        ArmRefusedError: too far, too fast, out of reach, or outside the limits.
     """
     if axis not in (*AXES, *_JOINT_AXES):
         raise ArmRefusedError(f"no axis '{axis}'; there are {', '.join((*_JOINT_AXES, *AXES))}")
@@ -257,7 +260,7 @@ def jog_path(spec: UrArmSpec, joints: Joints, axis: str, amount: float, speed: f
         raise ArmRefusedError(f"a step's speed is at most 100 mm/s or 20°/s; {_show(speed, straight)}/s was asked for")
     duration = max(2.0 * abs(amount) / speed, 0.2)
     times = np.linspace(0.0, duration, _POINTS)
-    share = 0.5 - 0.5 * np.cos(np.pi * times / duration)  # the fastest of it is π/2 of the mean, below the speed
+    share = 0.5 - 0.5 * np.cos(np.pi * times / duration)  # its highest speed is π/2 times the mean, and below the limit
     start = np.array(joints)
     if axis in _JOINT_AXES:
         points = np.repeat(start[None], _POINTS, axis=0)
@@ -306,13 +309,13 @@ def _check(spec: UrArmSpec, points: FloatArray) -> None:
     frames = {"tool": cell_transforms(spec).tool.position, "pourer": cell_transforms(spec).pourer.position}
     for thing, place in frames.items():
         begin, end = flange.apply(place)
-        # Who stands outside may come back in: only what a step makes worse is refused.
+        # An arm outside the limits may move back inside: only steps that increase a violation are refused.
         if np.any(_beyond(end, spec) > np.maximum(_beyond(begin, spec), 0.0) + 1e-9):
             raise ArmRefusedError(f"the {thing} would be {', '.join(outside(end, spec))}")
 
 
 def _beyond(point: FloatArray, spec: UrArmSpec) -> FloatArray:
-    """How far a point lies beyond each limit [m], negative inside."""
+    """Distance of a point beyond each limit [m], negative inside."""
     limits = spec.limits
     planes = [plane.offset - float(np.dot(plane.normal, point)) for plane in limits.planes]
     low, high = np.array(limits.box_low) - point, point - np.array(limits.box_high)

@@ -1,9 +1,9 @@
-"""The primary interface: programs go there, and the robot's state and its complaints come from there.
+"""The primary interface: it receives programs, and sends the robot's state and messages about errors.
 
-A package is `int32 size, uint8 type, …`, big-endian; a robot state (16) consists of sub-packages of the same shape.
+A package is `int32 size, uint8 type, …`, big-endian; a robot state (16) consists of sub-packages of the same format.
 
-Source: the manufacturer's page on primary and secondary interfaces; the safety data's first four bytes are the
-checksum, as the manufacturer's forum has it.
+Source: the manufacturer's page on primary and secondary interfaces. That the checksum is the first four bytes of the
+safety data is stated in the manufacturer's forum.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ _JOINT = struct.Struct(">3d4fB")
 
 
 class PrimaryError(Exception):
-    """It can't be reached, or says nothing that can be understood."""
+    """The primary interface cannot be reached, or its data cannot be understood."""
 
 
 def split(data: bytes) -> tuple[list[tuple[int, bytes]], bytes]:
-    """Whole packages in a row, as type and body, and what is left.
+    """Split data into whole packages, as type and body, and the remaining bytes.
 
     Raises:
-        PrimaryError: a size that can't be.
+        PrimaryError: a package has an invalid size.
     """
     found, place = [], 0
     while len(data) - place >= _HEAD.size:
@@ -54,7 +54,7 @@ def split(data: bytes) -> tuple[list[tuple[int, bytes]], bytes]:
 
 @dataclass(frozen=True)
 class RobotState:
-    """What the parts of a robot state say; empty where one has not come.
+    """Contents of a robot state; empty if a part has not arrived.
 
     Attributes:
         joints: [rad].
@@ -62,7 +62,7 @@ class RobotState:
         tool: TCP in the flange's frame, likewise.
         checksum: of the safety configuration, eight hexadecimal digits.
         joint_ranges: lowest and highest position of each joint [rad].
-        joint_speeds: fastest speed of each joint [rad/s].
+        joint_speeds: largest speed of each joint [rad/s].
     """
 
     joints: tuple[float, ...] = ()
@@ -96,12 +96,12 @@ class Primary:
         address: of the controller.
 
     Attributes:
-        state: as it was sent first, with the tool in it.
-        complaints: the last things it said about programs.
-        broken: it said that a program can't be read, or can't go on.
+        state: the first complete one, with the tool.
+        complaints: its latest messages about programs.
+        broken: it reported that a program cannot be read, or cannot continue.
 
     Raises:
-        PrimaryError: it can't be reached, or sends no state.
+        PrimaryError: it cannot be reached, or sends no state.
     """
 
     def __init__(self, address: str) -> None:
@@ -128,7 +128,7 @@ class Primary:
         """Send a program.
 
         Raises:
-            PrimaryError: the connection is gone.
+            PrimaryError: the connection is lost.
         """
         try:
             self._socket.sendall(program.encode())
@@ -136,7 +136,7 @@ class Primary:
             raise PrimaryError(f"the program can't be sent: {error}") from error
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
@@ -147,7 +147,7 @@ class Primary:
                 self._take(data)
 
     def _take(self, data: bytes) -> list[bytes]:
-        """Note what messages say; robot states are returned."""
+        """Store the contents of messages; returns robot states."""
         if not data:
             raise PrimaryError("hung up")
         packages, self._rest = split(self._rest + data)

@@ -18,12 +18,12 @@ class RobotModel:
     """One model of robot.
 
     Attributes:
-        name: as the controller calls it on its dashboard.
+        name: on the controller's dashboard.
         d1, a2, a3, d4, d5, d6: lengths [m]; a2 and a3 are negative by convention.
         masses: of the links [kg].
         centres: of the links' masses, in their own frames [m].
-        joint_speed: what each joint may do [rad/s].
-        joint_range: how far each joint may turn either way [rad].
+        joint_speed: largest speed of each joint [rad/s].
+        joint_range: largest rotation of each joint in either direction [rad].
         frequency: control cycles per second [Hz].
     """
 
@@ -82,4 +82,4 @@ UR10E = RobotModel(
 )
 
 MODELS = {"ur10": UR10, "ur10e": UR10E}
-"""By the name that configurations have for them."""
+"""Models by their names in configuration files."""

@@ -1,8 +1,8 @@
 """Real-time data exchange (port 30004): packages and field types.
 
-A package is `uint16 size, uint8 type, payload`, big-endian, the size including these three bytes.
+A package is `uint16 size, uint8 type, payload`, big-endian; the size includes these three bytes.
 
-Source: the manufacturer's RTDE guide; what real clients send was measured.
+Source: the manufacturer's RTDE guide, and recordings of real clients.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FORMATS: dict[str, tuple[str, int]] = {
 
 
 class PackageError(Exception):
-    """Bytes that can't be a package: the stream can't be followed any more."""
+    """Bytes that are no valid package; the rest of the stream cannot be read."""
 
 
 def package(kind: int, payload: bytes) -> bytes:
@@ -46,16 +46,16 @@ def package(kind: int, payload: bytes) -> bytes:
 
 
 class PackageReader:
-    """Cuts a stream into packages."""
+    """Splits a stream into packages."""
 
     def __init__(self) -> None:
         self._rest = bytearray()
 
     def feed(self, data: bytes) -> Iterator[tuple[int, bytes]]:
-        """Take bytes; give each complete package's type and payload.
+        """Add bytes; yield each complete package's type and payload.
 
         Raises:
-            PackageError: a size that no package has.
+            PackageError: the size is invalid.
         """
         rest = self._rest
         rest += data
@@ -71,5 +71,5 @@ class PackageReader:
 
 
 def names(payload: bytes) -> list[str]:
-    """Field names, separated by commas; some clients put one behind the last too."""
+    """Field names, separated by commas; some clients add a comma after the last one."""
     return [name.strip() for name in payload.decode("ascii", "replace").strip(",\0 \n").split(",") if name.strip()]

@@ -1,10 +1,10 @@
-"""The client library, behind as little as a worker needs. Imported by the worker only; never rebuilt, only discarded.
+"""A small interface to the RTDE client library, for the worker process only. A client is discarded, never reconnected.
 
-Of the library only what reads and what writes input registers is used. Its control interface uploads a program of its
-own when it is made, reconnects by itself and uploads again, ends the program each time and sometimes its process: that
-can't be had in a cell where nothing may run without consent.
+It uses only the parts of the library that read values and write input registers. The library's control interface
+uploads its own program when it is created, reconnects by itself, uploads again, and then ends the running program and
+sometimes its process. This is not acceptable in a cell where nothing may run without consent.
 
-Whether the client library is there that a UR arm is reached by.
+`client_missing` reports whether the library is installed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from actors.arm.ur.worker_messages import (
 
 
 def client_missing() -> str | None:
-    """Why no arm can be reached from here at all: the client library isn't installed; None if it is."""
+    """Why no arm can be reached from this machine: the client library is not installed; None if it is."""
     if importlib.util.find_spec("rtde_receive") is not None:
         return None
     return (
@@ -44,16 +44,18 @@ def client_missing() -> str | None:
 PORTS = {30004: "RTDE", 29999: "dashboard", 30001: "primary interface"}
 PROBE_TIME = 2.0
 CONSTRUCTION_TIME = 5.0
-"""After which a constructor that doesn't come back ends the process [s]: it holds the interpreter."""
+"""Time after which a blocked constructor ends the process [s], because it holds the interpreter lock."""
 
 ATTEMPTS, BETWEEN_ATTEMPTS = 3, 0.4
-"""A controller may take a moment to notice that the connection before was cut [s]."""
+"""Number of connection attempts, and the time between them [s]: a controller may need a moment to notice that the
+previous connection was cut.
+"""
 
 AT_REST = 8.0
-"""Patience with silence while nothing moves: a controller may be taking in a program."""
+"""Factor of the longest silence while nothing moves, because a controller may be loading a program."""
 
 _LOOKS = 10
-"""Looks that must have found the same time before data count as stale: a late look says nothing."""
+"""Number of readings with the same time before data count as stale: a single late reading proves nothing."""
 
 _VARIABLES = [
     *("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state", "robot_status_bits"),
@@ -64,15 +66,15 @@ _VARIABLES = [
 
 
 class RtdeClient:
-    """Reads the controller and writes what its program listens to.
+    """Reads the controller's state and writes the input registers of its program.
 
     Args:
         address: of the controller.
         rate: of reading [Hz of the clock].
-        silence: longest time without anything new [s of the clock].
+        silence: longest time without new data [s of the clock].
 
     Raises:
-        TroubleError: it can't be reached, or the library isn't there.
+        TroubleError: the controller cannot be reached, or the library is missing.
     """
 
     def __init__(self, address: str, rate: float, silence: float) -> None:
@@ -104,10 +106,10 @@ class RtdeClient:
         """The latest package.
 
         Args:
-            patience: with silence, as a multiple of the longest.
+            patience: longest silence, as a multiple of the usual one.
 
         Raises:
-            TroubleError: the connection is lost, or its time stands still.
+            TroubleError: the connection is lost, or the controller's time does not advance.
         """
         r = self._receive
         if not r.isConnected():
@@ -147,7 +149,7 @@ class RtdeClient:
         """A package that is newer than this call.
 
         Raises:
-            TroubleError: none comes.
+            TroubleError: none arrives.
         """
         before = self._receive.getTimestamp()
         self._last, self._looks = None, 0
@@ -160,19 +162,19 @@ class RtdeClient:
     # ---- writing
 
     def beat(self, count: int) -> None:
-        """The program may go on."""
+        """Write the heartbeat, so that the program continues."""
         self._write(HEARTBEAT, count & 0xFFFF)
 
     def go(self, number: int) -> None:
-        """The program may begin."""
+        """Write the order to start."""
         self._write(GO, number)
 
     def order_stop(self, number: int) -> None:
-        """The program shall stop."""
+        """Write the order to stop."""
         self._write(STOP_ORDER, number)
 
     def _write(self, register: int, value: int) -> None:
-        # A thread that hangs in here must not keep a stop from being tried by other means.
+        # If another thread is blocked here, the stop must still be attempted by other means.
         if not self._writing.acquire(timeout=0.2):
             return
         try:
@@ -196,7 +198,7 @@ def _probe(address: str, port: int, name: str) -> None:
 
 @contextlib.contextmanager
 def _bounded(seconds: float) -> Iterator[None]:
-    """End this process if what is inside takes longer: a thread of C does, which needs no interpreter."""
+    """End this process if the body takes longer. The timer is a C thread, which does not need the interpreter lock."""
     faulthandler.dump_traceback_later(seconds, exit=True)
     try:
         yield

@@ -1,8 +1,7 @@
-"""`python -m actors.arm.ur.rtde_worker FD`: the process that holds the client library, until its driver hangs up or
-dies.
+"""`python -m actors.arm.ur.rtde_worker FD`: the process that holds the client library.
 
-Whatever the library prints goes where standard output goes: the driver reads it if things go wrong. Requests are done
-one after the other; stops and signs of life are taken by a thread of their own.
+It ends when its driver closes the connection or dies. The library's messages go to standard output, which the driver
+reads after errors. Requests are executed one after another; a separate thread receives stops and signs of life.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ HANDS_IN_TIME = 3.0
 
 
 class Worker:
-    """What can be asked for.
+    """The worker's requests.
 
     Args:
         connection: to the driver.
@@ -51,17 +50,18 @@ class Worker:
         self._stops = 0
         self._owner_seen = time.monotonic()
 
-    # ---- life
+    # ---- lifetime
 
     def serve(self) -> None:
-        """Until the driver hangs up."""
+        """Serve requests until the driver closes the connection."""
         threading.Thread(target=self._hear, name="hear", daemon=True).start()
         parent = os.getppid()
         while True:
             try:
                 number, method, arguments = self._requests.get(timeout=1.0)
             except queue.Empty:
-                if os.getppid() != parent:  # dead, though somebody else holds the connection's other end
+                # the driver is dead, although another process holds the connection's other end
+                if os.getppid() != parent:
                     os._exit(0)
                 continue
             try:
@@ -105,13 +105,13 @@ class Worker:
 
     @property
     def client(self) -> RtdeClient:
-        """To the controller."""
+        """The client of the controller."""
         if self._client is None:
             raise TroubleError("lost", "not connected")
         return self._client
 
     def facts(self) -> Facts:
-        """Who is there, and how it is; nothing moves."""
+        """Identity and state of the controller; nothing moves."""
         reading = self.client.fresh()
         try:
             with Dashboard(self._address) as dashboard:
@@ -134,7 +134,7 @@ class Worker:
         return self.client.fresh()
 
     def run(self, motion: MotionOrder) -> MotionOutcome:
-        """Make a motion."""
+        """Execute a motion."""
         watch = MotionMonitor(self.client, self._address, motion, self._tell, lambda: self._owner_seen)
         self._watch = watch
         try:
@@ -145,7 +145,7 @@ class Worker:
             self._watch = None
 
     def hands_in(self) -> None:
-        """End any program, and see that none runs."""
+        """End any program, and check that none runs."""
         end = time.monotonic() + HANDS_IN_TIME
         refusal = ""
         if self.client.fresh().runtime != STOPPED_PROGRAM:
@@ -167,7 +167,7 @@ class Worker:
             raise TroubleError("refused", "the arm still moves: keep hands out")
 
     def recover(self, scale: float) -> str:
-        """Make the robot ready after a stop; nothing moves but the brakes."""
+        """Make the robot ready after a stop; only the brakes move."""
         return recover(self.client, self._address, scale)
 
 
@@ -178,7 +178,7 @@ def _version(text: str) -> tuple[int, ...]:
 
 
 def main() -> None:
-    """Serve on the connection whose number is the first argument."""
+    """Serve on the connection whose file descriptor is the first argument."""
     faulthandler.enable()
     Worker(Connection(int(sys.argv[1]))).serve()
 

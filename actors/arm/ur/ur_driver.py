@@ -1,8 +1,8 @@
-"""A UR arm as everything above sees it: plain, blocking, and still until an operator has said that it may move.
+"""The driver of a UR arm: plain and blocking. The arm does not move until an operator has given consent.
 
-The client library lives in a worker process; here are consent, checks, and what came of a motion.
-
-The driver of an arm of hardware: it moves nothing under safety settings that nobody has accepted.
+- `UrArm` implements `Arm`: consent, checks, and the outcomes of motions. The client library runs in a worker process
+  (`actors.arm.ur.rtde_worker`).
+- `AcceptedArm` is for hardware: it moves nothing under safety settings that have not been accepted.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from actors.arm.arm_geometry import Joints, Pose
 from actors.arm.arm_interface import (
     ArmError,
     ArmLostError,
@@ -24,9 +25,7 @@ from actors.arm.arm_interface import (
     ArmRefusedError,
     ArmState,
     ArmStoppedError,
-    Joints,
     NotAcceptedError,
-    Pose,
 )
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planned_pour import ExecutedPath, PourPath
@@ -45,23 +44,23 @@ RECOVERY_TIME = 90.0
 """Longest wait for a robot to be made ready [s of controller time]."""
 
 MOTION_MARGIN = 40.0
-"""What a motion may take beyond twice its planned time before its worker counts as hung [s]."""
+"""Time beyond twice its planned duration after which a motion's worker counts as blocked [s]."""
 
 STOP_TIME = 1.0
-"""Each means of stopping gets so long before the next is tried [s]."""
+"""Time for each means of stopping before the next one is tried [s]."""
 
 _numbers = itertools.count(os.getpid() % 4096 * 65536 + 1)
-"""Numbers of motions: unlike any that another process may have left in the controller's registers."""
+"""Numbers of motions, different from any that another process may have left in the controller's registers."""
 
 
 class UrArm:
-    """The arm.
+    """A UR arm.
 
     Args:
-        spec: which arm, where, and what it may do. Its address must be filled in.
+        spec: its model, address and limits. The address must be filled in.
 
     Attributes:
-        last_stop: how soon the last stop of a moving arm took effect.
+        last_stop: delays of the last stop of a moving arm.
     """
 
     def __init__(self, spec: UrArmSpec) -> None:
@@ -80,7 +79,7 @@ class UrArm:
     # ---- nothing moves
 
     def connect(self) -> UrFacts:
-        """See `Arm.connect`: by a new worker."""
+        """See `Arm.connect`; starts a new worker."""
         if not self._spec.address:
             raise ArmRefusedError("the arm has no address; give the controller's, or have a virtual one started")
         with self._at_work("connecting"):
@@ -93,7 +92,7 @@ class UrArm:
             return self._session.find_out()
 
     def joints(self) -> Joints:
-        """Measured, now [rad]; during a motion as last told, some twenty times a second."""
+        """Measured joints [rad]; during a motion as last reported, about twenty times a second."""
         progress = self._session.progress
         if self._leg is not None and progress is not None:
             a, b, c, d, e, f = progress.joints
@@ -123,11 +122,11 @@ class UrArm:
         self._stopped = False
 
     def lock(self) -> None:
-        """Nothing may begin to move until `release`."""
+        """Lock the arm: nothing may begin to move until `release`."""
         self._released_at = None
 
     def hands_in(self) -> None:
-        """See `Arm.hands_in`: no program runs on the controller."""
+        """See `Arm.hands_in`; checks that no program runs on the controller."""
         self.lock()
         with self._at_work("being made safe"):
             self._session.ask("hands_in")
@@ -157,7 +156,7 @@ class UrArm:
             self._go(MotionSegment.of("approach", path.approach, self._spec))
 
     def execute(self, path: PourPath) -> ExecutedPath:
-        """See `Arm.execute`; what the encoders say, sampled `spec.rate` times per second of the clock."""
+        """See `Arm.execute`; the encoders are sampled `spec.rate` times per second of the clock."""
         with self._at_work("pouring"):
             self._last_pour = path
             executed = self._go(MotionSegment.of_pour(path))
@@ -186,14 +185,14 @@ class UrArm:
             self.lock()
 
     def jog(self, axis: str, amount: float, speed: float) -> None:
-        """See `Arm.jog`: at most 10°, or 50 mm."""
+        """See `Arm.jog`; at most 10° or 50 mm."""
         with self._at_work("jogging"):
             self._consent()
             self._go(MotionSegment.of("jog", jog_path(self._spec, self._joints(), axis, amount, speed), self._spec))
             self.lock()
 
     def recover(self) -> str:
-        """See `Arm.recover`: unlock, switch on, connect anew."""
+        """See `Arm.recover`; unlocks, switches on and reconnects."""
         self._consent()
         self.lock()
         self.connect()
@@ -207,8 +206,11 @@ class UrArm:
     # ---- stopping
 
     def stop(self) -> float:
-        """See `Arm.stop`. Three means, one after the other: an order that the running program looks for in every cycle;
-        the dashboard, over a connection of its own; an end of the heartbeat.
+        """See `Arm.stop`. Three means are tried one after another:
+
+        - a stop order, which the running program reads in every cycle;
+        - the dashboard, over a separate connection;
+        - the end of the heartbeat.
         """
         asked = time.monotonic()
         self._stopped = True
@@ -242,7 +244,7 @@ class UrArm:
         self.lock()
         self._session.discard()
 
-    # ---- how
+    # ---- implementation
 
     @contextlib.contextmanager
     def _at_work(self, doing: str) -> Iterator[None]:
@@ -266,11 +268,11 @@ class UrArm:
         return released
 
     def _go(self, leg: MotionSegment) -> ExecutedPath:
-        """One motion, to its end."""
-        stops = self._stops.count  # before consent is looked at: a stop in between must count
+        """Execute one motion to its end."""
+        stops = self._stops.count  # before consent is checked, so that a stop in between counts
         released, spec = self._consent(), self._spec
         path = leg.path
-        if leg.name != "jog":  # which checks itself: it may be the way back in
+        if leg.name != "jog":  # a jog has its own checks, since it may be the way back inside the limits
             recheck(path, spec)
         facts = self._session.facts
         if facts is None:
@@ -290,7 +292,7 @@ class UrArm:
             return self._judge(outcome, leg)
         except LaboratoryError:
             raise
-        except BaseException:  # an interrupt at the keyboard, say: whoever waited for the motion doesn't any more
+        except BaseException:  # e.g. a keyboard interrupt: the caller does not wait for the motion any more
             self._session.stop(self._stops.ask())
             self.lock()
             self._stopped = True
@@ -334,11 +336,11 @@ class UrArm:
 
 
 class AcceptedArm(UrArm):
-    """A `UrArm` that compares the controller's safety checksum whenever it asks who is there.
+    """A `UrArm` that compares the controller's safety checksum each time it reads the controller's facts.
 
     Args:
         spec: as for `UrArm`.
-        accepted: checksum that people have accepted; '' if nobody has.
+        accepted: the accepted checksum; '' if none is accepted.
     """
 
     def __init__(self, spec: UrArmSpec, accepted: str) -> None:
@@ -350,7 +352,7 @@ class AcceptedArm(UrArm):
         """See `UrArm.connect`.
 
         Raises:
-            NotAcceptedError: other safety settings than the accepted ones; the arm is let go of.
+            NotAcceptedError: the safety settings differ from the accepted ones; the arm is disconnected.
         """
         return self._compared(super().connect())
 
@@ -370,15 +372,15 @@ class AcceptedArm(UrArm):
 def require_accepted(accepted: str | None, found: str | None, controller: str) -> None:
     """Compare the checksum of a controller's safety configuration with the accepted one.
 
-    Called once the controller is connected, before anything is asked to move.
+    Called once the controller is connected, before any motion is requested.
 
     Args:
-        accepted: eight hexadecimal digits, as `decant doctor --accept-safety` recorded them; None if nobody has.
-        found: as the controller says now; None if it says nothing.
-        controller: its address, for people.
+        accepted: eight hexadecimal digits, as `decant doctor --accept-safety` recorded them; None if there are none.
+        found: as the controller reports it now; None if it reports none.
+        controller: its address, for messages.
 
     Raises:
-        NotAcceptedError: with what to do about it.
+        NotAcceptedError: with the remedy.
     """
     if accepted is None:
         raise NotAcceptedError(

@@ -1,11 +1,12 @@
-"""A connection to one robot: made by a new worker, discarded with it, never mended.
+"""A connection to one robot through a worker process.
 
-What a driver knows of its robot, for people and for records.
+- `Session` starts a new worker for each connection, and discards both together; a connection is never repaired.
+- `WorkerProcess` is the driver's side of the worker: calls with deadlines, stops that overtake them, and detection of
+  the worker's end.
+- `UrFacts` holds the robot's identity and state for messages and records.
 
-The worker as its driver sees it: calls with deadlines, stops that overtake them, and an end that is noticed.
-
-The worker isn't asked to die with the thread that started it, as Linux offers, for that thread may end while the arm
-moves. It ends when this process closes its side of the connection, in whatever way that happens.
+Linux could end the worker together with the thread that started it. This is not used, because that thread may end while
+the arm moves. The worker ends when this process closes its side of the connection for any reason.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from concurrent.futures import TimeoutError as FutureTimeoutError
 from dataclasses import dataclass, field
 from typing import Any
 
-from actors.arm.arm_interface import ArmError, ArmFacts, ArmLostError, ArmRefusedError, Joints, Pose, Vector
+from actors.arm.arm_geometry import Joints, Pose, Vector
+from actors.arm.arm_interface import ArmError, ArmFacts, ArmLostError, ArmRefusedError
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.ur.worker_messages import (
     ROBOT_MODES,
@@ -34,18 +36,18 @@ from actors.runtime.child_process import ConnectedProcess
 
 @dataclass(frozen=True)
 class UrFacts(ArmFacts):
-    """A robot as its controller tells of it.
+    """A robot's identity and state, as its controller reports them.
 
     Attributes:
-        checksum: of the safety configuration, eight hexadecimal digits; '' if it isn't told.
-        robot_mode, safety_mode: in words; 'running' and 'normal' if it could move.
-        remote: remote control is on; None where the controller knows no such thing.
+        checksum: of the safety configuration, eight hexadecimal digits; '' if it is not reported.
+        robot_mode, safety_mode: as text; 'running' and 'normal' if it could move.
+        remote: remote control is on; None if the controller does not have this mode.
         tool: TCP in the flange's frame, as set at present.
         payload: as set at present [kg]; `payload_centre` [m].
         joints: measured [rad].
         slider: 0 … 1.
         program: state and name of the controller's program.
-        joint_ranges: lowest and highest of each joint [rad], as configured; empty if they aren't told.
+        joint_ranges: lowest and highest of each joint [rad], as configured; empty if they are not reported.
         joint_speeds: likewise [rad/s].
     """
 
@@ -68,7 +70,7 @@ class UrFacts(ArmFacts):
 
 
 def facts_of(told: Facts) -> UrFacts:
-    """As a worker has found out."""
+    """Convert the worker's facts."""
     r = told.reading
     a, b, c, d, e, f = r.joints
     x, y, z = r.centre
@@ -93,14 +95,14 @@ def facts_of(told: Facts) -> UrFacts:
 
 
 SIGN_OF_LIFE = 0.1
-"""Between two signs of life to the worker while a call is awaited [s]."""
+"""Time between two signs of life to the worker while a call is awaited [s]."""
 
 
 class WorkerProcess:
     """One worker, from its start to its end; never restarted.
 
     Attributes:
-        progress: what it last told of a motion.
+        progress: its latest progress report of a motion.
         pid: of the process.
     """
 
@@ -117,20 +119,20 @@ class WorkerProcess:
 
     @property
     def alive(self) -> bool:
-        """Whether it can be asked."""
+        """Whether it can receive requests."""
         return not self._gone.is_set()
 
     def call(self, method: str, *arguments: Any, deadline: float) -> Any:
-        """Have something done.
+        """Send a request and wait for its result.
 
         Args:
-            method: of `worker.Worker`.
+            method: of `actors.arm.ur.rtde_worker.Worker`.
             arguments: plain values.
             deadline: longest wait [s]; a worker that misses it is ended.
 
         Raises:
             ArmRefusedError: refused before anything moved.
-            ArmLostError: the controller can't be reached, or the worker died or missed its deadline.
+            ArmLostError: the controller cannot be reached, or the worker died or missed its deadline.
         """
         future: Future[Any] = Future()
         with self._sending:
@@ -154,16 +156,17 @@ class WorkerProcess:
         raise ArmLostError(f"the arm's worker did not answer '{method}' within {deadline:g} s{self._errors()}")
 
     def stop(self, stops: int) -> None:
-        """Stop whatever moves; doesn't wait."""
+        """Order a stop of any motion; does not wait."""
         self._send(("stop", stops))
 
     def kill(self) -> None:
-        """End it: a motion under way ends by its watchdog."""
+        """End the process; its watchdog ends a running motion."""
         self._child.kill()
         self._gone.wait(2.0)
 
     def _send(self, message: Any) -> None:
-        with self._sending, contextlib.suppress(OSError):  # that it is gone is noticed where its answers are read
+        # the end of the process is noticed where its responses are read
+        with self._sending, contextlib.suppress(OSError):
             self._connection.send(message)
 
     def _hear(self) -> None:
@@ -197,17 +200,17 @@ class WorkerProcess:
 
 
 OPEN_TIME, ANSWER_TIME = 30.0, 15.0
-"""Longest waits for the worker [s]: to start and connect, to answer."""
+"""Longest waits for the worker [s]: to start and connect, and to respond."""
 
 
 class Session:
-    """None to begin with.
+    """The connection to a robot; closed at first.
 
     Args:
-        spec: where the robot is, and what it should be.
+        spec: address and expected identity of the robot.
 
     Attributes:
-        facts: of the robot, as it was when the connection was made; None without one.
+        facts: of the robot when the connection was made; None without a connection.
     """
 
     def __init__(self, spec: UrArmSpec) -> None:
@@ -216,15 +219,16 @@ class Session:
         self.facts: UrFacts | None = None
 
     def open(self) -> UrFacts:
-        """Connect anew; nothing moves.
+        """Connect with a new worker; nothing moves.
 
         Raises:
-            ArmLostError: the robot can't be reached; ArmRefusedError: it is another one than the settings say.
+            ArmLostError: the robot cannot be reached.
+            ArmRefusedError: the robot is not the one that the settings describe.
         """
         self.discard()
         spec = self._spec
         self._worker = WorkerProcess()
-        # Only a virtual controller has its time scaled; its process may be kept waiting where a real one isn't.
+        # Only a virtual controller has scaled time; the machine may suspend its process, unlike a real controller.
         silence = SILENCE if spec.time_scale == 1.0 else 8.0 * SILENCE
         try:
             self.ask("open", spec.address, spec.rate, silence, deadline=OPEN_TIME)
@@ -236,7 +240,7 @@ class Session:
         return self.facts
 
     def ask(self, method: str, *arguments: object, deadline: float = ANSWER_TIME) -> Any:
-        """Have the worker do something; see `WorkerProcess.call`."""
+        """Send the worker a request; see `WorkerProcess.call`."""
         worker = self._worker
         if worker is None or not worker.alive:
             raise ArmLostError("the arm is not connected; connect first")
@@ -247,12 +251,12 @@ class Session:
             raise
 
     def find_out(self) -> UrFacts:
-        """The robot as it is now."""
+        """The robot's present facts."""
         return facts_of(self.ask("facts"))
 
     @property
     def progress(self) -> MotionProgress | None:
-        """What the worker last told of a motion."""
+        """The worker's latest progress report of a motion."""
         return None if self._worker is None else self._worker.progress
 
     @property
@@ -261,22 +265,22 @@ class Session:
         return None if self._worker is None else self._worker.pid
 
     def forget_progress(self) -> None:
-        """Before another motion."""
+        """Forget the progress of the previous motion."""
         if self._worker is not None:
             self._worker.progress = None
 
     def stop(self, stops: int) -> None:
-        """Order a stop; doesn't wait."""
+        """Order a stop; does not wait."""
         if self._worker is not None:
             self._worker.stop(stops)
 
     def kill(self) -> None:
-        """End the worker: a motion under way ends by its watchdog."""
+        """End the worker; its watchdog ends a running motion."""
         if self._worker is not None:
             self._worker.kill()
 
     def discard(self) -> None:
-        """End it, and forget the robot."""
+        """End the worker and forget the robot."""
         self.kill()
         self._worker, self.facts = None, None
 

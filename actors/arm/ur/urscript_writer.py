@@ -1,8 +1,12 @@
-"""From joints over time to a program for the controller, which interpolates at its own cycle. Pure.
+"""Converts joints over time to a program for the controller, which interpolates in its own cycle.
 
-Targets streamed from here would jitter with this machine; a program on the controller doesn't. It sets tool and payload
-and tells what the controller made of them, waits for its go, watches a heartbeat, looks for an order to stop in every
-cycle, and tells how far it is.
+These functions are pure.
+
+Targets streamed from this machine would jitter with its load; a program on the controller does not. The program:
+
+- sets tool and payload and reports the controller's values;
+- waits for its start, monitors a heartbeat and checks for a stop order in every cycle;
+- reports its progress.
 """
 
 from __future__ import annotations
@@ -28,16 +32,16 @@ from actors.arm.ur.worker_messages import (
 )
 
 LOOKAHEAD, GAIN = 0.03, 300.0
-"""Settings of servoj: as quick as the manual allows [s]; the usual stiffness."""
+"""Settings of servoj: the shortest lookahead that the manual allows [s]; the usual stiffness."""
 
 STOP_DECELERATION = 6.0
-"""Deceleration of a stop on order [rad/s²]."""
+"""Deceleration of a stop by order [rad/s²]."""
 
 SETTLING = 0.3
-"""For which the last target is held, ten times the lookahead [s]."""
+"""Time for which the last target is held: ten times the lookahead [s]."""
 
 THINNING = 1e-5
-"""Points that lie on the line between others within this are left out [rad]: a hundredth of a millimetre at 1 m."""
+"""Points within this distance of the line between others are left out [rad]: a hundredth of a millimetre at 1 m."""
 
 MOST_POINTS = 1_800
 
@@ -45,7 +49,7 @@ _ALIGNING_SPEED, _ALIGNING_ACCELERATION = 0.05, 0.3
 
 
 def thinned(path: JointPath, tolerance: float = THINNING) -> JointPath:
-    """The path without the points that a line between their neighbours passes anyway.
+    """The path without points that lie on the line between their neighbours.
 
     Args:
         path: with any number of points.
@@ -69,10 +73,10 @@ def thinned(path: JointPath, tolerance: float = THINNING) -> JointPath:
 
 
 def checked(path: JointPath) -> JointPath:
-    """A path that a program can be made of.
+    """Check that a program can be made from a path. Returns the path.
 
     Raises:
-        ArmRefusedError: its shape, its times or its numbers are wrong.
+        ArmRefusedError: its shape, its times or its numbers are invalid.
     """
     times, joints = np.asarray(path.times, dtype=float), np.asarray(path.joints, dtype=float)
     if times.ndim != 1 or len(times) < 2 or joints.shape != (len(times), 6):
@@ -90,13 +94,13 @@ def path_program(path: JointPath, settings: MotionSettings, number: int, *, cb3:
     """A program that moves the arm along a path.
 
     Args:
-        path: whole; the arm stands at its first point.
-        settings: tool and payload, set at its begin.
-        number: that it tells and listens to.
-        cb3: the controller is of the older generation, which can't be asked for its cycle.
+        path: complete; the arm stands at its first point.
+        settings: tool and payload, which the program sets first.
+        number: of the motion, which the program reports and reads from its orders.
+        cb3: the controller is of the older generation, which does not report its cycle time.
 
     Raises:
-        ArmRefusedError: there are too many points, or it is not a path.
+        ArmRefusedError: there are too many points, or the path is invalid.
     """
     points = thinned(checked(path))
     if len(points.times) > MOST_POINTS:
@@ -154,7 +158,10 @@ def _stop_function(number: int) -> list[str]:
 
 
 def _preparation(settings: MotionSettings, number: int) -> list[str]:
-    """The number is written last, so that whoever sees it sees all the rest."""
+    """Lines that set tool and payload and report them.
+
+    The number is written last, so that a reader of it sees the rest.
+    """
     return [
         f'  rtde_set_watchdog("input_int_register_{HEARTBEAT}", {SLOWEST_HEARTBEAT:.1f}, "stop")',
         f"  set_tcp(p{_list(settings.tool)})",

@@ -1,6 +1,7 @@
-"""What driver and worker say to each other. Plain values, and nothing heavy to import: the worker starts in an instant.
+"""Messages and registers shared by the driver, the worker and the controller's program.
 
-Registers that programs and worker share; the client library lets 18 … 22 be written and 12 … 19 be read.
+These are plain values, and the module has no slow imports, so that the worker starts quickly. The client library can
+write input registers 18 … 22 and read output registers 12 … 19.
 """
 
 from __future__ import annotations
@@ -8,22 +9,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 STOP_ORDER, HEARTBEAT, GO = 19, 20, 21
-"""Integer inputs. An order is the number of the motion that it is meant for, so an old one orders nothing."""
+"""Integer inputs. An order is the number of its motion, so that an old order has no effect."""
 
 NUMBER, STATUS = 12, 13
-"""Integer outputs: the number of the motion whose program runs, and what it is doing."""
+"""Integer outputs: the number of the motion whose program runs, and its status."""
 
 CLOCK, TOOL = 12, 13
-"""Double outputs: time on the path [s]; from here on six of the tool, as the controller has it."""
+"""Double outputs: time on the path [s]; from `TOOL` on, the six values of the controller's tool."""
 
 READY, RUNNING, DONE, STOPPED = 1, 2, 3, 4
-"""Statuses: set up and waiting for `GO`; moving; arrived; stopped on order."""
+"""Statuses: ready and waiting for `GO`; moving; arrived; stopped by order."""
 
 SLOWEST_HEARTBEAT = 2.0
-"""A program whose heartbeat is written less often than that ends, and the arm with it [Hz of the clock]."""
+"""If the heartbeat is written less often than this, the program ends and the arm stops [Hz of the clock]."""
 
 SILENCE = 0.2
-"""Data whose time stands still for so long, while the arm moves, are stale [s of the clock]."""
+"""If the time of the data does not advance for so long while the arm moves, they are stale [s of the clock]."""
 
 
 ROBOT_MODES = {
@@ -54,12 +55,12 @@ STOPPED_PROGRAM, PLAYING = 1, 2
 
 
 def why_not_ready(robot_mode: int, safety_mode: int, runtime: int, slider: float) -> str:
-    """Why an arm can't move; '' if it can. Driver, worker, `decant doctor` and what shows its lines all decide by this.
+    """Why an arm cannot move; '' if it can. Driver, worker, `decant doctor` and its display all use this decision.
 
     Reduced mode prevents motion: pours are planned within the normal limits, and would end in a protective stop.
 
     Args:
-        robot_mode, safety_mode, runtime: as numbers of RTDE (`robot_mode`, `safety_mode`, `runtime_state`).
+        robot_mode, safety_mode, runtime: RTDE's numbers (`robot_mode`, `safety_mode`, `runtime_state`).
         slider: `target_speed_fraction`, 0 … 1.
     """
     if safety_mode != NORMAL:
@@ -74,11 +75,11 @@ def why_not_ready(robot_mode: int, safety_mode: int, runtime: int, slider: float
 
 
 class TroubleError(Exception):
-    """The worker can't do what was asked.
+    """The worker cannot do what was requested.
 
     Args:
         kind: 'refused' before anything moved, or 'lost'.
-        text: for people.
+        text: the message.
     """
 
     def __init__(self, kind: str, text: str) -> None:
@@ -88,7 +89,7 @@ class TroubleError(Exception):
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """What every motion is made with.
+    """Settings of every motion.
 
     Attributes:
         tool: TCP in the flange's frame [m], [rad].
@@ -102,15 +103,15 @@ class MotionSettings:
 
 @dataclass(frozen=True)
 class MotionOrder:
-    """A program that moves the arm, and what has to hold around it.
+    """A program that moves the arm, and its conditions.
 
     Attributes:
-        program: text, waiting for `GO` before it moves anything.
-        number: its own.
+        program: text; it waits for `GO` before it moves anything.
+        number: of the motion.
         start, end: joints [rad].
         duration: of its path [s of controller time].
-        settings: read back before it may go.
-        stops: how many stops had been asked for when it was asked for; one more and it doesn't go.
+        settings: read back before the start.
+        stops: number of stops when the motion was requested; if there is another one, it does not start.
     """
 
     program: str
@@ -152,12 +153,12 @@ class DataPackage:
 
     @property
     def stands(self) -> bool:
-        """No joint moves."""
+        """Whether no joint moves."""
         return max(map(abs, self.speeds)) < STANDSTILL
 
 
 STANDSTILL = 2e-3
-"""Joint speed that counts as none [rad/s]."""
+"""Joint speed below which a joint counts as standing still [rad/s]."""
 
 Sample = tuple[float, tuple[float, ...], float]
 """Controller time [s], joints [rad], time on the path [s]."""
@@ -165,7 +166,7 @@ Sample = tuple[float, tuple[float, ...], float]
 
 @dataclass(frozen=True)
 class MotionProgress:
-    """Where a motion is now, told unasked.
+    """Progress of a motion, which the worker sends without a request.
 
     Attributes:
         clock: time on the path [s].
@@ -180,18 +181,18 @@ class MotionProgress:
 
 @dataclass(frozen=True)
 class MotionOutcome:
-    """What came of a motion.
+    """The outcome of a motion.
 
     Attributes:
-        kind: 'completed', or why it was broken off: see `errors.ArmStoppedError`, or 'lost'.
-        text: why, for people.
-        samples: what was read from its go on.
+        kind: 'completed', or why it was interrupted: see `actors.arm.arm_interface.ArmStoppedError`, or 'lost'.
+        text: the reason, as a message.
+        samples: readings from its start on.
         clock: time on the path where it ended [s].
         joints: where the arm stands [rad]; as last seen, if `standing` is None.
         standing: when it was first seen at rest [s of `time.monotonic`].
-        answered: when the program was first seen to have taken an order to stop [s of `time.monotonic`].
-        moved: it had been commanded to go.
-        slider: the lowest it was seen at.
+        answered: when the program was first seen to accept a stop order [s of `time.monotonic`].
+        moved: it had been ordered to start.
+        slider: lowest position seen.
     """
 
     kind: str
@@ -207,7 +208,7 @@ class MotionOutcome:
 
 @dataclass(frozen=True)
 class Facts:
-    """What the worker found out about a controller; see `facts.UrFacts`."""
+    """The worker's facts about a controller; see `actors.arm.ur.ur_session.UrFacts`."""
 
     model: str
     serial: str

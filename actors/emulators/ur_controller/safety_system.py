@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from enum import IntEnum
 from math import degrees
 
-from actors.arm.arm_interface import JOINT_NAMES
+from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.ur.robot_models import Joints, RobotModel
 from actors.emulators.ur_controller.poses import Vector
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_interface import ArmLimits, Pose, RobotCell
+from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planning.transfer_motion import follow
 from orchestrator.config.file_loading import load_vessel

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.arm.arm_interface import Mount, RobotCell
+from actors.arm.arm_geometry import Mount, RobotCell
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planning.frames import cell_transforms, flange_poses, pourer_motion, pourer_transforms
 from actors.arm.planning.kinematics import MODELS, inverse, singularities

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from actors.arm.arm_interface import Plane
+from actors.arm.arm_geometry import Plane
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planned_pour import JointPath, PourPath
 from actors.arm.planning.frames import cell_transforms, pourer_motion, pourer_transforms

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.arm.arm_interface import Plane, Pose
+from actors.arm.arm_geometry import Plane, Pose
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.path_checks import recheck

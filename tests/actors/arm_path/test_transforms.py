@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.arm.arm_interface import Pose
+from actors.arm.arm_geometry import Pose
 from actors.arm.planning.frames import flange_poses, pourer_motion, pourer_transforms, quaternions
 from actors.arm.planning.kinematics import MODELS, inverse
 from actors.arm.planning.pour_planner import plan_path

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from actors.arm.arm_interface import ArmLimits, PathReport, Pose, RobotCell
+from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
+from actors.arm.arm_interface import PathReport
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planned_pour import JointPath, PourPath
 

@@ -9,7 +9,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from actors.arm.arm_interface import ArmLimits, ArmStoppedError, Pose, RobotCell
+from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
+from actors.arm.arm_interface import ArmStoppedError
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planning.frames import pourer_motion
 from actors.arm.planning.pour_planner import plan_path

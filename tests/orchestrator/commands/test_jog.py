@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from actors.arm.arm_interface import ArmPose, Pose
+from actors.arm.arm_geometry import Pose
+from actors.arm.arm_interface import ArmPose
 from actors.arm.arm_settings import UrArmSpec
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import LaboratoryError

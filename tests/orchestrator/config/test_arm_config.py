@@ -8,7 +8,7 @@ from textwrap import dedent
 
 import pytest
 
-from actors.arm.arm_interface import Plane, Pose
+from actors.arm.arm_geometry import Plane, Pose
 from actors.arm.arm_settings import UrArmSpec
 from orchestrator.config.arm_file import CellSection, UrArmSection, resolve_arm
 from orchestrator.config.yaml.section_validation import validate

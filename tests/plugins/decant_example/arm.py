@@ -18,6 +18,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.arm.arm_geometry import Pose
 from actors.arm.arm_interface import (
     ArmFacts,
     ArmLostError,
@@ -26,7 +27,6 @@ from actors.arm.arm_interface import (
     ArmRefusedError,
     ArmState,
     ArmStoppedError,
-    Pose,
 )
 from actors.arm.arm_settings import ArmSpec
 from actors.arm.planned_pour import ExecutedMotion, MotionPath
