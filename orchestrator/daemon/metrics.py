@@ -1,4 +1,7 @@
-"""What is reported to Prometheus: counts of what there is, and of what happened."""
+"""Metrics of the daemon in Prometheus' text format.
+
+`measures` reads the current values of the daemon at each request, so that nothing is counted twice or stored.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,13 @@ from orchestrator.journal.disk_reserve import free_space
 
 
 class _Collector:
-    """Looks when it is asked: nothing is counted twice, and nothing has to be remembered."""
+    """Reads the current values when Prometheus collects them."""
 
     def __init__(self, daemon: Supervisor) -> None:
         self._daemon = daemon
 
     def collect(self) -> Iterable[Metric]:
-        """See prometheus_client's collectors."""
+        """Yield the metrics, as prometheus_client's collectors do."""
         daemon = self._daemon
         campaigns = GaugeMetricFamily("decant_campaigns", "Campaigns in each state.", labels=["state"])
         for state, count in daemon.store.counts().items():
@@ -60,7 +63,7 @@ class _Collector:
 
 
 def measures(daemon: Supervisor) -> bytes:
-    """Everything, in Prometheus' text format."""
+    """Return all metrics in Prometheus' text format."""
     registry = CollectorRegistry()
     registry.register(_Collector(daemon))
     return generate_latest(registry)

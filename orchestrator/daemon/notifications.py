@@ -1,7 +1,9 @@
-"""Word to people who are elsewhere: an answer is needed, a campaign ended or failed, something hangs.
+"""Notifications by mail, webhook or chat when a campaign needs an operator.
 
-Mail, webhooks and chats, through apprise, which knows a hundred of them by their URLs. Each receiver has a thread and a
-short queue of its own: one that is dead or slow keeps nobody waiting, neither the daemon nor the other receivers.
+Occasions are open questions, ended and failed campaigns, campaigns without news, and emergency stops. Messages are sent
+through apprise, which supports many services by URL. Each receiver has its own thread and a short queue, so that a slow
+receiver delays neither the daemon nor other receivers. `Notifier` is the main class; `pass_on` connects it to the
+daemon's event feed.
 """
 
 from __future__ import annotations
@@ -20,10 +22,10 @@ from sim_engine.settings.model import Section, Text
 from sim_engine.settings.quantity import Quantity
 
 QUEUE = 50
-"""Messages that wait for one receiver; while so many wait, further ones are dropped and counted."""
+"""Largest number of waiting messages per receiver; further messages are dropped and counted."""
 
 TRIES, PAUSES = 3, (2.0, 10.0)
-"""How often a message is tried, and how long is waited in between [s]."""
+"""Number of attempts for a message, and the pauses between them [s]."""
 
 ENVIRONMENT = "env:"
 
@@ -32,7 +34,7 @@ Occasion = Literal["question", "ended", "failed", "silence", "emergency"]
 OCCASIONS: tuple[Occasion, ...] = ("question", "ended", "failed", "silence", "emergency")
 
 _BY_PEOPLE = ("", "stopped on request")
-"""Reasons of a campaign that rests because somebody wanted it to."""
+"""Reasons of a campaign that an operator paused."""
 
 _TOLD = (
     "CampaignLeased",
@@ -43,30 +45,31 @@ _TOLD = (
     "QuestionClosed",
     "Deed",
 )
-"""Events whose data are looked at; of all others it counts that they came."""
+"""Events whose data are read; of all other events only the arrival counts."""
 
 _log = logging.getLogger(__name__)
 
 
 class NotifySection(Section):
-    """Who is told what happens, by mail, webhook or chat."""
+    """Notifications by mail, webhook or chat."""
 
     required: ClassVar[dict[str, str]] = {"to": "['mailtos://user:password@smtp.example.org?to=me@example.org']"}
 
     to: list[Text] | None = None
-    """Receivers, as URLs that apprise knows ([its list](https://appriseit.com/services/)); `env:NAME` reads one from
-    the environment, for URLs with secrets in them."""
+    """Receivers, as URLs that apprise supports ([its list](https://appriseit.com/services/)); `env:NAME` reads one from
+    the environment, for URLs with secrets in them.
+    """
 
     about: list[Literal["question", "ended", "failed", "silence", "emergency"]] | None = None
-    """What is sent: all unless given. `question`: a person has to answer; `ended`: a campaign is finished or was
-    stopped; `failed`: it can't go on, or a pour is UNKNOWN; `silence`: nothing happens; `emergency`: an emergency
-    stop."""
+    """Occasions for a message; all by default. `question`: an operator must answer; `ended`: a campaign is finished or
+    was stopped; `failed`: it can't continue, or a pour is UNKNOWN; `silence`: no news; `emergency`: an emergency stop.
+    """
 
     silence: Annotated[float, Quantity("s", "15 min", 1.0, 86_400.0, positive=True)] = 900.0
-    """A running campaign without news for so long hangs; a question that is open for so long is reported once more."""
+    """Time after which a running campaign without news, or an open question, is reported."""
 
     page: Text | None = None
-    """Address of the page as people elsewhere reach it: the link in messages."""
+    """Public address of the operator page; the link in messages."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ class Notification:
 
 @dataclass
 class Counts:
-    """Messages of one receiver so far."""
+    """Numbers of messages of one receiver."""
 
     sent: int = 0
     failed: int = 0
@@ -88,18 +91,18 @@ class Counts:
 
 
 class NotifyError(ValueError):
-    """A receiver that apprise does not know; the text says which, without its secrets."""
+    """apprise does not support a receiver; the message names it without its secrets."""
 
 
 class Notifier:
-    """Sends word to all receivers. `note` is called with everything that happens; it returns at once and never raises.
+    """Sends notifications to all receivers. `note` takes every event; it returns at once and never raises.
 
     Args:
         receivers: URLs.
-        about: occasions that are reported.
-        silence: without news from a running campaign [s] before that is reported.
-        page: link for people.
-        clock: seconds, monotonic.
+        about: occasions for a message.
+        silence: time without news from a running campaign before a message is sent [s].
+        page: link to the operator page.
+        clock: monotonic time [s].
 
     Raises:
         NotifyError: a URL can't be used.
@@ -128,21 +131,21 @@ class Notifier:
 
     @property
     def counts(self) -> dict[str, Counts]:
-        """Messages so far, by receiver; its name has no secrets in it."""
+        """Numbers of messages by receiver; receivers' names contain no secrets."""
         return {str(one): one.counts for one in self._receivers}
 
     def note(self, kind: str, data: Mapping[str, Any], campaign: str = "") -> None:
-        """Something happened: the type of an event of the daemon's feed, and its data."""
+        """Process an event: its type in the daemon's feed, and its data."""
         try:
             with self._lock:
                 word = self._word(kind, data, campaign)
             if word is not None:
                 self._send(word)
-        except Exception:  # who is told is never a reason for anything to end
+        except Exception:  # a failed notification must never end anything else
             _log.exception("no word could be made of %s", kind)
 
     def close(self, patience: float = 5.0) -> None:
-        """Send what waits, for at most so long [s], and end."""
+        """Send waiting messages for at most this long [s], and end."""
         self._ended.set()
         for one in self._receivers:
             one.end()
@@ -150,7 +153,7 @@ class Notifier:
         for thread in self._threads:
             thread.join(max(deadline - time.monotonic(), 0.0))
 
-    # ---- from what happens to words
+    # ---- from events to messages
 
     def _word(self, kind: str, data: Mapping[str, Any], campaign: str) -> Notification | None:
         heard = self._heard.get(campaign)
@@ -205,7 +208,7 @@ class Notifier:
             self.listen_for_silence()
 
     def listen_for_silence(self) -> None:
-        """Send word of campaigns in which nothing has happened for too long; once, until something does."""
+        """Report campaigns without news for too long; once, until the next event."""
         words = []
         with self._lock:
             for campaign, heard in self._heard.items():
@@ -230,11 +233,11 @@ class Notifier:
 
 
 class NotificationResult(Protocol):
-    """An event of the daemon's feed."""
+    """An event of the daemon's feed, as `pass_on` reads it."""
 
     @property
     def type(self) -> str:
-        """Name of its class, or a word for what the daemon itself says."""
+        """Name of its class, or of one of the daemon's own events."""
         ...
 
     @property
@@ -244,12 +247,12 @@ class NotificationResult(Protocol):
 
     @property
     def campaign(self) -> str:
-        """That it belongs to; '' for what concerns the daemon."""
+        """Campaign of the event; '' if it concerns the daemon."""
         ...
 
 
 async def pass_on(events: AsyncIterator[NotificationResult | None], notifier: Notifier) -> None:
-    """Tell a notifier what a feed tells, until the feed is closed: `pass_on(feed.read(), notifier)`."""
+    """Pass the events of a feed to a notifier until the feed is closed: `pass_on(feed.read(), notifier)`."""
     async for sent in events:
         if sent is not None:
             notifier.note(sent.type, json.loads(sent.data) if sent.type in _TOLD else {}, sent.campaign)
@@ -257,7 +260,7 @@ async def pass_on(events: AsyncIterator[NotificationResult | None], notifier: No
 
 @dataclass
 class _Heard:
-    """When a campaign last gave news (monotonic), and what is known of it."""
+    """Time of a campaign's last event (monotonic), and its state as far as it is known."""
 
     at: float
     rig: str = ""
@@ -268,7 +271,7 @@ class _Heard:
 
 @dataclass
 class _Receiver:
-    """One URL, its queue, and its thread's work."""
+    """One URL with its queue and the work of its thread."""
 
     number: int
     url: str
@@ -291,14 +294,14 @@ class _Receiver:
         return f"{self._scheme} ({self.number})"
 
     def put(self, word: Notification) -> None:
-        """Take a message, or drop it where too many wait."""
+        """Queue a message, or drop it if too many are waiting."""
         try:
             self._words.put_nowait(word)
         except queue.Full:
             self.counts.dropped += 1
 
     def end(self) -> None:
-        """Send what waits, without another try where one fails, and end."""
+        """Send waiting messages with one attempt each, and end."""
         self._ending.set()
         try:
             self._words.put_nowait(None)
@@ -308,7 +311,7 @@ class _Receiver:
             self._words.put_nowait(None)
 
     def work(self) -> None:
-        """Send, until the end."""
+        """Send messages until the end."""
         while (word := self._words.get()) is not None:
             if self._delivered(word):
                 self.counts.sent += 1
@@ -323,13 +326,13 @@ class _Receiver:
             try:
                 if self._apprise.notify(title=word.title, body=word.body):
                     return True
-            except Exception:  # a plug-in of apprise may raise anything
+            except Exception:  # apprise's plug-ins may raise anything
                 _log.debug("word to %s", self, exc_info=True)
         return False
 
 
 def problem_of(url: str) -> str | None:
-    """What is wrong with a receiver, without its secrets; None where apprise knows it."""
+    """Describe the problem with a receiver, without its secrets; None if apprise supports it."""
     try:
         _Receiver(1, url)
     except NotifyError as error:

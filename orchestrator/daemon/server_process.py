@@ -1,4 +1,8 @@
-"""`decant serve`: one process that listens, runs campaigns, and ends in order when it is told to."""
+"""The process of `decant serve`: it listens, runs the daemon, and shuts down at a safe point after a signal.
+
+`serve` is the entry point; `log_lines` configures structured logs. Routes are in `http_api`, scheduling in
+`supervisor`, and the restart after a failure of Ray in `restart`.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 
 class ServeError(RunError):
-    """The daemon can't listen; the text says why."""
+    """The daemon can't listen; the message gives the reason."""
 
     exit_code = 2
 
@@ -39,19 +43,19 @@ class ServeError(RunError):
 class _Server(uvicorn.Server):
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Signals are the daemon's: a pour has to be finished before anything closes."""
+        """Ignore signals here: the daemon handles them, since a pour must be finished before anything closes."""
         yield
 
 
 def serve(settings: DaemonSettings, ready: Callable[[str], None] = lambda url: None) -> None:
-    """Serve until told to end.
+    """Run the daemon until a signal or a client ends it.
 
     Args:
-        settings: in force.
-        ready: told the address once it is served.
+        settings: settings in force.
+        ready: called with the URL once it is served.
 
     Raises:
-        RunError: it can't begin: the state directory is another's, the tokens are open to others, the port is taken.
+        RunError: the state directory is in use, the tokens are readable by others, or the port is taken.
     """
     os.umask(0o077)
     use_state_directory(settings.state)
@@ -71,7 +75,7 @@ async def _serve(settings: DaemonSettings, ready: Callable[[str], None], renewal
         if live is not None:
             opened.enter_context(live)
         again = await _serve_with(settings, tokens, listening, ready, live, notifier, renewal)
-    if again:  # from inside of the loop: its end would wait for threads that hang in calls to a dead Ray
+    if again:  # after the event loop's end would be too late: it waits for threads that hang in calls to a dead Ray
         _log.warning("begins anew")
         renewal.begin_anew()
     _log.info("ended")
@@ -101,7 +105,7 @@ async def _serve_with(
     notifier: Notifier | None,
     renewal: DaemonRestart,
 ) -> bool:
-    """Serve until told to end, or until Ray has died: then everything has come to rest, and True is returned."""
+    """Serve until the end is requested or Ray dies; return True in the latter case, after all work has stopped."""
     daemon = Supervisor(settings, live)
     ending = _Ending(daemon)
     app = serve_app(daemon, tokens, ending, None if live is None else lambda campaign: live.url)
@@ -152,7 +156,7 @@ async def _serve_with(
 
 
 class _Ending:
-    """Called once: end at the next safe point. Called again: give everything up."""
+    """Shuts the daemon down: the first call at the next safe point, the second one at once."""
 
     def __init__(self, daemon: Supervisor) -> None:
         self._daemon = daemon
@@ -187,7 +191,7 @@ def _url(settings: DaemonSettings, listening: socket.socket) -> str:
 
 
 def log_lines(stream: Any = None) -> None:
-    """Structured log lines from now on: one JSON object a line, on stdout, as a service manager collects them."""
+    """Configure structured logs: one JSON object per line on stdout, as service managers collect them."""
     handler = logging.StreamHandler(stream or sys.stdout)
     form = JsonFormatter(
         "{asctime}{levelname}{name}{message}",
