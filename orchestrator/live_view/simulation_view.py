@@ -1,6 +1,7 @@
-"""A simulated pour on its own stage: vessels, particles by their fate, and how much of the liquid is where.
+"""Rows of simulated pours: vessels, particles by their fate, and the fractions of the liquid.
 
-One simulated pour as a recording, for `decant simulate --rrd`.
+`SimulatedStage` adds simulations to the playback of a campaign's recording. `simulation_rrd` writes one simulated pour
+as a recording of its own, for `decant simulate --rrd`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from sim_engine.outcome import RecordedFrames, SimulatedPour
 from sim_engine.scene import PourTask, Scene
 
 MAXIMUM_RATE = 10.0
-"""Frames per second of a film: 3 000 particles cost about 36 kB each."""
+"""Frames per second of playback: 3 000 particles take about 36 kB each."""
 
 PLACE = "/simulation"
 
@@ -28,11 +29,11 @@ SHARES = ("in the pourer", "falling", "received", "spilled")
 
 
 class SimulatedStage:
-    """Films of simulations. For one thread.
+    """Adds playbacks of simulations. For one thread.
 
     Args:
-        outlet: where rows go.
-        films: that they are shown by.
+        outlet: sink of the rows.
+        films: playback queue.
     """
 
     def __init__(self, outlet: RecordingSink, films: PlaybackQueue) -> None:
@@ -49,11 +50,11 @@ class SimulatedStage:
         """Show a simulation.
 
         Args:
-            frames: that were kept; thinned to `MAXIMUM_RATE`.
-            scene: what was simulated.
-            title: of it, for people.
-            now: on the wall clock [s since 1970].
-            step: of the campaign.
+            frames: recorded frames; subsampled to `MAXIMUM_RATE`.
+            scene: simulated scene.
+            title: title for the viewer.
+            now: wall clock [s since 1970].
+            step: step of the campaign.
         """
         times = np.asarray(frames.times, dtype=float)
         if len(times) == 0:
@@ -73,14 +74,14 @@ class SimulatedStage:
             float(moments[-1]),
             tracks,
             begin=lambda: self._set(scene, title),
-            end=lambda: self._outlet.clear(f"{PLACE}/share", recursive=True),  # no line to the next film
+            end=lambda: self._outlet.clear(f"{PLACE}/share", recursive=True),  # no line to the next playback
         )
         self._films.add(now, step, film)
 
     def _set(self, scene: Scene, title: str) -> None:
         self._outlet.log(f"{PLACE}/title", self._rr.TextDocument(f"### {title}", media_type="text/markdown"))
         for what, spec in (("pourer", scene.pourer), ("receiver", scene.receiver)):
-            # What is left out of the wall clock isn't there for those who watch by it.
+            # Viewers of the wall clock don't see rows that are left out of it.
             key, place = spec.content_hash(), (what, self._outlet.on_wall)
             if self._shown.get(place) != key:
                 self._shown[place] = self._shown[what, False] = key
@@ -88,7 +89,7 @@ class SimulatedStage:
 
 
 def thinned(times: NDArray[np.float64]) -> list[int]:
-    """Which frames a film keeps: `MAXIMUM_RATE`, and the last one, which decides what was spilled."""
+    """Return the indices of frames to show: at most `MAXIMUM_RATE`, and the last, which shows the spilled liquid."""
     kept = [0]
     for index in range(1, len(times)):
         if times[index] - times[kept[-1]] >= 1.0 / MAXIMUM_RATE - 1e-6:
@@ -103,9 +104,9 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
 
     Args:
         path: `.rrd` to write; replaced if it exists.
-        task: what was simulated, with `record_rate` > 0.
-        result: what came of it.
-        title: of the recording; what is poured into what if not given.
+        task: simulated task, with `record_rate` > 0.
+        result: result of the simulation.
+        title: title of the recording; default: names of the vessels, and the seed.
 
     Returns:
         `path`.
