@@ -11,12 +11,8 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli import queue_commands as daemon_verbs
+from orchestrator.cli import queue_commands, robot_commands, run_commands, simulate_command, vessel_command
 from orchestrator.cli import report_command as report
-from orchestrator.cli import robot_commands as bench_verbs
-from orchestrator.cli import run_commands as runs_verbs
-from orchestrator.cli import simulate_command as simulate_verb
-from orchestrator.cli import vessel_command as vessel_verb
 from orchestrator.cli import view_command as view
 from orchestrator.cli.command_options import (
     Answer,
@@ -73,7 +69,7 @@ def decant(
     """Options that precede the command."""
 
 
-def _campaign_verb(name: str, text: str, *lines: str) -> None:
+def _campaign_command(name: str, text: str, *lines: str) -> None:
     """Add a command that runs a campaign or a part of one; all of them have the same options."""
 
     def verb(
@@ -98,7 +94,7 @@ def _campaign_verb(name: str, text: str, *lines: str) -> None:
     app.command(name, help=text, epilog=examples(*lines))(verb)
 
 
-_campaign_verb(
+_campaign_command(
     "run",
     """Run a campaign: calibrate, then learn to pour. Journal, figures and recording are written to runs/ID/.
 
@@ -109,7 +105,7 @@ Ctrl-C pauses the run: a pour that has started is finished and weighed first. `-
     "decant run my.yaml --resume   # after a stop, a crash or a power failure; finished work is not repeated",
 )
 
-_campaign_verb(
+_campaign_command(
     "calibrate",
     """Only calibrate: find the θ whose simulated spillage matches the weighed pours (C1 to C4), scored on other pours.
 
@@ -144,8 +140,9 @@ def plan(
     """Plan a pour in simulation (D1), for the campaign's receivers or for a new one.
 
     By default, fifteen actions are simulated, in parallel on all cores. The planned action is then simulated with
-    further seeds, which give its prediction and its prediction interval. Nothing is poured. Actions are shown in deg,
-    deg/s, mm and s.
+    further seeds, which give its prediction and prediction interval. Nothing is poured.
+
+    Actions are shown in deg, deg/s, mm and s.
     """
     options = given(locals(), "campaign")
     from orchestrator.cli import campaign_commands as campaigns
@@ -190,7 +187,7 @@ app.command(
         "decant simulate my.yaml --set 'angular_velocity=0.7 rad/s' --set 'x_offset=9 cm' --png pour.png",
         "decant simulate my.yaml --from pours.csv --parameters theta.json --csv scored.csv --png scored.png",
     )
-)(simulate_verb.simulate)
+)(simulate_command.simulate)
 
 
 @app.command(
@@ -233,14 +230,14 @@ app.command(
         "decant doctor configs/laboratories/virtual.yaml",
         "decant doctor configs/laboratories/ur10-kern.yaml --accept-safety   # after reading them on the teach pendant",
     )
-)(bench_verbs.doctor)
+)(robot_commands.doctor)
 
 app.command(
     epilog=examples(
         "decant jog configs/laboratories/virtual.yaml         # practise without a robot",
         "decant jog configs/laboratories/ur10-kern.yaml --arm",
     )
-)(bench_verbs.jog)
+)(robot_commands.jog)
 
 app.command(
     epilog=examples(
@@ -248,11 +245,11 @@ app.command(
         "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --empty --slow 0.2 --arm",
         "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --arm",
     )
-)(bench_verbs.pour)
+)(robot_commands.pour)
 
 app.command(epilog=report.EXAMPLES)(report.report)
 app.command(epilog=view.EXAMPLES)(view.view)
-app.add_typer(runs_verbs.runs)
+app.add_typer(run_commands.runs)
 
 
 @app.command(epilog=examples("decant plugins", "decant plugins --json"))
@@ -295,8 +292,8 @@ def physics(
     call(verb.physics, cases or [], full=full, pours=pours, write=write, as_json=as_json, list_cases=list_cases)
 
 
-daemon_verbs.register(app)
-vessel_verb.register(app)
+queue_commands.register(app)
+vessel_command.register(app)
 
 
 def main() -> None:

@@ -142,8 +142,8 @@ NEWEST = 20
 
 def list_runs(conditions: Mapping[str, Any], *, daemon: bool = False, as_json: bool) -> None:
     """List the runs that meet the conditions, newest first."""
-    with _desk(daemon) as desk:
-        found = desk.runs(conditions)
+    with _client(daemon) as client:
+        found = client.runs(conditions)
     if as_json:
         print_json({"runs": found})
         return
@@ -171,8 +171,8 @@ def list_runs(conditions: Mapping[str, Any], *, daemon: bool = False, as_json: b
 
 def list_pours(conditions: Mapping[str, Any], *, daemon: bool = False, as_json: bool) -> None:
     """List the pours that meet the conditions, oldest first."""
-    with _desk(daemon) as desk:
-        found = desk.pours(conditions)
+    with _client(daemon) as client:
+        found = client.pours(conditions)
     if as_json:
         print_json({"pours": found})
     elif found:
@@ -183,8 +183,8 @@ def list_pours(conditions: Mapping[str, Any], *, daemon: bool = False, as_json: 
 
 def show(name: str, *, daemon: bool = False, as_json: bool) -> None:
     """Show one run."""
-    with _desk(daemon) as desk:
-        run = desk.run(name)
+    with _client(daemon) as client:
+        run = client.run(name)
     if as_json:
         print_json(run)
         return
@@ -227,8 +227,8 @@ def check(name: str, *, as_json: bool) -> None:
         if not has_begun(folder / JOURNAL_NAME):
             raise RefusalError(f"{folder}: there is no run in this folder", BAD_INPUT)
     else:
-        with _desk(daemon=False) as desk:
-            folder = Path(desk.run(name)["path"])
+        with _client(daemon=False) as client:
+            folder = Path(client.run(name)["path"])
     with _refusing():
         found = check_journal(folder / JOURNAL_NAME)
     if as_json:
@@ -254,8 +254,8 @@ def compare(names: Sequence[str], *, daemon: bool = False, as_json: bool) -> Non
     """Compare runs: the settings in which they differ, and their outcomes."""
     if len(names) < 2:
         raise RefusalError("comparing takes two runs or more: decant runs compare RUN RUN", BAD_INPUT)
-    with _desk(daemon) as desk:
-        found = desk.compare(names)
+    with _client(daemon) as client:
+        found = client.compare(names)
     if as_json:
         print_json(found)
         return
@@ -273,15 +273,15 @@ def tag(name: str, add: Sequence[str], remove: Sequence[str], *, daemon: bool = 
     """Add and remove tags of a run."""
     if not add and not remove:
         raise RefusalError("name tags to put on the run, or --remove those to take off", BAD_INPUT)
-    with _desk(daemon) as desk:
-        found = desk.tag(name, add, remove)
+    with _client(daemon) as client:
+        found = client.tag(name, add, remove)
     print(f"{found['run']}: {', '.join(found['tags']) or 'no tags'}")
 
 
 def note(name: str, text: str, *, daemon: bool = False) -> None:
     """Add a note to a run."""
-    with _desk(daemon) as desk:
-        found = desk.note(name, text)
+    with _client(daemon) as client:
+        found = client.note(name, text)
     print(f"{found['run']}: {len(found['notes'])} note{'s' * (len(found['notes']) > 1)}")
 
 
@@ -295,8 +295,8 @@ def export(
     if wrong := sorted(set(formats or ()) - set(FORMATS)):
         raise RefusalError(f"--format {wrong[0]}: should be {' or '.join(FORMATS)}", BAD_INPUT)
     try:
-        with _desk(daemon) as desk:
-            found = desk.export(folder, conditions, formats or FORMATS)
+        with _client(daemon) as client:
+            found = client.export(folder, conditions, formats or FORMATS)
     except MissingExtraError as error:
         raise RefusalError(f"{error}; or --format csv", BAD_INPUT) from None
     if as_json:
@@ -334,7 +334,7 @@ def rebuild() -> None:
 
 
 @contextlib.contextmanager
-def _desk(daemon: bool) -> Iterator[CatalogueClient]:
+def _client(daemon: bool) -> Iterator[CatalogueClient]:
     """Open a client of this machine's catalogue or of the daemon's."""
     try:
         if daemon:

@@ -106,12 +106,12 @@ class Jogging:
     """
 
     def __init__(self, arm: Arm, read: Callable[[str], str], tell: Callable[[str], None] = say) -> None:
-        self._arm, self._read, self._tell = arm, read, tell
+        self._arm, self._read, self._print = arm, read, tell
         self._known: set[tuple[str, bool]] = set()
 
     def run(self) -> None:
         """Run until 'quit' or the end of input."""
-        self._tell(_HELP)
+        self._print(_HELP)
         self.where()
         while True:
             try:
@@ -123,7 +123,7 @@ class Jogging:
             try:
                 self.do(typed)
             except (JogError, LaboratoryError) as error:
-                self._tell(str(error))
+                self._print(str(error))
 
     def do(self, typed: str) -> None:
         """Execute one line.
@@ -133,7 +133,7 @@ class Jogging:
             LaboratoryError: the motion is refused or stopped.
         """
         if typed in ("help", "?", "h"):
-            self._tell(_HELP)
+            self._print(_HELP)
         elif typed == "home":
             self.home()
         elif typed == "where":
@@ -146,18 +146,18 @@ class Jogging:
         here = self._arm.where()
         if here.joints:
             joints = "  ".join(f"{i}: {math.degrees(q):7.2f}" for i, q in enumerate(here.joints, start=1))
-            self._tell(f"joints  {joints} deg")
+            self._print(f"joints  {joints} deg")
         numbers = here.tool.as_list
         place = "  ".join(f"{name} {1e3 * value:7.1f}" for name, value in zip("xyz", numbers[:3], strict=True))
         turn = "  ".join(f"r{name} {value:6.3f}" for name, value in zip("xyz", numbers[3:], strict=True))
-        self._tell(f"tool    {place} mm   {turn} rad")
+        self._print(f"tool    {place} mm   {turn} rad")
 
     def step(self, step: JogStep) -> None:
         """Move one step; the first step along each axis and direction is confirmed."""
         known = (step.axis, step.amount > 0.0)
         if known not in self._known:
             if self._read(f"{step}: Enter moves, anything else doesn't > ").strip():
-                self._tell("not moved")
+                self._print("not moved")
                 return
             self._known.add(known)
         self._move(step)
@@ -174,17 +174,17 @@ class Jogging:
             raise JogError("this arm doesn't tell its joints, or where home is; bring it home by steps")
         steps = steps_home(here.joints, here.home)
         if not steps:
-            self._tell("at home")
+            self._print("at home")
             return
-        self._tell(
+        self._print(
             f"{len(steps)} small steps, one joint after the other, in nearly a straight line in the joints. Nothing "
             "knows what stands in the way: watch it, Ctrl-C stops it."
         )
         if self._read("type 'home' to begin > ").strip() != "home":
-            self._tell("not moved")
+            self._print("not moved")
             return
         for number, step in enumerate(steps, start=1):
-            self._tell(f"{number}/{len(steps)}  {step}")
+            self._print(f"{number}/{len(steps)}  {step}")
             self._move(step)
         self.where()
 

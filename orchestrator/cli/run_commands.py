@@ -219,7 +219,7 @@ def export(
     daemon: Daemon = False,
     as_json: Json = False,
 ) -> None:
-    """Export runs and pours as CSV and Parquet with a data dictionary: runs.*, pours.*, dictionary.csv."""
+    """Export runs and pours as CSV and Parquet, with a data dictionary: `runs.*`, `pours.*` and `dictionary.csv`."""
     from orchestrator.cli import catalogue_output as verb
 
     call(verb.export, folder, conditions, formats, daemon=daemon, as_json=as_json)

@@ -32,7 +32,7 @@ def study(path: Path, *, jobs: int | None, dry_run: bool, report_only: bool, as_
     with Refused(StudyError):
         if dry_run:
             check_settings(plan)
-            _tell_what_is_left(plan, cells, as_json)
+            _print_remaining(plan, cells, as_json)
             return
         with opened(plan) as folder:
             status = None if report_only else _run(plan, folder, jobs or os.cpu_count() or 1, path)
@@ -69,7 +69,7 @@ def read_study(path: Path) -> StudyPlan:
     return plan
 
 
-def _tell_what_is_left(plan: StudyPlan, cells: tuple[StudyCell, ...], as_json: bool) -> None:
+def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...], as_json: bool) -> None:
     from orchestrator.study.study_folder import is_finished
     from orchestrator.study.study_plan import estimated_seconds
 

@@ -173,10 +173,10 @@ def _turned(out: Path, name: str, sources: Sources) -> Made:
     spec = VesselSpec(name=name, shape=outline.shape())
     build_vessel(spec)
     doubts = _doubts(outline, sources)
-    told = [f"{fit.count} from the {fit.name}, {fit.rms:.1f} of their own deviations off" for fit in outline.fits]
+    used = [f"{fit.count} from the {fit.name}, {fit.rms:.1f} of their own deviations off" for fit in outline.fits]
     picture = draw_outline(name, outline, evidence, out.with_suffix(".png"))
-    out.write_text(_profile_file(name, outline, told, doubts))
-    return Made(outline.capacity, outline.capacity_deviation, outline.radius_deviation, picture, notes + told, doubts)
+    out.write_text(_profile_file(name, outline, used, doubts))
+    return Made(outline.capacity, outline.capacity_deviation, outline.radius_deviation, picture, notes + used, doubts)
 
 
 def _measured(sources: Sources, height: float) -> list[Evidence]:
@@ -330,11 +330,11 @@ def _unit(sources: Sources) -> LengthUnit | None:
     return cast("LengthUnit", sources.unit)
 
 
-def _profile_file(name: str, outline: FittedOutline, told: Sequence[str], doubts: Sequence[str]) -> str:
+def _profile_file(name: str, outline: FittedOutline, used: Sequence[str], doubts: Sequence[str]) -> str:
     shape = outline.shape()
     points = ", ".join(f"[{1e3 * r:.4g}, {1e3 * z:.4g}]" for r, z in shape.inner)
     lines = [
-        f"# Measured: {'; '.join(told)}.",
+        f"# Measured: {'; '.join(used)}.",
         f"# It holds {1e6 * outline.capacity:.0f} ± {1e6 * outline.capacity_deviation:.1f} mL; its inner radius is "
         f"known to ± {1e3 * outline.radius_deviation:.2f} mm (one standard deviation).",
         *(f"# Doubtful: {doubt}." for doubt in doubts),

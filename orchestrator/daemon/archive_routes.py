@@ -63,7 +63,7 @@ PreviousRunDetail = create_model(
 )
 
 
-def _asked(name: str, **more: Any) -> Callable[..., dict[str, Any]]:
+def _filters(name: str, **more: Any) -> Callable[..., dict[str, Any]]:
     """Make a dependency that returns the filters in a request's query."""
     text = Annotated[str | None, Field(max_length=200)]
     fields: dict[str, Any] = {
@@ -89,9 +89,9 @@ _FORMATS = (
     list[Literal["csv", "parquet"]],
     Field(default=["csv"], min_length=1, max_length=2, description="One format or both."),
 )
-RunsAsked = Annotated[dict[str, Any], Depends(_asked("RunsAsked"))]
-PoursAsked = Annotated[dict[str, Any], Depends(_asked("PoursAsked", run=_RUN))]
-ExportAsked = Annotated[dict[str, Any], Depends(_asked("ExportAsked", format=_FORMATS))]
+RunsAsked = Annotated[dict[str, Any], Depends(_filters("RunsAsked"))]
+PoursAsked = Annotated[dict[str, Any], Depends(_filters("PoursAsked", run=_RUN))]
+ExportAsked = Annotated[dict[str, Any], Depends(_filters("ExportAsked", format=_FORMATS))]
 
 
 class RunComparison(BaseModel):
@@ -140,13 +140,13 @@ class NotesOut(BaseModel):
     notes: list[Note]
 
 
-async def _at_desk(daemon: Supervisor, ask: Callable[[LocalCatalogueClient], T], by: str | None = None) -> T:
+async def _in_catalogue(daemon: Supervisor, query: Callable[[LocalCatalogueClient], T], by: str | None = None) -> T:
     """Query the catalogue in a thread: the first query may read many journals."""
 
     def work() -> T:
         with Catalogue(daemon.settings.state) as catalogue:
             catalogue.refresh()
-            return ask(LocalCatalogueClient(catalogue, by))
+            return query(LocalCatalogueClient(catalogue, by))
 
     try:
         return await asyncio.to_thread(work)
@@ -165,13 +165,13 @@ async def runs(daemon: Daemon, person: Viewer, asked: RunsAsked) -> Any:
     The list includes runs of the command line if it uses the same state directory. All given conditions must hold;
     names may contain the wildcards * and ?.
     """
-    return await _at_desk(daemon, lambda desk: desk.runs(asked))
+    return await _in_catalogue(daemon, lambda client: client.runs(asked))
 
 
 @router.get("/pours", operation_id="pours", response_model=_several(PreviousPour))
 async def pours(daemon: Daemon, person: Viewer, asked: PoursAsked) -> Any:
     """List the pours of all runs, oldest first: the action, the measured spillage and the prediction."""
-    return await _at_desk(daemon, lambda desk: desk.pours(asked))
+    return await _in_catalogue(daemon, lambda client: client.pours(asked))
 
 
 @router.get("/runs/compare", operation_id="compare_runs")
@@ -181,7 +181,7 @@ async def compare(
     run: Annotated[list[str], Query(min_length=2, max_length=20, description="Names of two or more runs.")],
 ) -> RunComparison:
     """Compare runs: the settings in which they differ, and their outcomes."""
-    return RunComparison.model_validate(await _at_desk(daemon, lambda desk: desk.compare(run)))
+    return RunComparison.model_validate(await _in_catalogue(daemon, lambda client: client.compare(run)))
 
 
 @router.get(
@@ -194,16 +194,16 @@ async def export(daemon: Daemon, person: Viewer, asked: ExportAsked) -> Response
     """Export runs and pours as files with a data dictionary, in one zip archive."""
     formats = dict.fromkeys(asked.pop("format"))
 
-    def written(desk: LocalCatalogueClient) -> bytes:
+    def written(client: LocalCatalogueClient) -> bytes:
         archive = BytesIO()
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
-            found = desk.export(Path(folder), asked, list(formats))
+            found = client.export(Path(folder), asked, list(formats))
             for path in map(Path, found.pop("files")):
                 packed.write(path, path.name)
             packed.comment = json.dumps(found).encode()
         return archive.getvalue()
 
-    content = await _at_desk(daemon, written)
+    content = await _in_catalogue(daemon, written)
     headers = {"Content-Disposition": 'attachment; filename="decant-runs.zip"'}
     return Response(content, media_type="application/zip", headers=headers)
 
@@ -211,7 +211,7 @@ async def export(daemon: Daemon, person: Viewer, asked: ExportAsked) -> Response
 @router.get("/runs/{run}", operation_id="run", response_model=PreviousRunDetail)
 async def run(daemon: Daemon, person: Viewer, run: str) -> Any:
     """Return one run by its folder's name or a prefix of it: θ*, recommendation, pours, tags and notes."""
-    return await _at_desk(daemon, lambda desk: desk.run(run))
+    return await _in_catalogue(daemon, lambda client: client.run(run))
 
 
 @router.get(
@@ -222,7 +222,7 @@ async def run(daemon: Daemon, person: Viewer, run: str) -> Any:
 )
 async def run_report(daemon: Daemon, person: Viewer, run: str) -> FileResponse:
     """Return the report of a run."""
-    path = Path((await _at_desk(daemon, lambda desk: desk.run(run)))["path"]) / REPORT
+    path = Path((await _in_catalogue(daemon, lambda client: client.run(run)))["path"]) / REPORT
     if not path.is_file():
         raise HTTPException(404, f"{run} has no report")
     return FileResponse(path, media_type="text/html")
@@ -231,7 +231,7 @@ async def run_report(daemon: Daemon, person: Viewer, run: str) -> FileResponse:
 @router.post("/runs/{run}/tags", operation_id="tag_run")
 async def tag(daemon: Daemon, person: Operator, run: str, body: TagsIn) -> TagsOut:
     """Add tags to a run or remove them. They are stored in the run's folder."""
-    found = await _at_desk(daemon, lambda desk: desk.tag(run, body.add, body.remove))
+    found = await _in_catalogue(daemon, lambda client: client.tag(run, body.add, body.remove))
     daemon.note(person.name, "tag", detail=f"{found['run']}: {', '.join(found['tags'])}")
     return TagsOut.model_validate(found)
 
@@ -239,6 +239,6 @@ async def tag(daemon: Daemon, person: Operator, run: str, body: TagsIn) -> TagsO
 @router.post("/runs/{run}/notes", operation_id="note_run")
 async def note(daemon: Daemon, person: Operator, run: str, body: NoteIn) -> NotesOut:
     """Add a note to a run, with date and author. It is stored in the run's folder."""
-    found = await _at_desk(daemon, lambda desk: desk.note(run, body.text), person.name)
+    found = await _in_catalogue(daemon, lambda client: client.note(run, body.text), person.name)
     daemon.note(person.name, "note", detail=f"{found['run']}: {body.text}")
     return NotesOut.model_validate(found)

@@ -145,11 +145,11 @@ async def move(request: Request, daemon: Daemon, person: Operator, key: str, bod
     )
 
 
-def _done(request: Request, daemon: Supervisor, key: str, deed: Callable[[], QueueItem]) -> CampaignOut:
+def _done(request: Request, daemon: Supervisor, key: str, command: Callable[[], QueueItem]) -> CampaignOut:
     """Run a command on a campaign; the daemon may refuse it."""
     found_item(daemon, key)
     with _refusing():
-        return campaign_out(request, daemon, deed())
+        return campaign_out(request, daemon, command())
 
 
 @contextlib.contextmanager

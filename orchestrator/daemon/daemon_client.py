@@ -62,7 +62,7 @@ class Client:
 
     def __init__(self, url: str | None = None, state: Path | None = None, token: str | None = None) -> None:
         state = state or state_directory()
-        self.url = (url or os.environ.get("DECANT_URL") or _told(state) or f"http://127.0.0.1:{PORT}").rstrip("/")
+        self.url = (url or os.environ.get("DECANT_URL") or _stored_url(state) or f"http://127.0.0.1:{PORT}").rstrip("/")
         token = token or os.environ.get("DECANT_TOKEN") or _token(state)
         self._http = httpx.Client(
             base_url=self.url, headers={"Authorization": f"Bearer {token}"}, timeout=TIMEOUT, trust_env=False,
@@ -116,7 +116,7 @@ class Client:
             campaign: only events of this campaign.
             follow: wait for further events.
         """
-        broken = 0
+        failures = 0
         while True:
             query = {"campaign": campaign, "after": after, "until": None if follow else "true"}
             try:
@@ -127,27 +127,27 @@ class Client:
                     if answer.status_code >= 400:
                         answer.read()
                     _check(answer)
-                    for told in _told_in(answer.iter_lines()):
-                        after, broken = told.id, 0
-                        yield told
+                    for event in _events_in(answer.iter_lines()):
+                        after, failures = event.id, 0
+                        yield event
             except httpx.HTTPError as error:
-                broken += 1
-                if broken > 3 or not follow:
+                failures += 1
+                if failures > 3 or not follow:
                     raise self._unreachable(error) from None
             else:
                 if not follow:
                     return
-                broken += 1
-                if broken > 3:
+                failures += 1
+                if failures > 3:
                     raise DaemonError("the daemon has ended")
-            time.sleep(0.3 * broken)
+            time.sleep(0.3 * failures)
 
 
 def _given(query: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in query.items() if value is not None}
 
 
-def _told_in(lines: Iterator[str]) -> Iterator[ServerReply]:
+def _events_in(lines: Iterator[str]) -> Iterator[ServerReply]:
     number, kind, data = 0, "", ""
     for line in lines:
         name, _, value = line.partition(":")
@@ -187,7 +187,7 @@ def _trusted(url: str) -> ssl.SSLContext | bool:
         raise DaemonError(f"$DECANT_CA: {path}: can't be used as a certificate (PEM): {error}", 2) from None
 
 
-def _told(state: Path) -> str | None:
+def _stored_url(state: Path) -> str | None:
     try:
         return (state / "url").read_text(encoding="utf-8").strip() or None
     except OSError:

@@ -13,9 +13,7 @@ from typing import Any
 
 from fastapi import FastAPI, Response
 
-from orchestrator.daemon import archive_routes as archive
-from orchestrator.daemon import command_routes as deeds
-from orchestrator.daemon import query_routes as looks
+from orchestrator.daemon import archive_routes, command_routes, query_routes
 from orchestrator.daemon.access_control import Daemon, RequestGuard, Tokens
 from orchestrator.daemon.page import page_router
 from orchestrator.daemon.schemas import HealthOut, ProblemOut
@@ -52,9 +50,9 @@ def create_app() -> FastAPI:
         redoc_url=None,
         openapi_url=None,
     )
-    app.include_router(looks.router, prefix=V1, responses=_ERRORS)
-    app.include_router(deeds.router, prefix=V1, responses=_ERRORS)
-    app.include_router(archive.router, prefix=V1, responses=_ERRORS)
+    app.include_router(query_routes.router, prefix=V1, responses=_ERRORS)
+    app.include_router(command_routes.router, prefix=V1, responses=_ERRORS)
+    app.include_router(archive_routes.router, prefix=V1, responses=_ERRORS)
     app.add_api_route("/healthz", _health, operation_id="health", response_model=HealthOut)
     app.add_api_route(
         "/readyz",

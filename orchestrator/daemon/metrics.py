@@ -33,8 +33,8 @@ class _Collector:
             campaigns.add_metric([state], count)
         yield campaigns
         busy = GaugeMetricFamily("decant_rig_busy", "Whether a campaign has the rig.", labels=["rig"])
-        for name, lane in daemon.lanes.items():
-            busy.add_metric([name], float(lane.running is not None))
+        for name, worker in daemon.lanes.items():
+            busy.add_metric([name], float(worker.running is not None))
         yield busy
         words = GaugeMetricFamily("decant_words", "Messages to people elsewhere.", labels=["receiver", "outcome"])
         for receiver, counts in daemon.words.items():

@@ -36,7 +36,7 @@ OCCASIONS: tuple[Occasion, ...] = ("question", "ended", "failed", "silence", "em
 _BY_PEOPLE = ("", "stopped on request")
 """Reasons of a campaign that an operator paused."""
 
-_TOLD = (
+_EVENTS_WITH_DATA = (
     "CampaignLeased",
     "CampaignOpened",
     "CampaignRests",
@@ -119,13 +119,13 @@ class Notifier:
     ) -> None:
         self._about, self._silence, self._page, self._clock = frozenset(about), silence, page, clock
         self._receivers = [_Receiver(number, url) for number, url in enumerate(receivers, start=1)]
-        self._heard: dict[str, _Heard] = {}
+        self._news: dict[str, _CampaignNews] = {}
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._threads = [
             threading.Thread(target=one.work, name=f"word to {one}", daemon=True) for one in self._receivers
         ]
-        self._threads.append(threading.Thread(target=self._listen_for_silence, name="silence", daemon=True))
+        self._threads.append(threading.Thread(target=self._watch_for_silence, name="silence", daemon=True))
         for thread in self._threads:
             thread.start()
 
@@ -138,9 +138,9 @@ class Notifier:
         """Process an event: its type in the daemon's feed, and its data."""
         try:
             with self._lock:
-                word = self._word(kind, data, campaign)
-            if word is not None:
-                self._send(word)
+                message = self._message(kind, data, campaign)
+            if message is not None:
+                self._send(message)
         except Exception:  # a failed notification must never end anything else
             _log.exception("no word could be made of %s", kind)
 
@@ -155,29 +155,29 @@ class Notifier:
 
     # ---- from events to messages
 
-    def _word(self, kind: str, data: Mapping[str, Any], campaign: str) -> Notification | None:
-        heard = self._heard.get(campaign)
-        if heard is not None:
-            heard.at, heard.told = self._clock(), False
+    def _message(self, kind: str, data: Mapping[str, Any], campaign: str) -> Notification | None:
+        news = self._news.get(campaign)
+        if news is not None:
+            news.at, news.reported = self._clock(), False
         match kind:
             case "CampaignLeased":
-                self._heard[campaign] = _Heard(self._clock(), rig=str(data.get("rig", "")))
-            case "CampaignOpened" if heard is not None:
-                heard.mode = str(data.get("mode", ""))
+                self._news[campaign] = _CampaignNews(self._clock(), rig=str(data.get("rig", "")))
+            case "CampaignOpened" if news is not None:
+                news.mode = str(data.get("mode", ""))
             case "QuestionAsked":
                 question = data["question"]
-                if heard is not None:
-                    heard.question = str(question["text"])
+                if news is not None:
+                    news.question = str(question["text"])
                 lines = [str(question["text"]), str(question.get("problem") or "")]
                 if options := question.get("options"):
                     lines.append("Answer with one of: " + ", ".join(map(str, options)))
                 return self._made("question", campaign, "an answer is needed", lines)
-            case "QuestionAnswered" | "QuestionClosed" if heard is not None:
-                heard.question = ""
+            case "QuestionAnswered" | "QuestionClosed" if news is not None:
+                news.question = ""
             case "CampaignRests":
-                word = self._rests(data, campaign)
-                self._heard.pop(campaign, None)
-                return word
+                message = self._rests(data, campaign)
+                self._news.pop(campaign, None)
+                return message
             case "Deed" if data.get("what") == "emergency stop":
                 lines = [f"By {data.get('by')}.", str(data.get("detail") or ""), "Nothing begins before it is cleared."]
                 return self._made("emergency", "", "EMERGENCY STOP", lines)
@@ -197,39 +197,39 @@ class Notifier:
     def _made(self, occasion: Occasion, campaign: str, what: str, lines: Sequence[str]) -> Notification | None:
         if occasion not in self._about:
             return None
-        heard = self._heard.get(campaign)
-        mode = "" if heard is None else {"hardware": "REAL ", "virtual": "VIRTUAL "}.get(heard.mode, "")
-        rig = "" if heard is None or not heard.rig else f" at {heard.rig}"
+        news = self._news.get(campaign)
+        mode = "" if news is None else {"hardware": "REAL ", "virtual": "VIRTUAL "}.get(news.mode, "")
+        rig = "" if news is None or not news.rig else f" at {news.rig}"
         title = f"Decant: {what}" if not campaign else f"Decant, {mode}{campaign}{rig}: {what}"
         return Notification(occasion, title, "\n".join(filter(None, (*lines, self._page))) or title)
 
-    def _listen_for_silence(self) -> None:
+    def _watch_for_silence(self) -> None:
         while not self._ended.wait(min(max(self._silence / 10.0, 0.05), 30.0)):
             self.listen_for_silence()
 
     def listen_for_silence(self) -> None:
         """Report campaigns without news for too long; once, until the next event."""
-        words = []
+        messages = []
         with self._lock:
-            for campaign, heard in self._heard.items():
-                quiet = self._clock() - heard.at
-                if heard.told or quiet < self._silence:
+            for campaign, news in self._news.items():
+                quiet = self._clock() - news.at
+                if news.reported or quiet < self._silence:
                     continue
-                heard.told = True
+                news.reported = True
                 lasts = f"{quiet / 60:.0f} min" if quiet >= 120.0 else f"{quiet:.0f} s"
-                if heard.question:
-                    words.append(
-                        self._made("silence", campaign, f"has waited for an answer for {lasts}", [heard.question])
+                if news.question:
+                    messages.append(
+                        self._made("silence", campaign, f"has waited for an answer for {lasts}", [news.question])
                     )
                 else:
                     lines = ["Nothing has happened in it since then: look after the bench."]
-                    words.append(self._made("silence", campaign, f"hangs: no news for {lasts}", lines))
-        for word in filter(None, words):
-            self._send(word)
+                    messages.append(self._made("silence", campaign, f"hangs: no news for {lasts}", lines))
+        for message in filter(None, messages):
+            self._send(message)
 
-    def _send(self, word: Notification) -> None:
+    def _send(self, message: Notification) -> None:
         for one in self._receivers:
-            one.put(word)
+            one.put(message)
 
 
 class NotificationResult(Protocol):
@@ -255,18 +255,18 @@ async def pass_on(events: AsyncIterator[NotificationResult | None], notifier: No
     """Pass the events of a feed to a notifier until the feed is closed: `pass_on(feed.read(), notifier)`."""
     async for sent in events:
         if sent is not None:
-            notifier.note(sent.type, json.loads(sent.data) if sent.type in _TOLD else {}, sent.campaign)
+            notifier.note(sent.type, json.loads(sent.data) if sent.type in _EVENTS_WITH_DATA else {}, sent.campaign)
 
 
 @dataclass
-class _Heard:
+class _CampaignNews:
     """Time of a campaign's last event (monotonic), and its state as far as it is known."""
 
     at: float
     rig: str = ""
     mode: str = ""
     question: str = ""
-    told: bool = False
+    reported: bool = False
 
 
 @dataclass
@@ -287,16 +287,16 @@ class _Receiver:
             where = self.url if self.url.startswith(ENVIRONMENT) else f"the {self.number}. one ({self._scheme}:…)"
             raise NotifyError(f"{where}: is not a URL that apprise knows; see https://appriseit.com/services/")
         self._apprise = found
-        self._words: queue.Queue[Notification | None] = queue.Queue(QUEUE)
+        self._messages: queue.Queue[Notification | None] = queue.Queue(QUEUE)
         self._ending = threading.Event()
 
     def __str__(self) -> str:
         return f"{self._scheme} ({self.number})"
 
-    def put(self, word: Notification) -> None:
+    def put(self, message: Notification) -> None:
         """Queue a message, or drop it if too many are waiting."""
         try:
-            self._words.put_nowait(word)
+            self._messages.put_nowait(message)
         except queue.Full:
             self.counts.dropped += 1
 
@@ -304,27 +304,27 @@ class _Receiver:
         """Send waiting messages with one attempt each, and end."""
         self._ending.set()
         try:
-            self._words.put_nowait(None)
+            self._messages.put_nowait(None)
         except queue.Full:
-            self._words.get_nowait()
+            self._messages.get_nowait()
             self.counts.dropped += 1
-            self._words.put_nowait(None)
+            self._messages.put_nowait(None)
 
     def work(self) -> None:
         """Send messages until the end."""
-        while (word := self._words.get()) is not None:
-            if self._delivered(word):
+        while (message := self._messages.get()) is not None:
+            if self._delivered(message):
                 self.counts.sent += 1
             else:
                 self.counts.failed += 1
-                _log.warning("no word to %s: '%s' could not be delivered", self, word.title)
+                _log.warning("no word to %s: '%s' could not be delivered", self, message.title)
 
-    def _delivered(self, word: Notification) -> bool:
+    def _delivered(self, message: Notification) -> bool:
         for attempt in range(TRIES):
             if attempt and self._ending.wait(PAUSES[attempt - 1]):
                 return False
             try:
-                if self._apprise.notify(title=word.title, body=word.body):
+                if self._apprise.notify(title=message.title, body=message.body):
                     return True
             except Exception:  # apprise's plug-ins may raise anything
                 _log.debug("word to %s", self, exc_info=True)

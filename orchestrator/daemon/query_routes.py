@@ -70,14 +70,20 @@ async def rigs(daemon: Daemon, person: Viewer) -> list[RigOut]:
 def rigs_out(daemon: Supervisor) -> list[RigOut]:
     """Convert the rigs to their response models."""
     found = []
-    for name, lane in daemon.lanes.items():
-        running = lane.running
+    for name, worker in daemon.lanes.items():
+        running = worker.running
         checkpoint = running.watching.checkpoint if running is not None and running.watching is not None else ""
         campaign = None if running is None else running.item.id
         stop = daemon.emergencies.get(name)
         found.append(
             RigOut.model_validate(
-                {"name": name, "mode": lane.rig.mode, "campaign": campaign, "checkpoint": checkpoint, "emergency": stop}
+                {
+                    "name": name,
+                    "mode": worker.rig.mode,
+                    "campaign": campaign,
+                    "checkpoint": checkpoint,
+                    "emergency": stop,
+                }
             )
         )
     return found

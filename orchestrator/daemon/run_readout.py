@@ -98,7 +98,7 @@ class _Read:
             if entry.body["request"]["type"] == Pour.__name__:
                 request = decode_request(entry.body["request"])
                 assert isinstance(request, Pour)
-                self._requests[key], self._pours[key] = request, _asked(self._plan, entry.stage, request)
+                self._requests[key], self._pours[key] = request, _requested(self._plan, entry.stage, request)
         elif entry.kind == Kind.POUR_FINISHED:
             outcome = decode_outcome(entry.body["outcome"])
             self._pours[key] |= {"time": entry.t, **_outcome(self._plan, self._requests[key], outcome)}
@@ -107,7 +107,7 @@ class _Read:
             self._pours[key] |= {"state": "under way" if begun else "asked", "time": entry.t}
 
 
-def _asked(plan: CampaignPlan, stage: str, pour: Pour) -> dict[str, Any]:
+def _requested(plan: CampaignPlan, stage: str, pour: Pour) -> dict[str, Any]:
     section = plan.calibration if is_calibration(plan, pour) else plan.deployment
     names = section.actions.names if section is not None else ("angular_velocity", "x_offset")
     predicted = "" if pour.predicted is None else unit_of_pour(plan, pour).prediction(pour.predicted)

@@ -62,22 +62,22 @@ def serve(settings: DaemonSettings, ready: Callable[[str], None] = lambda url: N
     asyncio.run(_serve(settings, ready, DaemonRestart()))
 
 
-async def _serve(settings: DaemonSettings, ready: Callable[[str], None], renewal: DaemonRestart) -> None:
+async def _serve(settings: DaemonSettings, ready: Callable[[str], None], restart: DaemonRestart) -> None:
     make_state_directory(settings.state)
     tokens = Tokens(settings.tokens)
     with contextlib.ExitStack() as opened:
-        listening = opened.enter_context(renewal.listening or _listen(settings))
-        renewal.keep(listening)
+        listening = opened.enter_context(restart.listening or _listen(settings))
+        restart.keep(listening)
         notifier = _notifier(settings)
         if notifier is not None:
             opened.callback(notifier.close)
         live = None if settings.live is None else LiveView(address=settings.live[0], web_port=settings.live[1])
         if live is not None:
             opened.enter_context(live)
-        again = await _serve_with(settings, tokens, listening, ready, live, notifier, renewal)
+        again = await _serve_with(settings, tokens, listening, ready, live, notifier, restart)
     if again:  # after the event loop's end would be too late: it waits for threads that hang in calls to a dead Ray
         _log.warning("begins anew")
-        renewal.begin_anew()
+        restart.begin_anew()
     _log.info("ended")
 
 
@@ -103,7 +103,7 @@ async def _serve_with(
     ready: Callable[[str], None],
     live: LiveView | None,
     notifier: Notifier | None,
-    renewal: DaemonRestart,
+    restart: DaemonRestart,
 ) -> bool:
     """Serve until the end is requested or Ray dies; return True in the latter case, after all work has stopped."""
     daemon = Supervisor(settings, live)
@@ -126,11 +126,11 @@ async def _serve_with(
     for number in ENDING:
         loop.add_signal_handler(number, ending)
     serving = asyncio.create_task(server.serve([listening]))
-    telling = None if notifier is None else asyncio.create_task(pass_on(daemon.feed.read(), notifier))
+    notifying = None if notifier is None else asyncio.create_task(pass_on(daemon.feed.read(), notifier))
     daemon.words = {} if notifier is None else notifier.counts
     url = _url(settings, listening)
     settings.address.write_text(url + "\n", encoding="utf-8")
-    watch = RayWatch(daemon, renewal, ending.asked.is_set)
+    watch = RayWatch(daemon, restart, ending.asked.is_set)
     try:
         await daemon.start()
         _log.info("serving %s", url, extra={"url": url, "state": str(settings.state)})
@@ -140,13 +140,13 @@ async def _serve_with(
         if not daemon.left.is_set():
             _log.info("ending: what has begun comes to rest at the next safe point; once more to give it up")
         await daemon.close()
-        if telling is not None:
-            await telling
+        if notifying is not None:
+            await notifying
     finally:
         again = daemon.left.is_set() and not ending.asked.is_set()
         if not again:
             watch.close()
-            renewal.drop()
+            restart.drop()
             settings.address.unlink(missing_ok=True)
         server.should_exit = True
         await serving

@@ -77,19 +77,21 @@ class Supervisor:
 
     async def start(self) -> None:
         """Recover the stored state and start all tasks."""
-        await asyncio.to_thread(self._forget_half_submitted, {item.id for item in self.store.items(limit=1_000_000)})
+        await asyncio.to_thread(self._remove_unacknowledged, {item.id for item in self.store.items(limit=1_000_000)})
         for item in self.store.items():
             if item.state not in AT_REST:
                 found = f"found {item.state} after the daemon had ended without a word"
                 self.store.change(item.id, state="paused", reason=found)
                 self.feed.tell("CampaignFound", {"state": item.state, "text": found}, item.id)
         self._tasks = [asyncio.create_task(self.feed.flushing(), name="feed")]
-        self._tasks += [asyncio.create_task(lane.work(), name=f"rig {lane.rig.name}") for lane in self.lanes.values()]
+        self._tasks += [
+            asyncio.create_task(worker.work(), name=f"rig {worker.rig.name}") for worker in self.lanes.values()
+        ]
         if self.settings.quick_start:
             self._tasks.append(asyncio.create_task(self._warm_up(), name="simulators"))
         self.feed.tell("DaemonStarted", {"rigs": [rig.name for rig in self.settings.rigs]})
 
-    def _forget_half_submitted(self, known: set[str]) -> None:
+    def _remove_unacknowledged(self, known: set[str]) -> None:
         """Delete snapshots of submissions that were not yet acknowledged when the daemon died."""
         for folder in self.settings.snapshots.iterdir():
             if folder.name not in known:
@@ -113,7 +115,7 @@ class Supervisor:
     @property
     def pouring(self) -> bool:
         """Whether a pour is in progress on any rig."""
-        return any(lane.running is not None and lane.running.pouring for lane in self.lanes.values())
+        return any(worker.running is not None and worker.running.pouring for worker in self.lanes.values())
 
     def leave(self, lost: str) -> None:
         """Stop as much work as possible in order to restart; sets `left` at the end."""
@@ -122,14 +124,14 @@ class Supervisor:
             self.problem(
                 "ray", f"Ray has lost its {lost}: the daemon begins anew, and what ran goes on from its journal"
             )
-            self._tasks.append(asyncio.create_task(self._leave(), name="leaving"))
+            self._tasks.append(asyncio.create_task(self._stop_for_restart(), name="leaving"))
 
-    async def _leave(self) -> None:
-        resting = [asyncio.ensure_future(lane.close()) for lane in self.lanes.values()]
+    async def _stop_for_restart(self) -> None:
+        resting = [asyncio.ensure_future(worker.close()) for worker in self.lanes.values()]
         await asyncio.wait(resting, timeout=LEAVING)
-        for lane in self.lanes.values():
-            if lane.running is not None and not lane.running.pouring:
-                lane.background(lane.running.give_up())
+        for worker in self.lanes.values():
+            if worker.running is not None and not worker.running.pouring:
+                worker.background(worker.running.give_up())
         await asyncio.wait(resting)
         self.feed.flush()
         self.left.set()
@@ -137,7 +139,7 @@ class Supervisor:
     async def close(self) -> None:
         """Stop all work at the next safe point, or at once after `hurry`."""
         self.stopping = True
-        await asyncio.gather(*(lane.close() for lane in self.lanes.values()))
+        await asyncio.gather(*(worker.close() for worker in self.lanes.values()))
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -149,9 +151,9 @@ class Supervisor:
 
     def hurry(self) -> None:
         """Give all work up, after a second request to end."""
-        for lane in self.lanes.values():
-            if lane.running is not None:
-                lane.background(lane.running.give_up())
+        for worker in self.lanes.values():
+            if worker.running is not None:
+                worker.background(worker.running.give_up())
 
     # ---- the queue
 
@@ -313,8 +315,8 @@ class Supervisor:
         return self.item(item.id)
 
     def _running(self, item: QueueItem) -> Running | None:
-        lane = self.lanes.get(item.rig)
-        return lane.running if lane is not None and lane.running is not None and lane.holds(item.id) else None
+        worker = self.lanes.get(item.rig)
+        return worker.running if worker is not None and worker.running is not None and worker.holds(item.id) else None
 
     def progress(self, item: QueueItem) -> dict[str, Any] | None:
         """Return the progress of a running campaign; None for others."""
@@ -335,15 +337,15 @@ class Supervisor:
             KeyError: the rig does not exist.
         """
         flag, lanes = self._stops(rig)
-        stops = [asyncio.create_task(lane.running.emergency()) for lane in lanes if lane.running]
-        for lane in lanes:
-            lane.latched = True
+        stops = [asyncio.create_task(worker.running.emergency()) for worker in lanes if worker.running]
+        for worker in lanes:
+            worker.latched = True
         await asyncio.sleep(0)
         with contextlib.suppress(RunError):  # a full disk must not prevent the stop
             self.store.set_flag(flag, {"by": by, "time": time.time(), "reason": reason})
-            for lane in lanes:
-                if lane.running is not None:
-                    self.store.change(lane.running.item.id, wish=str(DesiredState.ABORT))
+            for worker in lanes:
+                if worker.running is not None:
+                    self.store.change(worker.running.item.id, wish=str(DesiredState.ABORT))
             where = f"rig {rig}" if rig else ""
             self.note(by, "emergency stop", detail=": ".join(filter(None, (where, reason))))
         await asyncio.gather(*stops, return_exceptions=True)
@@ -360,8 +362,8 @@ class Supervisor:
         """
         flag, lanes = self._stops(rig)
         self.store.set_flag(flag, None)
-        for lane in lanes:
-            lane.latched = self.is_stopped(lane.rig.name)
+        for worker in lanes:
+            worker.latched = self.is_stopped(worker.rig.name)
         self.note(by, "clear emergency stop", detail=f"rig {rig}" if rig else "")
         self.wake()
 
@@ -377,8 +379,8 @@ class Supervisor:
 
     def wake(self) -> None:
         """Wake all rig workers after a change."""
-        for lane in self.lanes.values():
-            lane.wake.set()
+        for worker in self.lanes.values():
+            worker.wake.set()
 
     def note(self, by: str, what: str, campaign: str = "", detail: str = "") -> None:
         """Store, publish and log an audit entry."""

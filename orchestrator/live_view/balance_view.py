@@ -57,14 +57,14 @@ class BalanceStage:
     """Writes the rows of the balance. For one thread.
 
     Args:
-        outlet: sink of the rows.
+        sink: sink of the rows.
         time_scale: bench seconds per second of the clock.
     """
 
-    def __init__(self, outlet: RecordingSink, time_scale: float) -> None:
+    def __init__(self, sink: RecordingSink, time_scale: float) -> None:
         import rerun as rr
 
-        self._rr, self._outlet, self._scale = rr, outlet, time_scale
+        self._rr, self._sink, self._scale = rr, sink, time_scale
         self._simulated: dict[str, list[tuple[Action, PourOutcome]]] = {}
         self._running: _Running | None = None
         self._checkpoint = ""
@@ -80,15 +80,15 @@ class BalanceStage:
             ("pour/weighed", "balance [g]", style.MEASURED, 3.0),
             ("pour/liquid", "virtual liquid [g]", style.FALLING, 3.0),
         ):
-            looks = rr.SeriesLines(names=label, colors=shapes.rgb(colour), widths=width)
-            outlet.log(f"{PLACE}/{name}", looks, static=True)
+            appearance = rr.SeriesLines(names=label, colors=shapes.rgb(colour), widths=width)
+            sink.log(f"{PLACE}/{name}", appearance, static=True)
         for name, label, colour, size in (
             ("stable", "stable [g]", style.GOOD, 4.0),
             ("tare", "tare [g]", style.INK, 6.0),
             ("verdict", "weighed [g]", style.BEST, 9.0),
             ("pour/verdict", "weighed [g]", style.BEST, 9.0),
         ):
-            outlet.log(
+            sink.log(
                 f"{PLACE}/{name}",
                 rr.SeriesPoints(names=label, colors=shapes.rgb(colour), marker_sizes=size),
                 static=True,
@@ -103,7 +103,7 @@ class BalanceStage:
 
     def begin(self, pour: Pour, scene: Scene) -> None:
         """Start a pour."""
-        times, band = self._foretold(pour, scene)
+        times, band = self._predicted(pour, scene)
         self._running, self._checkpoint = _Running(scene, band, times), ""
         if band is not None:
             for name, value in zip(("low", "middle", "high"), band[:, -1], strict=True):
@@ -148,7 +148,7 @@ class BalanceStage:
             for name, value in zip(("low", "middle", "high"), running.band[:, -1], strict=True):
                 self._number(f"expected/{name}", value)
         for ended in ("net", "expected"):  # no line between two pours
-            self._outlet.clear(f"{PLACE}/{ended}", recursive=True)
+            self._sink.clear(f"{PLACE}/{ended}", recursive=True)
         return running
 
     def beside(self, running: _Running | None, times: FloatArray, spilled: FloatArray | None) -> list[Track]:
@@ -179,12 +179,12 @@ class BalanceStage:
 
     def told(self) -> None:
         """Clear the curves after the playback of a pour."""
-        self._outlet.clear(f"{PLACE}/pour", recursive=True)
+        self._sink.clear(f"{PLACE}/pour", recursive=True)
 
     def _curve(self, name: str, times: FloatArray, values: FloatArray) -> Track:
         return Track(f"{PLACE}/{name}", times, columns_of(self._rr.Scalars.columns(scalars=values)))
 
-    def _foretold(self, pour: Pour, scene: Scene) -> tuple[FloatArray, FloatArray | None]:
+    def _predicted(self, pour: Pour, scene: Scene) -> tuple[FloatArray, FloatArray | None]:
         known = self._simulated.get(pour.scene, [])
         wanted = _numbers(pour.action.values())
         if not known:
@@ -202,7 +202,7 @@ class BalanceStage:
         return times, np.stack([curves.min(axis=0), np.median(curves, axis=0), curves.max(axis=0)])
 
     def _number(self, name: str, value: float) -> None:
-        self._outlet.number(f"{PLACE}/{name}", float(value))
+        self._sink.number(f"{PLACE}/{name}", float(value))
 
 
 def _numbers(values: Mapping[str, float | None]) -> dict[str, float]:

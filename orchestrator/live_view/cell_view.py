@@ -46,15 +46,15 @@ class CellScene:
     """Writes the rows of the bench and its motion. For one thread.
 
     Args:
-        outlet: sink of the rows.
+        sink: sink of the rows.
         films: queue for the playback of completed pours.
         plan: plan of the campaign.
     """
 
-    def __init__(self, outlet: RecordingSink, films: PlaybackQueue, plan: CampaignPlan) -> None:
+    def __init__(self, sink: RecordingSink, films: PlaybackQueue, plan: CampaignPlan) -> None:
         import rerun as rr
 
-        self._rr, self._outlet, self._films = rr, outlet, films
+        self._rr, self._sink, self._films = rr, sink, films
         laboratory = plan.laboratory
         self._figure: ArmFigure | None = None if laboratory.arm is None else laboratory.arm.figure()
         scales = [one.time_scale for one in (laboratory.bench, laboratory.arm) if one is not None]
@@ -64,14 +64,14 @@ class CellScene:
         self._moves: list[tuple[Moment, tuple[float, ...]]] = []
         self._liquid: RecordedFrames | None = None
         self._stands: tuple[float, ...] = ()
-        outlet.log(PLACE, shapes.fates(), static=True)  # on the parent, since clearing the liquid would remove it
-        outlet.log(f"{PLACE}/tool", rr.TransformAxes3D(0.06), static=True)
+        sink.log(PLACE, shapes.fates(), static=True)  # on the parent, since clearing the liquid would remove it
+        sink.log(f"{PLACE}/tool", rr.TransformAxes3D(0.06), static=True)
         self._furnish()
 
     def _furnish(self) -> None:
         rr = self._rr
         table = -_TRAY if self._figure is None else min(self._figure.table, -_TRAY)
-        self._outlet.log(
+        self._sink.log(
             f"{PLACE}/tray",
             rr.Boxes3D(
                 centers=[[0.0, 0.0, -0.5 * _TRAY - 1e-3]],
@@ -88,10 +88,10 @@ class CellScene:
             low, high = np.minimum(base, 0.0) - 0.3, np.maximum(base, 0.0) + 0.3
             middle, half = 0.5 * (low + high), 0.5 * (high - low)
             # The initial pose of the arm; its appearance is static.
-            self._outlet.times(wall=time.time(), step=0, sim_time=0.0)
-            self._outlet.log(f"{PLACE}/arm", shapes.bars(self._figure, home), static=True)
-            self._outlet.rows(f"{PLACE}/arm", [self._outlet.now], shapes.stances(home[None]))
-        self._outlet.log(
+            self._sink.times(wall=time.time(), step=0, sim_time=0.0)
+            self._sink.log(f"{PLACE}/arm", shapes.bars(self._figure, home), static=True)
+            self._sink.rows(f"{PLACE}/arm", [self._sink.now], shapes.stances(home[None]))
+        self._sink.log(
             f"{PLACE}/table",
             rr.Boxes3D(
                 centers=[[*middle, table - 0.015]],
@@ -110,14 +110,14 @@ class CellScene:
         self._trail, self._liquid = [], None
         self._stand("pourer", scene.pourer)
         self._stand("receiver", scene.receiver)
-        self._outlet.clear(f"{PLACE}/liquid")
-        self._outlet.clear(f"{PLACE}/path/executed")
+        self._sink.clear(f"{PLACE}/liquid")
+        self._sink.clear(f"{PLACE}/path/executed")
         planned = planned_poses(scene, pour)
         if planned is None:
             return
-        self._outlet.log(f"{PLACE}/path/planned", self._line(self._tool_places(planned), style.PREDICTED, 1.5e-3))
+        self._sink.log(f"{PLACE}/path/planned", self._line(self._tool_places(planned), style.PREDICTED, 1.5e-3))
         if self._figure is None:
-            self._outlet.log(f"{PLACE}/pourer", shapes.placed(planned[0]))
+            self._sink.log(f"{PLACE}/pourer", shapes.placed(planned[0]))
 
     def progress(self, told: PourProgress) -> None:
         """Process progress of a pour: the arm's pose and the liquid."""
@@ -129,10 +129,10 @@ class CellScene:
             return
         self._stands = stands
         if told.joints and self._figure is not None:
-            self._moves.append((self._outlet.now, told.joints))
+            self._moves.append((self._sink.now, told.joints))
         elif told.pourer:
-            self._outlet.log(f"{PLACE}/pourer", shapes.placed(np.array(told.pourer)))
-            self._follow(told.pourer[:3], self._outlet.now)
+            self._sink.log(f"{PLACE}/pourer", shapes.placed(np.array(told.pourer)))
+            self._follow(told.pourer[:3], self._sink.now)
 
     def show(self) -> None:
         """Log the arm's motion since the last call. Several poses are computed and sent at the cost of one."""
@@ -141,9 +141,9 @@ class CellScene:
         moments, joints = [at for at, _ in self._moves], np.array([where for _, where in self._moves])
         self._moves = []
         tools = figure.tool(joints)
-        self._outlet.rows(f"{PLACE}/arm", moments, shapes.stances(figure.ends(joints)))
-        self._outlet.rows(f"{PLACE}/tool", moments, shapes.places(tools))
-        self._outlet.rows(f"{PLACE}/pourer", moments, shapes.places(figure.pourer(joints)))
+        self._sink.rows(f"{PLACE}/arm", moments, shapes.stances(figure.ends(joints)))
+        self._sink.rows(f"{PLACE}/tool", moments, shapes.places(tools))
+        self._sink.rows(f"{PLACE}/pourer", moments, shapes.places(figure.pourer(joints)))
         for at, tool in zip(moments, tools, strict=True):
             self._follow(tool[:3], at)
 
@@ -152,7 +152,7 @@ class CellScene:
         self._trail.append([float(value) for value in place])
         if len(self._trail) % TRAILING == 2 and self.time_scale <= SLOW:
             line = self._line(np.array(self._trail), style.MEASURED, 3e-3)
-            self._outlet.log(f"{PLACE}/path/executed", line, at=at)
+            self._sink.log(f"{PLACE}/path/executed", line, at=at)
 
     # ---- a completed pour
 
@@ -196,7 +196,7 @@ class CellScene:
 
         def begin() -> None:
             if len(path) > 1:
-                self._outlet.log(f"{PLACE}/path/executed", self._line(path, style.MEASURED, 3e-3))
+                self._sink.log(f"{PLACE}/path/executed", self._line(path, style.MEASURED, 3e-3))
 
         self._films.add(now, step, Playback(float(times[-1]), tracks, begin, told))
 
@@ -244,7 +244,7 @@ class CellScene:
     def _stand(self, what: str, spec: VesselSpec) -> None:
         if self._shown.get(what) != (key := spec.content_hash()):
             self._shown[what] = key
-            self._outlet.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
+            self._sink.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
 
     def _tool_places(self, poses: FloatArray) -> FloatArray:
         return poses[:, :3] if self._figure is None else self._figure.tool_of(poses)

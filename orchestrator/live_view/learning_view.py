@@ -52,14 +52,14 @@ class LearningStage:
     """Writes rows and pictures of the learning progress. For one thread.
 
     Args:
-        outlet: sink of the rows.
+        sink: sink of the rows.
         plan: plan of the campaign.
     """
 
-    def __init__(self, outlet: RecordingSink, plan: CampaignPlan) -> None:
+    def __init__(self, sink: RecordingSink, plan: CampaignPlan) -> None:
         import rerun as rr
 
-        self._rr, self._outlet, self._plan = rr, outlet, plan
+        self._rr, self._sink, self._plan = rr, sink, plan
         self._names = receiver_names(plan)
         self._styled: set[str] = set()
         self._scene_of_stage: dict[str, str] = {}
@@ -87,7 +87,7 @@ class LearningStage:
 
     def _coming(self, place: str, text: str) -> None:
         picture = pictures.png(pictures.words(text))
-        self._outlet.log(f"{PLACE}/{place}", self._rr.EncodedImage(contents=picture, media_type="image/png"))
+        self._sink.log(f"{PLACE}/{place}", self._rr.EncodedImage(contents=picture, media_type="image/png"))
 
     def about(self, stage: str, scene: str) -> None:
         """Associate a stage with a scene."""
@@ -186,17 +186,17 @@ class LearningStage:
     def _draw(self, entity: str, now: float, draw: Callable[[], bytes]) -> None:
         self._waiting.pop(entity, None)
         self._drawn[entity] = now
-        self._outlet.log(entity, self._rr.EncodedImage(contents=draw(), media_type="image/png"))
+        self._sink.log(entity, self._rr.EncodedImage(contents=draw(), media_type="image/png"))
 
     def _number(
         self, entity: str, value: float, name: str, colour: str, *, marker: float = 0.0, width: float = 3.0
     ) -> None:
         if entity not in self._styled:
             self._styled.add(entity)
-            looks = (
+            appearance = (
                 self._rr.SeriesPoints(names=name, colors=shapes.rgb(colour), marker_sizes=marker)
                 if marker
                 else self._rr.SeriesLines(names=name, colors=shapes.rgb(colour), widths=width)
             )
-            self._outlet.log(entity, looks, static=True)
-        self._outlet.number(entity, float(value))
+            self._sink.log(entity, appearance, static=True)
+        self._sink.number(entity, float(value))

@@ -52,13 +52,13 @@ class MachineView:
     """Writes the rows of the machine. For one thread.
 
     Args:
-        outlet: sink of the rows.
+        sink: sink of the rows.
     """
 
-    def __init__(self, outlet: RecordingSink) -> None:
+    def __init__(self, sink: RecordingSink) -> None:
         import rerun as rr
 
-        self._rr, self._outlet = rr, outlet
+        self._rr, self._sink = rr, sink
         self._simulators = 1
         self._slots: dict[int, int] = {}
         self._styled: set[str] = set()
@@ -72,12 +72,12 @@ class MachineView:
             ("dropped", "events that watchers missed", style.ESCAPED),
         ):
             points = name in ("seconds", "wait")
-            looks = (
+            appearance = (
                 rr.SeriesPoints(names=label, colors=shapes.rgb(colour), marker_sizes=4.0)
                 if points
                 else rr.SeriesLines(names=label, colors=shapes.rgb(colour), widths=2.5)
             )
-            outlet.log(f"{PLACE}/{name}", looks, static=True)
+            sink.log(f"{PLACE}/{name}", appearance, static=True)
 
     def opened(self, simulators: int, *, arm: bool) -> None:
         """Initialise the rows for a pool of simulators, the optimiser, and an arm if there is one; all are idle."""
@@ -120,9 +120,9 @@ class MachineView:
             self._styled.add(entity)
             known = list(_PURPOSES)
             colours = [shapes.rgb(_PURPOSES[each]) for each in known]
-            looks = self._rr.StateConfiguration(values=known, labels=known, colors=colours)
-            self._outlet.log(entity, looks, static=True)
-        self._outlet.log(entity, self._rr.StateChange(state=doing or IDLE))
+            appearance = self._rr.StateConfiguration(values=known, labels=known, colors=colours)
+            self._sink.log(entity, appearance, static=True)
+        self._sink.log(entity, self._rr.StateChange(state=doing or IDLE))
 
     def dropped(self, count: int) -> None:
         """Log the number of events dropped so far."""
@@ -132,17 +132,17 @@ class MachineView:
         """Add a line to the log."""
         log = self._rr.TextLogLevel
         levels = {"info": log.INFO, "warning": log.WARN, "error": log.ERROR}
-        self._outlet.log(f"{LOG}/{safe_name(source)}", self._rr.TextLog(text, level=levels.get(level, log.INFO)))
+        self._sink.log(f"{LOG}/{safe_name(source)}", self._rr.TextLog(text, level=levels.get(level, log.INFO)))
 
     def status(self, markdown: str) -> None:
         """Replace the status page."""
         if markdown != self._page:
             self._page = markdown
-            self._outlet.log(STATUS, self._rr.TextDocument(markdown, media_type="text/markdown"))
+            self._sink.log(STATUS, self._rr.TextDocument(markdown, media_type="text/markdown"))
 
     def outcome(self, markdown: str) -> None:
         """Log the outcome of the run, shown at every position of a viewer's time cursor."""
-        self._outlet.log(OUTCOME, self._rr.TextDocument(markdown, media_type="text/markdown"), static=True)
+        self._sink.log(OUTCOME, self._rr.TextDocument(markdown, media_type="text/markdown"), static=True)
 
     def _load(self) -> None:
         running = len(self._slots)
@@ -150,7 +150,7 @@ class MachineView:
         self._number("load/queue", max(running - self._simulators, 0))
 
     def _number(self, name: str, value: float) -> None:
-        self._outlet.number(f"{PLACE}/{name}", float(value))
+        self._sink.number(f"{PLACE}/{name}", float(value))
 
 
 _DOING = {

@@ -89,11 +89,11 @@ class PlaybackQueue:
     """Waiting playbacks. For one thread.
 
     Args:
-        outlet: sink of the frames.
+        sink: sink of the frames.
     """
 
-    def __init__(self, outlet: RecordingSink) -> None:
-        self._outlet = outlet
+    def __init__(self, sink: RecordingSink) -> None:
+        self._sink = sink
         self._planned: deque[_Showing] = deque()
         self._free_at = 0.0
         self.end = 0.0
@@ -112,7 +112,7 @@ class PlaybackQueue:
         start = max(now, self._free_at)
         shown = [0] * len(film.tracks)
         if start - now > LONGEST_BACKLOG:
-            self._outlet.without("wall")
+            self._sink.without("wall")
             self._show(_Showing(film, step, None, begin, shown=shown), float("inf"))
             return
         self._free_at = start + film.length + PAUSE
@@ -143,14 +143,14 @@ class PlaybackQueue:
         film = showing.film
         if not showing.begun:
             showing.begun = True
-            self._outlet.times(**showing.times(0.0))
+            self._sink.times(**showing.times(0.0))
             film.begin()
         for number, track in enumerate(film.tracks):
             first = showing.shown[number]
             showing.shown[number] = last = int(np.searchsorted(track.times, until + _SOON, side="right"))
             if last > first:
                 moments = [moment(**showing.times(float(each))) for each in track.times[first:last]]
-                self._outlet.rows(track.entity, moments, [(what, rows[first:last]) for what, rows in track.columns])
+                self._sink.rows(track.entity, moments, [(what, rows[first:last]) for what, rows in track.columns])
         if until >= film.length:
-            self._outlet.times(**showing.times(film.length))
+            self._sink.times(**showing.times(film.length))
             film.end()

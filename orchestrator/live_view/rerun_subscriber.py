@@ -131,7 +131,7 @@ class RerunMonitor:
         self.path.open("wb").close()
         self._process = _start_writer()
         self._report: dict[str, Any] = {"failed": 0}
-        self._told = 0
+        self._reported = 0
         self._worker: QueueThread[Event | Opening] = QueueThread(
             self._send, self._finish, capacity=capacity, name=f"recording {self.path.name}"
         )
@@ -165,8 +165,8 @@ class RerunMonitor:
         return self._report.get("complete", False) is True
 
     def _send(self, item: Event | Opening | Missed | Closing) -> None:
-        if (dropped := self._worker.dropped if isinstance(item, Event) else 0) > self._told:
-            self._told = dropped
+        if (dropped := self._worker.dropped if isinstance(item, Event) else 0) > self._reported:
+            self._reported = dropped
             self._send(Missed(dropped))
         self._process.write(pickle.dumps(item, protocol=pickle.HIGHEST_PROTOCOL))
 

@@ -64,20 +64,20 @@ class CampaignRecording:
         self.path, self._plan = path, plan
         self._scenes = scenes_of(plan)
         self.status = StatusView(plan)
-        outlet = self._outlet = RecordingSink(
+        sink = self._sink = RecordingSink(
             path, application=f"decant {plan.name}", name=f"{plan.name} · {self.status.reality}", url=url
         )
         self._moment: Moment | None = None
-        outlet.keep(blueprint_of(plan, "replaying"))
+        sink.keep(blueprint_of(plan, "replaying"))
         self._show("calibrating" if plan.calibration is not None else "deploying")
-        outlet.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        outlet.times(step=0, sim_time=0.0)
-        self._films = PlaybackQueue(outlet)
-        self._simulated = SimulatedStage(outlet, self._films)
-        self._cell = CellScene(outlet, self._films, plan)
-        self._balance = BalanceStage(outlet, self._cell.time_scale)
-        self._learning = LearningStage(outlet, plan)
-        self._machine = MachineView(outlet)
+        sink.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        sink.times(step=0, sim_time=0.0)
+        self._films = PlaybackQueue(sink)
+        self._simulated = SimulatedStage(sink, self._films)
+        self._cell = CellScene(sink, self._films, plan)
+        self._balance = BalanceStage(sink, self._cell.time_scale)
+        self._learning = LearningStage(sink, plan)
+        self._machine = MachineView(sink)
         self._machine.outcome(
             f"# {self.status.reality}: no end\n\nThe run is under way, or its process was killed before it ended.\n"
         )
@@ -88,14 +88,14 @@ class CampaignRecording:
     def wait(self) -> float | None:
         """Time until `play` has work to do [s]; None if it must wait for events."""
         film = self._films.next_due
-        waits = (None if film is None else max(film - time.time(), 0.0), self._outlet.wait)
+        waits = (None if film is None else max(film - time.time(), 0.0), self._sink.wait)
         return min((each for each in waits if each is not None), default=None)
 
     def play(self) -> None:
         """Write everything that is due. Call it about every half second rather than after each event."""
         self._films.play(time.time())
         self._cell.show()
-        self._outlet.send()
+        self._sink.send()
 
     def close(self, dropped: int = 0) -> None:
         """Complete the recording; `dropped` is the number of missing events."""
@@ -104,7 +104,7 @@ class CampaignRecording:
         if dropped:
             self.missed(dropped)
             self._machine.line(f"{dropped} events are missing: the recording could not keep up", "warning", "recording")
-        self._outlet.close()
+        self._sink.close()
 
     def missed(self, dropped: int) -> None:
         """Log the number of events dropped so far."""
@@ -114,7 +114,7 @@ class CampaignRecording:
         """Process an event."""
         if isinstance(event, RequestFinished):
             self._step += 1
-        self._outlet.times(wall=event.time, step=self._step, sim_time=self._films.end)
+        self._sink.times(wall=event.time, step=self._step, sim_time=self._films.end)
         self.status.take(event)
         match event:
             case CampaignOpened():
@@ -161,7 +161,7 @@ class CampaignRecording:
         if self._moment == moment:
             return
         self._moment = moment
-        self._outlet.show(blueprint_of(self._plan, moment))
+        self._sink.show(blueprint_of(self._plan, moment))
 
     def _follow(self, request: Request) -> None:
         """Select the layout for a request."""

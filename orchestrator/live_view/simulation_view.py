@@ -32,19 +32,19 @@ class SimulatedStage:
     """Adds playbacks of simulations. For one thread.
 
     Args:
-        outlet: sink of the rows.
+        sink: sink of the rows.
         films: playback queue.
     """
 
-    def __init__(self, outlet: RecordingSink, films: PlaybackQueue) -> None:
+    def __init__(self, sink: RecordingSink, films: PlaybackQueue) -> None:
         import rerun as rr
 
-        self._rr, self._outlet, self._films = rr, outlet, films
+        self._rr, self._sink, self._films = rr, sink, films
         self._shown: dict[tuple[str, bool], str] = {}
-        outlet.log(f"{PLACE}/liquid", shapes.fates(), static=True)
+        sink.log(f"{PLACE}/liquid", shapes.fates(), static=True)
         for state, name in enumerate(SHARES):
             colour = shapes.rgb(style.PARTICLE_STATES[state][1])
-            outlet.log(f"{PLACE}/share/{state}", rr.SeriesLines(names=name, colors=colour, widths=3), static=True)
+            sink.log(f"{PLACE}/share/{state}", rr.SeriesLines(names=name, colors=colour, widths=3), static=True)
 
     def film(self, frames: RecordedFrames, scene: Scene, title: str, *, now: float, step: int) -> None:
         """Show a simulation.
@@ -74,18 +74,18 @@ class SimulatedStage:
             float(moments[-1]),
             tracks,
             begin=lambda: self._set(scene, title),
-            end=lambda: self._outlet.clear(f"{PLACE}/share", recursive=True),  # no line to the next playback
+            end=lambda: self._sink.clear(f"{PLACE}/share", recursive=True),  # no line to the next playback
         )
         self._films.add(now, step, film)
 
     def _set(self, scene: Scene, title: str) -> None:
-        self._outlet.log(f"{PLACE}/title", self._rr.TextDocument(f"### {title}", media_type="text/markdown"))
+        self._sink.log(f"{PLACE}/title", self._rr.TextDocument(f"### {title}", media_type="text/markdown"))
         for what, spec in (("pourer", scene.pourer), ("receiver", scene.receiver)):
             # Viewers of the wall clock don't see rows that are left out of it.
-            key, place = spec.content_hash(), (what, self._outlet.on_wall)
+            key, place = spec.content_hash(), (what, self._sink.on_wall)
             if self._shown.get(place) != key:
                 self._shown[place] = self._shown[what, False] = key
-                self._outlet.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
+                self._sink.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
 
 
 def thinned(times: NDArray[np.float64]) -> list[int]:
@@ -121,13 +121,13 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
         raise ValueError("this simulation kept no frames to record; simulate it with a record rate above 0")
     scene, outcome = task.scene, result.outcome
     title = title or f"{scene.pourer.name} into {scene.receiver.name}, seed {task.seed}"
-    outlet = RecordingSink(path, application="decant simulation", name=title)
-    outlet.keep(simulation_blueprint())
-    outlet.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    films = PlaybackQueue(outlet)
+    sink = RecordingSink(path, application="decant simulation", name=title)
+    sink.keep(simulation_blueprint())
+    sink.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    films = PlaybackQueue(sink)
     now = time.time()
-    outlet.times(wall=now, step=0, sim_time=0.0)
-    SimulatedStage(outlet, films).film(result.frames, scene, title, now=now, step=0)
+    sink.times(wall=now, step=0, sim_time=0.0)
+    SimulatedStage(sink, films).film(result.frames, scene, title, now=now, step=0)
     films.play(float("inf"))
     for source, text in (
         ("action", style.display_values(task.action.values())),
@@ -139,6 +139,6 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
         ),
     ):
         level = rr.TextLogLevel.WARN if source == "outcome" and outcome.invalid is not None else rr.TextLogLevel.INFO
-        outlet.log(f"/log/{source}", rr.TextLog(text, level=level))
-    outlet.close()
+        sink.log(f"/log/{source}", rr.TextLog(text, level=level))
+    sink.close()
     return path

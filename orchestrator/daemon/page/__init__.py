@@ -43,7 +43,7 @@ def page_router() -> APIRouter:
     return router
 
 
-def _served(content: bytes, kind: str):  # FastAPI reads the signature of its return value
+def _served(content: bytes, kind: str):  # type: ignore[no-untyped-def]  # FastAPI reads its result's signature
     async def serve() -> Response:
         return Response(content, media_type=kind, headers=HEADERS)
 
