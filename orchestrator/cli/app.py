@@ -1,4 +1,8 @@
-"""The `decant` command."""
+"""The `decant` command: declares the commands with their options and help texts.
+
+Each command imports the module that does its work when it is called, so that `--help` starts fast. The daemon's
+commands, `decant vessel` and `decant runs` are registered from their own modules.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +11,8 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli import queue_commands as daemon_verbs
+from orchestrator.cli import queue_commands, robot_commands, run_commands, simulate_command, vessel_command
 from orchestrator.cli import report_command as report
-from orchestrator.cli import robot_commands as bench_verbs
-from orchestrator.cli import run_commands as runs_verbs
-from orchestrator.cli import simulate_command as simulate_verb
-from orchestrator.cli import vessel_command as vessel_verb
 from orchestrator.cli import view_command as view
 from orchestrator.cli.command_options import (
     Answer,
@@ -42,12 +42,12 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="""Teach a robot arm to pour without spilling.
 
-A campaign (YAML) says what is poured from where into what, which actions may be tried, how the simulator is calibrated
-(C4) and how pours are found (D1 in simulation, D2 on the bench, D3 by both). Start with:
+A campaign file (YAML) defines the liquid, the vessels, the allowed actions, how the simulator is calibrated (C1 to C4)
+and how pours are optimised: D1 in simulation, D2 on the bench, D3 with both. Start with:
 
     decant run configs/campaigns/quickstart.yaml
 
-Exit codes: 0 done, 1 failed, 2 bad input (nothing was started), 3 a person has to answer, 130 interrupted.
+Exit codes: 0 success, 1 failed, 2 bad input (nothing was started), 3 an operator must answer, 130 interrupted.
 """,
 )
 
@@ -63,14 +63,14 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def decant(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """What stands before the verbs."""
+    """Options that precede the command."""
 
 
-def _campaign_verb(name: str, text: str, *lines: str) -> None:
-    """Add a verb that runs a campaign, or a part of one: all have the same options."""
+def _campaign_command(name: str, text: str, *lines: str) -> None:
+    """Add a command that runs a campaign or a part of one; all of them have the same options."""
 
     def verb(
         campaign: Campaign,
@@ -94,22 +94,22 @@ def _campaign_verb(name: str, text: str, *lines: str) -> None:
     app.command(name, help=text, epilog=examples(*lines))(verb)
 
 
-_campaign_verb(
+_campaign_command(
     "run",
-    """Run a campaign: calibrate, then learn to pour. Journal, figures and recording go to runs/ID/.
+    """Run a campaign: calibrate, then learn to pour. Journal, figures and recording are written to runs/ID/.
 
-Ctrl-C pauses: a pour that has begun is finished and weighed first. `--resume` goes on where it stopped.
+Ctrl-C pauses the run: a pour that has started is finished and weighed first. `--resume` continues it.
 """,
     "decant run configs/campaigns/quickstart.yaml",
     "decant run configs/campaigns/quickstart.yaml --live   # open the printed address in a browser",
-    "decant run my.yaml --resume   # after a stop, a crash or a power cut; nothing finished is done again",
+    "decant run my.yaml --resume   # after a stop, a crash or a power failure; finished work is not repeated",
 )
 
-_campaign_verb(
+_campaign_command(
     "calibrate",
-    """Only calibrate: find the θ whose simulated spills match the weighed ones (C1 to C4), scored on unseen pours.
+    """Only calibrate: find the θ whose simulated spillage matches the weighed pours (C1 to C4), scored on other pours.
 
-The recommended θ goes to runs/ID/theta.json in SI units (cohesion in N/m, viscosity in 1/s); `--parameters` reads it.
+The recommended θ is written to runs/ID/theta.json in SI units (cohesion in N/m, viscosity in 1/s), for `--parameters`.
 """,
     "decant calibrate configs/campaigns/recorded.yaml --json",
     "decant calibrate my.yaml && decant plan my.yaml --parameters runs/my-20300131-1/theta.json",
@@ -129,7 +129,7 @@ def plan(
     iterations: Annotated[int | None, typer.Option(min=2, help="Iterations of the optimiser.")] = None,
     seed: Seed = None,
     seeds: Annotated[
-        int, typer.Option(min=2, max=1000, help="Simulations of the planned action, for its prediction and its spread.")
+        int, typer.Option(min=2, max=1000, help="Simulations of the planned action, for its prediction interval.")
     ] = 5,
     thetas: Thetas = None,
     laboratory: OtherLaboratory = None,
@@ -137,10 +137,12 @@ def plan(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Plan a pour in simulation (D1), for the campaign's receivers or one that it never saw.
+    """Plan a pour in simulation (D1), for the campaign's receivers or for a new one.
 
-    Fifteen actions are simulated, as many at a time as there are cores, and the planned one again with fresh seeds: its
-    prediction and band are made of these. Nothing is poured. Actions are shown in deg, deg/s, mm and s.
+    By default, fifteen actions are simulated, in parallel on all cores. The planned action is then simulated with
+    further seeds, which give its prediction and prediction interval. Nothing is poured.
+
+    Actions are shown in deg, deg/s, mm and s.
     """
     options = given(locals(), "campaign")
     from orchestrator.cli import campaign_commands as campaigns
@@ -151,28 +153,28 @@ def plan(
 @app.command(
     epilog=examples(
         "decant study configs/studies/quick.yaml",
-        "decant study configs/studies/paper.yaml --dry-run   # what it would take",
-        "decant study configs/studies/paper.yaml --jobs 2    # goes on where it stopped, however it was stopped",
+        "decant study configs/studies/paper.yaml --dry-run   # estimate the cost",
+        "decant study configs/studies/paper.yaml --jobs 2    # continues a stopped study",
     )
 )
 def study(
     file: Annotated[Path, typer.Argument(help="Study file (YAML).", metavar="STUDY", show_default=False)],
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes at a time; one per core if not given.", show_default=False)
+        int | None, typer.Option(min=1, help="Number of parallel processes; default: one per core.", show_default=False)
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="List what is left, with an estimate of its cost; start nothing.")
+        bool, typer.Option("--dry-run", help="List the unfinished cells with an estimate of their cost; start nothing.")
     ] = False,
     report_only: Annotated[
-        bool, typer.Option("--report", help="Only write figures, tables and page of what is there.")
+        bool, typer.Option("--report", help="Only write figures, tables and page from the existing results.")
     ] = False,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Compare C1 to C4 and D1 to D3, repeated, on virtual benches that are more or less like the simulator.
+    """Compare C1 to C4 and D1 to D3 with repetitions, on virtual benches that differ more or less from the simulator.
 
-    Figures (PNG, SVG, CSV), tables and a page go to runs/study-NAME/report/. Stopped or killed, the same command goes
-    on.
+    Figures (PNG, SVG, CSV), tables and a page are written to runs/study-NAME/report/. Run the same command again to
+    continue a study that was stopped or killed.
     """
     from orchestrator.cli import study_command as verb
 
@@ -185,7 +187,7 @@ app.command(
         "decant simulate my.yaml --set 'angular_velocity=0.7 rad/s' --set 'x_offset=9 cm' --png pour.png",
         "decant simulate my.yaml --from pours.csv --parameters theta.json --csv scored.csv --png scored.png",
     )
-)(simulate_verb.simulate)
+)(simulate_command.simulate)
 
 
 @app.command(
@@ -197,15 +199,15 @@ def validate(
     ],
     quiet: Quiet = False,
 ) -> None:
-    """Check files without starting anything: keys, units, bounds, vessels, and that some action can be poured."""
+    """Check files without starting anything: keys, units, bounds, vessels, and whether some action can be poured."""
     from orchestrator.cli import file_commands as verb
 
     call(verb.validate, files)
 
 
 @app.command(epilog=examples("decant init lab", "decant run lab/campaigns/quickstart.yaml"))
-def init(directory: Annotated[Path, typer.Argument(help="A folder that is empty, or not there yet.")]) -> None:
-    """Copy a starting set into a folder: campaigns, laboratories, studies, vessels and weighed pours."""
+def init(directory: Annotated[Path, typer.Argument(help="An empty folder, or one that does not exist yet.")]) -> None:
+    """Copy example files into a folder: campaigns, laboratories, studies, vessels and weighed pours."""
     from orchestrator.cli import file_commands as starting
 
     call(starting.init, directory)
@@ -217,7 +219,7 @@ def init(directory: Annotated[Path, typer.Argument(help="A folder that is empty,
 def schema(
     which: Annotated[str, typer.Argument(help="campaign, study, vessel, laboratory, or result.")] = "campaign",
 ) -> None:
-    """Print the JSON schema of campaign files (editors complete YAML with it), or of a run's summary.json."""
+    """Print the JSON schema of campaign files (editors use it for completion), of other files, or of summary.json."""
     from orchestrator.cli import pour_prediction as single
 
     call(single.schema, which)
@@ -228,14 +230,14 @@ app.command(
         "decant doctor configs/laboratories/virtual.yaml",
         "decant doctor configs/laboratories/ur10-kern.yaml --accept-safety   # after reading them on the teach pendant",
     )
-)(bench_verbs.doctor)
+)(robot_commands.doctor)
 
 app.command(
     epilog=examples(
         "decant jog configs/laboratories/virtual.yaml         # practise without a robot",
         "decant jog configs/laboratories/ur10-kern.yaml --arm",
     )
-)(bench_verbs.jog)
+)(robot_commands.jog)
 
 app.command(
     epilog=examples(
@@ -243,18 +245,18 @@ app.command(
         "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --empty --slow 0.2 --arm",
         "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --arm",
     )
-)(bench_verbs.pour)
+)(robot_commands.pour)
 
 app.command(epilog=report.EXAMPLES)(report.report)
 app.command(epilog=view.EXAMPLES)(view.view)
-app.add_typer(runs_verbs.runs)
+app.add_typer(run_commands.runs)
 
 
 @app.command(epilog=examples("decant plugins", "decant plugins --json"))
 def plugins(as_json: Json = False) -> None:
-    """List what installed packages add: strategies, objectives, balances, arms and sources of vessels.
+    """List the plug-ins of installed packages: strategies, objectives, balances, arms and sources of vessels.
 
-    Exit code 1 if a package registers something that can't be used; it is named with its package and the reason.
+    Exit code 1 if a plug-in can't be used; the output gives its package and the reason.
     """
     from orchestrator.cli import file_commands as verb
 
@@ -265,25 +267,23 @@ def plugins(as_json: Json = False) -> None:
     epilog=examples("decant physics", "decant physics outflow walls --full", "decant physics --full --write docs"),
 )
 def physics(
-    cases: Annotated[
-        list[str] | None, typer.Argument(help="Cases by name; all if none is given.", show_default=False)
-    ] = None,
-    full: Annotated[bool, typer.Option("--full", help="All resolutions and seeds: minutes instead of one.")] = False,
+    cases: Annotated[list[str] | None, typer.Argument(help="Names of cases; default: all.", show_default=False)] = None,
+    full: Annotated[bool, typer.Option("--full", help="Use all resolutions and seeds; takes several minutes.")] = False,
     pours: Annotated[
-        int | None, typer.Option(min=1, help="Random pours of the case 'walls'.", show_default=False)
+        int | None, typer.Option(min=1, help="Number of random pours in the case 'walls'.", show_default=False)
     ] = None,
     write: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the page validation.md, its data and figures; cases not run now keep what was "
-            "written there before.",
+            help="Folder for the page validation.md, its data and figures. Cases that are not run keep their "
+            "previous results.",
             show_default=False,
         ),
     ] = None,
-    list_cases: Annotated[bool, typer.Option("--list", help="Name the cases and end.")] = False,
+    list_cases: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Hold the solver against physics: theory, experiments and other solvers, each case with its criterion.
+    """Validate the solver against theory, experiments and other solvers; each case has a criterion.
 
     Exit code 1 if a criterion is not met.
     """
@@ -292,10 +292,10 @@ def physics(
     call(verb.physics, cases or [], full=full, pours=pours, write=write, as_json=as_json, list_cases=list_cases)
 
 
-daemon_verbs.register(app)
-vessel_verb.register(app)
+queue_commands.register(app)
+vessel_command.register(app)
 
 
 def main() -> None:
-    """Entry point."""
+    """Run the command line."""
     app()

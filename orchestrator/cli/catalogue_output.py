@@ -1,6 +1,7 @@
-"""`decant runs …`: what the catalogue knows, in front of people.
+"""The commands `decant runs …`: queries of the catalogue, printed as tables or JSON.
 
-Runs and pours of the catalogue as people read them: dates, units, tables.
+The functions query this machine's catalogue or a daemon's through `CatalogueClient`. Options are declared in
+`run_commands`; queries and the index are in `orchestrator.catalogue`.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ _UNITS = {column.name: column.unit for column in POURS}
 
 
 def mode(text: str | None) -> str:
-    """What kind of bench, so that nobody takes one for the other."""
+    """Return 'REAL' or 'VIRTUAL', so that the two kinds of bench can't be confused."""
     return "REAL" if text == "hardware" else "VIRTUAL" if text else ""
 
 
 def print_pours(pours: Sequence[Row], *, of_one_run: bool = False) -> None:
-    """A table of pours; what is the same in all of them stands once, above."""
+    """Print a table of pours; values that are equal in all pours are printed once, above it."""
     used = [name for name in ACTION_COLUMNS if any(pour[name] is not None for pour in pours)]
     many = len(pours) > 1
     differing = [name for name in used if not many or len({_rounded(pour[name]) for pour in pours}) > 1]
@@ -78,30 +79,30 @@ def _expected(pour: Row) -> str:
 
 
 def loss(value: float | None, name: str | None, deviation: float | None = None) -> str:
-    """The loss of a pour or a prediction, in its unit: '3.4 %', '3.4 ± 1.2 %'."""
+    """Format the loss of a pour or a prediction with its unit: '3.4 %', '3.4 ± 1.2 %'."""
     from orchestrator.results.loss_units import named_loss_unit
 
     return "" if value is None else named_loss_unit(str(name)).text(value, deviation)
 
 
 def percent(value: float | None) -> str:
-    """A share for people; empty where nobody knows it."""
+    """Format a fraction in percent; '' if it is unknown."""
     return "" if value is None else f"{100 * value:.2f} %"
 
 
 def advice(run: Row) -> list[tuple[str, dict[str, Any]]]:
-    """What a run recommends, by receiver."""
+    """Return the recommendations of a run, by receiver."""
     return list((run["recommended"] or {}).items())
 
 
 def count_of_pours(run: Row) -> str:
-    """'6', or '6 + 1 without a weight'."""
+    """Format the number of pours: '6', or '6 + 1 without a weight'."""
     lost = (run["failed_pours"] or 0) + (run["open_pours"] or 0)
     return f"{run['pours'] or 0}" + (f" + {lost} without a weight" if lost else "")
 
 
 def action(values: Mapping[str, float | None]) -> str:
-    """'angular velocity 41.2 deg/s, x offset 112 mm'."""
+    """Format an action: 'angular velocity 41.2 deg/s, x offset 112 mm'."""
     known = ((name, value) for name, value in values.items() if value is not None)
     return ", ".join(f"{_words(name)} {value:.4g} {_UNITS.get(name, '')}" for name, value in known)
 
@@ -116,7 +117,7 @@ def _head(name: str) -> str:
 
 
 def compared(name: str, heads: Sequence[str], values: Sequence[Any]) -> dict[str, str]:
-    """A line of a comparison."""
+    """Return one row of a comparison."""
     return {"": name, **{head: _plain(value) for head, value in zip(heads, values, strict=True)}}
 
 
@@ -132,7 +133,7 @@ def _rounded(value: float | None) -> str:
 
 
 def date(seconds: float | None) -> str:
-    """When, in this machine's time."""
+    """Format a time in this machine's time zone."""
     return "" if seconds is None else datetime.fromtimestamp(seconds).strftime("%Y-%m-%d %H:%M")
 
 
@@ -140,9 +141,9 @@ NEWEST = 20
 
 
 def list_runs(conditions: Mapping[str, Any], *, daemon: bool = False, as_json: bool) -> None:
-    """Runs that conditions hold for, the newest first."""
-    with _desk(daemon) as desk:
-        found = desk.runs(conditions)
+    """List the runs that meet the conditions, newest first."""
+    with _client(daemon) as client:
+        found = client.runs(conditions)
     if as_json:
         print_json({"runs": found})
         return
@@ -169,9 +170,9 @@ def list_runs(conditions: Mapping[str, Any], *, daemon: bool = False, as_json: b
 
 
 def list_pours(conditions: Mapping[str, Any], *, daemon: bool = False, as_json: bool) -> None:
-    """Pours that conditions hold for, the oldest first."""
-    with _desk(daemon) as desk:
-        found = desk.pours(conditions)
+    """List the pours that meet the conditions, oldest first."""
+    with _client(daemon) as client:
+        found = client.pours(conditions)
     if as_json:
         print_json({"pours": found})
     elif found:
@@ -181,9 +182,9 @@ def list_pours(conditions: Mapping[str, Any], *, daemon: bool = False, as_json: 
 
 
 def show(name: str, *, daemon: bool = False, as_json: bool) -> None:
-    """One run with all that is known of it."""
-    with _desk(daemon) as desk:
-        run = desk.run(name)
+    """Show one run."""
+    with _client(daemon) as client:
+        run = client.run(name)
     if as_json:
         print_json(run)
         return
@@ -226,8 +227,8 @@ def check(name: str, *, as_json: bool) -> None:
         if not has_begun(folder / JOURNAL_NAME):
             raise RefusalError(f"{folder}: there is no run in this folder", BAD_INPUT)
     else:
-        with _desk(daemon=False) as desk:
-            folder = Path(desk.run(name)["path"])
+        with _client(daemon=False) as client:
+            folder = Path(client.run(name)["path"])
     with _refusing():
         found = check_journal(folder / JOURNAL_NAME)
     if as_json:
@@ -250,11 +251,11 @@ def check(name: str, *, as_json: bool) -> None:
 
 
 def compare(names: Sequence[str], *, daemon: bool = False, as_json: bool) -> None:
-    """Settings in which runs differ, and what they came to."""
+    """Compare runs: the settings in which they differ, and their outcomes."""
     if len(names) < 2:
         raise RefusalError("comparing takes two runs or more: decant runs compare RUN RUN", BAD_INPUT)
-    with _desk(daemon) as desk:
-        found = desk.compare(names)
+    with _client(daemon) as client:
+        found = client.compare(names)
     if as_json:
         print_json(found)
         return
@@ -269,33 +270,33 @@ def compare(names: Sequence[str], *, daemon: bool = False, as_json: bool) -> Non
 
 
 def tag(name: str, add: Sequence[str], remove: Sequence[str], *, daemon: bool = False) -> None:
-    """Change a run's tags."""
+    """Add and remove tags of a run."""
     if not add and not remove:
         raise RefusalError("name tags to put on the run, or --remove those to take off", BAD_INPUT)
-    with _desk(daemon) as desk:
-        found = desk.tag(name, add, remove)
+    with _client(daemon) as client:
+        found = client.tag(name, add, remove)
     print(f"{found['run']}: {', '.join(found['tags']) or 'no tags'}")
 
 
 def note(name: str, text: str, *, daemon: bool = False) -> None:
-    """Write a note about a run."""
-    with _desk(daemon) as desk:
-        found = desk.note(name, text)
+    """Add a note to a run."""
+    with _client(daemon) as client:
+        found = client.note(name, text)
     print(f"{found['run']}: {len(found['notes'])} note{'s' * (len(found['notes']) > 1)}")
 
 
 def export(
     folder: Path, conditions: Mapping[str, Any], formats: Sequence[str] | None, *, daemon: bool = False, as_json: bool
 ) -> None:
-    """Write runs and pours that conditions hold for."""
+    """Export the runs and pours that meet the conditions."""
     from orchestrator.catalogue.export import FORMATS
     from sim_engine.resources import MissingExtraError
 
     if wrong := sorted(set(formats or ()) - set(FORMATS)):
         raise RefusalError(f"--format {wrong[0]}: should be {' or '.join(FORMATS)}", BAD_INPUT)
     try:
-        with _desk(daemon) as desk:
-            found = desk.export(folder, conditions, formats or FORMATS)
+        with _client(daemon) as client:
+            found = client.export(folder, conditions, formats or FORMATS)
     except MissingExtraError as error:
         raise RefusalError(f"{error}; or --format csv", BAD_INPUT) from None
     if as_json:
@@ -306,7 +307,7 @@ def export(
 
 
 def add(folders: Sequence[Path]) -> None:
-    """Enter runs found in folders."""
+    """Register all runs found in folders."""
     from orchestrator.catalogue.run_registry import enter, runs_below
 
     found: list[Path] = []
@@ -323,18 +324,18 @@ def add(folders: Sequence[Path]) -> None:
 
 
 def rebuild() -> None:
-    """Make the index anew."""
+    """Rebuild the index."""
     with _catalogue(anew=True) as catalogue:
         count = len(catalogue.rows("run"))
     print(f"{count} run{'s' * (count != 1)} in the catalogue")
 
 
-# -- inside ----------------------------------------------------------------------------------------------------------
+# -- helpers ---------------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
-def _desk(daemon: bool) -> Iterator[CatalogueClient]:
-    """Whoever answers: this machine's catalogue, or the daemon's."""
+def _client(daemon: bool) -> Iterator[CatalogueClient]:
+    """Open a client of this machine's catalogue or of the daemon's."""
     try:
         if daemon:
             from orchestrator.cli.queue_actions import talking
@@ -347,13 +348,13 @@ def _desk(daemon: bool) -> Iterator[CatalogueClient]:
 
             with _catalogue() as catalogue, _refusing():
                 yield LocalCatalogueClient(catalogue)
-    except ValueError as error:  # a date that is none
+    except ValueError as error:  # an invalid date
         raise RefusalError(str(error), BAD_INPUT) from None
 
 
 @contextlib.contextmanager
 def _catalogue(*, anew: bool = False, before: Any = None) -> Iterator[Catalogue]:
-    """The catalogue, up to date; what of it can't be read is printed at the end."""
+    """Open the catalogue and update it; problems with unreadable runs are printed at the end."""
     from orchestrator.catalogue.catalogue_index import Catalogue
     from orchestrator.catalogue.run_registry import state_directory
 

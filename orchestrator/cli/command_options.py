@@ -1,4 +1,4 @@
-"""Arguments and options that several verbs share, and how a verb is called."""
+"""Arguments and options that several commands share, and `call`, which runs a command."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from orchestrator.cli.console import BAD_INPUT, INTERRUPTED, RefusalError, fail,
 
 Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with the newest unfinished run of this campaign.")]
-RunId = Annotated[str | None, typer.Option("--run", help="With --resume: the run, by its folder's name.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue the newest unfinished run of this campaign.")]
+RunId = Annotated[str | None, typer.Option("--run", help="With --resume: name of the run's folder.")]
 Answer = Annotated[
     str | None,
     typer.Option(
-        help="With --resume: what came of the pour that was under way: 'lost', 'weighed 3.2 0.4' (g spilled, g "
-        "retained), or on the virtual bench 'repeat'. Or, where a D3 asks whether to trust its simulator: 'D2', "
+        help="With --resume: the outcome of the interrupted pour: 'lost', 'weighed 3.2 0.4' (g spilled, g retained), "
+        "or on the virtual bench 'repeat'. If D3 has stopped because its simulator fails the model check: 'D2', "
         "'widen' or 'go on'.",
         show_default=False,
     ),
@@ -27,7 +27,7 @@ Answer = Annotated[
 Laboratory = Annotated[Path, typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY", show_default=False)]
 OtherLaboratory = Annotated[
     Path | None,
-    typer.Option("--laboratory", help="Laboratory file (YAML) in place of the campaign's.", show_default=False),
+    typer.Option("--laboratory", help="Laboratory file (YAML) instead of the campaign's.", show_default=False),
 ]
 Quiet = Annotated[
     bool,
@@ -35,47 +35,47 @@ Quiet = Annotated[
         "--quiet",
         "-q",
         callback=hush,
-        help="Only results, questions, warnings of a run, and errors: no progress, no notes.",
+        help="Print only results, questions, warnings and errors: no progress, no notes.",
     ),
 ]
 Seed = Annotated[
     int | None,
-    # The largest is the schema's, whose module takes longer to import than `--help` may.
-    typer.Option(min=0, max=2**63 - 1, help="In place of the campaign's.", show_default=False),
+    # The limit equals the schema's, whose module takes too long to import for `--help`.
+    typer.Option(min=0, max=2**63 - 1, help="Seed, instead of the campaign's.", show_default=False),
 ]
 Assignments = Annotated[
     list[str] | None,
-    typer.Option("--set", help="An action's value: angular_velocity=40 (deg/s), x_offset='90 mm'. Repeat."),
+    typer.Option("--set", help="Value of an action: angular_velocity=40 (deg/s), x_offset='90 mm'. Repeatable."),
 ]
 Thetas = Annotated[
     int | None,
     typer.Option(
         min=0,
         max=50,
-        help="Predict with so many θ of the posterior in --parameters, in turn; 0: with θ* alone. As many as seeds if "
-        "not given and the file has a posterior.",
+        help="Number of posterior draws of θ in --parameters to predict with; 0: θ* alone. By default as many as "
+        "seeds, if the file has a posterior.",
         show_default=False,
     ),
 ]
 SceneName = Annotated[
     str | None,
-    typer.Option("--scene", help="'calibration', 'transfer' or a receiver's name; the first receiver if not given."),
+    typer.Option("--scene", help="'calibration', 'transfer' or a receiver's name; default: the first receiver."),
 ]
 Arm = Annotated[
     bool,
     typer.Option(
         "--arm",
-        help="Arm hardware for this run only: shows what will move, and asks for the laboratory's name.",
+        help="Enable motion of the hardware for this run only: shows what will move, requires the laboratory's name.",
     ),
 ]
 InProcess = Annotated[
-    bool, typer.Option("--in-process", help="Everything in one process, without Ray: slower, for debugging.")
+    bool, typer.Option("--in-process", help="Run everything in one process, without Ray: slower, for debugging.")
 ]
 Live = Annotated[
     bool,
     typer.Option(
         "--live",
-        help="Serve a live view for browsers while it runs: the address is printed. It can't slow anything down.",
+        help="Serve a live view for browsers during the run and print its address. It does not slow the run down.",
     ),
 ]
 LiveAt = Annotated[
@@ -83,30 +83,30 @@ LiveAt = Annotated[
     typer.Option(
         "--live-at",
         metavar="ADDRESS[:PORT]",
-        help="Where to serve it: '0.0.0.0' for other machines too (there is no password), with a port of your choice. "
-        "Otherwise this machine only, port 9090 or the next free one.",
+        help="Address of the live view: '0.0.0.0' for other machines too (without a password), optionally with a "
+        "port. Default: this machine only, port 9090 or the next free one.",
         show_default=False,
     ),
 ]
 Parameters = Annotated[
-    Path | None, typer.Option(help="θ: a theta.json of a calibration, or your own YAML or JSON.", show_default=False)
+    Path | None, typer.Option(help="θ: theta.json of a calibration, or a YAML or JSON file.", show_default=False)
 ]
 Receiver = Annotated[
-    Path | None, typer.Option(help="Vessel file (YAML) in place of the campaign's receiver.", show_default=False)
+    Path | None, typer.Option(help="Vessel file (YAML) instead of the campaign's receiver.", show_default=False)
 ]
 
 
 def examples(*commands: str) -> str:
-    """The end of a command's help: what one may type."""
+    """Format the examples at the end of a command's help."""
     return "Examples:\n\n" + "\n\n".join(f"`{command}`" for command in commands)
 
 
 def given(options: dict[str, Any], *left_out: str) -> dict[str, Any]:
-    """A verb's options by name, for the function that does its work.
+    """Return a command's options by name, for the function that does its work.
 
     Args:
-        options: `locals()` at the verb's beginning.
-        left_out: what is not for that function; `--quiet` has had its effect already.
+        options: `locals()` at the beginning of the command.
+        left_out: names that the function does not take; `--quiet` has already been applied.
     """
     return {name: value for name, value in options.items() if name not in ("quiet", *left_out)}
 
@@ -121,7 +121,7 @@ def _expanded(path: Path) -> Path:
 
 
 def _in_home(value: Any) -> Any:
-    """An argument with its paths expanded: a shell leaves `--state=~/lab` as it is."""
+    """Expand ~ in the paths of an argument: a shell does not expand it in `--state=~/lab`."""
     if isinstance(value, Path):
         return _expanded(value)
     if isinstance(value, list | tuple):
@@ -133,7 +133,7 @@ def _in_home(value: Any) -> Any:
 
 
 def call(verb: Callable[..., None], *args: Any, **kwargs: Any) -> None:
-    """Run a verb; a refusal is printed, and ends with its exit code. `~` in paths is the home directory."""
+    """Run a command; a refusal is printed and sets the exit code. `~` in paths is the home directory."""
     try:
         verb(*map(_in_home, args), **{name: _in_home(value) for name, value in kwargs.items()})
     except RefusalError as refusal:

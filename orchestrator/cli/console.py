@@ -1,6 +1,9 @@
-"""How verbs speak to people and to other programs, and how they end.
+"""Console output of the commands: messages on stderr, results on stdout, refusals with exit codes, and progress.
 
-What is being done, for people who wait: nothing for some seconds, then a line that is kept current.
+- `say` and `mention` print messages; `--quiet` suppresses the latter.
+- `print_json` prints a result as one line.
+- `RefusalError` ends a command with a message and an exit code.
+- `WaitingIndicator` and `waiting_for` report slow work: nothing for some seconds, then a line that is kept current.
 """
 
 from __future__ import annotations
@@ -18,11 +21,11 @@ from types import TracebackType
 from typing import Any, NoReturn, TextIO
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
-"""Exit codes beside 0 (done) and 3 (a person has to answer; `RunError.exit_code`)."""
+"""Exit codes in addition to 0 (success) and 3 (an operator must answer; `RunError.exit_code`)."""
 
 
 class RefusalError(Exception):
-    """A command can't do what was asked; printed as it is, without a traceback."""
+    """A command can't do its work; the message is printed without a traceback."""
 
     def __init__(self, message: str, code: int = FAILED) -> None:
         super().__init__(message)
@@ -30,12 +33,12 @@ class RefusalError(Exception):
 
 
 class Refused:
-    """Whatever of some kinds is raised inside is a refusal, in its own words.
+    """Context manager that converts errors of given types to refusals with the same message.
 
     Args:
-        kinds: of errors whose text is for the person who can mend it.
+        kinds: types of errors whose messages are written for users.
         code: exit code.
-        at: what stands before the text: an option, a file.
+        at: prefix of the message: an option, a file.
     """
 
     def __init__(self, *kinds: type[Exception], code: int = BAD_INPUT, at: str = "") -> None:
@@ -50,8 +53,8 @@ class Refused:
 
 
 def say(text: str) -> None:
-    """A line for people: stderr, so that stdout stays for results."""
-    with contextlib.suppress(OSError):  # a terminal that was closed is not a reason to leave an arm where it is
+    """Print a message on stderr; stdout is for results."""
+    with contextlib.suppress(OSError):  # a closed terminal must not interrupt a command that moves an arm
         print(text, file=sys.stderr, flush=True)
 
 
@@ -59,25 +62,25 @@ _quiet = False
 
 
 def hush(quiet: bool) -> bool:
-    """Whether from now on `mention` says nothing; questions, warnings of what moves, and errors are still told."""
+    """Set whether `mention` prints nothing; questions, warnings of motion, and errors are always printed."""
     global _quiet
     _quiet = quiet
     return quiet
 
 
 def is_quiet() -> bool:
-    """Whether only results and what has to be known are wanted."""
+    """Whether `--quiet` was given."""
     return _quiet
 
 
 def mention(text: str) -> None:
-    """A line for people who want to know what goes on: left out with `--quiet`."""
+    """Print a note or a progress message, unless `--quiet` was given."""
     if not _quiet:
         say(text)
 
 
 def print_json(data: dict[str, Any]) -> None:
-    """One line of JSON on stdout. Numbers that JSON has no word for become null."""
+    """Print one line of JSON on stdout. Numbers without a JSON equivalent become null."""
     print(json.dumps(_plain(data), ensure_ascii=False), flush=True)
 
 
@@ -93,9 +96,9 @@ def _plain(value: Any) -> Any:
 
 @contextlib.contextmanager
 def stdout_for_results() -> Iterator[None]:
-    """While libraries are at work, whatever they print goes to stderr: stdout is for the result alone.
+    """Redirect the output of libraries to stderr, so that stdout contains only the result.
 
-    Done to the file descriptor, since some of them print from C++ and from processes of their own.
+    The file descriptor itself is redirected, since some libraries print from C++ and from child processes.
     """
     sys.stdout.flush()
     kept = os.dup(1)
@@ -109,24 +112,24 @@ def stdout_for_results() -> Iterator[None]:
 
 
 def fail(refusal: RefusalError) -> NoReturn:
-    """Print a refusal and leave with its code."""
+    """Print a refusal and exit with its code."""
     say(f"decant: {refusal}" if refusal.code != BAD_INPUT else str(refusal))
     raise SystemExit(refusal.code)
 
 
 PATIENCE = 2.0
-"""Nobody asks within this time [s]."""
+"""Time before the first progress message [s]."""
 
 EVERY = 10.0
-"""Between two lines where stderr is not a terminal, such as a log file [s]."""
+"""Interval of messages if stderr is not a terminal, such as a log file [s]."""
 
 
 class WaitingIndicator:
-    """Call it with what is being done, as often as one likes. Use as a context manager.
+    """Reports progress of slow work. Use it as a context manager, and call it with a text as often as needed.
 
     Args:
-        out: by default stderr.
-        clock: seconds, monotonic.
+        out: stream; by default stderr.
+        clock: monotonic time [s].
     """
 
     def __init__(self, out: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
@@ -136,7 +139,7 @@ class WaitingIndicator:
         self._shown = False
 
     def __call__(self, text: str) -> None:
-        """Show it, if it is time."""
+        """Show the text, if it is time."""
         if is_quiet() or self._clock() < self._next:
             return
         if self._out.isatty():
@@ -160,11 +163,11 @@ class WaitingIndicator:
 
 @contextlib.contextmanager
 def waiting_for(text: Callable[[], str], *, beat: float = 0.5) -> Iterator[None]:
-    """The same around something that never comes back to say what it is doing: a thread asks every now and then.
+    """Report progress of a call that does not return until it is done; a thread queries the text.
 
     Args:
-        text: what is being done; called in that thread.
-        beat: how often it is asked [s].
+        text: returns the current text; called in the thread.
+        beat: interval of the queries [s].
     """
     done = threading.Event()
     with WaitingIndicator() as doing:

@@ -1,6 +1,7 @@
-"""`decant doctor`: is the bench ready to pour, and if not, what is to be done about it?
+"""The command `decant doctor`: checks whether a bench is ready to pour, and advises how to solve each problem.
 
-What `decant doctor` finds out about a balance. It asks questions; a tare is tried only if it was asked for.
+The checks read the arm, its safety settings, the balance and the installed packages. Nothing moves; the balance is
+tared only on request.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ if TYPE_CHECKING:
 
 
 def look_at_balance(spec: BalanceSpec | None, *, tare: bool) -> list[DeviceCheck]:
-    """Who is there, a stable reading, its step; and whether it obeys a tare.
+    """Check the balance: identity, a stable reading, its step, and optionally whether it can be tared.
 
     Args:
-        spec: as in the laboratory's file, its address filled in.
+        spec: settings from the laboratory's file, with the address.
         tare: also tare it.
     """
     if spec is None:
@@ -42,16 +43,16 @@ _MARKS = {"ok": ("ok", "green"), "warn": ("warn", "yellow"), "fail": ("FAIL", "b
 
 
 def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> None:
-    """Look at everything that a pour needs, and say what to do. Nothing moves.
+    """Check everything that a pour needs, and print advice. Nothing moves.
 
     Args:
         path: laboratory file.
         accept_safety: record the controller's safety settings as accepted.
         tare: also tare the balance.
-        as_json: one line of JSON in place of the table.
+        as_json: print one line of JSON instead of the table.
 
     Raises:
-        RefusalError: something fails (exit code 1), or the file can't be used (2).
+        RefusalError: a check fails (exit code 1), or the file can't be used (2).
     """
     spec = read_laboratory(path)
     if spec.arm is None:
@@ -92,7 +93,7 @@ def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> Non
 
 
 def _packages(spec: LaboratorySpec) -> list[DeviceCheck]:
-    """Whether a run would find the packages that it needs, by the run's own check."""
+    """Check the packages that a run needs, with the run's own check."""
     try:
         check_laboratory(dataclasses.replace(spec, ray=None), need_bench=True)
     except LaboratoryError as error:
@@ -101,10 +102,10 @@ def _packages(spec: LaboratorySpec) -> list[DeviceCheck]:
 
 
 def without_arm(path: Path, spec: LaboratorySpec, asked: str) -> RefusalError:
-    """Why there is nothing to do in a laboratory without an arm, and where there is.
+    """Return the refusal for a laboratory without an arm, with a suggestion.
 
     Args:
-        asked: what the command is about.
+        asked: the command's purpose, as part of the message.
     """
     has = "its bench is made of numbers" if spec.bench is not None else "it has no bench"
     return RefusalError(
@@ -115,10 +116,10 @@ def without_arm(path: Path, spec: LaboratorySpec, asked: str) -> RefusalError:
 
 
 def read_laboratory(path: Path) -> LaboratorySpec:
-    """A laboratory's file.
+    """Load a laboratory's file.
 
     Raises:
-        RefusalError: with all its problems, exit code 2.
+        RefusalError: the file is invalid; lists all problems, exit code 2.
     """
     from orchestrator.config.file_loading import load_laboratory
     from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -128,7 +129,7 @@ def read_laboratory(path: Path) -> LaboratorySpec:
 
 
 def print_table(checks: list[DeviceCheck]) -> None:
-    """The checks on stdout, advice below what it is about."""
+    """Print the checks on stdout, each followed by its advice."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -145,10 +146,10 @@ def print_table(checks: list[DeviceCheck]) -> None:
 
 
 def _accept(path: Path, look: ArmDiagnostics) -> SafetyRecord:
-    """Write down the safety settings as they are now.
+    """Record the current safety settings as accepted.
 
     Raises:
-        RefusalError: the controller doesn't tell them, or the record can't be written.
+        RefusalError: the controller does not report them, or the record can't be written.
     """
     if not look.checksum or not look.serial:
         raise RefusalError(

@@ -1,8 +1,8 @@
-"""`decant validate`: files are read, vessels built and actions tried; nothing is started.
+"""The commands `decant validate`, `decant init` and `decant plugins`.
 
-`decant init`: files to begin with, in a folder of one's own.
-
-`decant plugins`: what installed packages add, and what of it can't be used.
+- `validate` reads files, builds vessels and tries actions; it starts nothing.
+- `init` copies example files into a folder.
+- `plugins` lists the plug-ins of installed packages, including those that can't be used.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from orchestrator.shipped import starting_set
 
 
 def validate(paths: list[Path]) -> None:
-    """Check files; every problem of every file, exit code 2 if there is one. What makes little sense is a warning."""
+    """Check files and print all their problems; exit code 2 if there is one. Implausible values are warnings."""
     from orchestrator.config.yaml.yaml_errors import ConfigError
     from sim_engine.vessel.shapes import VesselError
 
@@ -39,10 +39,10 @@ def validate(paths: list[Path]) -> None:
 
 
 def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
-    """What a good file is, in a few words; and what is wrong with it.
+    """Return a short description of a file, and its problems.
 
     Raises:
-        ConfigError, VesselError: it can't be used.
+        ConfigError, VesselError: the file can't be used.
     """
     from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
     from orchestrator.config.yaml.file_access import resolved
@@ -74,7 +74,7 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
 
 
 def init(directory: Path) -> None:
-    """Copy the shipped campaigns and what they refer to.
+    """Copy the example campaigns and the files they refer to.
 
     Raises:
         RefusalError: the folder is not empty, or can't be written (exit code 2).
@@ -93,10 +93,10 @@ def plugins(*, as_json: bool) -> None:
     """List strategies, objectives, balances, arms and sources of vessels by the names that files use.
 
     Args:
-        as_json: one line of JSON in place of the table.
+        as_json: print one line of JSON instead of the table.
 
     Raises:
-        RefusalError: a package registers something that can't be used (exit code 1).
+        RefusalError: a plug-in can't be used (exit code 1).
     """
     found, unusable = installed(), broken()
     if as_json:

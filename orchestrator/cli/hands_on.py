@@ -1,4 +1,4 @@
-"""An arm for one command at the terminal: connected, its safety settings compared, stopped when somebody says so."""
+"""Access to an arm for one command at the terminal: connection, check of the safety settings, and stop with Ctrl-C."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ T = TypeVar("T")
 
 @contextlib.contextmanager
 def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
-    """A laboratory with its addresses: on hardware its own, else those of what is started for as long as this.
+    """Yield the laboratory with the addresses of its devices; a virtual one is started for the duration of the context.
 
     Raises:
-        LaboratoryError: a package that it needs is not installed, or what is started does not start.
+        LaboratoryError: a required package is not installed, or an emulator does not start.
     """
     from actors.laboratory import check_bench_packages
 
@@ -52,14 +52,14 @@ def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
 
 @contextlib.contextmanager
 def connected(spec: LaboratorySpec, accepted: str | None) -> Iterator[tuple[Arm, ArmFacts]]:
-    """The arm's driver, connected and locked; it is stopped and let go of in any case.
+    """Yield the arm's connected driver and facts; the arm is stopped and released in any case.
 
     Args:
-        spec: of a laboratory that was reached.
-        accepted: checksum of the safety settings that people have accepted; not asked for where nothing is hardware.
+        spec: settings of a laboratory from `reached`.
+        accepted: checksum of the accepted safety settings; not used if the laboratory is virtual.
 
     Raises:
-        RefusalError: the arm isn't ready, or its safety settings are others.
+        RefusalError: the arm isn't ready, or its safety settings differ.
         LaboratoryError: it can't be reached.
     """
     assert spec.arm is not None
@@ -76,7 +76,7 @@ def connected(spec: LaboratorySpec, accepted: str | None) -> Iterator[tuple[Arm,
 
 
 def accepted_for(path: Path) -> str | None:
-    """The checksum that people have accepted for a laboratory's file; None if none was.
+    """Return the checksum of the accepted safety settings for a laboratory's file, or None.
 
     Raises:
         RefusalError: the record can't be read (exit code 2).
@@ -87,9 +87,10 @@ def accepted_for(path: Path) -> str | None:
 
 
 def stoppable(arm: Arm, motion: Callable[[], T]) -> T:
-    """Do something that moves the arm; Ctrl-C stops it, and the error that the stop causes is raised.
+    """Run a motion in a thread; Ctrl-C stops the arm, and the resulting error is raised.
 
-    The motion runs in a thread: an interrupt must reach the arm as an order to stop, not tear the driver apart.
+    The motion runs in a thread, since an interrupt must stop the arm instead of ending the driver in the middle of a
+    call.
     """
     result: list[T] = []
     failure: list[BaseException] = []
@@ -114,10 +115,10 @@ def stoppable(arm: Arm, motion: Callable[[], T]) -> T:
 
 
 def typed_line(prompt: str) -> str:
-    """A line from the terminal; keys pressed before it was asked for are thrown away: they meant something else.
+    """Read a line from the terminal. Keys pressed before the prompt are discarded.
 
     Raises:
-        EOFError: there are no more.
+        EOFError: end of input.
     """
     termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
     print(prompt, end="", file=sys.stderr, flush=True)

@@ -1,4 +1,7 @@
-"""`decant jog`: the arm by small, slow steps, typed one by one, for setting up and for bringing it home."""
+"""The command `decant jog`: moves the arm by small, slow steps that are typed one by one, or brings it home.
+
+`Jogging` is the interactive session; `parse_step` parses a line, and `steps_home` computes the steps of the way home.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ SPEEDS = {"deg": 5.0, "mm": 20.0}
 """Speed of every step [deg/s], [mm/s]."""
 
 ANNOUNCEMENT = 1.0
-"""From a step's consent to its movement [s]."""
+"""Time between the confirmation of a step and its motion [s]."""
 
 _STEP = re.compile(r"(?P<axis>j[1-6]|[xyz]|r[xyz])\s*(?P<amount>[+−-]?\s*\d+(?:[.,]\d+)?)")
 _HELP = """\
@@ -37,7 +40,7 @@ _HELP = """\
 
 
 class JogError(ValueError):
-    """What was typed is not a step; says what would be one."""
+    """The typed line is not a step; the message shows a valid one."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +68,10 @@ class JogStep:
 
 
 def parse_step(text: str) -> JogStep:
-    """'j5 +2' → a step.
+    """Parse a step such as 'j5 +2'.
 
     Raises:
-        JogError: it is none, or too large.
+        JogError: the text is not a step, or the step is too large.
     """
     match = _STEP.fullmatch(" ".join(text.lower().split()))
     if match is None:
@@ -82,7 +85,7 @@ def parse_step(text: str) -> JogStep:
 
 
 def steps_home(joints: tuple[float, ...], home: tuple[float, ...]) -> list[JogStep]:
-    """Small steps of one joint after the other that lead home along a nearly straight line in joint space.
+    """Return small single-joint steps that lead home along a nearly straight line in joint space.
 
     Args:
         joints, home: six each [rad].
@@ -94,21 +97,21 @@ def steps_home(joints: tuple[float, ...], home: tuple[float, ...]) -> list[JogSt
 
 
 class Jogging:
-    """A session.
+    """An interactive session.
 
     Args:
-        arm: connected.
-        read: the next line typed, after a prompt; raises EOFError.
-        tell: a line for people.
+        arm: connected driver.
+        read: returns the next line, after a prompt; raises EOFError.
+        tell: prints a line.
     """
 
     def __init__(self, arm: Arm, read: Callable[[str], str], tell: Callable[[str], None] = say) -> None:
-        self._arm, self._read, self._tell = arm, read, tell
+        self._arm, self._read, self._print = arm, read, tell
         self._known: set[tuple[str, bool]] = set()
 
     def run(self) -> None:
-        """Until 'quit', or the end of input."""
-        self._tell(_HELP)
+        """Run until 'quit' or the end of input."""
+        self._print(_HELP)
         self.where()
         while True:
             try:
@@ -120,17 +123,17 @@ class Jogging:
             try:
                 self.do(typed)
             except (JogError, LaboratoryError) as error:
-                self._tell(str(error))
+                self._print(str(error))
 
     def do(self, typed: str) -> None:
-        """One line.
+        """Execute one line.
 
         Raises:
             JogError: it is not a step.
-            LaboratoryError: refused, or stopped on the way.
+            LaboratoryError: the motion is refused or stopped.
         """
         if typed in ("help", "?", "h"):
-            self._tell(_HELP)
+            self._print(_HELP)
         elif typed == "home":
             self.home()
         elif typed == "where":
@@ -139,49 +142,49 @@ class Jogging:
             self.step(parse_step(typed))
 
     def where(self) -> None:
-        """Joints and tool."""
+        """Print the positions of joints and tool."""
         here = self._arm.where()
         if here.joints:
             joints = "  ".join(f"{i}: {math.degrees(q):7.2f}" for i, q in enumerate(here.joints, start=1))
-            self._tell(f"joints  {joints} deg")
+            self._print(f"joints  {joints} deg")
         numbers = here.tool.as_list
         place = "  ".join(f"{name} {1e3 * value:7.1f}" for name, value in zip("xyz", numbers[:3], strict=True))
         turn = "  ".join(f"r{name} {value:6.3f}" for name, value in zip("xyz", numbers[3:], strict=True))
-        self._tell(f"tool    {place} mm   {turn} rad")
+        self._print(f"tool    {place} mm   {turn} rad")
 
     def step(self, step: JogStep) -> None:
-        """A step; the first along an axis, in either direction, is confirmed."""
+        """Move one step; the first step along each axis and direction is confirmed."""
         known = (step.axis, step.amount > 0.0)
         if known not in self._known:
             if self._read(f"{step}: Enter moves, anything else doesn't > ").strip():
-                self._tell("not moved")
+                self._print("not moved")
                 return
             self._known.add(known)
         self._move(step)
         self.where()
 
     def home(self) -> None:
-        """All joints home, by small steps, after a confirmation.
+        """Bring all joints home by small steps, after a confirmation.
 
         Raises:
-            JogError: too far for that.
+            JogError: the arm does not report its joints or its home position.
         """
         here = self._arm.where()
         if len(here.home) != len(here.joints) or not here.home:
             raise JogError("this arm doesn't tell its joints, or where home is; bring it home by steps")
         steps = steps_home(here.joints, here.home)
         if not steps:
-            self._tell("at home")
+            self._print("at home")
             return
-        self._tell(
+        self._print(
             f"{len(steps)} small steps, one joint after the other, in nearly a straight line in the joints. Nothing "
             "knows what stands in the way: watch it, Ctrl-C stops it."
         )
         if self._read("type 'home' to begin > ").strip() != "home":
-            self._tell("not moved")
+            self._print("not moved")
             return
         for number, step in enumerate(steps, start=1):
-            self._tell(f"{number}/{len(steps)}  {step}")
+            self._print(f"{number}/{len(steps)}  {step}")
             self._move(step)
         self.where()
 
@@ -192,14 +195,14 @@ class Jogging:
 
 
 def jog(path: Path, *, armed: bool) -> None:
-    """Steps typed at the terminal.
+    """Move the arm by steps that are typed at the terminal.
 
     Args:
         path: laboratory file.
         armed: whether `--arm` was given.
 
     Raises:
-        RefusalError: it may not, or can't, be moved.
+        RefusalError: the arm can't be moved, or motion is not enabled.
     """
     spec = read_laboratory(path)
     if spec.arm is None:

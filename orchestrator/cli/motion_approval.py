@@ -1,4 +1,8 @@
-"""Hardware moves for one run, after somebody at the terminal has read what it will do and typed its name."""
+"""Approval of motion on hardware: the operator at the terminal reads what will move and types the laboratory's name.
+
+`arm_campaign` does this for a campaign, `confirm` for other commands. `Envelope` summarises the planned paths of
+representative actions. Without approval, no command moves hardware; virtual laboratories need none.
+"""
 
 from __future__ import annotations
 
@@ -30,16 +34,16 @@ if TYPE_CHECKING:
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
 CORNERS, INTERIOR = 32, 12
-"""Actions of each space whose paths are planned for the envelope, beside its middle."""
+"""Number of corner and interior actions of each space whose paths are planned, in addition to the middle."""
 
 
 @dataclass(frozen=True)
 class Envelope:
-    """What the paths of some actions keep within.
+    """Extremes of the paths of several actions.
 
     Attributes:
-        reports: of the paths that can be executed.
-        refused: why the others can't, one text each.
+        reports: reports of the executable paths.
+        refused: reasons of the others, one text each.
     """
 
     reports: tuple[PathReport, ...]
@@ -47,7 +51,7 @@ class Envelope:
 
     @property
     def worst(self) -> PathReport:
-        """The extremes of all of them in one.
+        """The extremes of all paths in one report.
 
         Raises:
             ValueError: no path can be executed.
@@ -73,7 +77,7 @@ class Envelope:
 
 
 def envelope(arm: ArmSpec, pours: Iterable[tuple[Scene, Action]]) -> Envelope:
-    """Plan paths, and see what they keep within."""
+    """Plan the paths of actions and collect their reports."""
     reports, refused = [], []
     for scene, action in pours:
         try:
@@ -84,7 +88,7 @@ def envelope(arm: ArmSpec, pours: Iterable[tuple[Scene, Action]]) -> Envelope:
 
 
 def campaign_pours(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> list[tuple[Scene, Action]]:
-    """Actions from all over the spaces that the stages' pours are chosen from: middle, corners, and some between."""
+    """Return representative actions of the spaces that the stages search: middle, corners and interior."""
     calibrating, deploying = _pouring(stages)
     cases: list[tuple[Scene, Action]] = []
     if plan.calibration is not None and calibrating:
@@ -102,12 +106,12 @@ def _from_all_over(scene: Scene, actions: Space, constraints: Sequence[Linear]) 
         try:
             found.append((scene, scene.action(values)))
         except ValueError:
-            continue  # no such action
+            continue  # the values do not form a valid action
     return found
 
 
 def pour_count(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> int:
-    """How many pours the stages may ask for."""
+    """Return the largest number of pours that the stages may request."""
     from orchestrator.runs.stages import CONFIRMATION
 
     calibrating, deploying = _pouring(stages)
@@ -119,7 +123,7 @@ def pour_count(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> int:
 
 
 def _pouring(stages: Sequence[StageDefinition]) -> tuple[bool, int]:
-    """Whether the calibration's pours are among the stages, and how many deployments that pour."""
+    """Return whether the stages include calibration pours, and the number of deployments that pour."""
     from orchestrator.runs.stages import CONFIRMATION, DEPLOYMENT
 
     names = [stage.name for stage in stages if stage.pours and not stage.name.startswith(CONFIRMATION)]
@@ -128,19 +132,19 @@ def _pouring(stages: Sequence[StageDefinition]) -> tuple[bool, int]:
 
 
 def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed: bool, verb: str) -> str | None:
-    """Before a campaign that pours: on hardware nothing begins without the flag, a record, and a typed name.
+    """Check the approval of motion before a campaign: hardware needs the flag, a safety record, and a typed name.
 
     Args:
-        plan: with its laboratory.
-        stages: that are to run.
+        plan: campaign with its laboratory.
+        stages: stages to run.
         armed: whether `--arm` was given.
-        verb: of the command, for messages.
+        verb: name of the command, for messages.
 
     Returns:
-        The checksum of the safety settings that were accepted; None where there is no hardware.
+        The checksum of the accepted safety settings; None without hardware.
 
     Raises:
-        RefusalError: it isn't armed (exit code 2).
+        RefusalError: motion is not enabled (exit code 2).
     """
     laboratory = plan.laboratory
     if not any(stage.pours for stage in stages):
@@ -166,7 +170,7 @@ def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed
 
 
 def require_flag(laboratory: LaboratorySpec, *, armed: bool, again: str) -> None:
-    """Refuse to move hardware that nobody has asked to be armed.
+    """Refuse to move hardware without `--arm`.
 
     Raises:
         RefusalError: exit code 2.
@@ -180,10 +184,10 @@ def require_flag(laboratory: LaboratorySpec, *, armed: bool, again: str) -> None
 
 
 def accepted(plan: CampaignPlan) -> str:
-    """The checksum that people have accepted for the hardware of the laboratory in use.
+    """Return the checksum of the accepted safety settings of the laboratory's hardware.
 
     Raises:
-        RefusalError: none was (exit code 2).
+        RefusalError: no settings have been accepted (exit code 2).
     """
     with Refused(SafetyRecordError):
         checksum = accepted_checksum(plan.laboratory_source or plan.source)
@@ -197,7 +201,7 @@ def accepted(plan: CampaignPlan) -> str:
 
 
 def envelope_lines(found: Envelope) -> list[str]:
-    """What the paths keep within, for people."""
+    """Describe the extremes of the paths for the operator."""
     lines = report_lines(found.worst)
     total = len(found.reports) + len(found.refused)
     lines.append(
@@ -210,7 +214,7 @@ def envelope_lines(found: Envelope) -> list[str]:
 
 
 def report_lines(report: PathReport) -> list[str]:
-    """One path's report, or many's extremes, for people."""
+    """Describe one path's report, or the extremes of several, for the operator."""
     low, high = ([f"{1e3 * v:.0f}" for v in corner] for corner in (report.low, report.high))
     turned, turning = math.degrees(report.tilt), math.degrees(report.tilt_speed)
     return [
@@ -230,7 +234,7 @@ def report_lines(report: PathReport) -> list[str]:
 
 
 def announce(laboratory: str, arm: str, lines: Sequence[str], lasting: str = "") -> None:
-    """Show what hardware would do, before its laboratory's name is typed."""
+    """Print what hardware will do, before the laboratory's name is typed."""
     say(f"\nHARDWARE: laboratory {laboratory}, {arm}. This will move:\n")
     for line in lines:
         say(f"  {line}")
@@ -241,10 +245,10 @@ def announce(laboratory: str, arm: str, lines: Sequence[str], lasting: str = "")
 
 
 def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
-    """Show what hardware would do, and have its laboratory's name typed.
+    """Print what hardware will do, and require the laboratory's name to be typed.
 
     Raises:
-        RefusalError: nobody is at the terminal, or something else was typed (exit code 2).
+        RefusalError: stdin is not a terminal, or another text was typed (exit code 2).
     """
     assert laboratory.arm is not None
     if not sys.stdin.isatty():
@@ -254,7 +258,7 @@ def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
             BAD_INPUT,
         )
     announce(laboratory.name, laboratory.arm.title, lines, " for this run")
-    termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # keys pressed before this was read mean something else
+    termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # discard keys that were pressed before this text was shown
     print("> ", end="", file=sys.stderr, flush=True)
     typed = sys.stdin.readline()
     if typed.strip() != laboratory.name:

@@ -1,6 +1,10 @@
-"""`decant simulate`, `decant schema`: verbs that need no laboratory.
+"""The commands `decant simulate` and `decant schema`, which need no laboratory.
 
-`decant simulate --from`: a table of weighed pours is predicted in one go, and the predictions are scored.
+- `simulate` predicts one pour from several simulations in this process.
+- `predict_table` predicts all pours of a table of weighed pours, and scores the predictions (`--from`).
+- `schema` prints JSON schemas.
+
+Options are declared in `simulate_command`; θ is read in `prediction_inputs`.
 """
 
 from __future__ import annotations
@@ -38,7 +42,7 @@ if TYPE_CHECKING:
 
 
 def simulate(path: Path, options: SimulateOptions) -> None:
-    """One pour in the simulator of this process, with several seeds: their mean and spread are the prediction."""
+    """Simulate one pour with several seeds; their mean and spread are the prediction."""
     from orchestrator.cli.prediction_inputs import foretelling
     from orchestrator.config.action_assignments import assigned_action
     from orchestrator.config.campaign_checks import check_vessels
@@ -68,7 +72,7 @@ def simulate(path: Path, options: SimulateOptions) -> None:
         require_backend(options.backend)
     simulator = PourSimulator(options.backend)
     with Refused(InvalidSceneError, at="with shapes that the vessels may have, " if scene.uncertain else ""):
-        for task in tasks if scene.uncertain else tasks[:1]:  # refused before Taichi starts
+        for task in tasks if scene.uncertain else tasks[:1]:  # refuse before Taichi starts
             simulator.prepare(task)
     regime = _regimes(tasks[0])
     runs = _simulated_pour(simulator, tasks)
@@ -110,12 +114,12 @@ def simulate(path: Path, options: SimulateOptions) -> None:
 
 
 def wanted_in(plan: CampaignPlan, scene: Scene, name: str | None) -> float | None:
-    """Volume that a scene's receiver has to hold where less than the load is asked for [m³]; None for all of it.
+    """Return the volume that a scene's receiver must hold if less than the load is requested [m³]; None for all of it.
 
     Args:
         plan: the campaign.
-        scene: one that `scene_to_simulate` gave, perhaps with another receiver.
-        name: as given to that.
+        scene: a scene from `scene_to_simulate`, perhaps with another receiver.
+        name: name that was passed to `scene_to_simulate`.
     """
     if plan.deployment is None or name in ("calibration", "transfer"):
         return None
@@ -123,7 +127,7 @@ def wanted_in(plan: CampaignPlan, scene: Scene, name: str | None) -> float | Non
 
 
 def _simulated_pour(simulator: PourSimulator, tasks: list[PourTask]) -> list[SimulatedPour]:
-    """One after the other; Taichi ends with them."""
+    """Run simulations one after the other, then close the simulator."""
     begin = time.monotonic()
     runs: list[SimulatedPour] = []
 
@@ -141,12 +145,12 @@ def _simulated_pour(simulator: PourSimulator, tasks: list[PourTask]) -> list[Sim
 
 
 def told(outcomes: list[PourOutcome], over_seeds: Mapping[str, SampleStatistics], delivered: str = "") -> str:
-    """The outcomes in one line: mean ± standard deviation of the seeds.
+    """Format the outcomes in one line: mean ± standard deviation over the seeds.
 
     Args:
         outcomes: one for each seed.
         over_seeds: their means and deviations.
-        delivered: how much is in the receiver, in the mean; '' if nobody knows.
+        delivered: mean amount in the receiver; '' if it is unknown.
     """
     from sim_engine.prediction_band import FRACTIONS
 
@@ -164,7 +168,7 @@ def told(outcomes: list[PourOutcome], over_seeds: Mapping[str, SampleStatistics]
 
 
 def _regimes(task: PourTask) -> ModelValidity | None:
-    """What the planned pour is like; what the simulator lacks for it is printed on stderr."""
+    """Return the model validity of a pour; effects that the simulator lacks are printed on stderr."""
     from orchestrator.results.validity_warnings import numbers_line, regimes_of
 
     try:
@@ -179,7 +183,7 @@ def _regimes(task: PourTask) -> ModelValidity | None:
 
 
 def scene_to_simulate(plan: CampaignPlan, name: str | None = None) -> tuple[Scene, Space]:
-    """A scene of the campaign with its searched actions: the one named, else deployment's first, else calibration's.
+    """Return a scene of the campaign with its action space: the named one, deployment's first, or calibration's.
 
     Args:
         name: 'calibration', 'transfer', or a receiver's name.
@@ -213,7 +217,7 @@ def _show(task: PourTask, pour: SimulatedPour, options: SimulateOptions) -> None
 
 
 def schema(which: str) -> None:
-    """The JSON schema of the files that people write, or of what a run writes."""
+    """Print the JSON schema of input files or of a run's summary."""
     from orchestrator.config.json_schema import SCHEMAS, schema_text
 
     if which not in SCHEMAS:
@@ -222,7 +226,7 @@ def schema(which: str) -> None:
 
 
 def predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
-    """All pours of a table, in the simulator of this process."""
+    """Predict all pours of a table with simulations in this process."""
     from orchestrator.cli.prediction_inputs import foretelling
     from orchestrator.results.prediction_scores import scores
     from sim_engine.prediction_band import LEVEL
@@ -284,10 +288,10 @@ def predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
 
 
 def _scene(plan: CampaignPlan, options: SimulateOptions, source: Path) -> tuple[Scene, RecordSet | None]:
-    """Where the pours were made: the scene named, else that whose file this is, else calibration's, else the first.
+    """Select the scene of the pours: the named one, the one whose file this is, calibration's, or the first.
 
     Returns:
-        The scene, and the records that say how such a file is read, if the campaign has any.
+        The scene, and the records that define how such a file is read, if the campaign has any.
     """
     import dataclasses
 
@@ -310,10 +314,10 @@ def _scene(plan: CampaignPlan, options: SimulateOptions, source: Path) -> tuple[
 
 
 def _pours(scene: Scene, records: RecordSet | None, source: Path) -> tuple[RecordTable, list[RecordedPour]]:
-    """The table's pours as actions of the scene.
+    """Convert the table's rows to actions of the scene.
 
     Raises:
-        RefusalError: with everything that is wrong with the table, by line and column (exit code 2).
+        RefusalError: the table has problems; lists them by line and column (exit code 2).
     """
     from orchestrator.config.weighed_pours import read_records
     from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
@@ -336,17 +340,17 @@ def _pours(scene: Scene, records: RecordSet | None, source: Path) -> tuple[Recor
             pours.append(row.pour(scene.fixed))
         except ValueError as error:
             problems.append(Problem(source, row.line, 1, "", f"makes no action of scene '{scene.name}': {error}"))
-            break  # the same holds for all of them
+            break  # all rows have the same problem
     if problems:
         raise RefusalError(str(ConfigError(problems)), BAD_INPUT)
     return table, pours
 
 
 def _check(simulator: PourSimulator, table: RecordTable, source: Path, tasks: Sequence[Sequence[PourTask]]) -> None:
-    """Refuse what can't be poured before Taichi starts.
+    """Refuse invalid pours before Taichi starts.
 
     Raises:
-        RefusalError: with every line at which the vessels touch, or can't be built (exit code 2).
+        RefusalError: lists the lines at which the vessels touch or can't be built (exit code 2).
     """
     from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
     from sim_engine.simulator import InvalidSceneError
@@ -369,7 +373,7 @@ def _check(simulator: PourSimulator, table: RecordTable, source: Path, tasks: Se
 
 
 def _simulated(simulator: PourSimulator, tasks: Sequence[Sequence[PourTask]]) -> list[list[PourOutcome]]:
-    """Pour after pour; Taichi ends with them."""
+    """Run the simulations of all pours, then close the simulator."""
     begin, total, done = time.monotonic(), sum(map(len, tasks)), 0
     found: list[list[PourOutcome]] = []
 

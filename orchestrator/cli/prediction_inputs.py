@@ -1,4 +1,8 @@
-"""With what a verb foretells pours: what was asked for, θ, draws of its posterior, what calibration left over."""
+"""Inputs of predictions on the command line: options, θ, draws of its posterior, and the calibration's discrepancy.
+
+`SimulateOptions` holds the options of `decant simulate`; `PredictionInputs` holds θ and makes the simulation tasks of a
+pour.
+"""
 
 from __future__ import annotations
 
@@ -18,21 +22,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateOptions:
-    """What `simulate` is given on the command line beside its campaign."""
+    """Options of `decant simulate`, without the campaign."""
 
     assignments: list[str] | None = None
     """Values of the action, `name=value`."""
     source: Path | None = None
-    """CSV of weighed pours, in place of an action."""
+    """CSV file of weighed pours, instead of an action."""
     parameters: Path | None = None
     """theta.json; None: the campaign's θ."""
     receiver: Path | None = None
-    """In place of the scene's."""
+    """Vessel file instead of the scene's receiver."""
     thetas: int | None = None
-    """Draws of the posterior that a pour's simulations take turns with; None: as many as `seeds`, if there is one."""
+    """Posterior draws that a pour's simulations cycle through; None: as many as `seeds`, if a posterior exists."""
     seed: int = 0
     seeds: int = 3
-    """Simulations of each pour; as many as `thetas` where those are more."""
+    """Simulations of each pour, at least as many as `thetas`."""
     scene: str | None = None
     csv: Path | None = None
     rrd: Path | None = None
@@ -46,9 +50,9 @@ class PredictionInputs:
     """θ of a prediction.
 
     Attributes:
-        theta: that of the file, or the campaign's.
-        drawn: draws of the posterior that simulations take turns with; empty: θ alone.
-        discrepancy: shift that the calibration left (`sim_engine.prediction_band`); None where nobody knows.
+        theta: θ of the file, or the campaign's.
+        drawn: draws of the posterior that simulations cycle through; empty: θ alone.
+        discrepancy: shift that remains after calibration (`sim_engine.prediction_band`); None if it is unknown.
     """
 
     theta: SimulationParameters
@@ -57,16 +61,17 @@ class PredictionInputs:
 
     @property
     def thetas(self) -> tuple[SimulationParameters, ...]:
-        """What simulations take turns with."""
+        """All θ that simulations cycle through."""
         return self.drawn or (self.theta,)
 
     def tasks(self, scene: Scene, action: Action, seed: int, seeds: int, record_rate: float = 0.0) -> list[PourTask]:
-        """The simulations of one pour: θ take turns, and vessels whose shape may be off have another each time.
+        """Return the simulations of one pour. They cycle through θ; uncertain vessel shapes are drawn for each
+        simulation.
 
         Args:
-            seed: of the first one.
-            seeds: how many; as many as θ where those are more.
-            record_rate: frames of the first one [1/s].
+            seed: seed of the first simulation.
+            seeds: number of simulations, at least as many as θ.
+            record_rate: frame rate of the first simulation [1/s].
         """
         from sim_engine.scene import PourTask
 
@@ -77,7 +82,7 @@ class PredictionInputs:
         ]
 
     def said(self, scene: Scene) -> str:
-        """What the bands of a scene's pours hold, for people."""
+        """Describe the sources of uncertainty in the prediction intervals of a scene's pours."""
         among = f"{len(self.drawn)} θ of the posterior" if self.drawn else "one θ"
         parts = ["seeds", among, f"{self.theta.particles} particles' resolution"]
         if scene.uncertain:
@@ -88,24 +93,24 @@ class PredictionInputs:
         return f"bands of {', '.join(parts[:-1])} and {parts[-1]} alone (no calibration says what it left over)"
 
     def as_json(self) -> dict[str, Any]:
-        """The shifts behind the bands, JSON-ready."""
+        """Return the shifts in the prediction intervals, JSON-ready."""
         from sim_engine.prediction_band import resolution_shift
 
         return {"discrepancy_shift": self.discrepancy, "resolution_shift": resolution_shift(self.theta.particles)}
 
 
 def foretelling(plan: CampaignPlan, parameters: Path | None, thetas: int | None, seeds: int) -> PredictionInputs:
-    """What the command line asks for.
+    """Read θ and its posterior as requested on the command line.
 
     Args:
-        plan: whose θ has what the file does not name.
-        parameters: theta.json of a calibration, or somebody's own file; None: the campaign's θ.
-        thetas: draws of the posterior; None: as many as `seeds` where the file has a posterior and recommends
-            the calibrated θ; 0: θ alone.
+        plan: campaign with the values of θ that the file does not contain.
+        parameters: theta.json of a calibration, or the user's own file; None: the campaign's θ.
+        thetas: number of posterior draws; None: as many as `seeds` if the file has a posterior and recommends the
+            calibrated θ; 0: θ alone.
         seeds: simulations of a pour.
 
     Raises:
-        RefusalError: something is wrong with the file, or it has no posterior that was asked for (exit code 2).
+        RefusalError: the file is invalid, or it lacks the requested posterior (exit code 2).
     """
     from orchestrator.config.file_loading import (
         load_discrepancy,

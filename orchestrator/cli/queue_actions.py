@@ -1,4 +1,7 @@
-"""What the daemon's verbs do: `decant serve`, and those that talk to it over HTTP."""
+"""The work of the daemon's commands: `decant serve`, and the commands that call the daemon over HTTP.
+
+Options are declared in `queue_commands`; the HTTP client is in `orchestrator.daemon.daemon_client`.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +20,14 @@ if TYPE_CHECKING:
     from orchestrator.daemon.daemon_client import Client
 
 At = tuple[str | None, Path | None]
-"""Address and state directory of the daemon, as given."""
+"""URL and state directory of the daemon, as given."""
 
 
 def serve(path: Path | None, *, state: Path | None, port: int | None, simulators: int | None, in_process: bool) -> None:
-    """Serve until told to end.
+    """Serve until the daemon is stopped.
 
     Raises:
-        RefusalError: it can't begin.
+        RefusalError: it can't start.
     """
     from orchestrator.config.yaml.file_access import resolved
     from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -64,7 +67,7 @@ def _require_extra() -> None:
 
 @contextmanager
 def talking(at: At) -> Iterator[Client]:
-    """A client of the daemon there. Its refusals are this command's."""
+    """Open a client of the daemon; its refusals end the command."""
     _require_extra()
     from orchestrator.daemon.daemon_client import Client
     from orchestrator.run_errors import RunError
@@ -90,10 +93,10 @@ def submit(
     at: At,
     as_json: bool,
 ) -> None:
-    """Pack a campaign here, and have it queued there.
+    """Pack a campaign on this machine, and submit it to the daemon.
 
     Raises:
-        RefusalError: it can't be used, here or there.
+        RefusalError: it is refused here or by the daemon.
     """
     from orchestrator.cli.foreground_run import read_campaign
     from orchestrator.daemon.submission_bundle import pack
@@ -122,7 +125,7 @@ def submit(
 
 
 def list_campaigns(*, at: At, as_json: bool) -> None:
-    """Everything at a glance."""
+    """Print problems, campaigns and open questions."""
     with talking(at) as client:
         status, campaigns = client.get("/status"), client.get("/campaigns", limit=50)
         questions = client.get("/questions")
@@ -163,7 +166,7 @@ def _standing(one: dict[str, Any]) -> str:
 
 
 def show(key: str, *, at: At, as_json: bool) -> None:
-    """One campaign."""
+    """Print one campaign."""
     with talking(at) as client:
         found = client.get(f"/campaigns/{key}")
     if as_json:
@@ -187,7 +190,7 @@ def show(key: str, *, at: At, as_json: bool) -> None:
 
 
 def logs(key: str | None, *, follow: bool, as_json: bool, at: At) -> None:
-    """Events, as lines."""
+    """Print events as lines."""
     with talking(at) as client:
         only = None if key is None else client.get(f"/campaigns/{key}")["id"]
         try:
@@ -203,7 +206,7 @@ _PASSING = ("PourProgressed", "StrategyProgressed", "MadeAhead", "RequestStarted
 
 
 def _line(event: dict[str, Any]) -> str | None:
-    """What people want to read of an event; None: nothing."""
+    """Format an event for the user; None for events that are not shown."""
     kind = event["type"]
     match kind:
         case _ if kind in _PASSING:
@@ -246,7 +249,7 @@ def _finished(event: dict[str, Any]) -> str:
 
 
 def act(key: str | None, what: str, *, at: At) -> None:
-    """Pause, resume or stop a campaign; without one the queue."""
+    """Pause, resume or stop a campaign, or pause or resume the queue if none is given."""
     with talking(at) as client:
         found = client.post(f"/queue/{what}" if key is None else f"/campaigns/{key}/{what}")
     if key is None:
@@ -256,7 +259,7 @@ def act(key: str | None, what: str, *, at: At) -> None:
 
 
 def abort(key: str | None, *, everything: bool, clear: bool, rig: str | None, at: At) -> None:
-    """Stop the motion of one campaign, of one rig, or of all of them."""
+    """Stop the motion of one campaign, of one rig, or of all rigs."""
     if sum((key is not None, everything, clear or rig is not None)) != 1:
         raise RefusalError(
             "name one campaign, or --all for the emergency stop, or --rig for that of one rig, or --clear to end one",
@@ -277,7 +280,7 @@ def abort(key: str | None, *, everything: bool, clear: bool, rig: str | None, at
 
 
 def answer(number: int | None, text: str, *, at: At) -> None:
-    """Answer a question, or list those that are open."""
+    """Answer a question, or list the open questions."""
     with talking(at) as client:
         if number is None:
             questions = client.get("/questions")
@@ -306,7 +309,7 @@ def _print_question(question: dict[str, Any]) -> None:
 
 
 def arm(key: str, *, at: At) -> None:
-    """Show what hardware would do, and have its laboratory's name typed."""
+    """Print what hardware will do, and require the laboratory's name to be typed."""
     from orchestrator.cli.motion_approval import announce
 
     if not sys.stdin.isatty():
@@ -324,7 +327,7 @@ def arm(key: str, *, at: At) -> None:
 
 
 def move(key: str, *, before: str | None, priority: int | None, at: At) -> None:
-    """Another place in the queue."""
+    """Move a campaign in the queue."""
     if before is None and priority is None:
         raise RefusalError("where to? --first, --before CAMPAIGN_ID or --priority N", BAD_INPUT)
     with talking(at) as client:
@@ -335,7 +338,7 @@ def move(key: str, *, before: str | None, priority: int | None, at: At) -> None:
 
 
 def shutdown(*, at: At) -> None:
-    """End the daemon."""
+    """Shut the daemon down."""
     with talking(at) as client:
         client.post("/shutdown")
     print("ending at the next safe point; its queue is kept")

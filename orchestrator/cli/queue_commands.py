@@ -1,4 +1,7 @@
-"""The daemon and those who talk to it, as the command line has them: `serve`, `submit`, `list`, `show`, …"""
+"""Options and help texts of the daemon's commands: `serve`, `submit`, `list`, `show` and others.
+
+Their work is done in `queue_actions`.
+"""
 
 from __future__ import annotations
 
@@ -22,32 +25,37 @@ from orchestrator.cli.command_options import (
 
 Key = Annotated[
     str,
-    typer.Argument(metavar="CAMPAIGN_ID", help="As 'decant list' shows it; its beginning will do.", show_default=False),
+    typer.Argument(metavar="CAMPAIGN_ID", help="Id as shown by 'decant list', or a prefix of it.", show_default=False),
 ]
 Url = Annotated[
     str | None,
-    typer.Option(help="The daemon's address; else $DECANT_URL, or this machine's.", show_default=False),
+    typer.Option(help="URL of the daemon; default: $DECANT_URL, or the daemon on this machine.", show_default=False),
 ]
 State = Annotated[
-    Path | None, typer.Option(help="The daemon's state directory; else $DECANT_STATE.", show_default=False)
+    Path | None, typer.Option(help="The daemon's state directory; default: $DECANT_STATE.", show_default=False)
 ]
 
 
 def serve(
     settings: Annotated[
-        Path | None, typer.Argument(help="Settings (YAML); without, a virtual laboratory.", show_default=False)
+        Path | None, typer.Argument(help="Settings file (YAML); default: a virtual laboratory.", show_default=False)
     ] = None,
     state: State = None,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="0 takes a free one.", show_default=False)] = None,
-    simulators: Annotated[int | None, typer.Option(min=0, help="0: one per core.", show_default=False)] = None,
+    port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="TCP port; 0 selects a free one.", show_default=False)
+    ] = None,
+    simulators: Annotated[
+        int | None, typer.Option(min=0, help="Number of simulators; 0: one per core.", show_default=False)
+    ] = None,
     in_process: Annotated[
-        bool, typer.Option("--in-process", help="One simulator, without Ray: to try it out.")
+        bool, typer.Option("--in-process", help="Use one simulator without Ray, for trying it out.")
     ] = False,
 ) -> None:
-    """Run a laboratory as a service: a queue of campaigns, an API on this machine, questions that wait for answers.
+    """Run a laboratory as a service: a queue of campaigns, an HTTP API, and questions that wait for answers.
 
-    Everything it keeps is under one state directory; killed at any moment and started again, it goes on where it was,
-    and asks about a pour that had begun. SIGTERM or Ctrl-C ends it at the next safe point, a second one at once.
+    All data are stored in one state directory. If the daemon is killed and started again, it continues where it
+    stopped, and asks the operator about a pour that had started. SIGTERM or Ctrl-C stops it at the next safe point, a
+    second signal at once.
     """
     from orchestrator.cli import queue_actions as verb
 
@@ -56,22 +64,22 @@ def serve(
 
 def submit(
     campaign: Campaign,
-    verb: Annotated[str, typer.Option("--verb", help="run, calibrate or plan.")] = "run",
-    rig: Annotated[str, typer.Option(help="Which rig it is for, where several fit.", show_default=False)] = "",
-    priority: Annotated[int, typer.Option(help="Higher ones come first.")] = 0,
+    verb: Annotated[str, typer.Option("--verb", help="Task: run, calibrate or plan.")] = "run",
+    rig: Annotated[str, typer.Option(help="Rig to run on, if several match.", show_default=False)] = "",
+    priority: Annotated[int, typer.Option(help="Higher priorities run first.")] = 0,
     laboratory: OtherLaboratory = None,
     seed: Seed = None,
     parameters: Parameters = None,
     receiver: Receiver = None,
     iterations: Annotated[
         int | None,
-        typer.Option(min=1, help="With --verb plan: simulations in place of the campaign's.", show_default=False),
+        typer.Option(min=1, help="With --verb plan: simulations instead of the campaign's.", show_default=False),
     ] = None,
     url: Url = None,
     state: State = None,
     as_json: Json = False,
 ) -> None:
-    """Put a campaign into the daemon's queue, with copies of everything that it refers to."""
+    """Add a campaign to the daemon's queue, with copies of all files that it refers to."""
     options = given(locals(), "campaign", "verb", "url", "state")
     from orchestrator.cli import queue_actions as module
 
@@ -79,14 +87,14 @@ def submit(
 
 
 def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) -> None:
-    """What runs, what waits, what is done; rigs, questions and problems."""
+    """List campaigns, rigs, open questions and problems."""
     from orchestrator.cli import queue_actions as verb
 
     call(verb.list_campaigns, at=(url, state), as_json=as_json)
 
 
 def show(key: Key, url: Url = None, state: State = None, as_json: Json = False) -> None:
-    """One campaign: where it stands, its pours with what was predicted and weighed, and who did what."""
+    """Show one campaign: its progress, its pours with predictions and weights, and the audit entries."""
     from orchestrator.cli import queue_actions as verb
 
     call(verb.show, key, at=(url, state), as_json=as_json)
@@ -94,27 +102,27 @@ def show(key: Key, url: Url = None, state: State = None, as_json: Json = False) 
 
 def logs(
     key: Annotated[
-        str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Whose events; all of them unless given.")
+        str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Only events of this campaign; default: all events.")
     ] = None,
-    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what comes; Ctrl-C ends it.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Every event as one line of JSON.")] = False,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Wait for new events; Ctrl-C ends it.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print every event as one line of JSON.")] = False,
     url: Url = None,
     state: State = None,
 ) -> None:
-    """What happened, and with -f what happens."""
+    """Print past events, and with -f also new events as they happen."""
     from orchestrator.cli import queue_actions as verb
 
     call(verb.logs, key, follow=follow, as_json=as_json, at=(url, state))
 
 
 def pause(
-    key: Annotated[str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Without: the queue.")] = None,
+    key: Annotated[str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Default: the whole queue.")] = None,
     url: Url = None,
     state: State = None,
 ) -> None:
-    """Bring a campaign to rest at its next checkpoint: a pour that has begun is finished and weighed.
+    """Pause a campaign at its next checkpoint: a pour that has started is finished and weighed.
 
-    Without a campaign the queue is paused: none is begun, what runs goes on.
+    Without a campaign, the queue is paused: no campaign starts, and running ones continue.
     """
     from orchestrator.cli import queue_actions as verb
 
@@ -122,36 +130,36 @@ def pause(
 
 
 def resume(
-    key: Annotated[str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Without: the queue.")] = None,
+    key: Annotated[str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Default: the whole queue.")] = None,
     url: Url = None,
     state: State = None,
 ) -> None:
-    """Go on with a campaign that rests, or with the queue."""
+    """Resume a paused campaign, or the queue."""
     from orchestrator.cli import queue_actions as verb
 
     call(verb.act, key, "resume", at=(url, state))
 
 
 def stop(key: Key, url: Url = None, state: State = None) -> None:
-    """End a campaign, or take it out of the queue. A pour is finished and weighed; what came of it is published."""
+    """Stop a campaign, or remove it from the queue. A started pour is finished; the results are published."""
     from orchestrator.cli import queue_actions as verb
 
     call(verb.act, key, "stop", at=(url, state))
 
 
 def abort(
-    key: Annotated[str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Without: see --all.")] = None,
+    key: Annotated[str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Campaign to abort; or use --all.")] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="Emergency stop: every arm, everything given up, latched until --clear.")
+        bool, typer.Option("--all", help="Emergency stop: stop every arm and give up all work until --clear.")
     ] = False,
-    clear: Annotated[bool, typer.Option("--clear", help="Clear the emergency stop, once all is safe.")] = False,
+    clear: Annotated[bool, typer.Option("--clear", help="Clear the emergency stop, after the cell is safe.")] = False,
     rig: Annotated[
-        str | None, typer.Option("--rig", help="Emergency stop of this rig alone; with --clear: clear that one.")
+        str | None, typer.Option("--rig", help="Emergency stop of this rig alone; with --clear: clear it.")
     ] = None,
     url: Url = None,
     state: State = None,
 ) -> None:
-    """Stop the motion at once. What is tilted is brought upright once somebody has agreed to it.
+    """Stop the motion at once. A tilted vessel is brought upright after the operator has agreed.
 
     A software stop is not a safety function: keep the robot's own emergency stop within reach.
     """
@@ -166,14 +174,14 @@ def answer(
     url: Url = None,
     state: State = None,
 ) -> None:
-    """Answer a question; without one, list those that are open."""
+    """Answer a question, or list the open questions if none is given."""
     from orchestrator.cli import queue_actions as verb
 
     call(verb.answer, question, " ".join(text or ()), at=(url, state))
 
 
 def arm(key: Key, url: Url = None, state: State = None) -> None:
-    """Let hardware move in the coming part of a campaign's run: shows what will move, asks for its name."""
+    """Enable motion for the coming part of a run: shows what will move, and requires the laboratory's name."""
     from orchestrator.cli import queue_actions as verb
 
     call(verb.arm, key, at=(url, state))
@@ -181,20 +189,20 @@ def arm(key: Key, url: Url = None, state: State = None) -> None:
 
 def move(
     key: Key,
-    before: Annotated[str | None, typer.Option(help="In front of that campaign.", show_default=False)] = None,
-    first: Annotated[bool, typer.Option("--first", help="To the head of the queue.")] = False,
-    priority: Annotated[int | None, typer.Option(help="Higher ones come first.", show_default=False)] = None,
+    before: Annotated[str | None, typer.Option(help="Move in front of this campaign.", show_default=False)] = None,
+    first: Annotated[bool, typer.Option("--first", help="Move to the head of the queue.")] = False,
+    priority: Annotated[int | None, typer.Option(help="Higher priorities run first.", show_default=False)] = None,
     url: Url = None,
     state: State = None,
 ) -> None:
-    """Give a queued campaign another place."""
+    """Move a queued campaign to another place."""
     from orchestrator.cli import queue_actions as verb
 
     call(verb.move, key, before="" if first else before, priority=priority, at=(url, state))
 
 
 def shutdown(url: Url = None, state: State = None) -> None:
-    """End the daemon at the next safe point; a second time: at once. Its queue is kept."""
+    """Shut the daemon down at the next safe point; a second time: at once. The queue is kept."""
     from orchestrator.cli import queue_actions as verb
 
     call(verb.shutdown, at=(url, state))
@@ -228,6 +236,6 @@ _VERBS: dict[str, tuple[Callable[..., None], tuple[str, ...]]] = {
 
 
 def register(app: typer.Typer) -> None:
-    """Add the verbs to the command."""
+    """Add the commands to the application."""
     for name, (verb, shown) in _VERBS.items():
         app.command(name, epilog=examples(*shown), rich_help_panel="Daemon")(verb)

@@ -1,4 +1,4 @@
-"""`decant report`: the page about a run or a study, made again from its folder."""
+"""The command `decant report`: writes the page of a run or a study again from its folder."""
 
 from __future__ import annotations
 
@@ -11,36 +11,37 @@ from orchestrator.cli.command_options import Json, Quiet, call, examples
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, print_json, say
 
 EXAMPLES = examples(
-    "decant report quickstart-20300131-1              # a run of the folder runs/",
+    "decant report quickstart-20300131-1              # a run in the folder runs/",
     "decant report runs/quickstart-20300131-1 --pdf -o for-the-lab-meeting.html",
     "decant report configs/studies/quick.yaml         # or the study's folder",
 )
 
 RUNS = Path("runs")
-"""Where a name without a folder is looked for."""
+"""Folder in which names without a folder are searched."""
 
 
 def report(
     what: Annotated[
         Path,
         typer.Argument(
-            help="A run's folder, or its name in runs/; a study's folder, or its file.",
+            help="Folder of a run, or its name in runs/; folder or file of a study.",
             metavar="RUN|STUDY",
             show_default=False,
         ),
     ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Another file than report.html in the run's folder.", show_default=False),
+        typer.Option("--output", "-o", help="Other file than report.html in the run's folder.", show_default=False),
     ] = None,
-    pdf: Annotated[bool, typer.Option("--pdf", help="Write every figure of a run as PDF, too, for LaTeX.")] = False,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Also write every figure of a run as PDF, for LaTeX.")] = False,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make the page about a run or a study: one HTML file that needs nothing beside it and prints well.
+    """Write the report of a run or a study: one self-contained HTML file, suitable for printing.
 
-    What was asked, what was done, θ* with its region, every pour, figures, cost, and in plain words what to do from now
-    on, how far it may be missed, and what nobody knows. Also of runs that are paused, failed or unknown: it says so.
+    It contains the settings, the work done, θ* with its region, every pour, figures and costs. It recommends an action
+    with its expected deviation, and lists open questions. Runs that are paused, failed or unknown have reports too,
+    which state this.
     """
     call(_report, what, output=output, pdf=pdf, as_json=as_json)
 

@@ -1,4 +1,7 @@
-"""The verbs of people beside a bench, as the command line has them: `doctor`, `jog`, `pour`."""
+"""Options and help texts of the commands at a bench: `doctor`, `jog` and `pour`.
+
+Their work is done in `doctor`, `jogging` and `pour_command`.
+"""
 
 from __future__ import annotations
 
@@ -28,20 +31,20 @@ def doctor(
         bool,
         typer.Option(
             "--accept-safety",
-            help="Record the controller's safety settings, by their checksum, as those that people have read and "
-            "accepted: NAME.safety.json beside the file. Without such a record nothing is poured.",
+            help="Record the controller's current safety settings, by their checksum, as read and accepted: "
+            "NAME.safety.json next to the laboratory file. Without such a record nothing is poured.",
         ),
     ] = False,
     tare: Annotated[
         bool,
-        typer.Option("--tare", help="Also tare the balance, to see that it obeys: what is on it counts as nothing."),
+        typer.Option("--tare", help="Also tare the balance as a test: the load on it then reads zero."),
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Look at everything that a pour needs, and say what to do: network, controller, safety settings, balance.
+    """Check everything that a pour needs, and print advice: network, controller, safety settings, balance.
 
-    Nothing moves and nothing is set. In a virtual laboratory its controller and balance are started for the purpose.
-    Exit code 1 if something fails.
+    Nothing moves and no setting is changed. For a virtual laboratory, controller and balance are started for the check.
+    Exit code 1 if a check fails.
     """
     from orchestrator.cli import doctor as verb
 
@@ -52,7 +55,7 @@ def jog(laboratory: Laboratory, arm: Arm = False) -> None:
     """Move the arm by small, slow steps that are typed one by one, or bring it home.
 
     'j5 +2' turns joint 5 by 2 deg, 'z -5' moves the tool by 5 mm, 'home' goes home. The first step along an axis is
-    confirmed by Enter; Ctrl-C stops the arm.
+    confirmed with Enter; Ctrl-C stops the arm.
     """
     from orchestrator.cli import jogging as verb
 
@@ -64,16 +67,16 @@ def pour(
     assignments: Assignments = None,
     scene: SceneName = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Plan and check the whole path of the arm, show it, and move nothing.")
+        bool, typer.Option("--dry-run", help="Plan, check and show the whole path of the arm; move nothing.")
     ] = False,
     connect: Annotated[
-        bool, typer.Option("--connect", help="With --dry-run: also read whether the arm stands at home.")
+        bool, typer.Option("--connect", help="With --dry-run: also check whether the arm is at home.")
     ] = False,
     png: Annotated[
-        Path | None, typer.Option(help="Draw the arm's path, from the side and from above.", show_default=False)
+        Path | None, typer.Option(help="Draw the arm's path from the side and from above.", show_default=False)
     ] = None,
     empty: Annotated[
-        bool, typer.Option("--empty", help="The whole cycle with an empty pourer, and nothing weighed.")
+        bool, typer.Option("--empty", help="Run the whole cycle with an empty pourer, without weighing.")
     ] = False,
     slow: Annotated[float, typer.Option(min=0.05, max=1.0, help="With --empty: fraction of the planned speed.")] = 1.0,
     laboratory: OtherLaboratory = None,
@@ -82,9 +85,9 @@ def pour(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Pour once, with an action of your own, on the campaign's bench; or only plan it, or try it with an empty pourer.
+    """Pour once with a given action on the campaign's bench, only plan the pour, or try it with an empty pourer.
 
-    A pour with liquid is journalled and weighed as a small run of its own; `--empty` leaves a record, pour.json.
+    A pour with liquid is recorded in a journal and weighed, as a small run; `--empty` writes a record, pour.json.
     """
     options = given(locals(), "campaign")
     from orchestrator.cli import pour_command as verb

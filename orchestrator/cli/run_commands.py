@@ -1,4 +1,7 @@
-"""`decant runs …`, as the command line has it: the catalogue of runs."""
+"""Options and help texts of `decant runs …`, the catalogue of runs.
+
+Their work is done in `catalogue_output`.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +21,15 @@ runs = typer.Typer(
     name="runs",
     rich_markup_mode="markdown",
     invoke_without_command=True,
-    help="""Find runs and pours of this machine, whoever made them: which action, when, and what it spilled.
+    help="""Find runs and pours of this machine: which action was used, when, and how much it spilled.
 
-Without a verb: the newest twenty. Every run is entered when it begins; what is shown is read from its journal, so that
-it is right after a crash, too. `decant runs add FOLDER` enters older ones, and those that were copied from elsewhere.
-Dates are `2030-03-01`, `2030-03` (a whole month), `'2030-03-01 14:30'` or `7d` (ago); names may hold * and ?.
+Without a command, the newest twenty runs are listed. Every run is registered when it starts. The lists are read from
+the runs' journals, so they are correct after a crash, too. `decant runs add FOLDER` registers older runs and copies.
+Dates are `2030-03-01`, `2030-03` (a whole month), `'2030-03-01 14:30'` or `7d` (ago); names may contain * and ?.
 """,
     epilog=examples(
         "decant runs",
-        "decant runs pours --receiver beaker --since 2030-03 --until 2030-03   # which actions, and what they spilled",
+        "decant runs pours --receiver beaker --since 2030-03 --until 2030-03   # actions and their spillage",
         "decant runs list --strategy D3 --since 7d",
         "decant runs show quickstart-20300301-1",
     ),
@@ -47,7 +50,7 @@ State = Annotated[
         "--state",
         callback=_state,
         is_eager=True,
-        help="The state directory; $DECANT_STATE, or ~/.local/state/decant, if not given.",
+        help="The state directory; default: $DECANT_STATE, or ~/.local/state/decant.",
         show_default=False,
     ),
 ]
@@ -55,19 +58,17 @@ Daemon = Annotated[
     bool,
     typer.Option(
         "--daemon",
-        help="Ask the daemon in place of this machine's catalogue: the one at $DECANT_URL, with $DECANT_TOKEN, or the "
-        "one that has the state directory.",
+        help="Query a daemon instead of this machine's catalogue: the one at $DECANT_URL, with $DECANT_TOKEN, or the "
+        "one that uses the state directory.",
     ),
 ]
-Which = Annotated[str, typer.Argument(help="A run: its folder's name, the beginning of it, or its path.")]
+Which = Annotated[str, typer.Argument(help="A run: its folder's name, a prefix of the name, or its path.")]
 
-_LIMIT = Annotated[int | None, typer.Option("--limit", min=1, help="The newest so many.")]
-_WORDS = Annotated[
-    list[str] | None, typer.Argument(metavar="[WORDS]", help="Words that stand in a run's names, tags or notes.")
-]
+_LIMIT = Annotated[int | None, typer.Option("--limit", min=1, help="Show at most this many, the newest.")]
+_WORDS = Annotated[list[str] | None, typer.Argument(metavar="[WORDS]", help="Words in a run's names, tags or notes.")]
 _OTHERS: dict[str, Any] = {
     "words": _WORDS,
-    "run": Annotated[str | None, typer.Option("--run", help="One run, by its folder's name or path.")],
+    "run": Annotated[str | None, typer.Option("--run", help="Folder name or path of one run.")],
     "limit": _LIMIT,
 }
 _CONDITIONS: dict[str, Any] = {
@@ -77,12 +78,12 @@ _CONDITIONS: dict[str, Any] = {
 
 
 def _asking(*others: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """A command that takes all conditions of the catalogue, and some of `_OTHERS`: they reach it as one mapping."""
+    """Make a decorator that adds the catalogue's conditions and some of `_OTHERS` as one mapping."""
     options = {name: _OTHERS[name] for name in others} | _CONDITIONS
 
     def taking(command: Callable[..., None]) -> Callable[..., None]:
         own = inspect.signature(command, eval_str=True).parameters
-        # The state directory is an option as well: a run's state goes by another name until here.
+        # The state directory is an option as well, so the options have other names up to this point.
         names = {f"asked_{name}": name for name in options}
 
         def call_it(**given: Any) -> None:
@@ -103,7 +104,7 @@ def _asking(*others: str) -> Callable[[Callable[..., None]], Callable[..., None]
 
 @runs.callback()
 def newest(context: typer.Context, state: State = None, daemon: Daemon = False) -> None:
-    """What `decant runs` does without a verb."""
+    """Run `decant runs` without a command."""
     if context.invoked_subcommand is None:
         from orchestrator.cli import catalogue_output as verb
 
@@ -120,7 +121,7 @@ def newest(context: typer.Context, state: State = None, daemon: Daemon = False) 
 )
 @_asking("words", "limit")
 def list_(conditions: dict[str, Any], state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
-    """List runs, the newest first; every condition that is given must hold."""
+    """List runs, newest first; all given conditions must hold."""
     from orchestrator.cli import catalogue_output as verb
 
     call(verb.list_runs, conditions, daemon=daemon, as_json=as_json)
@@ -137,7 +138,7 @@ runs.command("search", hidden=True)(list_)
 )
 @_asking("words", "run", "limit")
 def pours(conditions: dict[str, Any], state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
-    """List pours: which action was used, what it spilled, and what had been expected."""
+    """List pours with their actions, weighed spillage and predictions."""
     from orchestrator.cli import catalogue_output as verb
 
     call(verb.list_pours, conditions, daemon=daemon, as_json=as_json)
@@ -145,7 +146,7 @@ def pours(conditions: dict[str, Any], state: State = None, daemon: Daemon = Fals
 
 @runs.command(epilog=examples("decant runs show quickstart-20300301-1"))
 def show(run: Which, state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
-    """Show one run: where it stands, θ*, what it recommends, its pours, tags, notes, and files."""
+    """Show one run: state, θ*, recommendations, pours, tags, notes, and files."""
     from orchestrator.cli import catalogue_output as verb
 
     call(verb.show, run, daemon=daemon, as_json=as_json)
@@ -166,12 +167,12 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
 
 @runs.command(epilog=examples("decant runs compare quickstart-20300301-1 quickstart-20300301-2"))
 def compare(
-    which: Annotated[list[str], typer.Argument(help="Two runs or more.", show_default=False)],
+    which: Annotated[list[str], typer.Argument(help="Two or more runs.", show_default=False)],
     state: State = None,
     daemon: Daemon = False,
     as_json: Json = False,
 ) -> None:
-    """Set runs side by side: the settings in which they differ, and what they came to."""
+    """Compare runs: the settings in which they differ, and their outcomes."""
     from orchestrator.cli import catalogue_output as verb
 
     call(verb.compare, which, daemon=daemon, as_json=as_json)
@@ -180,12 +181,12 @@ def compare(
 @runs.command(epilog=examples("decant runs tag quickstart-20300301-1 good paper", "decant runs tag RUN --remove good"))
 def tag(
     run: Which,
-    tags: Annotated[list[str] | None, typer.Argument(help="Tags to put on it.")] = None,
-    remove: Annotated[list[str] | None, typer.Option(help="A tag to take off. Repeat.")] = None,
+    tags: Annotated[list[str] | None, typer.Argument(help="Tags to add.")] = None,
+    remove: Annotated[list[str] | None, typer.Option(help="A tag to remove. Repeatable.")] = None,
     state: State = None,
     daemon: Daemon = False,
 ) -> None:
-    """Put tags on a run, or take them off. They are kept in the run's folder, and go wherever it goes."""
+    """Add tags to a run, or remove them. They are stored in the run's folder and are copied with it."""
     from orchestrator.cli import catalogue_output as verb
 
     call(verb.tag, run, tags or [], remove or [], daemon=daemon)
@@ -194,11 +195,11 @@ def tag(
 @runs.command(epilog=examples("decant runs note quickstart-20300301-1 'the tray was wet from the first pour on'"))
 def note(
     run: Which,
-    text: Annotated[str, typer.Argument(help="What is to be remembered.")],
+    text: Annotated[str, typer.Argument(help="Text of the note.")],
     state: State = None,
     daemon: Daemon = False,
 ) -> None:
-    """Write a note about a run, with date and author. It is kept in the run's folder."""
+    """Add a note to a run, with date and author. It is stored in the run's folder."""
     from orchestrator.cli import catalogue_output as verb
 
     call(verb.note, run, text, daemon=daemon)
@@ -211,14 +212,14 @@ def note(
 )
 @_asking("words", "limit")
 def export(
-    folder: Annotated[Path, typer.Argument(help="Where the files are written.")],
+    folder: Annotated[Path, typer.Argument(help="Folder for the files.")],
     conditions: dict[str, Any],
-    formats: Annotated[list[str] | None, typer.Option("--format", help="csv or parquet; both if not given.")] = None,
+    formats: Annotated[list[str] | None, typer.Option("--format", help="csv or parquet; default: both.")] = None,
     state: State = None,
     daemon: Daemon = False,
     as_json: Json = False,
 ) -> None:
-    """Write runs and pours as CSV and Parquet, with a data dictionary: runs.*, pours.*, dictionary.csv."""
+    """Export runs and pours as CSV and Parquet, with a data dictionary: `runs.*`, `pours.*` and `dictionary.csv`."""
     from orchestrator.cli import catalogue_output as verb
 
     call(verb.export, folder, conditions, formats, daemon=daemon, as_json=as_json)
@@ -226,10 +227,10 @@ def export(
 
 @runs.command(epilog=examples("decant runs add runs/", "decant runs add /media/usb/runs/quickstart-20300301-1"))
 def add(
-    folders: Annotated[list[Path], typer.Argument(help="Folders of runs, or folders with runs in them.")],
+    folders: Annotated[list[Path], typer.Argument(help="Folders of runs, or folders that contain runs.")],
     state: State = None,
 ) -> None:
-    """Enter runs that the catalogue doesn't know: made by an older version, on another machine, or moved."""
+    """Register runs that the catalogue lacks: from an older version, from another machine, or moved."""
     from orchestrator.cli import catalogue_output as verb
 
     call(verb.add, folders)
@@ -237,7 +238,7 @@ def add(
 
 @runs.command(epilog=examples("decant runs rebuild"))
 def rebuild(state: State = None) -> None:
-    """Make the index anew from the runs' journals; runs that are gone are forgotten."""
+    """Rebuild the index from the runs' journals; runs that no longer exist are removed from it."""
     from orchestrator.cli import catalogue_output as verb
 
     call(verb.rebuild)

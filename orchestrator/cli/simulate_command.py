@@ -1,4 +1,7 @@
-"""`decant simulate` as the command line has it: one pour, or a table of weighed ones."""
+"""Options and help text of `decant simulate`: one pour, or a table of weighed pours.
+
+The work is done in `pour_prediction`.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from orchestrator.cli.console import BAD_INPUT, RefusalError
 
 
 class BackendChoice(StrEnum):
-    """Where the solver runs."""
+    """Device that the solver runs on."""
 
     CPU = "cpu"
     CUDA = "cuda"
@@ -37,15 +40,15 @@ def simulate(
         Path | None,
         typer.Option(
             "--from",
-            help="CSV of weighed pours, as calibration reads it: predict them all and score the predictions.",
+            help="CSV file of weighed pours, as for a calibration: predict all of them and score the predictions.",
             show_default=False,
         ),
     ] = None,
     parameters: Parameters = None,
     receiver: Receiver = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the initial positions; the first of several.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the initial positions; the first if several.")] = 0,
     seeds: Annotated[
-        int, typer.Option(min=1, max=1000, help="How many seeds of a pour: SEED, SEED + 1, … Their spread is shown.")
+        int, typer.Option(min=1, max=1000, help="Number of seeds per pour: SEED, SEED + 1, … Their spread is shown.")
     ] = 3,
     thetas: Thetas = None,
     scene: SceneName = None,
@@ -53,31 +56,31 @@ def simulate(
     rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.", show_default=False)] = None,
     png: Annotated[
         Path | None,
-        typer.Option(help="Draw four moments of the pour; with --from measured over predicted.", show_default=False),
+        typer.Option(help="Draw four moments of the pour; with --from: measured over predicted.", show_default=False),
     ] = None,
     csv: Annotated[
-        Path | None, typer.Option(help="With --from: write a table of the predictions.", show_default=False)
+        Path | None, typer.Option(help="With --from: write a table of the predictions as CSV.", show_default=False)
     ] = None,
-    backend: Annotated[BackendChoice, typer.Option(help="Where the solver runs.")] = BackendChoice.CPU,
+    backend: Annotated[BackendChoice, typer.Option(help="Device that the solver runs on.")] = BackendChoice.CPU,
     quiet: Quiet = False,
 ) -> None:
-    """Simulate one pour of a campaign's scene, with several seeds, and say where the liquid went.
+    """Simulate one pour of a campaign's scene with several seeds, and print the fate of the liquid.
 
-    Actions without a unit are in deg, deg/s, deg/s^2, mm and s; what the campaign fixes needs no `--set`. With `--json`
-    fractions are of the load: received + spilled + retained + in_flight + escaped = 1; they, the recording and the
-    picture are the first seed's, means and standard deviations of all seeds stand under 'prediction', with the band
-    that nine pours in ten should lie in.
+    Values of `--set` without a unit are in deg, deg/s, deg/s^2, mm and s; values that the campaign fixes can be left
+    out. With `--json`, fractions are of the load: received + spilled + retained + in_flight + escaped = 1. They are of
+    the first seed, as are the recording and the picture. 'prediction' contains means and standard deviations of all
+    seeds, and the interval that should contain nine pours in ten.
 
-    With `--from` every pour of a table is predicted, and the predictions are scored: mean |measured − predicted|
-    spillage, Spearman's rank correlation, and how many pours lie inside their band. The scene is the one whose file it
-    is, else calibration's, unless `--scene` names another.
+    With `--from`, every pour of a table is predicted, and the predictions are scored: mean |measured − predicted|
+    spillage, Spearman's rank correlation, and the number of pours within their intervals. The scene is the one that
+    refers to the file, else calibration's, unless `--scene` names another.
     """
     options = given(locals(), "campaign")
     call(_simulate, campaign, options)
 
 
 def _simulate(campaign: Path, told: dict[str, Any]) -> None:
-    """One pour, or a table of them."""
+    """Simulate one pour, or a table of pours."""
     from orchestrator.cli.prediction_inputs import SimulateOptions
 
     options = SimulateOptions(**told)

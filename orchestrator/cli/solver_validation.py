@@ -1,4 +1,4 @@
-"""`decant physics`: the solver's physical cases, judged, as a table, a page and figures."""
+"""The command `decant physics`: validates the solver in physical cases, with a table, a page and figures."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 def physics(
     names: list[str], *, full: bool, pours: int | None, write: Path | None, as_json: bool, list_cases: bool
 ) -> None:
-    """Run cases one after the other and say what came of them.
+    """Run cases one after the other and print their results.
 
     Raises:
-        RefusalError: a case is unknown, the page can't be written there (exit code 2), or a criterion is not met (1).
+        RefusalError: a case is unknown, the page can't be written (exit code 2), or a criterion is not met (1).
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -44,7 +44,7 @@ def physics(
         for case in cases:
             say(f"{case.name}: {case.title} …")
             image = None
-            # a bar that has not begun stays invisible: short cases tell nothing of their progress
+            # a bar is shown only after the first report of progress, which short cases don't make
             with stdout_for_results(), Progress(console=Console(stderr=True), transient=True) as bars:
                 bar = bars.add_task(case.name, total=None, visible=False)
 

@@ -1,4 +1,4 @@
-"""`decant study`: a whole comparison from one file, resumable, with figures, tables and a page at the end."""
+"""The command `decant study`: a resumable comparison of strategies from one file, with figures, tables and a page."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SHOWN_FAILURES = 5
 
 
 def study(path: Path, *, jobs: int | None, dry_run: bool, report_only: bool, as_json: bool) -> None:
-    """Run what is left of a study, and report on what is there.
+    """Run the unfinished cells of a study, and write its report.
 
     Raises:
         RefusalError: the file can't be used (2), a cell failed (1), or it was interrupted (130).
@@ -32,7 +32,7 @@ def study(path: Path, *, jobs: int | None, dry_run: bool, report_only: bool, as_
     with Refused(StudyError):
         if dry_run:
             check_settings(plan)
-            _tell_what_is_left(plan, cells, as_json)
+            _print_remaining(plan, cells, as_json)
             return
         with opened(plan) as folder:
             status = None if report_only else _run(plan, folder, jobs or os.cpu_count() or 1, path)
@@ -49,10 +49,10 @@ def study(path: Path, *, jobs: int | None, dry_run: bool, report_only: bool, as_
 
 
 def read_study(path: Path) -> StudyPlan:
-    """A study's plan, its vessels built and its actions tried.
+    """Load a study, build its vessels and check its actions.
 
     Raises:
-        RefusalError: with all problems of its files, exit code 2.
+        RefusalError: the files are invalid; lists all problems, exit code 2.
     """
     from dataclasses import replace
 
@@ -63,13 +63,13 @@ def read_study(path: Path) -> StudyPlan:
     with Refused(ConfigError):
         plan = load_study(path)
     deployment = None
-    if plan.deployments:  # the cells take draws of θ from the cells of calibrations
+    if plan.deployments:  # the cells use draws of θ from the calibration cells
         deployment = replace(plan.deployments[0].plan, thetas=(plan.base.parameters,))
     check_campaign_can_run(replace(plan.base, source=plan.source, deployment=deployment))
     return plan
 
 
-def _tell_what_is_left(plan: StudyPlan, cells: tuple[StudyCell, ...], as_json: bool) -> None:
+def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...], as_json: bool) -> None:
     from orchestrator.study.study_folder import is_finished
     from orchestrator.study.study_plan import estimated_seconds
 
@@ -133,7 +133,7 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> CellStatus:
 
 @contextlib.contextmanager
 def _ending_like_ctrl_c() -> Iterator[None]:
-    """While cells run, SIGTERM and SIGHUP end them as Ctrl-C does."""
+    """Handle SIGTERM and SIGHUP like Ctrl-C while cells run."""
 
     def interrupt(number: int, frame: Any) -> None:
         raise KeyboardInterrupt

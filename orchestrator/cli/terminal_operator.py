@@ -1,6 +1,7 @@
-"""The person at the bench, asked in the terminal that `decant run` was started from.
+"""The operator at the terminal in which `decant run` was started: shows questions and reads the answers.
 
-Lines are read as they come, without a thread: a question can be given up, and the program can end, while nobody types.
+`TerminalOperator` implements `Operator`. Lines are read asynchronously, without a thread: a question can be withdrawn,
+and the program can end, while it waits for input.
 """
 
 from __future__ import annotations
@@ -32,17 +33,17 @@ _WORDS = {
 }
 _WIDTH = 100
 _ENDS_OF_INPUT = 3
-"""Ctrl-D once is a slip; so many in a row mean that the terminal is gone."""
+"""Ctrl-D once may be a mistake; this many in a row mean that the terminal was closed."""
 
 
 class TerminalOperator:
     """`Operator` at a terminal. Only whole words count: Enter alone, or keys pressed too early, confirm nothing.
 
     Args:
-        spec: how long an answer may take.
-        paused: entered while a question is open: holds a live display that would draw over it.
+        spec: time limits of answers.
+        paused: context that is entered while a question is open; it pauses a live display.
         stdin: file descriptor of the terminal.
-        out: where questions are written; by default stderr, so that stdout stays for results.
+        out: stream for questions; by default stderr, so that stdout contains only results.
     """
 
     def __init__(
@@ -65,23 +66,23 @@ class TerminalOperator:
         """See `Operator.ask`.
 
         Raises:
-            LaboratoryError: nobody is there, nobody answered in time, or the pour is given up.
+            LaboratoryError: there is no terminal, no answer came in time, or the pour is given up.
         """
         async with self._one_question:
             with self._paused(), _Lines(self._stdin) as lines:
                 if self._counting is not None:
-                    self._counting.cancel()  # whatever was announced is over: somebody is asked again
+                    self._counting.cancel()  # a new question ends the countdown of a previous announcement
                 self._write(f"\a\n{_worded(question)}\n{self._expected(question)}\n> ")
                 self._reminded = asyncio.get_running_loop().time()
                 return await self._answer(question, lines)
 
     async def announce(self, text: str, seconds: float) -> None:
-        """See `Operator.announce`. It is counted down."""
+        """See `Operator.announce`. Prints a countdown."""
         self._write(f"{text}\n")
         self._counting = asyncio.create_task(self._count_down(seconds))
 
     def _remind(self, question: OperatorQuestion, left: float) -> None:
-        """Ring, and ask again; `left` is what is left until the question is given up [s]."""
+        """Ring the bell and repeat the question; `left` is the time until the question is given up [s]."""
         self._reminded = asyncio.get_running_loop().time()
         self._write(f"\a\nstill waiting, {_time(left)} left: {question.text}\n{_EXPECTED[question.wants]}\n> ")
 
@@ -122,13 +123,13 @@ class TerminalOperator:
                 continue
             ends = 0
             if line.strip():
-                self._reminded = loop.time()  # somebody is there
+                self._reminded = loop.time()  # the operator is present
             understood = self._understood(question, line)
             if understood is not None:
                 return understood
 
     def _understood(self, question: OperatorQuestion, line: str) -> str | None:
-        """The answer that a line is; else None, and what would be one is printed."""
+        """Return the answer in a line, or print the valid answers and return None."""
         said = " ".join(line.lower().split())
         if said == GIVE_UP:
             raise LaboratoryError(f"given up by the operator at: {question.text.rstrip('.')}")
@@ -154,13 +155,13 @@ class TerminalOperator:
 
     def _write(self, text: str) -> None:
         out = self._out or sys.stderr
-        with contextlib.suppress(OSError, ValueError):  # a terminal that is gone is noticed where it is read
+        with contextlib.suppress(OSError, ValueError):  # a closed terminal is detected when it is read
             out.write(text)
             out.flush()
 
 
 class _Lines:
-    """Lines of a terminal from now on; what was typed before the question is thrown away.
+    """New lines of a terminal; input from before the question is discarded.
 
     Args:
         terminal: file descriptor.
@@ -198,11 +199,11 @@ class _Lines:
         self._news.set()
 
     async def next(self, wait: float) -> str:
-        """The next line, without its end.
+        """Return the next line, without its line break.
 
         Raises:
-            TimeoutError: none came.
-            EOFError: the terminal says that nothing more comes.
+            TimeoutError: no line arrived.
+            EOFError: end of input.
         """
         async with asyncio.timeout(wait):
             while b"\n" not in self._read:
@@ -216,7 +217,7 @@ class _Lines:
 
 
 def somebody_at_the_terminal(stdin: int = 0) -> bool:
-    """Whether a question can be asked and answered here."""
+    """Whether a question can be shown and answered at this terminal."""
     return _is_terminal(stdin)
 
 
@@ -228,7 +229,7 @@ def _is_terminal(descriptor: int) -> bool:
 
 
 def _worded(question: OperatorQuestion) -> str:
-    """The question as it stands on the screen: what was wrong, what to do, numbers that belong to it."""
+    """Format the question for the screen: problem, instruction and numbers."""
     rows = []
     if question.problem:
         rows.append(textwrap.fill(f"Problem: {question.problem}", _WIDTH))

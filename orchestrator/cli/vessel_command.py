@@ -1,4 +1,4 @@
-"""The verb `decant vessel`, as the command line has it."""
+"""Options and help text of `decant vessel`. The work is done in `vessel_measurement`."""
 
 from __future__ import annotations
 
@@ -15,34 +15,36 @@ def vessel(
     height: Annotated[str | None, typer.Option(help="Depth inside, from floor to rim: '95 mm'.")] = None,
     diameters: Annotated[
         str | None,
-        typer.Option(help="Inner diameters at heights above the inner floor: '5 mm: 60 mm, 95 mm: 72 mm'."),
+        typer.Option(help="Inner diameters by height above the inner floor: '5 mm: 60 mm, 95 mm: 72 mm'."),
     ] = None,
-    photo: Annotated[Path | None, typer.Option(help="Photograph of its side, on a plain background.")] = None,
-    known_height: Annotated[str | None, typer.Option(help="Outer height, for its scale.")] = None,
-    known_width: Annotated[str | None, typer.Option(help="Largest outer width, for its scale.")] = None,
-    points: Annotated[Path | None, typer.Option(help="Points of its surface: PLY, XYZ, or CSV with x, y, z.")] = None,
-    depth: Annotated[Path | None, typer.Option(help="Depth image from its side: PNG of 16 bits, or NPY.")] = None,
+    photo: Annotated[Path | None, typer.Option(help="Photograph from the side, on a plain background.")] = None,
+    known_height: Annotated[str | None, typer.Option(help="Outer height, for the scale of the photograph.")] = None,
+    known_width: Annotated[str | None, typer.Option(help="Largest outer width, for the scale.")] = None,
+    points: Annotated[Path | None, typer.Option(help="Points of the surface: PLY, XYZ, or CSV with x, y, z.")] = None,
+    depth: Annotated[Path | None, typer.Option(help="Depth image from the side: PNG of 16 bits, or NPY.")] = None,
     focal: Annotated[float | None, typer.Option(help="Focal length of the depth camera [pixels].", min=1.0)] = None,
     centre: Annotated[
-        str | None, typer.Option(help="Column and row of its axis: '318.2, 241.5'; the image's middle unless given.")
+        str | None, typer.Option(help="Column and row of the axis: '318.2, 241.5'; default: the image's centre.")
     ] = None,
-    mesh: Annotated[Path | None, typer.Option(help="Mesh to be mended: STL, OBJ, PLY or GLB.")] = None,
-    unit: Annotated[str | None, typer.Option(help="Unit of points, mesh or depths: m, cm, mm, in; depths: mm.")] = None,
+    mesh: Annotated[Path | None, typer.Option(help="Mesh to repair: STL, OBJ, PLY or GLB.")] = None,
+    unit: Annotated[
+        str | None, typer.Option(help="Unit of points, mesh or depths: m, cm, mm, in; default for depths: mm.")
+    ] = None,
     up: Annotated[str, typer.Option(help="Axis of points or mesh that points out of the opening.")] = "z",
-    fill: Annotated[Path | None, typer.Option(help="CSV of levels and what was in it then: level_mm, mass_g.")] = None,
-    tilt: Annotated[Path | None, typer.Option(help="CSV of tilts and what it still held: tilt_deg, mass_g.")] = None,
-    brimful: Annotated[str | None, typer.Option(help="What it holds brimful, as weighed: '322 g'; a check.")] = None,
-    density: Annotated[str, typer.Option(help="Density of what was weighed.")] = "998 kg/m^3",
+    fill: Annotated[Path | None, typer.Option(help="CSV of levels and masses: level_mm, mass_g.")] = None,
+    tilt: Annotated[Path | None, typer.Option(help="CSV of tilts and retained masses: tilt_deg, mass_g.")] = None,
+    brimful: Annotated[str | None, typer.Option(help="Weighed mass when full to the brim: '322 g'; a check.")] = None,
+    density: Annotated[str, typer.Option(help="Density of the weighed liquid.")] = "998 kg/m^3",
     wall: Annotated[str | None, typer.Option(help="Thickness of the wall: '3 mm'.")] = None,
-    floor: Annotated[str | None, typer.Option(help="Thickness of the floor; as the wall's unless given.")] = None,
-    name: Annotated[str | None, typer.Option(help="Its name; the file's unless given.")] = None,
+    floor: Annotated[str | None, typer.Option(help="Thickness of the floor; default: as the wall.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the vessel; default: the file's name.")] = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a vessel file from what you can measure: callipers, photograph, points, depths, a mesh, fill or tilt tables.
+    """Make a vessel file from measurements: callipers, photograph, points, depth image, a mesh, fill or tilt tables.
 
-    Sources for a turned vessel can be joined: each says what it knows, with its own uncertainty. Beside the file there
-    is a picture with the section, its band and what was measured. What was measured is written into the file.
+    Several sources of a turned vessel can be combined; each is weighted by its uncertainty. A picture with the section,
+    its uncertainty and the measurements is written next to the file. The measurements are summarised in the file.
     """
     sources = given(locals(), "out", "name", "as_json")
     from orchestrator.cli import vessel_measurement as verb
@@ -58,5 +60,5 @@ EXAMPLES = examples(
 
 
 def register(app: typer.Typer) -> None:
-    """Add the verb."""
+    """Add the command to the application."""
     app.command(epilog=EXAMPLES)(vessel)

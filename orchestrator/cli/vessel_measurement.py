@@ -1,4 +1,8 @@
-"""`decant vessel`: a vessel file from what people can measure of a cup."""
+"""The command `decant vessel`: makes a vessel file from measurements of a cup.
+
+Turned vessels are fitted to all given measurements; a mesh is repaired and used alone. `Sources` holds the options,
+`Made` the result. Tables and images are read in `vessel_tables`; the fits are in `sim_engine.vessel_acquisition`.
+"""
 
 from __future__ import annotations
 
@@ -19,21 +23,21 @@ if TYPE_CHECKING:
     from sim_engine.vessel_acquisition.point_cloud import Scan
 
 CALLIPERS = 2e-4
-"""Standard deviation of a radius that was measured with callipers [m]."""
+"""Standard deviation of a radius measured with callipers [m]."""
 
 HEIGHT = 3e-4
-"""Standard deviation of the height of the rim [m]; a depth image's is a pixel."""
+"""Standard deviation of the rim's height [m]; for a depth image, at least one pixel."""
 
 RULER, BALANCE, ANGLE = 5e-4, 5e-4, 0.005
 """Standard deviations of a level [m], of a mass [kg] and of a tilt [rad] in tables."""
 
 DOUBTFUL = 3.0
-"""Deviations from which on a check says that something is wrong."""
+"""Number of standard deviations above which a check fails."""
 
 
 @dataclass(frozen=True)
 class Sources:
-    """What was given on the command line, as it stands there; see `vessel_verb`."""
+    """Options of the command line as given; see `vessel_command`."""
 
     height: str | None = None
     diameters: str | None = None
@@ -56,10 +60,10 @@ class Sources:
 
 
 def vessel(out: Path, sources: Sources, *, name: str | None, as_json: bool) -> None:
-    """Make the file, and a picture beside it.
+    """Write the vessel file and its picture.
 
     Raises:
-        RefusalError: what was given does not make a vessel (exit code 2).
+        RefusalError: the measurements do not define a vessel (exit code 2).
     """
     called = name or out.stem
     if out.suffix not in (".yaml", ".yml"):
@@ -99,10 +103,10 @@ class Made:
     """A vessel that was made.
 
     Attributes:
-        capacity, deviation: brimful, with its standard deviation [m³].
-        radius_deviation: mean over the height [m]; None of a mesh.
-        picture: of it.
-        notes, doubts: for people.
+        capacity, deviation: volume to the brim and its standard deviation [m³].
+        radius_deviation: mean over the height [m]; None for a mesh.
+        picture: path of the picture.
+        notes, doubts: messages for the user.
     """
 
     capacity: float
@@ -132,7 +136,7 @@ def _volume(sources: Sources, mass: float) -> float:
 
 
 def _turned(out: Path, name: str, sources: Sources) -> Made:
-    """A surface of revolution from everything that was measured of it."""
+    """Make a surface of revolution from all measurements."""
     from orchestrator.results.pour_figures import draw_outline
     from sim_engine.vessel.shapes import VesselSpec
     from sim_engine.vessel.vessel import build_vessel
@@ -169,14 +173,14 @@ def _turned(out: Path, name: str, sources: Sources) -> Made:
     spec = VesselSpec(name=name, shape=outline.shape())
     build_vessel(spec)
     doubts = _doubts(outline, sources)
-    told = [f"{fit.count} from the {fit.name}, {fit.rms:.1f} of their own deviations off" for fit in outline.fits]
+    used = [f"{fit.count} from the {fit.name}, {fit.rms:.1f} of their own deviations off" for fit in outline.fits]
     picture = draw_outline(name, outline, evidence, out.with_suffix(".png"))
-    out.write_text(_profile_file(name, outline, told, doubts))
-    return Made(outline.capacity, outline.capacity_deviation, outline.radius_deviation, picture, notes + told, doubts)
+    out.write_text(_profile_file(name, outline, used, doubts))
+    return Made(outline.capacity, outline.capacity_deviation, outline.radius_deviation, picture, notes + used, doubts)
 
 
 def _measured(sources: Sources, height: float) -> list[Evidence]:
-    """Callipers and tables."""
+    """Read callipers and tables."""
     import numpy as np
 
     from orchestrator.cli.vessel_tables import read_diameters, read_fill_table, read_tilt_table
@@ -206,7 +210,7 @@ def _measured(sources: Sources, height: float) -> list[Evidence]:
 
 
 def _doubts(outline: FittedOutline, sources: Sources) -> list[str]:
-    """Where what was measured does not agree."""
+    """Describe inconsistencies between the measurements."""
     import numpy as np
 
     doubts = [
@@ -267,7 +271,7 @@ def _points(sources: Sources, wall: float | None, floor: float | None, notes: li
 
 
 def _scanned(sources: Sources) -> tuple[Scan, float]:
-    """What was scanned, and how large a pixel of a depth image is on it [m]; 0 of points."""
+    """Return the scan, and the size of a depth image's pixel on it [m]; 0 for points."""
     from orchestrator.cli.vessel_tables import read_depth, read_points
     from sim_engine.vessel_acquisition.point_cloud import points_on_table, scan_of
 
@@ -286,7 +290,7 @@ def _scanned(sources: Sources) -> tuple[Scan, float]:
 
 
 def _centre(text: str | None) -> tuple[float, float] | None:
-    """Column and row of '318.2, 241.5'."""
+    """Parse column and row of '318.2, 241.5'."""
     if text is None:
         return None
     try:
@@ -326,15 +330,15 @@ def _unit(sources: Sources) -> LengthUnit | None:
     return cast("LengthUnit", sources.unit)
 
 
-def _profile_file(name: str, outline: FittedOutline, told: Sequence[str], doubts: Sequence[str]) -> str:
+def _profile_file(name: str, outline: FittedOutline, used: Sequence[str], doubts: Sequence[str]) -> str:
     shape = outline.shape()
     points = ", ".join(f"[{1e3 * r:.4g}, {1e3 * z:.4g}]" for r, z in shape.inner)
     lines = [
-        f"# Measured: {'; '.join(told)}.",
+        f"# Measured: {'; '.join(used)}.",
         f"# It holds {1e6 * outline.capacity:.0f} ± {1e6 * outline.capacity_deviation:.1f} mL; its inner radius is "
         f"known to ± {1e3 * outline.radius_deviation:.2f} mm (one standard deviation).",
         *(f"# Doubtful: {doubt}." for doubt in doubts),
-        f"name: {json.dumps(name, ensure_ascii=False)}",  # "12" and "no" are no texts without quotes
+        f"name: {json.dumps(name, ensure_ascii=False)}",  # without quotes, YAML reads "12" and "no" as other types
         "profile:",
         "  unit: mm",
         f"  inner: [{points}]",
@@ -373,7 +377,7 @@ def _from_mesh(out: Path, name: str, sources: Sources) -> Made:
 def _written_mesh(
     out: Path, name: str, vertices: Any, faces: Any, sources: Sources, notes: list[str], *, up: str = "z"
 ) -> Made:
-    """A mesh in millimetres beside the vessel's file, once it is seen to hold liquid."""
+    """Write a mesh in millimetres next to the vessel's file, after checking that it holds liquid."""
     import trimesh
 
     from orchestrator.results.pour_figures import draw_solid

@@ -1,4 +1,7 @@
-"""What `decant vessel` reads: pairs of lengths, tables of two columns, points, a photograph, a depth image."""
+"""Input of `decant vessel`: pairs of lengths, tables of two columns, points, photographs and depth images.
+
+Every reader reports invalid input as a `RefusalError` with file and line.
+"""
 
 from __future__ import annotations
 
@@ -20,23 +23,23 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 LARGEST_FILE = 200_000_000
-"""Bytes of a file that is read whole."""
+"""Largest file that is read [bytes]."""
 
 MOST_ROWS = 10_000
 
 FEWEST_ROWS = 3
 
 NARROWEST_MM, WIDEST_MM = 4.0, 1000.0
-"""Mean inner diameters of vessels [mm]."""
+"""Limits of the mean inner diameter of vessels [mm]."""
 
 MOST_PIXELS = 60_000_000
 
 
 def read_diameters(text: str, height: float) -> tuple[Floats, Floats]:
-    """Heights and diameters of '5 mm: 60 mm, 95 mm: 72 mm' [m].
+    """Parse heights and diameters of '5 mm: 60 mm, 95 mm: 72 mm' [m].
 
     Raises:
-        RefusalError: a pair is not one, or lies outside of the vessel (exit code 2).
+        RefusalError: a pair is invalid, or lies outside the vessel (exit code 2).
     """
     import numpy as np
 
@@ -65,15 +68,15 @@ def read_diameters(text: str, height: float) -> tuple[Floats, Floats]:
 def read_fill_table(
     path: Path, *, height: float, density: float, ruler: float, balance: float
 ) -> tuple[Floats, Floats]:
-    """Levels above the inner floor [mm], ascending, and the masses below them [g].
+    """Read a table of levels above the inner bottom [mm] and the masses below them [g], sorted by level.
 
     Args:
-        height: of the rim [mm].
-        density: of what was weighed [g/mm³].
+        height: height of the rim [mm].
+        density: density of the weighed liquid [g/mm³].
         ruler, balance: standard deviations of a level [mm] and of a mass [g].
 
     Raises:
-        RefusalError: with the file, the line, and what would be right (exit code 2).
+        RefusalError: with the file, the line, and a correction (exit code 2).
     """
     rows = _read_rows(path, "level_mm", upper=height)
     rows.sort(key=lambda row: row[1:])
@@ -91,13 +94,13 @@ def read_fill_table(
 
 
 def read_tilt_table(path: Path, *, angle: float, balance: float) -> tuple[Floats, Floats]:
-    """Tilts [deg], ascending, and the masses that the vessel still held there [g].
+    """Read a table of tilts [deg] and the masses that the vessel retains at them [g], sorted by tilt.
 
     Args:
         angle, balance: standard deviations of a tilt [deg] and of a mass [g].
 
     Raises:
-        RefusalError: with the file, the line, and what would be right (exit code 2).
+        RefusalError: with the file, the line, and a correction (exit code 2).
     """
     rows = _read_rows(path, "tilt_deg", upper=90.0)
     rows.sort(key=lambda row: (row[1], -row[2]))
@@ -107,7 +110,7 @@ def read_tilt_table(path: Path, *, angle: float, balance: float) -> tuple[Floats
 def _monotonic(
     path: Path, rows: list[tuple[int, float, float]], rule: str, sign: float, reading: float, balance: float
 ) -> tuple[Floats, Floats]:
-    """The columns of sorted rows, whose masses rise (sign 1) or fall (-1) but for the errors of reading them."""
+    """Return the columns of sorted rows; masses must rise (sign 1) or fall (-1), within the errors of measurement."""
     import numpy as np
 
     table = np.array([row[1:] for row in rows])
@@ -117,7 +120,7 @@ def _monotonic(
             f"{path}: has {different} different value(s); at least {FEWEST_ROWS} say something about a shape", BAD_INPUT
         )
     steepness = float(np.ptp(masses) / np.ptp(values))
-    # three standard deviations of a difference of two
+    # three standard deviations of the difference of two readings
     allowed = 3.0 * math.sqrt(2.0) * math.hypot(balance, steepness * reading)
     best = 0
     for k in range(1, len(rows)):
@@ -135,7 +138,7 @@ def _monotonic(
 
 
 def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, float, float]]:
-    """Lines of a table with the value of a column and the mass in each [g]; see `read_fill_table`."""
+    """Read line number, value of a column and mass [g] of each row; see `read_fill_table`."""
     _check_size(path)
     found: list[tuple[int, float, float]] = []
     with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
@@ -164,7 +167,7 @@ def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, floa
 
 
 def read_points(path: Path, unit: LengthUnit | None, up: str) -> Floats:
-    """Points of a surface, z up, shape (n, 3) [m].
+    """Read points of a surface, z up, shape (n, 3) [m].
 
     Raises:
         RefusalError: they can't be read, or their unit is not clear (exit code 2).
@@ -180,7 +183,7 @@ def read_points(path: Path, unit: LengthUnit | None, up: str) -> Floats:
         raise RefusalError(f"--up {up!r}: should be x, y or z, or one of them with a minus", BAD_INPUT)
     try:
         points = _loaded(path)
-    except Exception as error:  # readers raise whatever the broken byte led to
+    except Exception as error:  # readers raise arbitrary errors for damaged files
         raise RefusalError(f"{path}: can't be read as points ({error})", BAD_INPUT) from None
     if points.ndim != 2 or points.shape[1] < 3 or not np.isfinite(points[:, :3]).all():
         raise RefusalError(f"{path}: should have x, y, z in each row, all of them finite numbers", BAD_INPUT)
@@ -208,30 +211,30 @@ def _loaded(path: Path) -> Any:
 
 
 def read_photograph(path: Path) -> Floats:
-    """Brightness of a picture as viewers show it, rows from the top, shape (rows, columns).
+    """Read the brightness of a picture as viewers show it, rows from the top, shape (rows, columns).
 
     Raises:
-        RefusalError: it is not a picture that can be read (exit code 2).
+        RefusalError: it is not a readable picture (exit code 2).
     """
     import numpy as np
     from PIL import Image, ImageOps, UnidentifiedImageError
 
     _check_size(path)
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # of large pictures: see below
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # large ones: see below
             if picture.width * picture.height > MOST_PIXELS:
                 raise RefusalError(f"{path}: {picture.width} × {picture.height} pixels; make it smaller", BAD_INPUT)
-            upright = ImageOps.exif_transpose(picture)  # cameras store the sensor's rows and how they were held
+            upright = ImageOps.exif_transpose(picture)  # cameras store the sensor's rows and their orientation
             return np.asarray(upright.convert("L"), dtype=float)
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError) as error:  # cut off, damaged
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError) as error:  # truncated, damaged
         raise RefusalError(f"{path}: is not a picture that can be read ({error})", BAD_INPUT) from None
 
 
 def read_depth(path: Path, unit: LengthUnit | None) -> Floats:
-    """A depth image, rows from the top, shape (rows, columns) [m]; 0 where nothing was seen.
+    """Read a depth image, rows from the top, shape (rows, columns) [m]; 0 for missing values.
 
     Raises:
-        RefusalError: it is not one, or its unit is not clear (exit code 2).
+        RefusalError: it is not a depth image, or its unit is not clear (exit code 2).
     """
     import numpy as np
     from PIL import Image, UnidentifiedImageError

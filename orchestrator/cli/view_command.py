@@ -1,6 +1,7 @@
-"""`decant view`: recordings opened in a browser, one or several beside each other; a pour simulated again.
+"""The command `decant view`: opens recordings in a browser, side by side if there are several, or simulates a pour
+again.
 
-The live view as the command line offers it.
+`live_view` makes the live view for commands that run campaigns.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 
 EXAMPLES = examples(
     "decant view quickstart-20300131-1                    # a run of the folder runs/",
-    "decant view runs/first runs/second                   # beside each other",
-    "decant view runs/first --pour 7 --particles 5000     # pour 7 simulated again, with all its particles",
+    "decant view runs/first runs/second                   # side by side",
+    "decant view runs/first --pour 7 --particles 5000     # simulate pour 7 again with 5000 particles",
 )
 
 
@@ -33,31 +34,31 @@ def view(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            help="Runs' folders, their names in runs/, or recordings (.rrd).", metavar="RUN…", show_default=False
+            help="Folders of runs, their names in runs/, or recordings (.rrd).", metavar="RUN…", show_default=False
         ),
     ],
     pour: Annotated[
         int | None,
-        typer.Option(min=1, help="Simulate this pour of the run again, as the arm moved, with the run's θ*."),
+        typer.Option(min=1, help="Simulate this pour of the run again, with the arm's motion and the run's θ*."),
     ] = None,
     particles: Annotated[
         int | None,
-        typer.Option(min=200, max=50_000, help="With --pour: so many particles in place of θ*'s.", show_default=False),
+        typer.Option(min=200, max=50_000, help="With --pour: number of particles instead of θ*'s.", show_default=False),
     ] = None,
     stage: Annotated[
         str | None,
-        typer.Option(help="With --pour: the stage that the pour belongs to, where several count theirs from 1."),
+        typer.Option(help="With --pour: stage of the pour, if several stages number their pours from 1."),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Write the recording here, and end.", show_default=False)
+        Path | None, typer.Option("--output", "-o", help="Write the recording here and exit.", show_default=False)
     ] = None,
     at: LiveAt = None,
     quiet: Quiet = False,
 ) -> None:
-    """Open recordings in a browser: the address is printed, and served until Ctrl-C. Needs no display.
+    """Serve recordings for a browser and print the address, until Ctrl-C. Needs no display.
 
-    Several runs are shown beside each other, on the timeline of their films. With --pour the liquid of one pour is
-    simulated again, from what the journal has of it; -o keeps that recording.
+    Several runs are shown side by side, on the timeline of simulated time. With --pour, the liquid of one pour is
+    simulated again from the journal; -o keeps that recording.
     """
     call(_view, recordings, pour=pour, particles=particles, stage=stage, output=output, at=at)
 
@@ -158,7 +159,7 @@ def _beside(what: list[Path], path: Path) -> Path:
 
 
 def _recording_of(what: Path) -> Path:
-    """The recording to be opened.
+    """Return the recording of a run, or the file itself.
 
     Raises:
         RefusalError: there is none (exit code 2).
@@ -192,15 +193,15 @@ def _plan_of(run: Path) -> CampaignPlan:
 
 
 def live_view(plan: CampaignPlan, *, live: bool, at: str | None) -> LiveView | None:
-    """The view that was asked for, not open yet; None if none was.
+    """Return the requested live view, not yet open, or None.
 
     Args:
-        plan: of the campaign that is to be seen.
-        live: whether one was asked for.
-        at: ADDRESS[:PORT]; asks for one too.
+        plan: campaign to show.
+        live: whether `--live` was given.
+        at: ADDRESS[:PORT]; implies `--live`.
 
     Raises:
-        RefusalError: it can't be had (exit code 2).
+        RefusalError: the view is not available (exit code 2).
     """
     from orchestrator.live_view.live_server import LOOPBACK, LiveView, is_free
     from sim_engine.resources import installed
@@ -226,10 +227,10 @@ def live_view(plan: CampaignPlan, *, live: bool, at: str | None) -> LiveView | N
 
 
 def parsed(at: str) -> tuple[str, int | None]:
-    """'0.0.0.0:9091' → address and port; None for no port.
+    """Parse '0.0.0.0:9091' into address and port; None without a port.
 
     Raises:
-        RefusalError: it is neither.
+        RefusalError: the text is invalid.
     """
     found = re.fullmatch(r"(?P<address>[A-Za-z0-9.-]+|\[[0-9a-fA-F:]+\])(:(?P<port>\d+))?", at)
     port = None if found is None or found["port"] is None else int(found["port"])

@@ -1,1 +1,1 @@
-"""A laboratory that is left running: a queue of campaigns, an API over HTTP, questions that wait for their answer."""
+"""The daemon: a queue of campaigns, an HTTP API, and questions that wait for an operator's answer."""

@@ -1,6 +1,10 @@
-"""Who may do what: bearer tokens from a file that only its owner reads, three roles, and an end to guessing.
+"""Access control of the HTTP API: bearer tokens, roles, and limits on each request.
 
-What every request has to pass: its size, the name it calls this machine by, a token, a role.
+`Tokens` reads a token file that only its owner can read, and limits guessing. `RequestGuard` is ASGI middleware that
+checks the size and the host name of a request. `needs` makes the FastAPI dependencies that check token and role:
+`Viewer`, `Operator` and `Admin`.
+
+This module contains no routes and doesn't encrypt connections.
 """
 
 from __future__ import annotations
@@ -29,31 +33,31 @@ from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.run_errors import RunError
 
 FAILURES, WINDOW = 10, 60.0
-"""Wrong tokens that one address may show within so many seconds; further wrong ones are refused for as long."""
+"""Number of wrong tokens per address and time window [s]; more wrong tokens are refused for as long."""
 
 _ADDRESSES = 1000
-"""Addresses that are remembered at a time."""
+"""Largest number of addresses whose wrong tokens are counted at a time."""
 
 
 class Role(IntEnum):
-    """What a token is good for; each may do what the ones before it may."""
+    """Permissions of a token; each role includes those of the lower ones."""
 
     VIEWER = 1
-    """Looks."""
+    """Reads."""
     OPERATOR = 2
-    """Submits, answers, pauses, stops."""
+    """Submits campaigns, answers questions, pauses and stops."""
     ADMIN = 3
-    """Also clears an emergency stop and ends the daemon."""
+    """Also clears an emergency stop and shuts the daemon down."""
 
 
 class TokenFileError(RunError):
-    """The tokens can't be used; the text says why."""
+    """The tokens can't be used; the message gives the reason."""
 
     exit_code = 2
 
 
 class TooManyFailuresError(Exception):
-    """An address has shown too many wrong tokens; `wait` is how long its wrong ones are refused [s]."""
+    """Too many wrong tokens from one address; `wait` is how long further wrong ones are refused [s]."""
 
     def __init__(self, wait: float) -> None:
         super().__init__(f"too many wrong tokens from this address; try again in {wait:.0f} s")
@@ -62,11 +66,11 @@ class TooManyFailuresError(Exception):
 
 @dataclass(frozen=True)
 class Person:
-    """Whoever holds a token.
+    """The holder of a token.
 
     Attributes:
-        name: as in the file of tokens: written beside what they did.
-        role: what they may.
+        name: from the token file; recorded with every action.
+        role: permissions.
     """
 
     name: str
@@ -76,15 +80,15 @@ class Person:
 class Tokens:
     """The tokens of one daemon.
 
-    A file of lines `ROLE NAME TOKEN`; lines that begin with # are notes. Made with one token for each role where there
-    is none.
+    The file has lines of the form `ROLE NAME TOKEN`; lines that begin with # are comments. If the file does not exist,
+    it is created with one token for each role.
 
     Args:
-        path: of the file.
-        clock: seconds, monotonic.
+        path: path of the file.
+        clock: monotonic time [s].
 
     Raises:
-        TokenFileError: others can read it, or a line is wrong.
+        TokenFileError: other users can read the file, or a line is invalid.
     """
 
     def __init__(self, path: Path, clock: Callable[[], float] = time.monotonic) -> None:
@@ -95,20 +99,20 @@ class Tokens:
         self._known = _read(path)
 
     def person(self, token: str, address: str) -> Person | None:
-        """Who shows a token; None: nobody does.
+        """Return the holder of a token, or None if the token is unknown.
 
-        A token that is known is accepted whatever else its address has shown: wrong tokens of one program never bar
-        another one next to it. Known tokens are long and random, so that guessing is hopeless at any rate.
+        A known token is always accepted, even if its address has sent wrong tokens: one program can't lock out another
+        on the same machine. Known tokens are long and random, so guessing fails at any rate.
 
         Args:
-            token: as shown.
-            address: from which.
+            token: token of the request.
+            address: address that the request came from.
 
         Raises:
-            TooManyFailuresError: the token is wrong, and this address has shown too many wrong ones before.
+            TooManyFailuresError: the token is wrong, and this address has sent too many wrong tokens before.
         """
         shown, found = _digest(token), None
-        for known, person in self._known:  # all of them, so that the time taken tells nothing
+        for known, person in self._known:  # compare all of them, so that the time taken reveals nothing
             if hmac.compare_digest(known, shown):
                 found = person
         if found is None:
@@ -135,10 +139,10 @@ class Tokens:
 
 
 def token_of(path: Path, role: Role) -> str | None:
-    """The first token of a role or a higher one in a file; None where there is none.
+    """Return the first token in a file with this role or a higher one, or None.
 
     Raises:
-        TokenFileError: it can't be read.
+        TokenFileError: the file can't be read.
     """
     found = [(Role[line[0].upper()], line[2]) for line in _lines(path)]
     return next((token for known, token in sorted(found) if known >= role), None)
@@ -191,22 +195,23 @@ BEARER = HTTPBearer(auto_error=False, description="A token of the file 'tokens' 
 
 
 DRAIN = 10.0
-"""Longest time that the rest of a refused body is read and dropped [s]."""
+"""Longest time for which the rest of a refused body is read and dropped [s]."""
 
 
 class TooLargeError(Exception):
-    """The body of a request is larger than is read."""
+    """The body of a request exceeds the limit."""
 
 
 class RequestGuard:
-    """ASGI middleware: refuses what is too large before it is read, and names that this machine does not have.
+    """ASGI middleware that refuses requests that are too large or use a foreign host name.
 
-    A browser that was led here under another name (DNS rebinding) would speak for a page of strangers.
+    The host name is checked because of DNS rebinding: a page of another site could reach the API through a name that
+    resolves to this machine.
 
     Args:
-        app: what is guarded.
+        app: application to protect.
         limit: largest body [bytes].
-        host: that the API listens at; names are checked on the loopback interface only.
+        host: address that the API listens at; host names are checked on the loopback interface only.
     """
 
     def __init__(self, app: Callable[[Message, Receive, Send], Awaitable[None]], limit: int, host: str) -> None:
@@ -214,7 +219,7 @@ class RequestGuard:
         self._names = frozenset((*LOOPBACK, "[::1]", host)) if host in LOOPBACK else None
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
-        """See the ASGI specification."""
+        """Handle one ASGI connection."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -242,7 +247,7 @@ class RequestGuard:
 
         async def answered(message: Message) -> None:
             nonlocal started
-            if started or read <= self._limit:  # an answer to a body that is too large is replaced by 413
+            if started or read <= self._limit:  # a response to a body that is too large is replaced by 413
                 started = True
                 await send(message)
 
@@ -260,10 +265,12 @@ class RequestGuard:
 
 
 async def _refuse(receive: Receive, send: Send, status: int, detail: str, *, drain: bool = True) -> None:
-    """Answer, then read and drop the rest of the body: closed with unread data, the client gets a reset, no answer.
+    """Send an error response, then read and drop the rest of the body.
+
+    If the connection were closed with unread data, the client would get a reset and no response.
 
     Args:
-        drain: whether there is a rest; a client that expects 100-continue sends none after a refusal.
+        drain: whether a rest follows; a client that expects 100-continue sends none after a refusal.
     """
     from orchestrator.daemon.event_feed import text
 
@@ -281,7 +288,7 @@ async def _refuse(receive: Receive, send: Send, status: int, detail: str, *, dra
 
 
 def needs(role: Role) -> Callable[..., Awaitable[Person]]:
-    """A dependency: who asks, if the token's role is enough."""
+    """Make a dependency that returns the token's holder if its role is sufficient."""
 
     async def person(
         request: Request, shown: Annotated[HTTPAuthorizationCredentials | None, Depends(BEARER)]
@@ -304,7 +311,7 @@ def needs(role: Role) -> Callable[..., Awaitable[Person]]:
 
 
 def the_daemon(request: Request) -> Supervisor:
-    """What the application speaks for."""
+    """Return the daemon that the application serves."""
     found: Supervisor = request.app.state.daemon
     return found
 

@@ -1,4 +1,8 @@
-"""The part of the API that knows former runs: what `decant runs` does. Viewers read, operators tag and note."""
+"""Routes of the HTTP API for the catalogue of previous runs; the counterpart of `decant runs`.
+
+Viewers list, compare and export runs and pours. Operators add tags and notes. Queries run in a thread, since the first
+one may read many journals. The catalogue itself is in `orchestrator.catalogue`.
+"""
 
 from __future__ import annotations
 
@@ -51,25 +55,25 @@ def _several(model: Any) -> Any:
     return list[model]
 
 
-PreviousRunOut = _row("FormerRun", TABLES["run"], "One run, whoever made it.")
-PreviousPour = _row("FormerPour", TABLES["pour"], "One pour that had begun.")
+PreviousRunOut = _row("FormerRun", TABLES["run"], "One run of this machine, made by the daemon or the command line.")
+PreviousPour = _row("FormerPour", TABLES["pour"], "One pour that has started.")
 _DETAILS: dict[str, Any] = {"notes": (list[Note], ...), "list_of_pours": (_several(PreviousPour), ...)}
 PreviousRunDetail = create_model(
     "FormerRunDetail", __base__=PreviousRunOut, __doc__="One run with its notes and its pours.", **_DETAILS
 )
 
 
-def _asked(name: str, **more: Any) -> Callable[..., dict[str, Any]]:
-    """A dependency: what is asked for in a request's query."""
+def _filters(name: str, **more: Any) -> Callable[..., dict[str, Any]]:
+    """Make a dependency that returns the filters in a request's query."""
     text = Annotated[str | None, Field(max_length=200)]
     fields: dict[str, Any] = {
         name: (text, Field(default=None, description=about)) for name, about in CONDITIONS.items()
     }
     fields["words"] = (
         list[Annotated[str, Field(max_length=200)]],
-        Field(default=[], max_length=20, description="Each stands somewhere in a run: its names, tags or notes."),
+        Field(default=[], max_length=20, description="Words that must all occur in a run's names, tags or notes."),
     )
-    fields["limit"] = (int, Field(default=200, ge=1, le=1000, description="The newest so many."))
+    fields["limit"] = (int, Field(default=200, ge=1, le=1000, description="Return at most this many, the newest."))
     model = create_model(name, __config__=ConfigDict(extra="forbid"), **fields, **more)
 
     def asked(query: Any) -> dict[str, Any]:
@@ -80,33 +84,33 @@ def _asked(name: str, **more: Any) -> Callable[..., dict[str, Any]]:
     return asked
 
 
-_RUN = (Annotated[str | None, Field(max_length=200)], Field(default=None, description="One run, by its folder's name."))
+_RUN = (Annotated[str | None, Field(max_length=200)], Field(default=None, description="Name of one run's folder."))
 _FORMATS = (
     list[Literal["csv", "parquet"]],
-    Field(default=["csv"], min_length=1, max_length=2, description="One or both."),
+    Field(default=["csv"], min_length=1, max_length=2, description="One format or both."),
 )
-RunsAsked = Annotated[dict[str, Any], Depends(_asked("RunsAsked"))]
-PoursAsked = Annotated[dict[str, Any], Depends(_asked("PoursAsked", run=_RUN))]
-ExportAsked = Annotated[dict[str, Any], Depends(_asked("ExportAsked", format=_FORMATS))]
+RunsAsked = Annotated[dict[str, Any], Depends(_filters("RunsAsked"))]
+PoursAsked = Annotated[dict[str, Any], Depends(_filters("PoursAsked", run=_RUN))]
+ExportAsked = Annotated[dict[str, Any], Depends(_filters("ExportAsked", format=_FORMATS))]
 
 
 class RunComparison(BaseModel):
-    """Runs side by side; one value for each of them."""
+    """Runs side by side, with one value for each run."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
 
     runs: list[str]
-    """Their folders."""
+    """Paths of their folders."""
 
     settings: dict[str, list[Any]]
-    """Those in which they differ: place in the plan → values."""
+    """Settings in which the runs differ: path in the plan → values."""
 
     outcomes: list[dict[str, Any]]
-    """What each came to."""
+    """Outcome of each run."""
 
 
 class TagsIn(BaseModel):
-    """Tags to put on a run, and tags to take off."""
+    """Tags to add to a run and tags to remove from it."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -115,7 +119,7 @@ class TagsIn(BaseModel):
 
 
 class NoteIn(BaseModel):
-    """Something to be remembered of a run."""
+    """A note about a run."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -136,13 +140,13 @@ class NotesOut(BaseModel):
     notes: list[Note]
 
 
-async def _at_desk(daemon: Supervisor, ask: Callable[[LocalCatalogueClient], T], by: str | None = None) -> T:
-    """Ask the catalogue, in a thread: the first time it may have to read many journals."""
+async def _in_catalogue(daemon: Supervisor, query: Callable[[LocalCatalogueClient], T], by: str | None = None) -> T:
+    """Query the catalogue in a thread: the first query may read many journals."""
 
     def work() -> T:
         with Catalogue(daemon.settings.state) as catalogue:
             catalogue.refresh()
-            return ask(LocalCatalogueClient(catalogue, by))
+            return query(LocalCatalogueClient(catalogue, by))
 
     try:
         return await asyncio.to_thread(work)
@@ -156,27 +160,28 @@ async def _at_desk(daemon: Supervisor, ask: Callable[[LocalCatalogueClient], T],
 
 @router.get("/runs", operation_id="runs", response_model=_several(PreviousRunOut))
 async def runs(daemon: Daemon, person: Viewer, asked: RunsAsked) -> Any:
-    """Runs of this machine, the newest first: the daemon's and, where they share a state directory, the command line's.
+    """List the runs of this machine, newest first.
 
-    All conditions that are given must hold; names may hold * and ?.
+    The list includes runs of the command line if it uses the same state directory. All given conditions must hold;
+    names may contain the wildcards * and ?.
     """
-    return await _at_desk(daemon, lambda desk: desk.runs(asked))
+    return await _in_catalogue(daemon, lambda client: client.runs(asked))
 
 
 @router.get("/pours", operation_id="pours", response_model=_several(PreviousPour))
 async def pours(daemon: Daemon, person: Viewer, asked: PoursAsked) -> Any:
-    """Pours of all runs, the oldest first: which action was used, what it spilled, and what had been expected."""
-    return await _at_desk(daemon, lambda desk: desk.pours(asked))
+    """List the pours of all runs, oldest first: the action, the measured spillage and the prediction."""
+    return await _in_catalogue(daemon, lambda client: client.pours(asked))
 
 
 @router.get("/runs/compare", operation_id="compare_runs")
 async def compare(
     daemon: Daemon,
     person: Viewer,
-    run: Annotated[list[str], Query(min_length=2, max_length=20, description="Two runs or more.")],
+    run: Annotated[list[str], Query(min_length=2, max_length=20, description="Names of two or more runs.")],
 ) -> RunComparison:
-    """Settings in which runs differ, and what they came to."""
-    return RunComparison.model_validate(await _at_desk(daemon, lambda desk: desk.compare(run)))
+    """Compare runs: the settings in which they differ, and their outcomes."""
+    return RunComparison.model_validate(await _in_catalogue(daemon, lambda client: client.compare(run)))
 
 
 @router.get(
@@ -186,38 +191,38 @@ async def compare(
     responses={200: {"content": {"application/zip": {}}, "description": "runs.*, pours.*, dictionary.csv."}},
 )
 async def export(daemon: Daemon, person: Viewer, asked: ExportAsked) -> Response:
-    """Runs and pours as files for other programs, with a data dictionary, in one archive."""
+    """Export runs and pours as files with a data dictionary, in one zip archive."""
     formats = dict.fromkeys(asked.pop("format"))
 
-    def written(desk: LocalCatalogueClient) -> bytes:
+    def written(client: LocalCatalogueClient) -> bytes:
         archive = BytesIO()
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
-            found = desk.export(Path(folder), asked, list(formats))
+            found = client.export(Path(folder), asked, list(formats))
             for path in map(Path, found.pop("files")):
                 packed.write(path, path.name)
             packed.comment = json.dumps(found).encode()
         return archive.getvalue()
 
-    content = await _at_desk(daemon, written)
+    content = await _in_catalogue(daemon, written)
     headers = {"Content-Disposition": 'attachment; filename="decant-runs.zip"'}
     return Response(content, media_type="application/zip", headers=headers)
 
 
 @router.get("/runs/{run}", operation_id="run", response_model=PreviousRunDetail)
 async def run(daemon: Daemon, person: Viewer, run: str) -> Any:
-    """One run, by its folder's name or the beginning of it: θ*, what it recommends, its pours, tags and notes."""
-    return await _at_desk(daemon, lambda desk: desk.run(run))
+    """Return one run by its folder's name or a prefix of it: θ*, recommendation, pours, tags and notes."""
+    return await _in_catalogue(daemon, lambda client: client.run(run))
 
 
 @router.get(
     "/runs/{run}/report",
     operation_id="run_report",
     response_class=FileResponse,
-    responses={200: {"content": {"text/html": {}}, "description": "A page that needs nothing else."}},
+    responses={200: {"content": {"text/html": {}}, "description": "A self-contained HTML page."}},
 )
 async def run_report(daemon: Daemon, person: Viewer, run: str) -> FileResponse:
-    """The report of a run."""
-    path = Path((await _at_desk(daemon, lambda desk: desk.run(run)))["path"]) / REPORT
+    """Return the report of a run."""
+    path = Path((await _in_catalogue(daemon, lambda client: client.run(run)))["path"]) / REPORT
     if not path.is_file():
         raise HTTPException(404, f"{run} has no report")
     return FileResponse(path, media_type="text/html")
@@ -225,15 +230,15 @@ async def run_report(daemon: Daemon, person: Viewer, run: str) -> FileResponse:
 
 @router.post("/runs/{run}/tags", operation_id="tag_run")
 async def tag(daemon: Daemon, person: Operator, run: str, body: TagsIn) -> TagsOut:
-    """Put tags on a run, or take them off. They are kept in the run's folder."""
-    found = await _at_desk(daemon, lambda desk: desk.tag(run, body.add, body.remove))
+    """Add tags to a run or remove them. They are stored in the run's folder."""
+    found = await _in_catalogue(daemon, lambda client: client.tag(run, body.add, body.remove))
     daemon.note(person.name, "tag", detail=f"{found['run']}: {', '.join(found['tags'])}")
     return TagsOut.model_validate(found)
 
 
 @router.post("/runs/{run}/notes", operation_id="note_run")
 async def note(daemon: Daemon, person: Operator, run: str, body: NoteIn) -> NotesOut:
-    """Write a note about a run, with date and author. It is kept in the run's folder."""
-    found = await _at_desk(daemon, lambda desk: desk.note(run, body.text), person.name)
+    """Add a note to a run, with date and author. It is stored in the run's folder."""
+    found = await _in_catalogue(daemon, lambda client: client.note(run, body.text), person.name)
     daemon.note(person.name, "note", detail=f"{found['run']}: {body.text}")
     return NotesOut.model_validate(found)

@@ -1,4 +1,7 @@
-"""Where a running campaign stands, for lists and pages: counted from its events."""
+"""Progress of a running campaign for the API and the page, computed from its events.
+
+`CampaignProgress` subscribes to a run's events and returns JSON-ready values. It stores nothing on disk.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +17,11 @@ from orchestrator.strategies.campaign_plan import CampaignPlan
 
 
 class CampaignProgress:
-    """A watcher.
+    """A subscriber that tracks the progress of one run.
 
     Attributes:
-        checkpoint: of the pour that is under way; '' between pours.
-        winding_down: set once the run has taken note that it is to end.
+        checkpoint: checkpoint of the pour in progress; '' between pours.
+        winding_down: set once the run has started to pause, stop or fail.
     """
 
     def __init__(self, plan: CampaignPlan) -> None:
@@ -28,7 +31,7 @@ class CampaignProgress:
         self._stage, self._index, self._count = "", 0, 0
 
     def __call__(self, event: Event) -> None:
-        """Take note of an event."""
+        """Process an event."""
         self._tally(event)
         match event:
             case PourProgressed():
@@ -42,7 +45,7 @@ class CampaignProgress:
                     self.winding_down.set()
 
     def progress(self) -> dict[str, Any]:
-        """JSON-ready: stage, counts, the pour in words, and how long it still takes [s] where that is known."""
+        """Return JSON-ready values: stage, counts, state of the pour, and the remaining time [s] if it is known."""
         tally = self._tally
         stage = tally.stages.get(self._stage)
         done = stage.progress if stage is not None else None

@@ -1,6 +1,8 @@
-"""The part of the API that does something. Everything is written down with its doer.
+"""Routes of the HTTP API that change something; every command is recorded with its author.
 
-Hardware moves for one part of one run, after somebody has read what it will do and typed its name.
+The routes submit, pause, stop, abort, resume and move campaigns, enable motion, answer questions, and handle emergency
+stops and shutdown. Motion is enabled for the coming part of one run, after the operator has read what will move and
+typed the laboratory's name. Read-only routes are in `query_routes` and `archive_routes`.
 """
 
 from __future__ import annotations
@@ -39,14 +41,14 @@ from orchestrator.run_errors import RunError
 
 
 class MotionNotEnabledError(RunError):
-    """It can't be armed; the text says why."""
+    """Motion can't be enabled; the message gives the reason."""
 
 
 def what_moves(daemon: Supervisor, item: QueueItem) -> WhatMovesOut:
-    """What would move, in words; planned anew. Takes seconds.
+    """Plan the campaign's motions again and describe them for the operator. Takes seconds.
 
     Raises:
-        NotArmedError: nothing does, or it may not.
+        MotionNotEnabledError: nothing would move, or motion is not allowed.
     """
     if item.mode != "hardware":
         raise MotionNotEnabledError(f"{item.id} has nothing to arm: its rig is {item.mode}")
@@ -69,10 +71,10 @@ def what_moves(daemon: Supervisor, item: QueueItem) -> WhatMovesOut:
 
 
 def arm(daemon: Supervisor, item: QueueItem, moves: WhatMovesOut, typed: str, by: str) -> QueueItem:
-    """Arm it.
+    """Enable motion.
 
     Raises:
-        NotArmedError: another name was typed.
+        MotionNotEnabledError: the typed name is not the laboratory's.
     """
     if typed != moves.laboratory:
         raise MotionNotEnabledError(
@@ -89,7 +91,7 @@ router = APIRouter()
 
 @router.post("/campaigns", status_code=201, operation_id="submit")
 async def submit(request: Request, daemon: Daemon, person: Operator, body: SubmissionIn) -> CampaignOut:
-    """Queue a campaign. It is checked as `decant run` checks one, and kept as it is now."""
+    """Queue a campaign. It is checked as by `decant run`, and later changes of its files don't affect it."""
     if bool(body.text) == bool(body.path) or (body.path and body.files):
         raise HTTPException(422, "give either 'text' (with 'files') or 'path'")
     with _refusing():
@@ -109,19 +111,19 @@ async def submit(request: Request, daemon: Daemon, person: Operator, body: Submi
 
 @router.post("/campaigns/{key}/pause", operation_id="pause")
 async def pause(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
-    """Come to rest at the next checkpoint: a pour that has begun is finished and weighed."""
+    """Pause at the next checkpoint; a pour that has started is finished and weighed."""
     return _done(request, daemon, key, lambda: daemon.pause(key, person.name))
 
 
 @router.post("/campaigns/{key}/stop", operation_id="stop")
 async def stop(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
-    """As pause; then what came of it so far is published, and it does not go on by itself."""
+    """Stop at the next checkpoint and publish the results so far. The campaign does not continue by itself."""
     return _done(request, daemon, key, lambda: daemon.stop(key, person.name))
 
 
 @router.post("/campaigns/{key}/abort", operation_id="abort")
 async def abort(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
-    """Stop the motion. What is tilted is brought upright once somebody agrees; again: it is left as it is."""
+    """Stop the motion. A tilted vessel is brought upright after the operator agrees, or left after a second abort."""
     found_item(daemon, key)
     with _refusing():
         return campaign_out(request, daemon, await daemon.abort(key, person.name))
@@ -129,13 +131,13 @@ async def abort(request: Request, daemon: Daemon, person: Operator, key: str) ->
 
 @router.post("/campaigns/{key}/resume", operation_id="resume")
 async def resume(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
-    """Go on with a campaign that rests. About a pour whose outcome nobody knows somebody is asked first."""
+    """Resume a paused campaign. If the outcome of a pour is unknown, the operator enters it first."""
     return _done(request, daemon, key, lambda: daemon.resume(key, person.name))
 
 
 @router.post("/campaigns/{key}/move", operation_id="move")
 async def move(request: Request, daemon: Daemon, person: Operator, key: str, body: MoveIn) -> CampaignOut:
-    """Another place in the queue."""
+    """Move a campaign to another place in the queue."""
     if body.before:
         found_item(daemon, body.before)
     return _done(
@@ -143,16 +145,16 @@ async def move(request: Request, daemon: Daemon, person: Operator, key: str, bod
     )
 
 
-def _done(request: Request, daemon: Supervisor, key: str, deed: Callable[[], QueueItem]) -> CampaignOut:
-    """Something done to a campaign, which may be refused."""
+def _done(request: Request, daemon: Supervisor, key: str, command: Callable[[], QueueItem]) -> CampaignOut:
+    """Run a command on a campaign; the daemon may refuse it."""
     found_item(daemon, key)
     with _refusing():
-        return campaign_out(request, daemon, deed())
+        return campaign_out(request, daemon, command())
 
 
 @contextlib.contextmanager
 def _refusing() -> Iterator[None]:
-    """What can't be done now is 409, with the reason."""
+    """Convert a refusal to a response with status 409 and the reason."""
     try:
         yield
     except (RequestRefusedError, MotionNotEnabledError) as error:
@@ -161,7 +163,7 @@ def _refusing() -> Iterator[None]:
 
 @router.get("/campaigns/{key}/arming", operation_id="arming")
 async def arming(daemon: Daemon, person: Operator, key: str) -> WhatMovesOut:
-    """What hardware would do in this campaign, for somebody to read before arming it."""
+    """Describe the motion of this campaign, to be read before motion is enabled."""
     item = found_item(daemon, key)
     with _refusing():
         return await asyncio.to_thread(what_moves, daemon, item)
@@ -169,7 +171,7 @@ async def arming(daemon: Daemon, person: Operator, key: str) -> WhatMovesOut:
 
 @router.post("/campaigns/{key}/arm", operation_id="arm")
 async def arm_it(request: Request, daemon: Daemon, person: Operator, key: str, body: ArmIn) -> CampaignOut:
-    """Let hardware move in the coming part of this campaign's run."""
+    """Enable motion in the coming part of this campaign's run."""
     item = found_item(daemon, key)
     with _refusing():
         moves = await asyncio.to_thread(what_moves, daemon, item)
@@ -193,14 +195,14 @@ async def answer(
 
 @router.post("/queue/pause", operation_id="pause_queue")
 async def pause_queue(request: Request, daemon: Daemon, person: Operator) -> StatusOut:
-    """Begin no campaign from now on. What runs goes on."""
+    """Start no further campaigns. Running campaigns continue."""
     daemon.pause_queue(True, person.name)
     return await status(request, daemon, person)
 
 
 @router.post("/queue/resume", operation_id="resume_queue")
 async def resume_queue(request: Request, daemon: Daemon, person: Operator) -> StatusOut:
-    """Begin campaigns again."""
+    """Start campaigns again."""
     daemon.pause_queue(False, person.name)
     return await status(request, daemon, person)
 
@@ -209,9 +211,9 @@ async def resume_queue(request: Request, daemon: Daemon, person: Operator) -> St
 async def emergency_stop(
     request: Request, daemon: Daemon, person: Viewer, body: EmergencyIn | None = None
 ) -> StatusOut:
-    """Stop every arm, or that of one rig; give up its work, and take nothing new there until it is cleared.
+    """Stop every arm, or the arm of one rig, and give up its work. The rig takes no new work until the stop is cleared.
 
-    A viewer's token is enough.
+    A viewer's token is sufficient.
     """
     body = body or EmergencyIn()
     with _known_rig(body.rig):
@@ -221,7 +223,7 @@ async def emergency_stop(
 
 @router.post("/emergency-stop/clear", operation_id="clear")
 async def clear(request: Request, daemon: Daemon, person: Admin, body: ClearIn | None = None) -> StatusOut:
-    """Take work again, at one rig or at all. What was given up rests until somebody resumes it."""
+    """Clear an emergency stop of one rig, or of all. Work that was given up rests until an operator resumes it."""
     rig = "" if body is None else body.rig
     with _known_rig(rig):
         daemon.clear(person.name, rig)
@@ -230,7 +232,7 @@ async def clear(request: Request, daemon: Daemon, person: Admin, body: ClearIn |
 
 @contextlib.contextmanager
 def _known_rig(rig: str) -> Iterator[None]:
-    """A rig that the settings do not name is 404."""
+    """Convert an unknown rig to a response with status 404."""
     try:
         yield
     except KeyError:
@@ -239,7 +241,7 @@ def _known_rig(rig: str) -> Iterator[None]:
 
 @router.post("/shutdown", status_code=202, operation_id="shutdown")
 async def shutdown(request: Request, daemon: Daemon, person: Admin) -> StatusOut:
-    """End the daemon at the next safe point; again: at once."""
+    """Shut the daemon down at the next safe point; a second request does so at once."""
     daemon.note(person.name, "shutdown")
     found = await status(request, daemon, person)
     request.app.state.shutdown()

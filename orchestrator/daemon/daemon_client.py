@@ -1,6 +1,7 @@
-"""The daemon from the command line, on this machine or another: HTTP calls whose refusals are passed on as they are.
+"""HTTP client of the daemon, for the command line on this machine or another.
 
-The catalogue of a daemon's machine, asked over HTTP.
+`Client` makes the calls and follows the event stream; it passes refusals on unchanged as `DaemonError`.
+`RemoteCatalogueClient` queries the catalogue on the daemon's machine with the interface of `CatalogueClient`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ TIMEOUT = httpx.Timeout(60.0, connect=5.0)
 
 
 class DaemonError(RunError):
-    """The daemon can't be reached, or refuses; the text is what it says."""
+    """The daemon can't be reached, or it refuses; the message is the daemon's own if there is one."""
 
     def __init__(self, text: str, exit_code: int = 1) -> None:
         super().__init__(text)
@@ -39,7 +40,7 @@ class DaemonError(RunError):
 
 @dataclass(frozen=True)
 class ServerReply:
-    """One event as it came."""
+    """One event of the stream."""
 
     id: int
     type: str
@@ -50,17 +51,18 @@ class Client:
     """Calls to one daemon.
 
     Args:
-        url: of the daemon; $DECANT_URL, what stands in the state directory, or the usual port of this machine.
-        state: the daemon's state directory, where its tokens are.
-        token: $DECANT_TOKEN, or one of the tokens in the state directory.
+        url: URL of the daemon; by default $DECANT_URL, the URL in the state directory, or the default port of this
+            machine.
+        state: the daemon's state directory, which contains the tokens.
+        token: bearer token; by default $DECANT_TOKEN, or one of the tokens in the state directory.
 
     Raises:
-        DaemonError: no token is known.
+        DaemonError: no token was found.
     """
 
     def __init__(self, url: str | None = None, state: Path | None = None, token: str | None = None) -> None:
         state = state or state_directory()
-        self.url = (url or os.environ.get("DECANT_URL") or _told(state) or f"http://127.0.0.1:{PORT}").rstrip("/")
+        self.url = (url or os.environ.get("DECANT_URL") or _stored_url(state) or f"http://127.0.0.1:{PORT}").rstrip("/")
         token = token or os.environ.get("DECANT_TOKEN") or _token(state)
         self._http = httpx.Client(
             base_url=self.url, headers={"Authorization": f"Bearer {token}"}, timeout=TIMEOUT, trust_env=False,
@@ -74,15 +76,15 @@ class Client:
         self._http.close()
 
     def get(self, path: str, **query: Any) -> Any:
-        """Look."""
+        """Request JSON with GET."""
         return self._call("GET", path, params=_given(query)).json()
 
     def fetch(self, path: str, **query: Any) -> bytes:
-        """Have a file."""
+        """Download a file."""
         return self._call("GET", path, params=_given(query)).content
 
     def post(self, path: str, body: Any = None) -> Any:
-        """Do something."""
+        """Send a command with POST."""
         return self._call("POST", path, json=body).json()
 
     def _call(self, method: str, path: str, **arguments: Any) -> httpx.Response:
@@ -107,14 +109,14 @@ class Client:
     def events(
         self, after: int | None = None, campaign: str | None = None, *, follow: bool = True
     ) -> Iterator[ServerReply]:
-        """Events, as they come; connections that break are made anew, and nothing is missed.
+        """Yield events as they arrive. A broken connection is restored without loss of events.
 
         Args:
-            after: the last one seen; None: from now on; 0: all there are.
-            campaign: only what belongs to it.
-            follow: wait for those that come.
+            after: id of the last event seen; None: only new events; 0: all stored events.
+            campaign: only events of this campaign.
+            follow: wait for further events.
         """
-        broken = 0
+        failures = 0
         while True:
             query = {"campaign": campaign, "after": after, "until": None if follow else "true"}
             try:
@@ -125,27 +127,27 @@ class Client:
                     if answer.status_code >= 400:
                         answer.read()
                     _check(answer)
-                    for told in _told_in(answer.iter_lines()):
-                        after, broken = told.id, 0
-                        yield told
+                    for event in _events_in(answer.iter_lines()):
+                        after, failures = event.id, 0
+                        yield event
             except httpx.HTTPError as error:
-                broken += 1
-                if broken > 3 or not follow:
+                failures += 1
+                if failures > 3 or not follow:
                     raise self._unreachable(error) from None
             else:
                 if not follow:
                     return
-                broken += 1
-                if broken > 3:
+                failures += 1
+                if failures > 3:
                     raise DaemonError("the daemon has ended")
-            time.sleep(0.3 * broken)
+            time.sleep(0.3 * failures)
 
 
 def _given(query: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in query.items() if value is not None}
 
 
-def _told_in(lines: Iterator[str]) -> Iterator[ServerReply]:
+def _events_in(lines: Iterator[str]) -> Iterator[ServerReply]:
     number, kind, data = 0, "", ""
     for line in lines:
         name, _, value = line.partition(":")
@@ -168,24 +170,24 @@ def _check(answer: httpx.Response) -> None:
         detail = answer.json()["detail"]
     except (ValueError, KeyError, TypeError):
         detail = answer.text[:500] or answer.reason_phrase
-    if isinstance(detail, list):  # what FastAPI says of fields
+    if isinstance(detail, list):  # validation errors of FastAPI
         detail = "; ".join(f"{'.'.join(map(str, one['loc'][1:]))}: {one['msg']}" for one in detail)
     code = 2 if answer.status_code in (400, 404, 413, 422) else 1
     raise DaemonError(str(detail), code)
 
 
 def _trusted(url: str) -> ssl.SSLContext | bool:
-    """Whose certificates are believed: those of the authorities that this machine knows, or of $DECANT_CA."""
+    """Return the trusted certificate authorities: those of this machine, or the file in $DECANT_CA."""
     path = os.environ.get("DECANT_CA")
     if not url.startswith("https") or not path:
         return True
     try:
         return ssl.create_default_context(cafile=path)
-    except OSError as error:  # one that is not a certificate is an SSLError, which is an OSError
+    except OSError as error:  # a file that is not a certificate raises SSLError, which is an OSError
         raise DaemonError(f"$DECANT_CA: {path}: can't be used as a certificate (PEM): {error}", 2) from None
 
 
-def _told(state: Path) -> str | None:
+def _stored_url(state: Path) -> str | None:
     try:
         return (state / "url").read_text(encoding="utf-8").strip() or None
     except OSError:
@@ -205,10 +207,10 @@ def _token(state: Path) -> str:
 
 
 class RemoteCatalogueClient:
-    """`CatalogueClient` of a daemon.
+    """`CatalogueClient` that queries a daemon.
 
     Args:
-        client: open.
+        client: an open client.
     """
 
     def __init__(self, client: Client) -> None:

@@ -1,4 +1,9 @@
-"""Settings of the daemon: a YAML file, read as strictly as a campaign, and what is meant where there is none."""
+"""Settings of the daemon: the YAML file and the values in force.
+
+`DaemonFile` is the schema of the file, which is checked as strictly as a campaign. `DaemonSettings` holds the resolved
+values, including defaults. `Rig` is one laboratory that campaigns lease. `load_settings` combines the file with options
+of the command line.
+"""
 
 from __future__ import annotations
 
@@ -23,17 +28,17 @@ from sim_engine.settings.quantity import Quantity
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 PORT = 8377
 ANY_RIG = "virtual"
-"""The rig of a daemon whose settings name none: each campaign's own laboratory, as long as it is virtual."""
+"""The rig of a daemon whose settings name none: each campaign's own laboratory, which must be virtual."""
 
 DESK = "desk"
-"""Where campaigns run that pour nothing: they need simulators and no rig."""
+"""The rig of campaigns that pour nothing: they need simulators only."""
 
 Port = Annotated[int, Field(strict=True, ge=0, le=65535)]
 DAY = 86400.0
 
 
 class TlsSection(Section):
-    """A certificate, for addresses that other machines reach."""
+    """A TLS certificate, for addresses that other machines can reach."""
 
     required: ClassVar[dict[str, str]] = {"certificate": "decant.crt", "key": "decant.key"}
 
@@ -45,89 +50,89 @@ class TlsSection(Section):
 
 
 class ListenSection(Section):
-    """Where the API is served. Unless said otherwise only this machine reaches it."""
+    """Address of the API. By default, only this machine can reach it."""
 
     host: Text = "127.0.0.1"
     """Address to listen at."""
 
     port: Port = PORT
-    """TCP port; 0 takes a free one, which is written into the state directory."""
+    """TCP port; 0 selects a free one, which is written to the state directory."""
 
     tls: TlsSection | None = None
-    """Encrypts; needed for other addresses than the loopback interface's."""
+    """TLS certificate; required for addresses other than loopback."""
 
     plain: Switch = False
-    """Serve another address without TLS all the same, because something in front of it encrypts."""
+    """Serve another address without TLS, because a proxy in front of the daemon encrypts."""
 
     body: Annotated[float, Quantity("MB", "4 MB", 0.01, 1000.0)] = 4.0
-    """Largest request that is read: a campaign with the files that it refers to."""
+    """Largest request: a campaign with all files that it refers to."""
 
 
 class LiveSection(Section):
-    """A live view of what runs, for browsers."""
+    """A live view of running campaigns for browsers."""
 
     host: Text = "127.0.0.1"
-    """Address to listen at. It has no password: whoever reaches it can look."""
+    """Address to listen at. It has no password: anyone who can reach it can watch."""
 
     port: Port | None = None
-    """TCP port of the viewer's page; the usual one, or the next free one, unless given."""
+    """TCP port of the viewer's page; by default the usual one or the next free one."""
 
 
 class RecordingsSection(Section):
-    """Which recordings (`.rrd`) are kept. Journals, figures and summaries always are."""
+    """Retention of recordings (`.rrd`). Journals, figures and summaries are always kept."""
 
     keep: Count | None = None
-    """So many of the newest runs; all unless given."""
+    """Number of newest runs whose recordings are kept; all by default."""
 
     age: Annotated[float, Quantity("s", "30 days", 0.0, 3650.0 * DAY, positive=True)] | None = None
-    """Those of younger runs; any age unless given."""
+    """Largest age of a recording; unlimited by default."""
 
 
 class DaemonFile(Section):
-    """A daemon's settings."""
+    """Settings of a daemon."""
 
     state: FilePath | None = None
-    """Folder of everything that it keeps: queue, questions, events, tokens, runs."""
+    """State directory: queue, questions, events, tokens and runs."""
 
     listen: ListenSection = ListenSection()
-    """Where the API is served."""
+    """Address of the API."""
 
     rigs: dict[Name, FilePath] | None = None
-    """Laboratories by name: each has an arm and a balance that one campaign at a time may use."""
+    """Laboratories by name; one campaign at a time leases the arm and the balance of each."""
 
     roots: list[FilePath] | None = None
-    """Folders in which campaigns that are submitted by path may lie, with all they refer to; none unless given."""
+    """Folders for campaigns that are submitted by path, with all files they refer to; none by default."""
 
     simulators: Annotated[Count, Field(le=10_000)] = 0
     """Simulators in the pool that all campaigns share; 0: one per core."""
 
     in_process: Switch = False
-    """One simulator in the daemon's own process, without Ray: for trying it out."""
+    """Use one simulator in the daemon's own process, without Ray; for trying Decant out."""
 
     recordings: RecordingsSection = RecordingsSection()
-    """How long recordings are kept."""
+    """Retention of recordings."""
 
     live: LiveSection | None = None
-    """Serve a live view; none unless given."""
+    """Serve a live view; off by default."""
 
     notify: NotifySection | None = None
-    """Who is told what happens; nobody unless given."""
+    """Receivers of notifications; none by default."""
 
     keep_free: Annotated[float, Quantity("MB", "500 MB", 40.0, 1e7)] = 500.0
-    """Room on the disk below which no campaign is begun."""
+    """Free disk space below which no campaign starts."""
 
     events: PositiveCount = 50_000
-    """Events that are kept for those who ask for what they have missed."""
+    """Number of stored events, for clients that reconnect."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """A laboratory that campaigns lease, one at a time.
+    """A laboratory that one campaign at a time leases.
 
     Attributes:
-        name: unique.
-        source: its file; None where each campaign brings its own.
-        spec: as read from it.
+        name: unique name.
+        source: laboratory file; None if each campaign brings its own.
+        spec: settings read from the file.
     """
 
     name: str
@@ -136,7 +141,7 @@ class Rig:
 
     @property
     def mode(self) -> str:
-        """'virtual' or 'hardware'; 'none' for the desk."""
+        """'virtual' or 'hardware'; 'none' for the rig of campaigns that pour nothing."""
         if self.name == DESK:
             return "none"
         return "virtual" if self.spec is None else self.spec.mode
@@ -144,7 +149,7 @@ class Rig:
 
 @dataclass(frozen=True)
 class DaemonSettings:
-    """What is in force; see `DaemonFile` for the meaning. Sizes are in bytes, times in seconds."""
+    """The settings in force; see `DaemonFile` for their meaning. Sizes are in bytes, times in seconds."""
 
     state: Path
     host: str = "127.0.0.1"
@@ -163,42 +168,42 @@ class DaemonSettings:
     live: tuple[str, int | None] | None = None
     notify: NotifySection | None = None
     quick_start: bool = field(default=True, compare=False)
-    """Whether simulators are started at once, or with the first campaign."""
+    """Whether simulators start at once instead of with the first campaign."""
 
     @property
     def runs(self) -> Path:
-        """Where runs get their folders."""
+        """Folder of the runs' folders."""
         return self.state / "runs"
 
     @property
     def snapshots(self) -> Path:
-        """Where submitted campaigns are kept as they were."""
+        """Folder of the submitted campaigns, as they were at submission."""
         return self.state / "campaigns"
 
     @property
     def tokens(self) -> Path:
-        """File of the tokens."""
+        """Path of the token file."""
         return self.state / "tokens"
 
     @property
     def address(self) -> Path:
-        """File that says where the running daemon is reached."""
+        """Path of the file with the running daemon's URL."""
         return self.state / "url"
 
     def rig(self, name: str) -> Rig:
-        """A rig by its name. Raises KeyError."""
+        """Return a rig by its name. Raises KeyError."""
         return next(rig for rig in (*self.rigs, Rig(DESK)) if rig.name == name)
 
 
 def load_settings(path: Path | None, **given: Any) -> DaemonSettings:
-    """Settings of a file, and of the command line, which has the last word.
+    """Load the settings from a file; options of the command line override them.
 
     Args:
-        path: of the file; None: defaults.
-        given: fields of `Settings`; None where the command line says nothing.
+        path: settings file; None: defaults.
+        given: fields of `DaemonSettings`; None for options that are not given.
 
     Raises:
-        ConfigError: anything is wrong with the file, or with a rig's.
+        ConfigError: the file or a rig's file is invalid.
     """
     given = {name: value for name, value in given.items() if value is not None}
     if path is None:
@@ -231,7 +236,7 @@ def _check_tls(certificate: Path | None, key: Path | None, at: Place, report: Re
     assert certificate is not None
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
-    except OSError as error:  # of which those of SSL are
+    except OSError as error:  # includes SSLError
         said = error.reason or "they can't be read" if isinstance(error, ssl.SSLError) else error.strerror
         report.add(at, f"{certificate.name} and {key and key.name} are not a certificate and its key in PEM ({said})")
 

@@ -1,6 +1,8 @@
-"""What the daemon remembers: queue, questions, flags, and who did what. One SQLite file, one writer, flushed to disk.
+"""Persistent state of the daemon: queue, questions, flags and audit entries.
 
-A run's own journal stays the truth about what happened in it. Here stands what people want of it.
+`Store` is the only writer of one SQLite file and flushes every change to disk. `QueueItem` is a submitted campaign with
+its desired state (`DesiredState`); `StoredQuestion` is a question to the operator. The journal of a run remains the
+authoritative record of its events; this file holds the operators' intentions.
 """
 
 from __future__ import annotations
@@ -47,11 +49,14 @@ create trigger deed_is_never_deleted before delete on deed begin select raise(ab
 
 
 class StoreError(RunError):
-    """The state directory can't be used; the text says why and what to do."""
+    """The state directory can't be used; the message gives the reason and a remedy."""
 
 
 class DesiredState(StrEnum):
-    """What people want of a campaign: kept apart from what it does, so that a crash forgets neither."""
+    """The state that operators want a campaign to be in.
+
+    It is stored separately from the current state, so that a crash loses neither.
+    """
 
     RUN = "run"
     PAUSE = "pause"
@@ -60,13 +65,13 @@ class DesiredState(StrEnum):
 
 
 STOPPED, WITHDRAWN = "stopped", "withdrawn"
-"""States of a campaign beside those of its run: ended by people, with and without having begun."""
+"""States of a campaign in addition to those of its run: ended by an operator, after or before its run started."""
 
 AT_REST = ("queued", "paused", "unknown", "failed", "finished", STOPPED, WITHDRAWN)
-"""In which a campaign may be left: any other, found at the start, means that the daemon died."""
+"""States in which a campaign may rest; any other state found at the start means that the daemon crashed."""
 
 ENDED = ("finished", STOPPED, WITHDRAWN)
-"""From which nothing goes on."""
+"""Final states."""
 
 
 @dataclass(frozen=True)
@@ -74,18 +79,18 @@ class QueueItem:
     """One submitted campaign.
 
     Attributes:
-        id: unique, for people to type.
-        verb: 'run', 'calibrate' or 'plan'.
-        rig: that it leases; 'desk' where it pours nothing.
-        mode: of that rig: 'virtual', 'hardware' or 'none'.
-        priority: higher ones come first.
-        rank: among those of one priority, the smallest first.
-        state: of the run (`orchestrator.states`), or 'stopped', 'withdrawn'.
-        wish: what people want.
-        reason: of the state, in words.
-        by: who submitted it.
-        run: name of its run's folder, once it has begun.
-        armed: whether hardware may move in the coming part of its run.
+        id: unique and short enough to type.
+        verb: task: 'run', 'calibrate' or 'plan'.
+        rig: rig that it leases; 'desk' if it pours nothing.
+        mode: mode of that rig: 'virtual', 'hardware' or 'none'.
+        priority: higher priorities run first.
+        rank: order within one priority, smallest first.
+        state: state of the run (`orchestrator.states`), or 'stopped', 'withdrawn'.
+        wish: desired state.
+        reason: reason of the state, for the operator.
+        by: user who submitted it.
+        run: name of its run's folder; None before the run starts.
+        armed: whether motion is enabled for the coming part of its run.
     """
 
     id: str
@@ -109,13 +114,13 @@ class QueueItem:
 
 @dataclass(frozen=True)
 class StoredQuestion:
-    """Something that a person is asked.
+    """A question to the operator.
 
     Attributes:
-        kind: 'bench' (a step at the arm), 'unknown' (a pour without outcome), 'strategy' (a decision).
-        wants: 'done', 'weight', 'yes or no', or 'option'.
-        options: where it wants one of them.
-        hands: whether it invites hands into the cell.
+        kind: 'bench' (a step at the arm), 'unknown' (a pour with unknown outcome), 'strategy' (a decision).
+        wants: kind of answer: 'done', 'weight', 'yes or no', or 'option'.
+        options: possible answers if `wants` is 'option'.
+        hands: whether the step requires hands in the cell.
         closed: why it needs no answer any more; None while it is open.
     """
 
@@ -138,7 +143,7 @@ class StoredQuestion:
 
     @property
     def open(self) -> bool:
-        """Whether an answer is waited for."""
+        """Whether the question waits for an answer."""
         return self.closed is None
 
 
@@ -147,13 +152,13 @@ _BOOLEAN = {"armed", "hands"}
 
 
 class Store:
-    """The one writer.
+    """The store of one daemon; the only writer of its file.
 
     Args:
-        path: of the file.
+        path: path of the SQLite file.
 
     Raises:
-        StoreError: another daemon has it, it is of another version, or can't be written.
+        StoreError: another daemon uses the file, its format differs, or it can't be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -178,7 +183,7 @@ class Store:
         self._lock.flush()
         try:
             self._open()
-        except sqlite3.OperationalError as error:  # the disk, the folder or their permissions, not the content
+        except sqlite3.OperationalError as error:  # the disk, the folder or their permissions, rather than the content
             self._lock.close()
             raise StoreError(f"{path}: can't be opened for writing ({error}); --state names another folder") from error
         except sqlite3.DatabaseError as error:
@@ -197,34 +202,34 @@ class Store:
             raise StoreError(f"{self.path}: written in format {version}, and this version of Decant has {FORMAT}")
 
     def close(self) -> None:
-        """Give the file back. May be called twice."""
+        """Close the file and release the lock. May be called twice."""
         self._db.close()
         self._lock.close()
 
     # ---- campaigns
 
     def add(self, item: QueueItem) -> None:
-        """A campaign that was submitted."""
+        """Add a submitted campaign."""
         values = {f.name: _written(f.name, getattr(item, f.name)) for f in fields(QueueItem)}
         names = ", ".join(values)
         self._write(f"insert into campaign ({names}) values ({', '.join('?' * len(values))})", *values.values())
 
     def change(self, key: str, **values: Any) -> None:
-        """Set some fields of a campaign, together."""
+        """Set fields of a campaign in one transaction."""
         names = ", ".join(f"{name} = ?" for name in values)
         self._write(f"update campaign set {names} where id = ?", *(_written(n, v) for n, v in values.items()), key)
 
     def item(self, key: str) -> QueueItem | None:
-        """A campaign; None: there is no such one."""
+        """Return a campaign, or None if the id is unknown."""
         row = self._db.execute("select * from campaign where id = ?", [key]).fetchone()
         return None if row is None else _item(row)
 
     def items(self, states: Iterable[str] = (), limit: int = 1000) -> list[QueueItem]:
-        """Campaigns: what runs first, then the queue in its order, then the others, the newest first.
+        """Return campaigns: running ones, then the queue in its order, then the others, newest first.
 
         Args:
-            states: only those in one of them; all unless given.
-            limit: at most so many.
+            states: only campaigns in these states; all by default.
+            limit: largest number of campaigns.
         """
         wanted = tuple(states)
         where = f"where state in ({', '.join('?' * len(wanted))})" if wanted else ""
@@ -238,17 +243,17 @@ class Store:
         return [_item(row) for row in rows]
 
     def last_rank(self) -> float:
-        """The largest rank so far; 0 before the first campaign."""
+        """Return the largest rank so far; 0 before the first campaign."""
         return float(self._db.execute("select coalesce(max(rank), 0) from campaign").fetchone()[0])
 
     def counts(self) -> dict[str, int]:
-        """How many campaigns there are in each state."""
+        """Return the number of campaigns in each state."""
         return dict(self._db.execute("select state, count(*) from campaign group by state").fetchall())
 
     # ---- questions
 
     def ask(self, **values: Any) -> StoredQuestion:
-        """Write a question down; it is open from now on."""
+        """Store an open question."""
         values["asked"] = time.time()
         names = ", ".join(values)
         written = [_written(n, v) for n, v in values.items()]
@@ -258,25 +263,25 @@ class Store:
         return found
 
     def answer(self, key: int, answer: str, by: str) -> None:
-        """Write an answer down, before anything follows from it."""
+        """Store an answer, before anything acts on it."""
         self._write(
             "update question set answer = ?, by = ?, answered = ?, closed = 'answered' where id = ? and closed is null",
             *(answer, by, time.time(), key),
         )
 
     def close_question(self, key: int, reason: str) -> None:
-        """Nobody needs the answer any more."""
+        """Close a question that needs no answer any more."""
         self._write("update question set closed = ? where id = ? and closed is null", reason, key)
 
     def question(self, key: int) -> StoredQuestion | None:
-        """A question; None: there is no such one."""
+        """Return a question, or None if the id is unknown."""
         row = self._db.execute("select * from question where id = ?", [key]).fetchone()
         return None if row is None else _question(row)
 
     def questions(
         self, *, only_open: bool = True, campaign: str | None = None, limit: int = 200
     ) -> list[StoredQuestion]:
-        """Questions, the oldest open one first, or all of them, the newest first."""
+        """Return open questions, oldest first, or all questions, newest first."""
         conditions = ["closed is null"] if only_open else ["1"]
         arguments: list[Any] = []
         if campaign is not None:
@@ -286,15 +291,15 @@ class Store:
         query = f"select * from question where {' and '.join(conditions)} order by {order} limit ?"
         return [_question(row) for row in self._db.execute(query, [*arguments, limit])]
 
-    # ---- flags and deeds
+    # ---- flags and audit entries
 
     def flag(self, name: str) -> Any:
-        """A value that outlives the daemon; None where it was never set."""
+        """Return a value that persists across restarts, or None if it is not set."""
         row = self._db.execute("select value from flag where name = ?", [name]).fetchone()
         return None if row is None else json.loads(row[0])
 
     def set_flag(self, name: str, value: Any) -> None:
-        """Set it; None takes it away."""
+        """Set a flag; None removes it."""
         if value is None:
             self._write("delete from flag where name = ?", name)
         else:
@@ -302,12 +307,12 @@ class Store:
                         name, json.dumps(value))  # fmt: skip
 
     def note(self, by: str, what: str, campaign: str = "", detail: str = "") -> None:
-        """Write down who did what."""
+        """Append an audit entry: who did what."""
         self._write("insert into deed (t, by, what, campaign, detail) values (?, ?, ?, ?, ?)",
                     time.time(), by, what, campaign, detail)  # fmt: skip
 
     def deeds(self, campaign: str | None = None, limit: int = 200) -> list[dict[str, Any]]:
-        """Who did what, the newest first."""
+        """Return the audit entries, newest first."""
         where, arguments = ("", []) if campaign is None else ("where campaign = ?", [campaign])
         query = f"select t, by, what, campaign, detail from deed {where} order by id desc limit ?"
         return [dict(row) for row in self._db.execute(query, [*arguments, limit])]

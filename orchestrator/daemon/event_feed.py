@@ -1,9 +1,8 @@
-"""Everything that happens, in order and numbered, for whoever watches: from now on, or from where they left off.
+"""The numbered sequence of all events of the daemon, for subscribers that may reconnect.
 
-Readers wait for nothing that they have not asked for and keep nobody waiting: each has seen so much of the sequence and
-takes from there what is still kept. One that is too slow is sent how much it has missed.
-
-Events as typed JSON: every field of every event, but for particles and for what can be asked for elsewhere.
+`Feed` keeps the newest events in memory and on disk. Each reader has its own position: it continues from the last event
+it saw and never blocks other readers. A slow reader misses events that are no longer stored. `event_json` converts
+events to typed JSON, without recorded particles and without values that other routes return.
 """
 
 from __future__ import annotations
@@ -35,14 +34,14 @@ from orchestrator.runs.events import (
 )
 
 PASSING = (PourProgressed, StrategyProgressed, MadeAhead)
-"""Events that say where something stands just now: the next one takes their place, so they are not kept on disk."""
+"""Progress events. Each replaces the one before it, so they are not stored on disk."""
 
 
 def event_json(event: Event) -> dict[str, Any]:
-    """The fields of an event, with the name of its class under 'type'.
+    """Return the fields of an event, with the name of its class under 'type'.
 
-    Recorded particles are left out (they are in the recording), a question to the optimiser has its purpose, its
-    answer its points; what a strategy has learnt is in the event that closes its stage.
+    Recorded particles are left out, since the recording contains them. A suggestion query is reduced to its purpose and
+    its outcome to the points. A strategy's stage result is part of the event that closes the stage.
     """
     left_out = {"frames"}
     if isinstance(event, StrategyProgressed):
@@ -58,7 +57,10 @@ def event_json(event: Event) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """JSON-ready, whatever it is: what has no word in JSON becomes null, what is a value of ours names its type."""
+    """Convert any value to JSON types.
+
+    Values without a JSON equivalent, such as NaN, become null; dataclasses are given a field with their type.
+    """
     if value is None or isinstance(value, bool | int | str):
         return value.value if isinstance(value, Enum) else value
     if isinstance(value, float):
@@ -78,18 +80,18 @@ def plain(value: Any) -> Any:
 
 
 def text(data: Any) -> str:
-    """On one line."""
+    """Return JSON on one line."""
     return json.dumps(data, ensure_ascii=False, separators=(",", ":"))
 
 
 RING = 1_000
-"""Events kept in memory."""
+"""Number of events kept in memory."""
 
 FLUSH = 0.25
-"""Between two times that events are written to the disk [s]; a journal has what matters before that."""
+"""Interval at which events are written to disk [s]; journals contain the important ones before that."""
 
 LEAP = 10_000
-"""Numbers that are left out at each start, since the last ones before a crash may never have been written."""
+"""Numbers skipped at each start, since the last ones before a crash may not have been written."""
 
 _BATCH = 200
 
@@ -102,12 +104,12 @@ create table if not exists event (
 
 @dataclass(frozen=True)
 class SentEvent:
-    """One event as it goes out.
+    """One event as it is sent.
 
     Attributes:
-        id: larger than that of any event before it.
-        campaign: that it belongs to; '' for what concerns the daemon.
-        type: name of its class in `orchestrator.runs.events`, or a word for what the daemon itself says.
+        id: larger than that of any earlier event.
+        campaign: campaign of the event; '' if it concerns the daemon.
+        type: name of its class in `orchestrator.runs.events`, or the name of one of the daemon's own events.
         data: JSON on one line.
     """
 
@@ -122,11 +124,11 @@ class Feed:
     """The sequence of events.
 
     Args:
-        path: of its file.
-        keep: events that are kept there.
-        broken: called once if they can't be written any more.
+        path: path of its SQLite file.
+        keep: number of events kept there.
+        broken: called if events can't be written.
 
-    Limitations: a crash loses what happened in the last quarter of a second from here, though not from the journals.
+    Limitations: a crash loses the events of the last quarter of a second from this file, though not from the journals.
     """
 
     def __init__(self, path: Path, keep: int = 50_000, broken: Callable[[str], None] = lambda text: None) -> None:
@@ -148,7 +150,7 @@ class Feed:
         return self._next - 1
 
     def watcher(self, campaign: str) -> Callable[[Event], None]:
-        """A watcher that tells of a campaign's events."""
+        """Return a subscriber that adds a campaign's events to the feed."""
 
         def watch(event: Event) -> None:
             data = event_json(event)
@@ -157,7 +159,7 @@ class Feed:
         return watch
 
     def tell(self, kind: str, data: dict[str, Any], campaign: str = "", *, kept: bool = True, t: float = 0.0) -> None:
-        """Something happened."""
+        """Add an event."""
         t = t or time.time()
         number, self._next = self._next, self._next + 1
         body = {"type": kind, "campaign": campaign, **data, "time": t}
@@ -169,13 +171,13 @@ class Feed:
         news.set()
 
     async def flushing(self) -> None:
-        """Write events down every now and then, until cancelled."""
+        """Write events to disk periodically, until cancelled."""
         while True:
             await asyncio.sleep(FLUSH)
             self.flush()
 
     def flush(self) -> None:
-        """Write down what waits, and forget what is too old. Never raises: who watches is no reason to end."""
+        """Write pending events and delete the oldest. Never raises: a failure here must not end the daemon."""
         if not self._unwritten or self._db is None:
             return
         batch, self._unwritten = self._unwritten, []
@@ -194,7 +196,7 @@ class Feed:
             self._broken(f"events can't be written down: {error}")
 
     def close(self) -> None:
-        """Write down what waits, and let everybody go who reads."""
+        """Write pending events and end all readers."""
         self.flush()
         if self._db is not None:
             self._db.close()
@@ -204,12 +206,12 @@ class Feed:
     async def read(
         self, after: int | None = None, campaign: str | None = None, *, beat: float = 3600.0
     ) -> AsyncIterator[SentEvent | None]:
-        """Events after a number, and then those that come.
+        """Yield events after a number, and then new ones.
 
         Args:
-            after: the last one that was seen; None: only what comes from now on.
-            campaign: only what belongs to it.
-            beat: after so long without news [s] None comes instead.
+            after: number of the last event seen; None: only new events.
+            campaign: only events of this campaign.
+            beat: yield None after so long without an event [s].
         """
         seen = self.last if after is None else min(after, self.last)
         self.readers += 1
@@ -231,7 +233,7 @@ class Feed:
             self.readers -= 1
 
     def _after(self, seen: int) -> list[SentEvent]:
-        """The next few events behind a number."""
+        """Return the next events after a number, at most one batch."""
         if self._ring and seen + 1 >= self._ring[0].id:
             # Numbers in the ring have no gaps.
             begin = seen + 1 - self._ring[0].id

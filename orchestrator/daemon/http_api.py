@@ -1,4 +1,8 @@
-"""The daemon over HTTP. No call reaches a device but those that stop it."""
+"""The FastAPI application of the daemon: routes, operator page, health checks and OpenAPI description.
+
+`create_app` makes the application without a daemon; `serve_app` connects it to a `Supervisor` and adds access control.
+No call reaches a device, except the commands that stop motion.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +13,7 @@ from typing import Any
 
 from fastapi import FastAPI, Response
 
-from orchestrator.daemon import archive_routes as archive
-from orchestrator.daemon import command_routes as deeds
-from orchestrator.daemon import query_routes as looks
+from orchestrator.daemon import archive_routes, command_routes, query_routes
 from orchestrator.daemon.access_control import Daemon, RequestGuard, Tokens
 from orchestrator.daemon.page import page_router
 from orchestrator.daemon.schemas import HealthOut, ProblemOut
@@ -23,41 +25,41 @@ _ERRORS: dict[int | str, dict[str, Any]] = {
     code: {"model": ProblemOut, "description": text}
     for code, text in {
         400: "The request can't be read.",
-        401: "No token, or one that is not known.",
-        403: "The token's role is not enough.",
-        404: "There is no such thing.",
-        409: "Not now: the detail says why.",
-        413: "Too large.",
-        421: "Called by a name that this machine does not have.",
-        422: "What was sent can't be used; the detail says what is wrong, where, and what would be right.",
+        401: "The token is missing or unknown.",
+        403: "The token's role is not sufficient.",
+        404: "Not found.",
+        409: "Not possible now; the detail gives the reason.",
+        413: "The request is too large.",
+        421: "The host name is not one of this machine.",
+        422: "The request is invalid; the detail gives the problem, its place and a remedy.",
         429: "Too many wrong tokens from this address.",
     }.items()
 }
 
 Live = Callable[[str | None], str | None]
-"""Where the live view of a campaign is, or of all with None; None where there is none."""
+"""Returns the URL of a campaign's live view, or of the common view for None; None if there is none."""
 
 
 def create_app() -> FastAPI:
-    """The application, without the daemon that it will speak for."""
+    """Make the application without a daemon."""
     app = FastAPI(
         title="Decant",
         version="1",
-        description="A laboratory that teaches a robot arm to pour: its queue, its questions, its events.",
+        description="A laboratory in which a robot arm learns to pour: queue, questions and events.",
         docs_url=None,
         redoc_url=None,
         openapi_url=None,
     )
-    app.include_router(looks.router, prefix=V1, responses=_ERRORS)
-    app.include_router(deeds.router, prefix=V1, responses=_ERRORS)
-    app.include_router(archive.router, prefix=V1, responses=_ERRORS)
+    app.include_router(query_routes.router, prefix=V1, responses=_ERRORS)
+    app.include_router(command_routes.router, prefix=V1, responses=_ERRORS)
+    app.include_router(archive_routes.router, prefix=V1, responses=_ERRORS)
     app.add_api_route("/healthz", _health, operation_id="health", response_model=HealthOut)
     app.add_api_route(
         "/readyz",
         _readiness,
         operation_id="readiness",
         response_model=HealthOut,
-        responses={503: {"model": HealthOut, "description": "Not ready; the problems say why."}},
+        responses={503: {"model": HealthOut, "description": "Not ready; the problems give the reasons."}},
     )
     app.include_router(page_router())
     app.state.live = _nowhere
@@ -66,13 +68,13 @@ def create_app() -> FastAPI:
 
 
 def serve_app(daemon: Supervisor, tokens: Tokens, shutdown: Callable[[], None], live: Live | None = None) -> FastAPI:
-    """The application, guarded.
+    """Make the application for a daemon, with access control.
 
     Args:
-        daemon: that it speaks for.
-        tokens: of those who may speak.
-        shutdown: begins the daemon's end.
-        live: where the live view is.
+        daemon: daemon to serve.
+        tokens: accepted tokens.
+        shutdown: starts the daemon's shutdown.
+        live: URL of the live view.
     """
     app = create_app()
     app.state.daemon, app.state.tokens, app.state.shutdown = daemon, tokens, shutdown
@@ -82,22 +84,22 @@ def serve_app(daemon: Supervisor, tokens: Tokens, shutdown: Callable[[], None], 
 
 
 def openapi_text() -> str:
-    """The API's description, as it stands in docs/openapi.json."""
+    """Return the API's OpenAPI description, as in docs/openapi.json."""
     return json.dumps(create_app().openapi(), indent=1, ensure_ascii=False) + "\n"
 
 
 def write_openapi(path: Path) -> None:
-    """Write that file."""
+    """Write the OpenAPI description to a file."""
     path.write_text(openapi_text(), encoding="utf-8")
 
 
 async def _health(daemon: Daemon) -> HealthOut:
-    """The daemon answers. Needs no token."""
+    """Return success if the daemon responds. Needs no token."""
     return HealthOut(ok=True)
 
 
 async def _readiness(daemon: Daemon, response: Response) -> HealthOut:
-    """Simulators are up, and nothing has to be mended. Needs no token, and says no more than that."""
+    """Check that simulators are running and no problem is open. Needs no token and returns no details."""
     problems = [] if daemon.warm.ready else ["simulators are starting"]
     problems += [f"problem: {key}" for key in daemon.problems]
     if daemon.emergency is not None or daemon.emergencies:
@@ -113,4 +115,4 @@ def _nowhere(campaign: str | None) -> str | None:
 
 
 def _nothing() -> None:
-    """Before there is anything to end."""
+    """Shutdown handler of an application without a daemon."""

@@ -1,4 +1,7 @@
-"""What is reported to Prometheus: counts of what there is, and of what happened."""
+"""Metrics of the daemon in Prometheus' text format.
+
+`measures` reads the current values of the daemon at each request, so that nothing is counted twice or stored.
+"""
 
 from __future__ import annotations
 
@@ -17,21 +20,21 @@ from orchestrator.journal.disk_reserve import free_space
 
 
 class _Collector:
-    """Looks when it is asked: nothing is counted twice, and nothing has to be remembered."""
+    """Reads the current values when Prometheus collects them."""
 
     def __init__(self, daemon: Supervisor) -> None:
         self._daemon = daemon
 
     def collect(self) -> Iterable[Metric]:
-        """See prometheus_client's collectors."""
+        """Yield the metrics, as prometheus_client's collectors do."""
         daemon = self._daemon
         campaigns = GaugeMetricFamily("decant_campaigns", "Campaigns in each state.", labels=["state"])
         for state, count in daemon.store.counts().items():
             campaigns.add_metric([state], count)
         yield campaigns
         busy = GaugeMetricFamily("decant_rig_busy", "Whether a campaign has the rig.", labels=["rig"])
-        for name, lane in daemon.lanes.items():
-            busy.add_metric([name], float(lane.running is not None))
+        for name, worker in daemon.lanes.items():
+            busy.add_metric([name], float(worker.running is not None))
         yield busy
         words = GaugeMetricFamily("decant_words", "Messages to people elsewhere.", labels=["receiver", "outcome"])
         for receiver, counts in daemon.words.items():
@@ -60,7 +63,7 @@ class _Collector:
 
 
 def measures(daemon: Supervisor) -> bytes:
-    """Everything, in Prometheus' text format."""
+    """Return all metrics in Prometheus' text format."""
     registry = CollectorRegistry()
     registry.register(_Collector(daemon))
     return generate_latest(registry)

@@ -1,7 +1,9 @@
-"""Word to people who are elsewhere: an answer is needed, a campaign ended or failed, something hangs.
+"""Notifications by mail, webhook or chat when a campaign needs an operator.
 
-Mail, webhooks and chats, through apprise, which knows a hundred of them by their URLs. Each receiver has a thread and a
-short queue of its own: one that is dead or slow keeps nobody waiting, neither the daemon nor the other receivers.
+Occasions are open questions, ended and failed campaigns, campaigns without news, and emergency stops. Messages are sent
+through apprise, which supports many services by URL. Each receiver has its own thread and a short queue, so that a slow
+receiver delays neither the daemon nor other receivers. `Notifier` is the main class; `pass_on` connects it to the
+daemon's event feed.
 """
 
 from __future__ import annotations
@@ -20,10 +22,10 @@ from sim_engine.settings.model import Section, Text
 from sim_engine.settings.quantity import Quantity
 
 QUEUE = 50
-"""Messages that wait for one receiver; while so many wait, further ones are dropped and counted."""
+"""Largest number of waiting messages per receiver; further messages are dropped and counted."""
 
 TRIES, PAUSES = 3, (2.0, 10.0)
-"""How often a message is tried, and how long is waited in between [s]."""
+"""Number of attempts for a message, and the pauses between them [s]."""
 
 ENVIRONMENT = "env:"
 
@@ -32,9 +34,9 @@ Occasion = Literal["question", "ended", "failed", "silence", "emergency"]
 OCCASIONS: tuple[Occasion, ...] = ("question", "ended", "failed", "silence", "emergency")
 
 _BY_PEOPLE = ("", "stopped on request")
-"""Reasons of a campaign that rests because somebody wanted it to."""
+"""Reasons of a campaign that an operator paused."""
 
-_TOLD = (
+_EVENTS_WITH_DATA = (
     "CampaignLeased",
     "CampaignOpened",
     "CampaignRests",
@@ -43,30 +45,31 @@ _TOLD = (
     "QuestionClosed",
     "Deed",
 )
-"""Events whose data are looked at; of all others it counts that they came."""
+"""Events whose data are read; of all other events only the arrival counts."""
 
 _log = logging.getLogger(__name__)
 
 
 class NotifySection(Section):
-    """Who is told what happens, by mail, webhook or chat."""
+    """Notifications by mail, webhook or chat."""
 
     required: ClassVar[dict[str, str]] = {"to": "['mailtos://user:password@smtp.example.org?to=me@example.org']"}
 
     to: list[Text] | None = None
-    """Receivers, as URLs that apprise knows ([its list](https://appriseit.com/services/)); `env:NAME` reads one from
-    the environment, for URLs with secrets in them."""
+    """Receivers, as URLs that apprise supports ([its list](https://appriseit.com/services/)); `env:NAME` reads one from
+    the environment, for URLs with secrets in them.
+    """
 
     about: list[Literal["question", "ended", "failed", "silence", "emergency"]] | None = None
-    """What is sent: all unless given. `question`: a person has to answer; `ended`: a campaign is finished or was
-    stopped; `failed`: it can't go on, or a pour is UNKNOWN; `silence`: nothing happens; `emergency`: an emergency
-    stop."""
+    """Occasions for a message; all by default. `question`: an operator must answer; `ended`: a campaign is finished or
+    was stopped; `failed`: it can't continue, or a pour is UNKNOWN; `silence`: no news; `emergency`: an emergency stop.
+    """
 
     silence: Annotated[float, Quantity("s", "15 min", 1.0, 86_400.0, positive=True)] = 900.0
-    """A running campaign without news for so long hangs; a question that is open for so long is reported once more."""
+    """Time after which a running campaign without news, or an open question, is reported."""
 
     page: Text | None = None
-    """Address of the page as people elsewhere reach it: the link in messages."""
+    """Public address of the operator page; the link in messages."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ class Notification:
 
 @dataclass
 class Counts:
-    """Messages of one receiver so far."""
+    """Numbers of messages of one receiver."""
 
     sent: int = 0
     failed: int = 0
@@ -88,18 +91,18 @@ class Counts:
 
 
 class NotifyError(ValueError):
-    """A receiver that apprise does not know; the text says which, without its secrets."""
+    """apprise does not support a receiver; the message names it without its secrets."""
 
 
 class Notifier:
-    """Sends word to all receivers. `note` is called with everything that happens; it returns at once and never raises.
+    """Sends notifications to all receivers. `note` takes every event; it returns at once and never raises.
 
     Args:
         receivers: URLs.
-        about: occasions that are reported.
-        silence: without news from a running campaign [s] before that is reported.
-        page: link for people.
-        clock: seconds, monotonic.
+        about: occasions for a message.
+        silence: time without news from a running campaign before a message is sent [s].
+        page: link to the operator page.
+        clock: monotonic time [s].
 
     Raises:
         NotifyError: a URL can't be used.
@@ -116,33 +119,33 @@ class Notifier:
     ) -> None:
         self._about, self._silence, self._page, self._clock = frozenset(about), silence, page, clock
         self._receivers = [_Receiver(number, url) for number, url in enumerate(receivers, start=1)]
-        self._heard: dict[str, _Heard] = {}
+        self._news: dict[str, _CampaignNews] = {}
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._threads = [
             threading.Thread(target=one.work, name=f"word to {one}", daemon=True) for one in self._receivers
         ]
-        self._threads.append(threading.Thread(target=self._listen_for_silence, name="silence", daemon=True))
+        self._threads.append(threading.Thread(target=self._watch_for_silence, name="silence", daemon=True))
         for thread in self._threads:
             thread.start()
 
     @property
     def counts(self) -> dict[str, Counts]:
-        """Messages so far, by receiver; its name has no secrets in it."""
+        """Numbers of messages by receiver; receivers' names contain no secrets."""
         return {str(one): one.counts for one in self._receivers}
 
     def note(self, kind: str, data: Mapping[str, Any], campaign: str = "") -> None:
-        """Something happened: the type of an event of the daemon's feed, and its data."""
+        """Process an event: its type in the daemon's feed, and its data."""
         try:
             with self._lock:
-                word = self._word(kind, data, campaign)
-            if word is not None:
-                self._send(word)
-        except Exception:  # who is told is never a reason for anything to end
+                message = self._message(kind, data, campaign)
+            if message is not None:
+                self._send(message)
+        except Exception:  # a failed notification must never end anything else
             _log.exception("no word could be made of %s", kind)
 
     def close(self, patience: float = 5.0) -> None:
-        """Send what waits, for at most so long [s], and end."""
+        """Send waiting messages for at most this long [s], and end."""
         self._ended.set()
         for one in self._receivers:
             one.end()
@@ -150,31 +153,31 @@ class Notifier:
         for thread in self._threads:
             thread.join(max(deadline - time.monotonic(), 0.0))
 
-    # ---- from what happens to words
+    # ---- from events to messages
 
-    def _word(self, kind: str, data: Mapping[str, Any], campaign: str) -> Notification | None:
-        heard = self._heard.get(campaign)
-        if heard is not None:
-            heard.at, heard.told = self._clock(), False
+    def _message(self, kind: str, data: Mapping[str, Any], campaign: str) -> Notification | None:
+        news = self._news.get(campaign)
+        if news is not None:
+            news.at, news.reported = self._clock(), False
         match kind:
             case "CampaignLeased":
-                self._heard[campaign] = _Heard(self._clock(), rig=str(data.get("rig", "")))
-            case "CampaignOpened" if heard is not None:
-                heard.mode = str(data.get("mode", ""))
+                self._news[campaign] = _CampaignNews(self._clock(), rig=str(data.get("rig", "")))
+            case "CampaignOpened" if news is not None:
+                news.mode = str(data.get("mode", ""))
             case "QuestionAsked":
                 question = data["question"]
-                if heard is not None:
-                    heard.question = str(question["text"])
+                if news is not None:
+                    news.question = str(question["text"])
                 lines = [str(question["text"]), str(question.get("problem") or "")]
                 if options := question.get("options"):
                     lines.append("Answer with one of: " + ", ".join(map(str, options)))
                 return self._made("question", campaign, "an answer is needed", lines)
-            case "QuestionAnswered" | "QuestionClosed" if heard is not None:
-                heard.question = ""
+            case "QuestionAnswered" | "QuestionClosed" if news is not None:
+                news.question = ""
             case "CampaignRests":
-                word = self._rests(data, campaign)
-                self._heard.pop(campaign, None)
-                return word
+                message = self._rests(data, campaign)
+                self._news.pop(campaign, None)
+                return message
             case "Deed" if data.get("what") == "emergency stop":
                 lines = [f"By {data.get('by')}.", str(data.get("detail") or ""), "Nothing begins before it is cleared."]
                 return self._made("emergency", "", "EMERGENCY STOP", lines)
@@ -194,47 +197,47 @@ class Notifier:
     def _made(self, occasion: Occasion, campaign: str, what: str, lines: Sequence[str]) -> Notification | None:
         if occasion not in self._about:
             return None
-        heard = self._heard.get(campaign)
-        mode = "" if heard is None else {"hardware": "REAL ", "virtual": "VIRTUAL "}.get(heard.mode, "")
-        rig = "" if heard is None or not heard.rig else f" at {heard.rig}"
+        news = self._news.get(campaign)
+        mode = "" if news is None else {"hardware": "REAL ", "virtual": "VIRTUAL "}.get(news.mode, "")
+        rig = "" if news is None or not news.rig else f" at {news.rig}"
         title = f"Decant: {what}" if not campaign else f"Decant, {mode}{campaign}{rig}: {what}"
         return Notification(occasion, title, "\n".join(filter(None, (*lines, self._page))) or title)
 
-    def _listen_for_silence(self) -> None:
+    def _watch_for_silence(self) -> None:
         while not self._ended.wait(min(max(self._silence / 10.0, 0.05), 30.0)):
             self.listen_for_silence()
 
     def listen_for_silence(self) -> None:
-        """Send word of campaigns in which nothing has happened for too long; once, until something does."""
-        words = []
+        """Report campaigns without news for too long; once, until the next event."""
+        messages = []
         with self._lock:
-            for campaign, heard in self._heard.items():
-                quiet = self._clock() - heard.at
-                if heard.told or quiet < self._silence:
+            for campaign, news in self._news.items():
+                quiet = self._clock() - news.at
+                if news.reported or quiet < self._silence:
                     continue
-                heard.told = True
+                news.reported = True
                 lasts = f"{quiet / 60:.0f} min" if quiet >= 120.0 else f"{quiet:.0f} s"
-                if heard.question:
-                    words.append(
-                        self._made("silence", campaign, f"has waited for an answer for {lasts}", [heard.question])
+                if news.question:
+                    messages.append(
+                        self._made("silence", campaign, f"has waited for an answer for {lasts}", [news.question])
                     )
                 else:
                     lines = ["Nothing has happened in it since then: look after the bench."]
-                    words.append(self._made("silence", campaign, f"hangs: no news for {lasts}", lines))
-        for word in filter(None, words):
-            self._send(word)
+                    messages.append(self._made("silence", campaign, f"hangs: no news for {lasts}", lines))
+        for message in filter(None, messages):
+            self._send(message)
 
-    def _send(self, word: Notification) -> None:
+    def _send(self, message: Notification) -> None:
         for one in self._receivers:
-            one.put(word)
+            one.put(message)
 
 
 class NotificationResult(Protocol):
-    """An event of the daemon's feed."""
+    """An event of the daemon's feed, as `pass_on` reads it."""
 
     @property
     def type(self) -> str:
-        """Name of its class, or a word for what the daemon itself says."""
+        """Name of its class, or of one of the daemon's own events."""
         ...
 
     @property
@@ -244,31 +247,31 @@ class NotificationResult(Protocol):
 
     @property
     def campaign(self) -> str:
-        """That it belongs to; '' for what concerns the daemon."""
+        """Campaign of the event; '' if it concerns the daemon."""
         ...
 
 
 async def pass_on(events: AsyncIterator[NotificationResult | None], notifier: Notifier) -> None:
-    """Tell a notifier what a feed tells, until the feed is closed: `pass_on(feed.read(), notifier)`."""
+    """Pass the events of a feed to a notifier until the feed is closed: `pass_on(feed.read(), notifier)`."""
     async for sent in events:
         if sent is not None:
-            notifier.note(sent.type, json.loads(sent.data) if sent.type in _TOLD else {}, sent.campaign)
+            notifier.note(sent.type, json.loads(sent.data) if sent.type in _EVENTS_WITH_DATA else {}, sent.campaign)
 
 
 @dataclass
-class _Heard:
-    """When a campaign last gave news (monotonic), and what is known of it."""
+class _CampaignNews:
+    """Time of a campaign's last event (monotonic), and its state as far as it is known."""
 
     at: float
     rig: str = ""
     mode: str = ""
     question: str = ""
-    told: bool = False
+    reported: bool = False
 
 
 @dataclass
 class _Receiver:
-    """One URL, its queue, and its thread's work."""
+    """One URL with its queue and the work of its thread."""
 
     number: int
     url: str
@@ -284,52 +287,52 @@ class _Receiver:
             where = self.url if self.url.startswith(ENVIRONMENT) else f"the {self.number}. one ({self._scheme}:…)"
             raise NotifyError(f"{where}: is not a URL that apprise knows; see https://appriseit.com/services/")
         self._apprise = found
-        self._words: queue.Queue[Notification | None] = queue.Queue(QUEUE)
+        self._messages: queue.Queue[Notification | None] = queue.Queue(QUEUE)
         self._ending = threading.Event()
 
     def __str__(self) -> str:
         return f"{self._scheme} ({self.number})"
 
-    def put(self, word: Notification) -> None:
-        """Take a message, or drop it where too many wait."""
+    def put(self, message: Notification) -> None:
+        """Queue a message, or drop it if too many are waiting."""
         try:
-            self._words.put_nowait(word)
+            self._messages.put_nowait(message)
         except queue.Full:
             self.counts.dropped += 1
 
     def end(self) -> None:
-        """Send what waits, without another try where one fails, and end."""
+        """Send waiting messages with one attempt each, and end."""
         self._ending.set()
         try:
-            self._words.put_nowait(None)
+            self._messages.put_nowait(None)
         except queue.Full:
-            self._words.get_nowait()
+            self._messages.get_nowait()
             self.counts.dropped += 1
-            self._words.put_nowait(None)
+            self._messages.put_nowait(None)
 
     def work(self) -> None:
-        """Send, until the end."""
-        while (word := self._words.get()) is not None:
-            if self._delivered(word):
+        """Send messages until the end."""
+        while (message := self._messages.get()) is not None:
+            if self._delivered(message):
                 self.counts.sent += 1
             else:
                 self.counts.failed += 1
-                _log.warning("no word to %s: '%s' could not be delivered", self, word.title)
+                _log.warning("no word to %s: '%s' could not be delivered", self, message.title)
 
-    def _delivered(self, word: Notification) -> bool:
+    def _delivered(self, message: Notification) -> bool:
         for attempt in range(TRIES):
             if attempt and self._ending.wait(PAUSES[attempt - 1]):
                 return False
             try:
-                if self._apprise.notify(title=word.title, body=word.body):
+                if self._apprise.notify(title=message.title, body=message.body):
                     return True
-            except Exception:  # a plug-in of apprise may raise anything
+            except Exception:  # apprise's plug-ins may raise anything
                 _log.debug("word to %s", self, exc_info=True)
         return False
 
 
 def problem_of(url: str) -> str | None:
-    """What is wrong with a receiver, without its secrets; None where apprise knows it."""
+    """Describe the problem with a receiver, without its secrets; None if apprise supports it."""
     try:
         _Receiver(1, url)
     except NotifyError as error:

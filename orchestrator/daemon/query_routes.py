@@ -1,4 +1,7 @@
-"""The part of the API that only looks: status, campaigns, questions, rigs, events, a run's report."""
+"""Read-only routes of the HTTP API: status, campaigns, questions, rigs, events, reports and metrics.
+
+Commands are in `command_routes`; previous runs are in `archive_routes`.
+"""
 
 from __future__ import annotations
 
@@ -26,17 +29,17 @@ from orchestrator.run_errors import RunError
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
 READERS = 400
-"""Readers of events at a time."""
+"""Largest number of concurrent event streams."""
 
 BEAT = 15.0
-"""After so long without an event a comment is sent, so that both ends notice a connection that is gone [s]."""
+"""Interval of comments on a silent event stream, so that both ends detect a lost connection [s]."""
 
 router = APIRouter()
 
 
 @router.get("/status", operation_id="status")
 async def status(request: Request, daemon: Daemon, person: Viewer) -> StatusOut:
-    """Everything at a glance."""
+    """Return the state of the daemon."""
     emergency = daemon.emergency
     return StatusOut.model_validate(
         {
@@ -60,21 +63,27 @@ async def status(request: Request, daemon: Daemon, person: Viewer) -> StatusOut:
 
 @router.get("/rigs", operation_id="rigs")
 async def rigs(daemon: Daemon, person: Viewer) -> list[RigOut]:
-    """Laboratories, and which campaign has each of them."""
+    """List the laboratories, with the campaign that leases each."""
     return rigs_out(daemon)
 
 
 def rigs_out(daemon: Supervisor) -> list[RigOut]:
-    """Rigs as they go out."""
+    """Convert the rigs to their response models."""
     found = []
-    for name, lane in daemon.lanes.items():
-        running = lane.running
+    for name, worker in daemon.lanes.items():
+        running = worker.running
         checkpoint = running.watching.checkpoint if running is not None and running.watching is not None else ""
         campaign = None if running is None else running.item.id
         stop = daemon.emergencies.get(name)
         found.append(
             RigOut.model_validate(
-                {"name": name, "mode": lane.rig.mode, "campaign": campaign, "checkpoint": checkpoint, "emergency": stop}
+                {
+                    "name": name,
+                    "mode": worker.rig.mode,
+                    "campaign": campaign,
+                    "checkpoint": checkpoint,
+                    "emergency": stop,
+                }
             )
         )
     return found
@@ -85,16 +94,16 @@ async def campaigns(
     request: Request,
     daemon: Daemon,
     person: Viewer,
-    state: Annotated[list[str] | None, Query(max_length=20, description="Only those in one of these states.")] = None,
+    state: Annotated[list[str] | None, Query(max_length=20, description="Only campaigns in these states.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 200,
 ) -> list[CampaignOut]:
-    """Campaigns: those that run, the queue in its order, then the others, the newest first."""
+    """List campaigns: running ones, then the queue in its order, then the others, newest first."""
     return [campaign_out(request, daemon, item) for item in daemon.store.items(state or (), limit)]
 
 
 @router.get("/campaigns/{key}", operation_id="campaign")
 async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -> CampaignDetailOut:
-    """One campaign, with its pours and what came of it."""
+    """Return one campaign with its pours and its summary."""
     item = found_item(daemon, key)
     summary: dict[str, Any] | None = None
     pours: list[dict[str, Any]] = []
@@ -109,10 +118,10 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
 
         try:
             pours, summary = await asyncio.to_thread(read)
-        except (ConfigError, RunError, KeyError):  # a rig that the settings don't name any more, say
+        except (ConfigError, RunError, KeyError):  # for example, a rig that the settings no longer contain
             summary = await asyncio.to_thread(summary_of, directory)
     table = campaign_out(request, daemon, item).model_dump()
-    if daemon.progress(item) is None:  # a run whose process was killed: its journal ends in the middle of the pour
+    if daemon.progress(item) is None:  # the process was killed, so the journal ends in the middle of the pour
         for pour in pours:
             pour["state"] = "unknown" if pour["state"] == "under way" else pour["state"]
     deeds = daemon.store.deeds(item.id)
@@ -123,10 +132,10 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
     "/campaigns/{key}/report",
     operation_id="report",
     response_class=FileResponse,
-    responses={200: {"content": {"text/html": {}}, "description": "A page that needs nothing else."}},
+    responses={200: {"content": {"text/html": {}}, "description": "A self-contained HTML page."}},
 )
 async def report(daemon: Daemon, person: Viewer, key: str) -> FileResponse:
-    """The report of a campaign's run."""
+    """Return the report of a campaign's run."""
     item = found_item(daemon, key)
     path = None if item.run is None else daemon.settings.runs / item.run / REPORT
     if path is None or not path.is_file():
@@ -138,10 +147,10 @@ async def report(daemon: Daemon, person: Viewer, key: str) -> FileResponse:
 async def questions(
     daemon: Daemon,
     person: Viewer,
-    answered: Annotated[bool, Query(description="All of them, the newest first.")] = False,
+    answered: Annotated[bool, Query(description="All questions, newest first.")] = False,
     limit: Annotated[int, Query(ge=1, le=1000)] = 200,
 ) -> list[QuestionOut]:
-    """What people are asked: open questions, the oldest first."""
+    """List questions to the operator: the open ones, oldest first."""
     found = daemon.store.questions(only_open=not answered, limit=limit)
     return [QuestionOut.model_validate(question_json(question)) for question in found]
 
@@ -158,12 +167,12 @@ async def questions(
 async def events(
     daemon: Daemon,
     person: Viewer,
-    campaign: Annotated[str | None, Query(max_length=80, description="Only what belongs to it.")] = None,
-    after: Annotated[int | None, Query(ge=0, description="The last event that was seen; 0 for all there are.")] = None,
-    last_event_id: Annotated[str | None, Header(description="The same, as browsers say it.")] = None,
-    until: Annotated[bool, Query(description="End with the newest event there is now.")] = False,
+    campaign: Annotated[str | None, Query(max_length=80, description="Only events of this campaign.")] = None,
+    after: Annotated[int | None, Query(ge=0, description="Id of the last event seen; 0 for all stored events.")] = None,
+    last_event_id: Annotated[str | None, Header(description="The same, as browsers send it.")] = None,
+    until: Annotated[bool, Query(description="End with the newest event at the time of the request.")] = False,
 ) -> Response:
-    """Everything that happens, as it happens; with a number to go on from."""
+    """Stream events as they happen; each has an id to continue from."""
     if daemon.feed.readers >= READERS:
         raise HTTPException(503, f"{READERS} readers are at it already")
     if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
@@ -197,12 +206,12 @@ async def events(
     responses={200: {"content": {"text/plain": {}}, "description": "Prometheus' text format."}},
 )
 async def metrics(daemon: Daemon, person: Viewer) -> Response:
-    """What Prometheus asks for."""
+    """Return the metrics in Prometheus' text format."""
     return Response(measures(daemon), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
 def found_item(daemon: Supervisor, key: str) -> QueueItem:
-    """A campaign by its id or the beginning of it. Raises HTTPException 404."""
+    """Return a campaign by its id or a prefix of it. Raises HTTPException 404."""
     try:
         return daemon.item(key)
     except KeyError:
@@ -210,7 +219,7 @@ def found_item(daemon: Supervisor, key: str) -> QueueItem:
 
 
 def campaign_out(request: Request, daemon: Supervisor, item: QueueItem) -> CampaignOut:
-    """A campaign as it goes out."""
+    """Convert a campaign to its response model."""
     table = asdict(item)
     waits = item.state not in ("finished", "stopped", "withdrawn") and daemon.progress(item) is None
     run: Path | None = None if item.run is None else daemon.settings.runs / item.run

@@ -1,7 +1,9 @@
-"""The people around a daemon: a question is written down before it is asked, an answer before it counts.
+"""Questions to the operators of a daemon. Each is stored before it is shown, each answer before it is used.
 
-Whoever is closest answers: on the page, with `decant answer`, from another machine. A question outlives neither its run
-nor the daemon; asked again after a crash, it says what had been answered.
+`Asking` stores a question and waits for its answer, from the page, from `decant answer` or from another machine. The
+first answer counts. `RemoteOperator` implements `Operator` for the steps at a bench; `RunQuestions` asks the questions
+of a run. A question does not outlive its run or the daemon. If it is repeated after a crash, it shows the previous
+answer.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from orchestrator.runs.unknown_pours import parse_answer
 GIVE_UP = "give up"
 
 LOAD = "load_g"
-"""Detail of a question about an unknown pour: the load that the campaign asks for [g]."""
+"""Detail of a question about an unknown pour: the campaign's load [g]."""
 
 _WORDS = {"done": {"done": "done", "d": "done"}, "yes or no": {"yes": "yes", "y": "yes", "no": "no", "n": "no"}}
 
@@ -31,15 +33,15 @@ _WANTED = {
 
 
 class AnswerError(ValueError):
-    """An answer that does not answer its question; the text says what would."""
+    """An answer does not fit its question; the message lists valid answers."""
 
 
 class Asking:
-    """Puts questions, and hands on the answers.
+    """Asks questions and passes the answers on.
 
     Args:
-        store: that they are written into.
-        tell: takes news: a word for what happened, and its data.
+        store: store of the questions.
+        tell: callback for events: the event's name, its data, and the campaign.
     """
 
     def __init__(self, store: Store, tell: Callable[[str, dict[str, Any], str], None]) -> None:
@@ -49,10 +51,10 @@ class Asking:
             store.close_question(left.id, "the daemon ended")
 
     async def ask(self, **values: Any) -> str:
-        """Put a question and await its answer, however long that takes.
+        """Ask a question and await its answer, without a time limit.
 
         Args:
-            values: fields of `store.Question`.
+            values: fields of `StoredQuestion`.
         """
         question = self._store.ask(**values)
         self._waiting[question.id] = asyncio.get_running_loop().create_future()
@@ -70,13 +72,13 @@ class Asking:
         """Answer a question.
 
         Args:
-            key: its id.
-            answer: as typed.
-            by: who answers.
+            key: id of the question.
+            answer: text as typed.
+            by: user who answers.
 
         Raises:
-            KeyError: there is no such question, or it needs no answer any more.
-            AnswerError: the answer doesn't fit it.
+            KeyError: the question does not exist or is closed.
+            AnswerError: the answer doesn't fit the question.
         """
         question = self._store.question(key)
         waiting = self._waiting.get(key)
@@ -92,10 +94,10 @@ class Asking:
 
 
 def understood(question: StoredQuestion, answer: str) -> str:
-    """What an answer means to its question.
+    """Normalise an answer to its question.
 
     Raises:
-        AnswerError: nothing.
+        AnswerError: the answer is not valid for the question.
     """
     said = " ".join(answer.split())
     if question.kind != "bench":
@@ -124,12 +126,12 @@ def understood(question: StoredQuestion, answer: str) -> str:
 
 
 class RemoteOperator:
-    """`Operator` at a rig of the daemon: whoever answers first.
+    """`Operator` at a rig of the daemon; the first user who answers acts as the operator.
 
     Args:
-        asking: puts the questions.
-        campaign, rig: that they are about.
-        announced: told what moves in how many seconds.
+        asking: asks the questions.
+        campaign, rig: subject of the questions.
+        announced: called with a warning before motion, and the time until it starts [s].
     """
 
     def __init__(self, asking: Asking, campaign: str, rig: str, announced: Callable[[str, float], None]) -> None:
@@ -139,7 +141,7 @@ class RemoteOperator:
         """See `Operator.ask`.
 
         Raises:
-            LaboratoryError: the pour is given up.
+            LaboratoryError: the operator gave the pour up.
         """
         answer = await self._asking.ask(
             campaign=self._campaign,
@@ -163,13 +165,13 @@ class RemoteOperator:
 
 
 class RunQuestions:
-    """Asks what a run has to know before it goes on: `AskOperator`.
+    """Asks the questions that a run needs answered before it continues; implements `AskOperator`.
 
     Args:
-        asking: puts the questions.
-        campaign, rig: that they are about.
-        load: of every pour of the campaign [kg].
-        look: says what arm and balance show now, for a pour whose outcome nobody knows; may take a while.
+        asking: asks the questions.
+        campaign, rig: subject of the questions.
+        load: load of every pour of the campaign [kg].
+        look: reads the arm and the balance for a pour with unknown outcome; may take seconds.
     """
 
     def __init__(
@@ -179,7 +181,7 @@ class RunQuestions:
         self._load, self._look = load, look
 
     async def __call__(self, text: str, options: Sequence[str]) -> str:
-        """Put a question with its options."""
+        """Ask a question with its options."""
         unknown = "lost" in options
         question, _, problem = text.partition("\n")
         details: dict[str, float | str] = {}
@@ -204,7 +206,7 @@ class RunQuestions:
 
 
 def question_json(question: StoredQuestion) -> dict[str, Any]:
-    """For screens."""
+    """Return the question as JSON-ready values."""
     from orchestrator.daemon.event_feed import plain
 
     table: dict[str, Any] = plain(question)

@@ -1,8 +1,11 @@
-"""Where Ray dies under the daemon, the daemon begins anew in place: its process executes its own command line again.
+"""Restart of the daemon in place after Ray has died: the process executes its own command line again.
 
-A program that has lost its Ray can't be given another one: calls to what is gone may hang for good. Everything that
-matters is on the disk, as for a daemon that is killed and started again. The process keeps its number, so that a
-service manager takes note of nothing, and the socket it listens at: who calls meanwhile waits for some seconds.
+A process that has lost its Ray can't connect to another one, since calls to the dead one may block forever. All state
+is on disk, as for a daemon that is killed and started again. The process id stays the same, so a service manager
+notices nothing. The listening socket is kept, so clients wait for some seconds instead of failing.
+
+`DaemonRestart` hands the socket over; `RayWatch` detects Ray's death in a thread of its own. Other crashes of the
+daemon are left to the service manager.
 """
 
 from __future__ import annotations
@@ -18,58 +21,58 @@ from collections.abc import Callable
 from typing import NoReturn, Protocol
 
 LISTENING, RENEWED = "DECANT_LISTENING", "DECANT_RENEWED"
-"""Environment variables from a program to the one that follows it: number of the socket; when this was done [s]."""
+"""Environment variables for the next program: file descriptor of the socket, and times of restarts [s]."""
 
 MOST, WITHIN = 5, 3600.0
-"""So many times within so long [s] it begins anew by itself: what kills Ray more often has to be mended by people."""
+"""Largest number of automatic restarts within a period [s]; more frequent failures need an operator."""
 
 LOOKING = 3.0
-"""Between two looks whether Ray lives [s]."""
+"""Interval at which Ray is checked [s]."""
 
 COMING_TO_REST = 20.0
-"""Longest time that campaigns and all else have to come to rest [s]; journals bear the program's end at any time."""
+"""Longest time for campaigns and services to stop [s]; journals are consistent if the program ends earlier."""
 
 POURING = 50.0
-"""The same while a pour is under way that may still be weighed: Ray ends programs 60 s after its directory has died."""
+"""The same while a pour may still be weighed: Ray ends its programs 60 s after its directory service has died."""
 
 REAPING = 10.0
-"""Longest time that is waited for the processes of the former program to end [s]."""
+"""Longest time to wait for the previous program's child processes to end [s]."""
 
 _log = logging.getLogger(__name__)
 
 
 class Losable(Protocol):
-    """What the watch needs of the daemon."""
+    """The part of the daemon that `RayWatch` uses."""
 
     @property
     def lost(self) -> str:
-        """Which of Ray's own processes has died; '' while all is well."""
+        """Name of the Ray process that has died; '' if all are running."""
         ...
 
     @property
     def pouring(self) -> bool:
-        """Whether a pour is under way somewhere."""
+        """Whether a pour is in progress."""
         ...
 
     def leave(self, lost: str) -> None:
-        """Come to rest, to begin anew."""
+        """Stop all work in order to restart."""
         ...
 
     def problem(self, key: str, text: str | None) -> None:
-        """Something that people should mend."""
+        """Report a problem that an operator should solve."""
         ...
 
 
 class DaemonRestart:
-    """What one program hands to the one that takes its place. Made before anything is started.
+    """Hands the listening socket to the next program. Create it before anything else is started.
 
     Attributes:
-        listening: the socket of the program before this one; None where this is the first.
+        listening: socket of the previous program; None at the first start.
     """
 
     def __init__(self) -> None:
         number, times = os.environ.pop(LISTENING, None), os.environ.pop(RENEWED, "")
-        self._environment = dict(os.environ)  # Ray changes it
+        self._environment = dict(os.environ)  # a copy, since Ray changes it
         now = time.time()
         self._times = [float(one) for one in times.split() if now - float(one) < WITHIN]
         self._kept: int | None = None
@@ -81,21 +84,24 @@ class DaemonRestart:
 
     @property
     def possible(self) -> bool:
-        """Whether it hasn't been done too often."""
+        """Whether the limit of restarts has not been reached."""
         return len(self._times) < MOST
 
     def keep(self, listening: socket.socket) -> None:
-        """The socket that the next program gets; it stays open when this one closes it."""
+        """Keep a duplicate of the socket for the next program; it stays open when this program closes its own."""
         self._kept = os.dup(listening.fileno())
 
     def drop(self) -> None:
-        """There will be no next program."""
+        """Close the kept socket; no program follows."""
         kept, self._kept = self._kept, None
         if kept is not None:
             os.close(kept)
 
     def begin_anew(self) -> NoReturn:
-        """Execute this process's command line again. Locks, pipes and files close: Ray's warden takes it for dead."""
+        """Execute this process's command line again.
+
+        Locks, pipes and files close, so Ray's cleanup process treats this program as ended.
+        """
         times = " ".join(str(one) for one in (*self._times, time.time()))
         environment = {**self._environment, RENEWED: times}
         if self._kept is not None:
@@ -106,7 +112,7 @@ class DaemonRestart:
 
 
 def _reap() -> None:
-    """Wait for the children of the program that was here before: nobody else will, and none of ours has started yet."""
+    """Wait for the previous program's children to end. No other child has been started yet."""
     end = time.monotonic() + REAPING
     try:
         while time.monotonic() < end:
@@ -117,14 +123,14 @@ def _reap() -> None:
 
 
 class RayWatch:
-    """Looks whether Ray lives, from a thread: the event loop itself may hang in a call to what has died.
+    """Checks in a thread whether Ray is alive; the event loop may block in a call to a dead Ray.
+
+    Create it in the daemon's event loop, and call `close` if the daemon ends normally.
 
     Args:
-        daemon: that is told.
-        renewal: how it begins anew.
-        ending: whether people have told it to end.
-
-    Use: made in the daemon's event loop, `close`d where the daemon ends in order.
+        daemon: daemon to notify.
+        renewal: restarts the process.
+        ending: returns whether a user has requested the daemon's end.
     """
 
     def __init__(self, daemon: Losable, renewal: DaemonRestart, ending: Callable[[], bool]) -> None:
@@ -134,7 +140,7 @@ class RayWatch:
         threading.Thread(target=self._watch, name="watch over Ray", daemon=True).start()
 
     def close(self) -> None:
-        """Look no more."""
+        """End the checks."""
         self._closed.set()
 
     def _watch(self) -> None:

@@ -1,8 +1,9 @@
-"""What runs have left on the disk, read for the API. Takes a moment, and no event loop.
+"""Reads run folders and benches for the API; every function may take seconds and must not run in an event loop.
 
-What arm and balance show after a crash: read, never moved or tared, for the person who says what came of a pour.
-
-Which recordings are kept: journals, figures and summaries always are.
+- `Pours` and `summary_of` read the pours and the summary of a run.
+- `found_at` reads the arm and the balance after a crash, for the operator who decides the outcome of a pour. Nothing is
+  moved or tared.
+- `prune_recordings` deletes old recordings; journals, figures and summaries are always kept.
 """
 
 from __future__ import annotations
@@ -35,10 +36,12 @@ __all__ = ["REPORT", "Pours", "summary_of"]
 
 
 class Pours:
-    """Pours of runs. Each journal is read on from where it was left: people look again at every event.
+    """Pours of runs. Each journal is read from its last position, since pages query again at every event.
+
+    May be called from several threads.
 
     Args:
-        keep: runs that are remembered, the latest that were looked at. May be asked from several threads.
+        keep: number of runs to cache, the most recently queried ones.
     """
 
     def __init__(self, keep: int = 16) -> None:
@@ -47,18 +50,18 @@ class Pours:
         self._guard = Lock()
 
     def of(self, directory: Path, plan: Callable[[], CampaignPlan]) -> list[dict[str, Any]]:
-        """The pours of a run that were asked for, in order: what was predicted, and what was weighed.
+        """Return the requested pours of a run in order, with predictions and measurements.
 
         Args:
-            directory: of the run.
-            plan: makes its campaign's plan, once. What it raises is passed on.
+            directory: folder of the run.
+            plan: makes the campaign's plan; called once. Its errors are passed on.
         """
         with self._guard:
             read = self._read.pop(directory, None) or _Read(plan())
             try:
                 read.on(directory)
             except (JournalError, CodecError, OSError):
-                return read.rows()  # a run that is just being made, or another version's: begun anew next time
+                return read.rows()  # being created, or of another version: read from its start at the next call
             self._read[directory] = read
             if len(self._read) > self._keep:
                 self._read.popitem(last=False)
@@ -66,7 +69,7 @@ class Pours:
 
 
 class _Read:
-    """What was read of one run."""
+    """The state read from one run's journal."""
 
     def __init__(self, plan: CampaignPlan) -> None:
         self._plan, self._last = plan, 0
@@ -95,7 +98,7 @@ class _Read:
             if entry.body["request"]["type"] == Pour.__name__:
                 request = decode_request(entry.body["request"])
                 assert isinstance(request, Pour)
-                self._requests[key], self._pours[key] = request, _asked(self._plan, entry.stage, request)
+                self._requests[key], self._pours[key] = request, _requested(self._plan, entry.stage, request)
         elif entry.kind == Kind.POUR_FINISHED:
             outcome = decode_outcome(entry.body["outcome"])
             self._pours[key] |= {"time": entry.t, **_outcome(self._plan, self._requests[key], outcome)}
@@ -104,7 +107,7 @@ class _Read:
             self._pours[key] |= {"state": "under way" if begun else "asked", "time": entry.t}
 
 
-def _asked(plan: CampaignPlan, stage: str, pour: Pour) -> dict[str, Any]:
+def _requested(plan: CampaignPlan, stage: str, pour: Pour) -> dict[str, Any]:
     section = plan.calibration if is_calibration(plan, pour) else plan.deployment
     names = section.actions.names if section is not None else ("angular_velocity", "x_offset")
     predicted = "" if pour.predicted is None else unit_of_pour(plan, pour).prediction(pour.predicted)
@@ -132,7 +135,7 @@ def _outcome(plan: CampaignPlan, pour: Pour, outcome: object) -> dict[str, Any]:
 
 
 def summary_of(directory: Path) -> dict[str, Any] | None:
-    """A run's `summary.json`; None before it is published."""
+    """Return a run's `summary.json`, or None before it is published."""
     try:
         found: dict[str, Any] = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -141,13 +144,13 @@ def summary_of(directory: Path) -> dict[str, Any] | None:
 
 
 def found_at(spec: LaboratorySpec) -> dict[str, str]:
-    """What is found at a bench, in words. Takes seconds.
+    """Describe the state of a bench for the operator. Takes seconds.
 
     Args:
-        spec: of the laboratory.
+        spec: settings of the laboratory.
 
     Returns:
-        By what was looked at; what could not be read says so.
+        Findings by device; a device that can't be read has an entry with the reason.
     """
     if spec.arm is None:
         return {"bench": "made of numbers: it has no arm and no balance that could be read"}
@@ -166,15 +169,15 @@ def found_at(spec: LaboratorySpec) -> dict[str, str]:
 
 
 def prune_recordings(settings: DaemonSettings, busy: Collection[str] = (), now: float | None = None) -> list[Path]:
-    """Remove recordings that are too many or too old.
+    """Delete recordings that exceed the configured number or age.
 
     Args:
-        settings: say which.
-        busy: names of runs that are being written.
-        now: seconds since 1970.
+        settings: limits and folder.
+        busy: names of runs in progress.
+        now: time in seconds since 1970.
 
     Returns:
-        What was removed.
+        The deleted files.
     """
     if settings.keep_recordings is None and settings.recording_age is None:
         return []

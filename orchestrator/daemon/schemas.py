@@ -1,4 +1,7 @@
-"""What goes over the wire, in both directions. Times are seconds since 1970."""
+"""Request and response models of the HTTP API. Times are in seconds since 1970.
+
+Classes whose names end in `In` are request bodies; the others are responses. The models contain no logic.
+"""
 
 from __future__ import annotations
 
@@ -16,23 +19,23 @@ class _Out(BaseModel):
 
 
 class SubmissionIn(_In):
-    """A campaign: `text` with its `files`, or the `path` of one on the daemon's machine."""
+    """A campaign: `text` with its `files`, or the `path` of a file on the daemon's machine."""
 
     text: str = Field(default="", max_length=500_000)
-    """The campaign as YAML. Paths in it are those of `files`."""
+    """The campaign as YAML. Its paths refer to `files`."""
 
     files: dict[str, str] = Field(default_factory=dict)
-    """Files that it refers to: relative path → content in base64."""
+    """Files that the campaign refers to: relative path → content in base64."""
 
     path: str = Field(default="", max_length=1000)
-    """In place of both: a file in one of the folders that the daemon's settings name as roots."""
+    """Instead of `text` and `files`: a file in one of the folders that the daemon's settings list as roots."""
 
     verb: Literal["run", "calibrate", "plan"] = "run"
     rig: str = Field(default="", max_length=60)
-    """Where it is to run; '' for the rig that fits."""
+    """Rig to run on; '' selects the matching one."""
 
     priority: int = Field(default=0, ge=-1000, le=1000)
-    """Higher ones come first."""
+    """Higher priorities run first."""
 
 
 class AnswerIn(_In):
@@ -43,23 +46,23 @@ class AnswerIn(_In):
 
 
 class MoveIn(_In):
-    """Another place in the queue."""
+    """A new place in the queue."""
 
     before: str | None = Field(default=None, max_length=80)
-    """In front of that campaign; '' for the head of the queue."""
+    """Id of the campaign to move in front of; '' for the head of the queue."""
 
     priority: int | None = Field(default=None, ge=-1000, le=1000)
 
 
 class ArmIn(_In):
-    """Hardware may move in the coming part of a run."""
+    """Enables motion in the coming part of a run."""
 
     laboratory: str = Field(max_length=80)
-    """Its name, typed by somebody who has read what will move."""
+    """Name of the laboratory, typed by an operator who has read what will move."""
 
 
 class EmergencyIn(_In):
-    """An emergency stop: of one rig, or of all of them."""
+    """An emergency stop of one rig or of all rigs."""
 
     reason: str = Field(default="", max_length=500)
     rig: str = Field(default="", max_length=60)
@@ -67,28 +70,28 @@ class EmergencyIn(_In):
 
 
 class ClearIn(_In):
-    """Which emergency stop is cleared."""
+    """Selects the emergency stop to clear."""
 
     rig: str = Field(default="", max_length=60)
-    """The one of this rig; '' for the one of all rigs. Each is cleared by itself."""
+    """Rig whose emergency stop is cleared; '' for the stop of all rigs. Each is cleared separately."""
 
 
 class ProblemOut(_Out):
-    """What is wrong, where, and what would be right."""
+    """An error: the problem, its place and a remedy."""
 
     detail: str | list[dict[str, Any]]
-    """In words; a list where fields of the request are not what they should be."""
+    """Text of the error; a list if fields of the request are invalid."""
 
 
 class HealthOut(_Out):
-    """Whether all is well."""
+    """Health of the daemon."""
 
     ok: bool
     problems: list[str] = []
 
 
 class ProgressOut(_Out):
-    """Where a running campaign stands."""
+    """Progress of a running campaign."""
 
     stage: str
     stage_index: int
@@ -114,15 +117,16 @@ class CampaignOut(_Out):
     verb: str
     rig: str
     mode: str
-    """'virtual', 'hardware', or 'none' where nothing is poured."""
+    """'virtual', 'hardware', or 'none' if nothing is poured."""
 
     priority: int
     state: str
-    """queued, preparing, running, pausing, paused, waiting for operator, stopping, finished, failed, unknown, stopped,
-    withdrawn."""
+    """One of: queued, preparing, running, pausing, paused, waiting for operator, stopping, finished, failed, unknown,
+    stopped, withdrawn.
+    """
 
     wish: str
-    """What people want of it: run, pause, stop, abort."""
+    """Desired state: run, pause, stop, abort."""
 
     reason: str
     by: str
@@ -134,75 +138,75 @@ class CampaignOut(_Out):
 
     armed: bool
     needs_arming: bool
-    """Hardware that nobody has armed yet: it waits for `decant arm`."""
+    """The campaign uses hardware and waits for `decant arm` to enable motion."""
 
     progress: ProgressOut | None
-    """While it runs."""
+    """Progress while the campaign runs."""
 
     report: bool
-    """Whether there is a report at `campaigns/ID/report`."""
+    """Whether a report exists at `campaigns/ID/report`."""
 
     live: str | None
-    """Where it can be watched live."""
+    """URL of the live view."""
 
 
 class PourOut(_Out):
-    """A pour that was asked for."""
+    """A requested pour."""
 
     stage: str
     number: int
     receiver: str
     action: str
-    """In the units that people use."""
+    """Values of the action with their units."""
 
     predicted: str
     measured: str
-    """'' while nobody knows."""
+    """'' until the pour is weighed."""
 
     loss: str
-    """What `predicted` and `measured` are, such as 'spilled / poured': each loss has its own denominator."""
+    """Meaning of `predicted` and `measured`, such as 'spilled / poured': each loss has its own denominator."""
 
     spillage: float | None
-    """Share of the load that fell outside: spilled / loaded."""
+    """Fraction of the load that was spilled: spilled / loaded."""
 
     state: Literal["asked", "under way", "weighed", "failed", "unknown"]
-    """'unknown': it had begun when its run ended, and has no outcome; resuming the run asks about it."""
+    """'unknown': the run ended during the pour, so it has no outcome; the operator enters it at the next resume."""
 
     time: float | None
 
 
 class CampaignDetailOut(CampaignOut):
-    """A submitted campaign with what came of it so far."""
+    """A submitted campaign with its results so far."""
 
     pours_made: list[PourOut]
     summary: dict[str, Any] | None
-    """`summary.json` of its run, once it is published."""
+    """`summary.json` of its run, after publication."""
 
     deeds: list[dict[str, Any]]
-    """Who did what to it, the newest first."""
+    """Audit entries of the campaign, newest first."""
 
 
 class QuestionOut(_Out):
-    """Something that a person is asked."""
+    """A question to the operator."""
 
     id: int
     campaign: str
     rig: str
     kind: str
-    """'bench': a step at the arm; 'unknown': a pour without outcome; 'strategy': a decision."""
+    """'bench': a step at the arm; 'unknown': a pour with unknown outcome; 'strategy': a decision."""
 
     about: str
     text: str
     problem: str
-    """Why it is asked again; '' the first time."""
+    """Why the question is repeated; '' the first time."""
 
     wants: str
-    """'done', 'weight', 'yes or no', or 'option'."""
+    """Kind of answer: 'done', 'weight', 'yes or no', or 'option'."""
 
     options: list[str]
     details: dict[str, Any]
     hands: bool
-    """Whether it invites hands into the cell."""
+    """Whether the step requires hands in the cell."""
 
     asked: float
     answer: str | None
@@ -213,7 +217,7 @@ class QuestionOut(_Out):
 
 
 class EmergencyOut(_Out):
-    """Who pressed an emergency stop, and when."""
+    """Author, time and reason of an emergency stop."""
 
     by: str
     time: float
@@ -221,39 +225,39 @@ class EmergencyOut(_Out):
 
 
 class RigOut(_Out):
-    """A laboratory that campaigns lease, one at a time."""
+    """A laboratory that one campaign at a time leases."""
 
     name: str
     mode: str
     campaign: str | None
-    """That has it now."""
+    """Campaign that leases the rig now."""
 
     checkpoint: str
-    """Where the pour that is under way stands."""
+    """Checkpoint of the pour in progress."""
 
     emergency: EmergencyOut | None
-    """The emergency stop of this rig alone; that of all rigs is in the status."""
+    """Emergency stop of this rig alone; the stop of all rigs is part of the status."""
 
 
 class WhatMovesOut(_Out):
-    """What hardware would do in a campaign."""
+    """The motion of a campaign on hardware."""
 
     laboratory: str
-    """The name to be typed."""
+    """Name to be typed to enable motion."""
 
     arm: str
     lines: list[str]
 
 
 class StatusOut(_Out):
-    """Everything at a glance."""
+    """State of the daemon."""
 
     version: str
     time: float
     began: float
     stopping: bool
     ready: bool
-    """Simulators are up, and nothing is wrong."""
+    """Simulators are running and no problem is open."""
 
     problems: list[str]
     queue_paused: bool
@@ -263,10 +267,10 @@ class StatusOut(_Out):
     simulators: int
     rigs: list[RigOut]
     campaigns: dict[str, int]
-    """How many in each state."""
+    """Number of campaigns in each state."""
 
     questions: int
-    """Open ones."""
+    """Number of open questions."""
 
     last_event: int
     live: str | None

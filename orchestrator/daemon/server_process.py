@@ -1,4 +1,8 @@
-"""`decant serve`: one process that listens, runs campaigns, and ends in order when it is told to."""
+"""The process of `decant serve`: it listens, runs the daemon, and shuts down at a safe point after a signal.
+
+`serve` is the entry point; `log_lines` configures structured logs. Routes are in `http_api`, scheduling in
+`supervisor`, and the restart after a failure of Ray in `restart`.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 
 class ServeError(RunError):
-    """The daemon can't listen; the text says why."""
+    """The daemon can't listen; the message gives the reason."""
 
     exit_code = 2
 
@@ -39,41 +43,41 @@ class ServeError(RunError):
 class _Server(uvicorn.Server):
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Signals are the daemon's: a pour has to be finished before anything closes."""
+        """Ignore signals here: the daemon handles them, since a pour must be finished before anything closes."""
         yield
 
 
 def serve(settings: DaemonSettings, ready: Callable[[str], None] = lambda url: None) -> None:
-    """Serve until told to end.
+    """Run the daemon until a signal or a client ends it.
 
     Args:
-        settings: in force.
-        ready: told the address once it is served.
+        settings: settings in force.
+        ready: called with the URL once it is served.
 
     Raises:
-        RunError: it can't begin: the state directory is another's, the tokens are open to others, the port is taken.
+        RunError: the state directory is in use, the tokens are readable by others, or the port is taken.
     """
     os.umask(0o077)
     use_state_directory(settings.state)
     asyncio.run(_serve(settings, ready, DaemonRestart()))
 
 
-async def _serve(settings: DaemonSettings, ready: Callable[[str], None], renewal: DaemonRestart) -> None:
+async def _serve(settings: DaemonSettings, ready: Callable[[str], None], restart: DaemonRestart) -> None:
     make_state_directory(settings.state)
     tokens = Tokens(settings.tokens)
     with contextlib.ExitStack() as opened:
-        listening = opened.enter_context(renewal.listening or _listen(settings))
-        renewal.keep(listening)
+        listening = opened.enter_context(restart.listening or _listen(settings))
+        restart.keep(listening)
         notifier = _notifier(settings)
         if notifier is not None:
             opened.callback(notifier.close)
         live = None if settings.live is None else LiveView(address=settings.live[0], web_port=settings.live[1])
         if live is not None:
             opened.enter_context(live)
-        again = await _serve_with(settings, tokens, listening, ready, live, notifier, renewal)
-    if again:  # from inside of the loop: its end would wait for threads that hang in calls to a dead Ray
+        again = await _serve_with(settings, tokens, listening, ready, live, notifier, restart)
+    if again:  # after the event loop's end would be too late: it waits for threads that hang in calls to a dead Ray
         _log.warning("begins anew")
-        renewal.begin_anew()
+        restart.begin_anew()
     _log.info("ended")
 
 
@@ -99,9 +103,9 @@ async def _serve_with(
     ready: Callable[[str], None],
     live: LiveView | None,
     notifier: Notifier | None,
-    renewal: DaemonRestart,
+    restart: DaemonRestart,
 ) -> bool:
-    """Serve until told to end, or until Ray has died: then everything has come to rest, and True is returned."""
+    """Serve until the end is requested or Ray dies; return True in the latter case, after all work has stopped."""
     daemon = Supervisor(settings, live)
     ending = _Ending(daemon)
     app = serve_app(daemon, tokens, ending, None if live is None else lambda campaign: live.url)
@@ -122,11 +126,11 @@ async def _serve_with(
     for number in ENDING:
         loop.add_signal_handler(number, ending)
     serving = asyncio.create_task(server.serve([listening]))
-    telling = None if notifier is None else asyncio.create_task(pass_on(daemon.feed.read(), notifier))
+    notifying = None if notifier is None else asyncio.create_task(pass_on(daemon.feed.read(), notifier))
     daemon.words = {} if notifier is None else notifier.counts
     url = _url(settings, listening)
     settings.address.write_text(url + "\n", encoding="utf-8")
-    watch = RayWatch(daemon, renewal, ending.asked.is_set)
+    watch = RayWatch(daemon, restart, ending.asked.is_set)
     try:
         await daemon.start()
         _log.info("serving %s", url, extra={"url": url, "state": str(settings.state)})
@@ -136,13 +140,13 @@ async def _serve_with(
         if not daemon.left.is_set():
             _log.info("ending: what has begun comes to rest at the next safe point; once more to give it up")
         await daemon.close()
-        if telling is not None:
-            await telling
+        if notifying is not None:
+            await notifying
     finally:
         again = daemon.left.is_set() and not ending.asked.is_set()
         if not again:
             watch.close()
-            renewal.drop()
+            restart.drop()
             settings.address.unlink(missing_ok=True)
         server.should_exit = True
         await serving
@@ -152,7 +156,7 @@ async def _serve_with(
 
 
 class _Ending:
-    """Called once: end at the next safe point. Called again: give everything up."""
+    """Shuts the daemon down: the first call at the next safe point, the second one at once."""
 
     def __init__(self, daemon: Supervisor) -> None:
         self._daemon = daemon
@@ -187,7 +191,7 @@ def _url(settings: DaemonSettings, listening: socket.socket) -> str:
 
 
 def log_lines(stream: Any = None) -> None:
-    """Structured log lines from now on: one JSON object a line, on stdout, as a service manager collects them."""
+    """Configure structured logs: one JSON object per line on stdout, as service managers collect them."""
     handler = logging.StreamHandler(stream or sys.stdout)
     form = JsonFormatter(
         "{asctime}{levelname}{name}{message}",

@@ -1,6 +1,7 @@
-"""A campaign with everything that it refers to, in one piece: what is submitted, and what a queued campaign is kept as.
+"""Submission bundles: a campaign with all files that it refers to, as one self-contained unit.
 
-Later changes of the files that it was made from change nothing about it.
+`pack` makes a bundle from a loaded campaign; `unpack` writes it to a folder; `load_confined` loads a campaign that may
+read only given folders. Later changes of the original files do not affect a bundle.
 """
 
 from __future__ import annotations
@@ -21,32 +22,32 @@ from orchestrator.journal.journal_file import whole_copy
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
 CAMPAIGN, THETA = "campaign.yaml", "theta.yaml"
-"""The campaign's file, and the file of the θ that it is planned with (`orchestrator.runs.run_tasks.read_theta`)."""
+"""Names of the campaign's file, and of the file with the θ for planning (`orchestrator.runs.run_tasks.read_theta`)."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}(/[A-Za-z0-9][A-Za-z0-9._-]{0,79}){0,3}")
 _FILES = 100
 
 Files = dict[str, str]
-"""Name → content in base64. Names are relative paths of plain words."""
+"""Name → content in base64. Names are relative paths of letters, digits, '.', '_' and '-'."""
 
 
 class SubmissionBundleError(ValueError):
-    """What was submitted can't be unpacked; the text says why."""
+    """The bundle can't be unpacked; the message gives the reason."""
 
 
 def pack(plan: CampaignPlan, theta: Path | None = None) -> tuple[str, Files]:
-    """A campaign that was loaded, as text and files.
+    """Convert a loaded campaign to text and files.
 
     Args:
-        plan: as loaded from its files.
-        theta: file of the θ to plan it with, such as the `theta.json` of a calibration; None: the campaign's θ.
+        plan: campaign as loaded from its files.
+        theta: file with the θ for planning, such as a calibration's `theta.json`; None: the campaign's θ.
 
     Returns:
-        The campaign's text (JSON, which is YAML), in which paths are those of the files.
+        The campaign's text (JSON, which is YAML) with paths of the returned files, and these files.
 
     Raises:
         OSError: a file can't be read.
-        ConfigError: a file lies where this campaign may not look.
+        ConfigError: a file is outside the folders that this campaign may read.
     """
     files: Files = {}
     resolved = dict(plan.resolved)
@@ -62,7 +63,7 @@ def _packed(value: Any, files: Files) -> Any:
         return {key: _packed(one, files) for key, one in value.items()}
     if isinstance(value, list):
         return [_packed(one, files) for one in value]
-    if isinstance(value, str) and value.startswith("/"):  # a record has absolute paths, and nothing else like them
+    if isinstance(value, str) and value.startswith("/"):  # only absolute paths begin with '/' in a record
         return _taken(Path(value), files)
     return value
 
@@ -72,7 +73,7 @@ def _taken(path: Path, files: Files) -> str:
         raise ConfigError([Problem(path, 0, 0, "", outside)])
     stem = re.sub(r"[^A-Za-z0-9._-]", "_", path.name).lstrip("._-")[-60:] or "file"
     name = f"files/{len(files) + 1}-{stem}"
-    if (path / JOURNAL_NAME).is_file():  # a former run: its journal is all that is read of it
+    if (path / JOURNAL_NAME).is_file():  # a previous run: only its journal is read
         files[f"{name}/{JOURNAL_NAME}"] = _coded(whole_copy(path / JOURNAL_NAME))
     elif path.is_file():
         files[name] = _coded(path.read_bytes())
@@ -86,18 +87,18 @@ def _coded(content: bytes) -> str:
 
 
 def unpack(text: str, files: Mapping[str, str], folder: Path) -> Path:
-    """Write what was submitted into a folder of its own.
+    """Write a bundle to a new folder.
 
     Args:
-        text: of the campaign.
-        files: that it refers to.
-        folder: is made; must not be there.
+        text: text of the campaign.
+        files: files that it refers to.
+        folder: is created; must not exist.
 
     Returns:
-        The campaign's file.
+        Path of the campaign's file.
 
     Raises:
-        PackingError: a name leads elsewhere, or a file is not in base64.
+        SubmissionBundleError: a name is not allowed, or a file is not in base64.
     """
     if len(files) > _FILES:
         raise SubmissionBundleError(f"{len(files)} files; a campaign refers to some, and {_FILES} are taken at most")
@@ -126,15 +127,15 @@ def unpack(text: str, files: Mapping[str, str], folder: Path) -> Path:
 
 
 def load_confined(campaign: Path, roots: Sequence[Path], laboratory: Path | None = None) -> CampaignPlan:
-    """Load a campaign that may look nowhere else.
+    """Load a campaign that may read only given folders.
 
     Args:
         campaign: its file.
-        roots: where it may look.
-        laboratory: in place of its own.
+        roots: folders that it may read.
+        laboratory: laboratory file instead of its own.
 
     Raises:
-        ConfigError: anything is wrong with it, or it refers to something else.
+        ConfigError: the campaign is invalid, or it refers to a file elsewhere.
     """
     with confined([*roots, *([] if laboratory is None else [laboratory])]):
         return load_campaign(campaign, laboratory)

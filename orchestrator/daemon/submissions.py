@@ -1,4 +1,8 @@
-"""From what somebody submits to a queued campaign: unpacked, confined, checked as `decant run` does, and frozen."""
+"""Converts a submission to a queued campaign: unpacked, confined, checked as by `decant run`, and stored.
+
+`prepare` does all steps and selects the rig; it does not start anything. The format of a bundle is defined in
+`submission_bundle`.
+"""
 
 from __future__ import annotations
 
@@ -20,17 +24,17 @@ from orchestrator.runs.run_tasks import RunTask, RunTaskError, check_job
 
 
 class SubmissionError(RunError):
-    """What was submitted can't be queued; the text says what is wrong and what would be right."""
+    """The submission can't be queued; the message gives the problem and a remedy."""
 
     exit_code = 2
 
 
 @dataclass(frozen=True)
 class Submission:
-    """What somebody submits: a campaign's text with its files, or the path of one that lies on the daemon's machine.
+    """A submission: a campaign's text with its files, or the path of a file on the daemon's machine.
 
     Attributes:
-        rig: that it is for; '' for the one that fits.
+        rig: name of the rig; '' selects the matching one.
     """
 
     text: str = ""
@@ -42,16 +46,16 @@ class Submission:
 
 
 def prepare(settings: DaemonSettings, submission: Submission, key: str, by: str) -> QueueItem:
-    """Unpack and check a submission. Takes seconds, and no event loop.
+    """Unpack and check a submission. Takes seconds; don't call it in an event loop.
 
     Args:
-        settings: of the daemon.
-        submission: what was sent.
-        key: letters that its id ends with.
-        by: who submits it.
+        settings: settings of the daemon.
+        submission: the submission.
+        key: letters at the end of the campaign's id.
+        by: user who submits it.
 
     Raises:
-        SubmissionError: it can't be used; nothing is left of it.
+        SubmissionError: the submission can't be used; its files are removed.
     """
     folder = settings.snapshots / key
     try:
@@ -65,18 +69,18 @@ def prepare(settings: DaemonSettings, submission: Submission, key: str, by: str)
 
 
 _PATH = re.compile(r"(?<![\w./~])/(?:[^\s/'\":;,()\[\]]+/)+([^\s/'\":;,()\[\]]+)")
-"""An absolute path of two parts or more; the group is its last part."""
+"""An absolute path with two or more parts; the group is its last part."""
 
 
 def _without_places(text: str, settings: DaemonSettings, folder: Path) -> str:
-    """A message without the paths of this machine: who submits from elsewhere may not learn where things are.
+    """Remove this machine's paths from a message, since remote users must not learn its directory structure.
 
-    Files of the campaign are named as the campaign names them, others by their last part.
+    The campaign's files keep the names that the campaign uses; other paths are reduced to their last part.
     """
     named = {folder, folder.resolve(), *settings.roots}
     for place in sorted(map(str, named), key=len, reverse=True):
         text = text.replace(f"{place}/", "").replace(place, "the campaign")
-    for state in {settings.state, settings.state.resolve()}:  # may hold spaces, which _PATH takes for an end
+    for state in {settings.state, settings.state.resolve()}:  # may contain spaces, which end a match of _PATH
         text = text.replace(f"{state}/", "/-/")
     return _PATH.sub(r"\1", text)
 
@@ -114,7 +118,7 @@ def _prepared(settings: DaemonSettings, submission: Submission, key: str, by: st
 
 
 def _from_path(settings: DaemonSettings, text: str) -> tuple[str, Files]:
-    """A campaign on this machine, from one of the folders that may be read."""
+    """Pack a campaign on this machine from one of the allowed folders."""
     if not settings.roots:
         raise SubmissionError("no campaign may be submitted by its path: the daemon's settings name no 'roots'")
     from orchestrator.config.yaml.file_access import confined
@@ -132,7 +136,7 @@ def _inside(path: Path, settings: DaemonSettings) -> bool:
 
 
 def _rig(settings: DaemonSettings, wanted: str, work: RunTask) -> Rig:
-    """The rig that was asked for, or the one that fits."""
+    """Return the requested rig, or the one that matches the campaign's laboratory."""
     names = [rig.name for rig in settings.rigs]
     spec = work.plan.laboratory
     if wanted:

@@ -1,7 +1,8 @@
-"""The queue and the rigs: which campaign runs where and when, and the four ways to stop.
+"""The supervisor of the daemon: queue, rigs, and the four ways to stop a campaign.
 
-One lane a rig, and one for campaigns that need none: two never hold the same rig, and what one does keeps no other
-waiting. The simulators are shared by all.
+`Supervisor` has one rig worker (`rig_worker`) per rig and one for campaigns without a rig. Two campaigns never lease
+the same rig, and rigs do not wait for each other. All campaigns share the simulators. HTTP, access control and the
+restart of the process are in other modules.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from orchestrator.live_view.live_server import LiveView
 from orchestrator.run_errors import RunError
 
 LEAVING = 10.0
-"""Time that campaigns have to come to rest where Ray has died [s]; then those that don't pour are given up."""
+"""Time for campaigns to stop after Ray has died [s]; then campaigns that don't pour are given up."""
 
 PAUSED, EMERGENCY = "paused", "emergency"
 
@@ -37,20 +38,20 @@ _log = logging.getLogger(__name__)
 
 
 def _emergency_of(rig: str) -> str:
-    """The flag of the emergency stop of one rig."""
+    """Name of the flag for the emergency stop of one rig."""
     return f"{EMERGENCY} {rig}"
 
 
 class RequestRefusedError(RunError):
-    """What was asked for can't be done now; the text says why."""
+    """The request can't be fulfilled now; the message gives the reason."""
 
 
 class Supervisor:
-    """Runs what was submitted.
+    """Runs submitted campaigns.
 
     Args:
-        settings: in force.
-        live: view that runs are shown in, open already.
+        settings: settings in force.
+        live: open live view for the runs.
     """
 
     def __init__(self, settings: DaemonSettings, live: LiveView | None = None) -> None:
@@ -69,27 +70,29 @@ class Supervisor:
         self.pours = Pours()
         self.stopping = False
         self.suspect = False
-        """Whether the simulators may be past mending: they are started anew when nobody uses them."""
+        """Whether the simulators may have failed for good: they are restarted when no campaign uses them."""
         self.left = asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []
         self.began = time.time()
 
     async def start(self) -> None:
-        """Take up what was left, and begin."""
-        await asyncio.to_thread(self._forget_half_submitted, {item.id for item in self.store.items(limit=1_000_000)})
+        """Recover the stored state and start all tasks."""
+        await asyncio.to_thread(self._remove_unacknowledged, {item.id for item in self.store.items(limit=1_000_000)})
         for item in self.store.items():
             if item.state not in AT_REST:
                 found = f"found {item.state} after the daemon had ended without a word"
                 self.store.change(item.id, state="paused", reason=found)
                 self.feed.tell("CampaignFound", {"state": item.state, "text": found}, item.id)
         self._tasks = [asyncio.create_task(self.feed.flushing(), name="feed")]
-        self._tasks += [asyncio.create_task(lane.work(), name=f"rig {lane.rig.name}") for lane in self.lanes.values()]
+        self._tasks += [
+            asyncio.create_task(worker.work(), name=f"rig {worker.rig.name}") for worker in self.lanes.values()
+        ]
         if self.settings.quick_start:
             self._tasks.append(asyncio.create_task(self._warm_up(), name="simulators"))
         self.feed.tell("DaemonStarted", {"rigs": [rig.name for rig in self.settings.rigs]})
 
-    def _forget_half_submitted(self, known: set[str]) -> None:
-        """Snapshots of campaigns that were being checked when the daemon died: nobody was told that they are queued."""
+    def _remove_unacknowledged(self, known: set[str]) -> None:
+        """Delete snapshots of submissions that were not yet acknowledged when the daemon died."""
         for folder in self.settings.snapshots.iterdir():
             if folder.name not in known:
                 shutil.rmtree(folder, ignore_errors=True)
@@ -102,60 +105,60 @@ class Supervisor:
         else:
             self.feed.tell("SimulatorsReady", {"simulators": self.warm.size})
 
-    # ---- beginning anew, where Ray has died: what runs on it comes to no end by itself
+    # ---- restart after Ray has died: work on a dead Ray never ends by itself
 
     @property
     def lost(self) -> str:
-        """Which of Ray's own processes has died; '' while all is well."""
+        """Name of the Ray process that has died; '' if all are running."""
         return self.warm.lost
 
     @property
     def pouring(self) -> bool:
-        """Whether a pour is under way somewhere."""
-        return any(lane.running is not None and lane.running.pouring for lane in self.lanes.values())
+        """Whether a pour is in progress on any rig."""
+        return any(worker.running is not None and worker.running.pouring for worker in self.lanes.values())
 
     def leave(self, lost: str) -> None:
-        """Come to rest as far as that is possible, to begin anew; `left` is set then."""
+        """Stop as much work as possible in order to restart; sets `left` at the end."""
         if not self.stopping:
             self.stopping = True
             self.problem(
                 "ray", f"Ray has lost its {lost}: the daemon begins anew, and what ran goes on from its journal"
             )
-            self._tasks.append(asyncio.create_task(self._leave(), name="leaving"))
+            self._tasks.append(asyncio.create_task(self._stop_for_restart(), name="leaving"))
 
-    async def _leave(self) -> None:
-        resting = [asyncio.ensure_future(lane.close()) for lane in self.lanes.values()]
+    async def _stop_for_restart(self) -> None:
+        resting = [asyncio.ensure_future(worker.close()) for worker in self.lanes.values()]
         await asyncio.wait(resting, timeout=LEAVING)
-        for lane in self.lanes.values():
-            if lane.running is not None and not lane.running.pouring:
-                lane.background(lane.running.give_up())
+        for worker in self.lanes.values():
+            if worker.running is not None and not worker.running.pouring:
+                worker.background(worker.running.give_up())
         await asyncio.wait(resting)
         self.feed.flush()
         self.left.set()
 
     async def close(self) -> None:
-        """Come to rest at the next safe point; cancelled or told again, at once."""
+        """Stop all work at the next safe point, or at once after `hurry`."""
         self.stopping = True
-        await asyncio.gather(*(lane.close() for lane in self.lanes.values()))
+        await asyncio.gather(*(worker.close() for worker in self.lanes.values()))
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        if not self.left.is_set():  # a Ray that has died may hang on for good
+        if not self.left.is_set():  # closing would block if Ray has died
             await self.warm.close()
         self.feed.tell("DaemonStopped", {})
         self.feed.close()
         self.store.close()
 
     def hurry(self) -> None:
-        """Told to end a second time: everything is given up."""
-        for lane in self.lanes.values():
-            if lane.running is not None:
-                lane.background(lane.running.give_up())
+        """Give all work up, after a second request to end."""
+        for worker in self.lanes.values():
+            if worker.running is not None:
+                worker.background(worker.running.give_up())
 
     # ---- the queue
 
     def new_key(self) -> str:
-        """Letters that nothing else is called by."""
+        """Return a random key that no campaign's id ends with."""
         while True:
             key = secrets.token_hex(3)
             if not any(item.id.endswith(key) for item in self.store.items()):
@@ -165,7 +168,7 @@ class Supervisor:
         """Queue a campaign whose snapshot has been checked.
 
         Raises:
-            RefusedError: nothing new is taken.
+            RequestRefusedError: the daemon or the rig accepts no new work.
         """
         self.refuse_new_work(item.rig)
         item = replace(item, rank=self.store.last_rank() + 1.0, created=time.time())
@@ -175,7 +178,7 @@ class Supervisor:
         return item
 
     def refuse_new_work(self, rig: str = "") -> None:
-        """Raises RefusedError where nothing new is taken, by the daemon or by one rig."""
+        """Raise RequestRefusedError if the daemon or one rig accepts no new work."""
         if self.emergency is not None:
             raise RequestRefusedError("the emergency stop is latched; nothing is taken before somebody has cleared it")
         if rig in self.emergencies:
@@ -189,7 +192,7 @@ class Supervisor:
             )
 
     def item(self, key: str) -> QueueItem:
-        """A campaign by its id, or by the beginning of one. Raises KeyError."""
+        """Return a campaign by its id or a unique prefix of three letters or more. Raises KeyError."""
         found = self.store.item(key)
         if found is None and len(key) >= 3:
             similar = [one for one in self.store.items() if one.id.startswith(key)]
@@ -199,11 +202,11 @@ class Supervisor:
         return found
 
     def move(self, key: str, by: str, *, before: str | None = None, priority: int | None = None) -> QueueItem:
-        """Give a queued campaign another place: in front of another one, at the head (''), or by its priority.
+        """Move a queued campaign in front of another one or to the head (''), or change its priority.
 
         Raises:
-            KeyError: there is no such campaign.
-            RefusedError: it is not queued.
+            KeyError: the campaign does not exist.
+            RequestRefusedError: it is not queued.
         """
         item = self.item(key)
         if item.state != "queued":
@@ -224,40 +227,40 @@ class Supervisor:
         return self.item(item.id)
 
     def pause_queue(self, paused: bool, by: str) -> None:
-        """Begin no campaign from now on, or begin them again. What runs goes on."""
+        """Start no further campaigns, or start them again. Running campaigns continue."""
         self.store.set_flag(PAUSED, {"by": by, "time": time.time()} if paused else None)
         self.note(by, "pause queue" if paused else "resume queue")
         self.wake()
 
     @property
     def queue_paused(self) -> bool:
-        """Whether no campaign is begun."""
+        """Whether the queue is paused."""
         return self.store.flag(PAUSED) is not None
 
     @property
     def emergency(self) -> dict[str, Any] | None:
-        """The emergency stop of all rigs that is latched: by, time, reason; None: there is none."""
+        """The active emergency stop of all rigs, with its fields by, time and reason; None if there is none."""
         found: dict[str, Any] | None = self.store.flag(EMERGENCY)
         return found
 
     @property
     def emergencies(self) -> dict[str, dict[str, Any]]:
-        """The emergency stops of single rigs that are latched, by the rig's name."""
+        """Active emergency stops of single rigs, by the rig's name."""
         stops = {rig.name: self.store.flag(_emergency_of(rig.name)) for rig in self.settings.rigs}
         return {name: stop for name, stop in stops.items() if stop is not None}
 
     def is_stopped(self, rig: str) -> bool:
-        """Whether a rig may not begin anything: its own emergency stop is latched, or that of all rigs."""
+        """Whether a rig may start nothing, because of its own emergency stop or that of all rigs."""
         return self.emergency is not None or rig in self.emergencies
 
     # ---- one campaign
 
     def pause(self, key: str, by: str) -> QueueItem:
-        """At the next checkpoint."""
+        """Pause a campaign at the next checkpoint."""
         return self._end(key, by, DesiredState.PAUSE)
 
     def stop(self, key: str, by: str) -> QueueItem:
-        """Finish the pour, publish what there is, and leave it at that."""
+        """Stop a campaign: finish the pour and publish the results so far."""
         return self._end(key, by, DesiredState.STOP)
 
     def _end(self, key: str, by: str, wish: DesiredState) -> QueueItem:
@@ -280,7 +283,7 @@ class Supervisor:
         return self.item(item.id)
 
     async def abort(self, key: str, by: str) -> QueueItem:
-        """Stop the motion; see `Running.abort`."""
+        """Stop the motion of a campaign; see `Running.abort`."""
         item = self.item(key)
         running = self._running(item)
         if running is None:
@@ -293,10 +296,10 @@ class Supervisor:
         return self.item(item.id)
 
     def resume(self, key: str, by: str) -> QueueItem:
-        """Go on with a campaign that rests.
+        """Resume a campaign that is at rest.
 
         Raises:
-            RefusedError: it does not rest, or nothing new may begin.
+            RequestRefusedError: it is not at rest, or no new work is accepted.
         """
         item = self.item(key)
         self.refuse_new_work(item.rig)
@@ -312,81 +315,81 @@ class Supervisor:
         return self.item(item.id)
 
     def _running(self, item: QueueItem) -> Running | None:
-        lane = self.lanes.get(item.rig)
-        return lane.running if lane is not None and lane.running is not None and lane.holds(item.id) else None
+        worker = self.lanes.get(item.rig)
+        return worker.running if worker is not None and worker.running is not None and worker.holds(item.id) else None
 
     def progress(self, item: QueueItem) -> dict[str, Any] | None:
-        """Where a running campaign stands."""
+        """Return the progress of a running campaign; None for others."""
         running = self._running(item)
         return None if running is None or running.watching is None else running.watching.progress()
 
     # ---- all of them
 
     async def emergency_stop(self, by: str, reason: str, rig: str = "") -> None:
-        """Stop every arm, give up everything, and take nothing new until `clear`. The arms come first.
+        """Stop every arm, give all work up, and accept nothing new until `clear`. The arms are stopped first.
 
         Args:
-            by: who presses it.
-            reason: why, if they say so.
-            rig: stop only this one; '' for all. A stop of all rigs and that of one are latched and cleared separately.
+            by: user who triggers the stop.
+            reason: reason, if given.
+            rig: stop only this rig; '' for all. The stop of all rigs and that of one are set and cleared separately.
 
         Raises:
-            KeyError: there is no such rig.
+            KeyError: the rig does not exist.
         """
         flag, lanes = self._stops(rig)
-        stops = [asyncio.create_task(lane.running.emergency()) for lane in lanes if lane.running]
-        for lane in lanes:
-            lane.latched = True
+        stops = [asyncio.create_task(worker.running.emergency()) for worker in lanes if worker.running]
+        for worker in lanes:
+            worker.latched = True
         await asyncio.sleep(0)
-        with contextlib.suppress(RunError):  # a full disk is no reason not to stop
+        with contextlib.suppress(RunError):  # a full disk must not prevent the stop
             self.store.set_flag(flag, {"by": by, "time": time.time(), "reason": reason})
-            for lane in lanes:
-                if lane.running is not None:
-                    self.store.change(lane.running.item.id, wish=str(DesiredState.ABORT))
+            for worker in lanes:
+                if worker.running is not None:
+                    self.store.change(worker.running.item.id, wish=str(DesiredState.ABORT))
             where = f"rig {rig}" if rig else ""
             self.note(by, "emergency stop", detail=": ".join(filter(None, (where, reason))))
         await asyncio.gather(*stops, return_exceptions=True)
 
     def clear(self, by: str, rig: str = "") -> None:
-        """Take work again. What was given up rests until somebody resumes it.
+        """Accept work again. Work that was given up rests until an operator resumes it.
 
         Args:
-            by: who clears it.
-            rig: whose own emergency stop is cleared; '' for the one of all rigs.
+            by: user who clears the stop.
+            rig: rig whose own emergency stop is cleared; '' for that of all rigs.
 
         Raises:
-            KeyError: there is no such rig.
+            KeyError: the rig does not exist.
         """
         flag, lanes = self._stops(rig)
         self.store.set_flag(flag, None)
-        for lane in lanes:
-            lane.latched = self.is_stopped(lane.rig.name)
+        for worker in lanes:
+            worker.latched = self.is_stopped(worker.rig.name)
         self.note(by, "clear emergency stop", detail=f"rig {rig}" if rig else "")
         self.wake()
 
     def _stops(self, rig: str) -> tuple[str, list[Lane]]:
-        """The flag of an emergency stop, and the lanes that it stops. Raises KeyError."""
+        """Return the flag of an emergency stop and the rig workers it affects. Raises KeyError."""
         if not rig:
             return EMERGENCY, list(self.lanes.values())
         if rig not in {one.name for one in self.settings.rigs}:
             raise KeyError(rig)
         return _emergency_of(rig), [self.lanes[rig]]
 
-    # ---- small things
+    # ---- helpers
 
     def wake(self) -> None:
-        """Something has changed that lanes should look at."""
-        for lane in self.lanes.values():
-            lane.wake.set()
+        """Wake all rig workers after a change."""
+        for worker in self.lanes.values():
+            worker.wake.set()
 
     def note(self, by: str, what: str, campaign: str = "", detail: str = "") -> None:
-        """Somebody did something."""
+        """Store, publish and log an audit entry."""
         self.store.note(by, what, campaign, detail)
         self.feed.tell("Deed", {"by": by, "what": what, "detail": detail}, campaign)
         _log.info("%s: %s %s", by, what, campaign, extra={"by": by, "what": what, "campaign": campaign})
 
     def problem(self, key: str, text: str | None) -> None:
-        """Something that people should mend, or that is mended."""
+        """Report a problem for the operator, or remove it with None."""
         if text is None:
             self.problems.pop(key, None)
         elif self.problems.get(key) != text:

@@ -1,1 +1,1 @@
-"""The Rerun live view: recordings, viewers and their servers."""
+"""The live view: Rerun recordings, viewers and their servers."""

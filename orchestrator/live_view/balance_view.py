@@ -1,7 +1,7 @@
-"""The balance: what it shows against time, and what simulations had foretold of the same pour.
+"""Rows of the balance: its display over time, and the spillage that simulations predicted for the same pour.
 
-The band is of the simulations whose actions lie nearest to the pour's, in the same scene: what they spilled at each
-moment, the middle of them and the outermost.
+`BalanceStage` keeps the simulations of each scene. The predicted range of a pour is formed from the simulations with
+the nearest actions in the same scene: minimum, median and maximum of their spilled mass at each time.
 """
 
 from __future__ import annotations
@@ -25,46 +25,46 @@ from sim_engine.scene import Scene
 PLACE = "/balance"
 
 NEAREST = 5
-"""Simulations that a prediction is made of."""
+"""Number of simulations that form a prediction."""
 
 REMEMBERED = 200
-"""Simulations of a scene that are kept for that."""
+"""Number of simulations kept per scene."""
 
 _POURING = ("tilt", "hold", "return", "settle", "weigh")
-"""While these last, what is on the balance beyond the tare is what was spilled."""
+"""Checkpoints during which the net weight is the spilled mass."""
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass
 class _Running:
-    """A pour under way."""
+    """A pour in progress."""
 
     scene: Scene
     band: FloatArray | None
-    """Spilled mass [g] at `times`: least, middle, most; shape (3, T)."""
+    """Spilled mass [g] at `times`: minimum, median, maximum; shape (3, T)."""
     times: FloatArray
     shown: list[tuple[float, float]] = field(default_factory=list)
     """Wall time and display [g]."""
     tilted: float | None = None
-    """Wall time."""
+    """Wall time at the start of tilting."""
     tared: float | None = None
     verdict: float | None = None
-    """Spilled, as weighed at the end [g]."""
+    """Spilled mass as weighed at the end [g]."""
 
 
 class BalanceStage:
-    """Rows of the balance. For one thread.
+    """Writes the rows of the balance. For one thread.
 
     Args:
-        outlet: where rows go.
+        sink: sink of the rows.
         time_scale: bench seconds per second of the clock.
     """
 
-    def __init__(self, outlet: RecordingSink, time_scale: float) -> None:
+    def __init__(self, sink: RecordingSink, time_scale: float) -> None:
         import rerun as rr
 
-        self._rr, self._outlet, self._scale = rr, outlet, time_scale
+        self._rr, self._sink, self._scale = rr, sink, time_scale
         self._simulated: dict[str, list[tuple[Action, PourOutcome]]] = {}
         self._running: _Running | None = None
         self._checkpoint = ""
@@ -80,37 +80,37 @@ class BalanceStage:
             ("pour/weighed", "balance [g]", style.MEASURED, 3.0),
             ("pour/liquid", "virtual liquid [g]", style.FALLING, 3.0),
         ):
-            looks = rr.SeriesLines(names=label, colors=shapes.rgb(colour), widths=width)
-            outlet.log(f"{PLACE}/{name}", looks, static=True)
+            appearance = rr.SeriesLines(names=label, colors=shapes.rgb(colour), widths=width)
+            sink.log(f"{PLACE}/{name}", appearance, static=True)
         for name, label, colour, size in (
             ("stable", "stable [g]", style.GOOD, 4.0),
             ("tare", "tare [g]", style.INK, 6.0),
             ("verdict", "weighed [g]", style.BEST, 9.0),
             ("pour/verdict", "weighed [g]", style.BEST, 9.0),
         ):
-            outlet.log(
+            sink.log(
                 f"{PLACE}/{name}",
                 rr.SeriesPoints(names=label, colors=shapes.rgb(colour), marker_sizes=size),
                 static=True,
             )
 
     def simulated(self, scene: str, action: Action, outcome: PourOutcome) -> None:
-        """A simulation that later pours may be compared with."""
+        """Keep a simulation for comparison with later pours."""
         if outcome.curve_times:
             kept = self._simulated.setdefault(scene, [])
             kept.append((action, outcome))
             del kept[:-REMEMBERED]
 
     def begin(self, pour: Pour, scene: Scene) -> None:
-        """A pour begins."""
-        times, band = self._foretold(pour, scene)
+        """Start a pour."""
+        times, band = self._predicted(pour, scene)
         self._running, self._checkpoint = _Running(scene, band, times), ""
         if band is not None:
             for name, value in zip(("low", "middle", "high"), band[:, -1], strict=True):
                 self._number(f"expected/{name}", value)
 
     def progress(self, told: PourProgress, wall: float) -> str | None:
-        """The display; returns what the balance is doing, where that is new."""
+        """Log the display; return the checkpoint if it is new."""
         running = self._running
         if running is None:
             return None
@@ -126,7 +126,7 @@ class BalanceStage:
                 if told.stable:
                     self._number("stable", grams)
                 net = grams - (running.tared or 0.0)
-                # After the verdict somebody puts the pourer there.
+                # After weighing, the operator may put the pourer on the balance.
                 if (
                     running.tilted is not None
                     and told.checkpoint in _POURING
@@ -139,7 +139,7 @@ class BalanceStage:
         return told.checkpoint
 
     def finish(self, measured: PourMeasurement) -> _Running | None:
-        """A pour was weighed; returns what it showed, for `beside`."""
+        """Log the result of a pour; return its readings for `beside`."""
         running, self._running = self._running, None
         self._number("verdict", 1e3 * measured.spilled)
         if running is not None:
@@ -147,17 +147,17 @@ class BalanceStage:
         if running is not None and running.band is not None:
             for name, value in zip(("low", "middle", "high"), running.band[:, -1], strict=True):
                 self._number(f"expected/{name}", value)
-        for ended in ("net", "expected"):  # no line from one pour to the next
-            self._outlet.clear(f"{PLACE}/{ended}", recursive=True)
+        for ended in ("net", "expected"):  # no line between two pours
+            self._sink.clear(f"{PLACE}/{ended}", recursive=True)
         return running
 
     def beside(self, running: _Running | None, times: FloatArray, spilled: FloatArray | None) -> list[Track]:
-        """What the balance showed in a pour, beside what simulations foretold.
+        """Return the readings of a pour together with the simulations' prediction.
 
         Args:
-            running: the pour, as `finish` returned it.
-            times: of the pour's film, shape (T,) [s of bench time].
-            spilled: by the liquid of a virtual bench, by then, shape (T,) [kg].
+            running: the pour, as returned by `finish`.
+            times: times of the pour's playback, shape (T,) [s of bench time].
+            spilled: mass spilled by the liquid of a virtual bench at these times, shape (T,) [kg].
         """
         if running is None:
             return []
@@ -178,13 +178,13 @@ class BalanceStage:
         return tracks
 
     def told(self) -> None:
-        """The film of a pour is over."""
-        self._outlet.clear(f"{PLACE}/pour", recursive=True)
+        """Clear the curves after the playback of a pour."""
+        self._sink.clear(f"{PLACE}/pour", recursive=True)
 
     def _curve(self, name: str, times: FloatArray, values: FloatArray) -> Track:
         return Track(f"{PLACE}/{name}", times, columns_of(self._rr.Scalars.columns(scalars=values)))
 
-    def _foretold(self, pour: Pour, scene: Scene) -> tuple[FloatArray, FloatArray | None]:
+    def _predicted(self, pour: Pour, scene: Scene) -> tuple[FloatArray, FloatArray | None]:
         known = self._simulated.get(pour.scene, [])
         wanted = _numbers(pour.action.values())
         if not known:
@@ -202,7 +202,7 @@ class BalanceStage:
         return times, np.stack([curves.min(axis=0), np.median(curves, axis=0), curves.max(axis=0)])
 
     def _number(self, name: str, value: float) -> None:
-        self._outlet.number(f"{PLACE}/{name}", float(value))
+        self._sink.number(f"{PLACE}/{name}", float(value))
 
 
 def _numbers(values: Mapping[str, float | None]) -> dict[str, float]:

@@ -1,6 +1,7 @@
-"""What a viewer shows: one arrangement for each moment of a campaign, each with what matters then in the middle.
+"""Blueprints of the viewer: one layout for each phase of a campaign, and recordings side by side.
 
-Several recordings in one, side by side: each under a name of its own, on the timelines that they share.
+`campaign_blueprint` and `simulation_blueprint` define layouts. `put_beside` merges several recordings into one: each is
+below its own name, on shared timelines. The rows are written by other modules.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ Moment = Literal["calibrating", "deploying", "replaying"]
 BACKGROUND = [246, 247, 249]
 
 LEGEND = 0.5
-"""Room beside a curve for its legend, as a share of the curve's time."""
+"""Space for a legend next to a curve, as a fraction of the curve's time range."""
 
 
 def simulation_blueprint() -> rrb.Blueprint:
-    """For one simulated pour: the scene above the shares of the liquid."""
+    """Return the layout of one simulated pour: the scene above the fractions of the liquid."""
     import rerun.blueprint as rrb
 
     return _blueprint(rrb.Vertical(_simulation(), _shares(), row_shares=[3, 1]), "replaying")
@@ -37,18 +38,18 @@ def campaign_blueprint(
     theta_slices: bool = False,
     action_slices: bool = False,
 ) -> rrb.Blueprint:
-    """For a campaign.
+    """Return the layout of a campaign.
 
     Args:
-        moment: 'calibrating', 'deploying', or 'replaying' once it is over.
-        receivers: what people call each deployment scene, by its name.
-        loss_label: of the pours' loss.
-        theta_slices: θ has more axes than one picture shows.
-        action_slices: actions have.
+        moment: 'calibrating', 'deploying', or 'replaying' after the end.
+        receivers: display name of each deployment scene, by the scene's name.
+        loss_label: label of the pours' loss.
+        theta_slices: whether θ has more axes than one picture shows.
+        action_slices: whether actions have more axes.
     """
     import rerun.blueprint as rrb
 
-    # Made anew for each tab: a view has one place, and one that were put into two would stay empty in the second.
+    # Created again for each tab: a view has one parent, and remains empty in a second one.
     def losses() -> list[Any]:
         named = [(safe_name(scene), name) for scene, name in receivers.items()]
         return [_loss(place, f"{name}: {loss_label}") for place, name in named] + [
@@ -100,7 +101,7 @@ def campaign_blueprint(
         column_shares=[5, 7, 4],
         name="Replaying",
     )
-    # All three stand in every arrangement, behind tabs: whoever looks late may be shown an earlier moment first.
+    # Every layout contains all three tabs, since a viewer that connects late may receive an earlier layout first.
     tabs = {"calibrating": calibrating, "deploying": deploying, "replaying": replaying}
     if not receivers:
         del tabs["deploying"]
@@ -109,7 +110,7 @@ def campaign_blueprint(
 
 
 def beside_blueprint(names: Sequence[str]) -> rrb.Blueprint:
-    """For several recordings in one, each below its name.
+    """Return the layout of several recordings in one, each below its name.
 
     Args:
         names: first parts of the entities' paths.
@@ -132,8 +133,8 @@ def beside_blueprint(names: Sequence[str]) -> rrb.Blueprint:
 def _blueprint(root: Any, moment: Moment) -> rrb.Blueprint:
     import rerun.blueprint as rrb
 
-    # The wall clock of a campaign that is over gives minutes to thought and an instant to a pour: films are watched on
-    # the timeline of simulated time, again and again.
+    # After a campaign, the wall clock has minutes of computation between short pours. Playback
+    # therefore uses the timeline of simulated time, in a loop.
     time = (
         rrb.TimePanel(timeline="sim_time", play_state="playing", loop_mode="all", state="collapsed")
         if moment == "replaying"
@@ -160,7 +161,7 @@ def _cell(under: str = "", name: str = "The cell: planned (orange), done (blue)"
 def _simulation(under: str = "", name: str = "Simulated pour, by the fate of its liquid") -> Any:
     import rerun.blueprint as rrb
 
-    # From the side, a little above: the picture in docs/frames.md.
+    # From the side, slightly above: as in the figure of docs/frames.md.
     eye = rrb.EyeControls3D(position=(-0.05, -0.42, 0.22), look_target=(-0.04, 0.0, 0.08), eye_up=(0, 0, 1))
     return rrb.Spatial3DView(
         origin=f"{under}/simulation",
@@ -173,7 +174,7 @@ def _simulation(under: str = "", name: str = "Simulated pour, by the fate of its
 
 
 def _recent(origin: str, name: str, before: float, *, contents: Any = "$origin/**", **more: Any) -> Any:
-    """Curves of the last so many seconds; to the right of now, where nothing is, there is room for the legend."""
+    """Return a view of curves over the last seconds; the space to the right of the cursor holds the legend."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -193,7 +194,7 @@ def _recent(origin: str, name: str, before: float, *, contents: Any = "$origin/*
 
 
 def _whole(origin: str, name: str, *, contents: Any = "$origin/**") -> Any:
-    """Curves of the whole campaign. Left to itself the viewer shows half a minute around now, which is mostly empty."""
+    """Return a view of curves over the whole campaign; the viewer's default is half a minute around the cursor."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -265,7 +266,7 @@ def _status(under: str = "") -> Any:
 
 
 def _outcome(under: str = "") -> Any:
-    """How the run ended. `_status` follows the time cursor, which begins at the start when a recording is opened."""
+    """Return a view of the run's outcome, which does not depend on the time cursor, unlike `_status`."""
     import rerun.blueprint as rrb
 
     return rrb.TextDocumentView(origin=f"{under}/outcome", name="How it ended")
@@ -274,17 +275,17 @@ def _outcome(under: str = "") -> Any:
 def _log() -> Any:
     import rerun.blueprint as rrb
 
-    # An empty list would stand for the timeline that is watched: a column of cut numbers.
+    # An empty list would show the active timeline as a narrow column of truncated numbers.
     hidden = [rrb.encodings.TimelineColumn(timeline, visible=False) for timeline in ("wall", "sim_time", "step")]
     columns = rrb.TextLogColumns(text_log_columns=[rrb.encodings.TextLogColumn("Body")], timeline_columns=hidden)
     return rrb.TextLogView(origin="/log", name="Events and decisions", columns=columns)
 
 
 def put_beside(recordings: Mapping[str, Path], path: Path) -> Path:
-    """Write one recording of several.
+    """Merge several recordings into one.
 
     Args:
-        recordings: `.rrd` files by the name that each is to have; a part of an entity's path.
+        recordings: `.rrd` files by name; each name becomes a part of entity paths.
         path: `.rrd` to write.
 
     Returns:

@@ -1,4 +1,8 @@
-"""The cell: table, tray, both vessels, the arm as it moves, its path planned and executed, and the pour's liquid."""
+"""Rows of the robot cell: table, tray, both vessels, the moving arm, its planned and executed path, and the liquid.
+
+`CellScene` follows a pour in real time. If the bench runs in scaled time, or the motion of the liquid is known
+afterwards, it adds a playback of the pour to the queue.
+"""
 
 from __future__ import annotations
 
@@ -27,10 +31,10 @@ if TYPE_CHECKING:
 PLACE = "/cell"
 
 SLOW = 3.0
-"""A bench whose time runs faster than this is shown by films of its pours: nobody could follow it."""
+"""A bench that runs faster than this factor is shown by playback of its pours, since live motion would be too fast."""
 
 TRAILING = 5
-"""The path that was executed is drawn again with every so many places of it."""
+"""The executed path is drawn again after this many new points."""
 
 _TRAY = 0.012
 """Thickness of the tray [m]."""
@@ -39,18 +43,18 @@ FloatArray = NDArray[np.float64]
 
 
 class CellScene:
-    """What stands and moves on the bench. For one thread.
+    """Writes the rows of the bench and its motion. For one thread.
 
     Args:
-        outlet: where rows go.
-        films: that pours are shown by once they are known.
-        plan: of the campaign.
+        sink: sink of the rows.
+        films: queue for the playback of completed pours.
+        plan: plan of the campaign.
     """
 
-    def __init__(self, outlet: RecordingSink, films: PlaybackQueue, plan: CampaignPlan) -> None:
+    def __init__(self, sink: RecordingSink, films: PlaybackQueue, plan: CampaignPlan) -> None:
         import rerun as rr
 
-        self._rr, self._outlet, self._films = rr, outlet, films
+        self._rr, self._sink, self._films = rr, sink, films
         laboratory = plan.laboratory
         self._figure: ArmFigure | None = None if laboratory.arm is None else laboratory.arm.figure()
         scales = [one.time_scale for one in (laboratory.bench, laboratory.arm) if one is not None]
@@ -60,14 +64,14 @@ class CellScene:
         self._moves: list[tuple[Moment, tuple[float, ...]]] = []
         self._liquid: RecordedFrames | None = None
         self._stands: tuple[float, ...] = ()
-        outlet.log(PLACE, shapes.fates(), static=True)  # not of the liquid, with which it would be cleared
-        outlet.log(f"{PLACE}/tool", rr.TransformAxes3D(0.06), static=True)
+        sink.log(PLACE, shapes.fates(), static=True)  # on the parent, since clearing the liquid would remove it
+        sink.log(f"{PLACE}/tool", rr.TransformAxes3D(0.06), static=True)
         self._furnish()
 
     def _furnish(self) -> None:
         rr = self._rr
         table = -_TRAY if self._figure is None else min(self._figure.table, -_TRAY)
-        self._outlet.log(
+        self._sink.log(
             f"{PLACE}/tray",
             rr.Boxes3D(
                 centers=[[0.0, 0.0, -0.5 * _TRAY - 1e-3]],
@@ -83,11 +87,11 @@ class CellScene:
             base = home[0, 0, :2]
             low, high = np.minimum(base, 0.0) - 0.3, np.maximum(base, 0.0) + 0.3
             middle, half = 0.5 * (low + high), 0.5 * (high - low)
-            # Where it waits, until it moves; what it looks like never changes.
-            self._outlet.times(wall=time.time(), step=0, sim_time=0.0)
-            self._outlet.log(f"{PLACE}/arm", shapes.bars(self._figure, home), static=True)
-            self._outlet.rows(f"{PLACE}/arm", [self._outlet.now], shapes.stances(home[None]))
-        self._outlet.log(
+            # The initial pose of the arm; its appearance is static.
+            self._sink.times(wall=time.time(), step=0, sim_time=0.0)
+            self._sink.log(f"{PLACE}/arm", shapes.bars(self._figure, home), static=True)
+            self._sink.rows(f"{PLACE}/arm", [self._sink.now], shapes.stances(home[None]))
+        self._sink.log(
             f"{PLACE}/table",
             rr.Boxes3D(
                 centers=[[*middle, table - 0.015]],
@@ -98,59 +102,59 @@ class CellScene:
             static=True,
         )
 
-    # ---- a pour under way
+    # ---- a pour in progress
 
     def begin(self, pour: Pour, scene: Scene) -> None:
-        """A pour begins: its vessels stand there, and its path is planned."""
+        """Start a pour: show its vessels and its planned path."""
         self.show()
         self._trail, self._liquid = [], None
         self._stand("pourer", scene.pourer)
         self._stand("receiver", scene.receiver)
-        self._outlet.clear(f"{PLACE}/liquid")
-        self._outlet.clear(f"{PLACE}/path/executed")
+        self._sink.clear(f"{PLACE}/liquid")
+        self._sink.clear(f"{PLACE}/path/executed")
         planned = planned_poses(scene, pour)
         if planned is None:
             return
-        self._outlet.log(f"{PLACE}/path/planned", self._line(self._tool_places(planned), style.PREDICTED, 1.5e-3))
+        self._sink.log(f"{PLACE}/path/planned", self._line(self._tool_places(planned), style.PREDICTED, 1.5e-3))
         if self._figure is None:
-            self._outlet.log(f"{PLACE}/pourer", shapes.placed(planned[0]))
+            self._sink.log(f"{PLACE}/pourer", shapes.placed(planned[0]))
 
     def progress(self, told: PourProgress) -> None:
-        """The arm is somewhere."""
+        """Process progress of a pour: the arm's pose and the liquid."""
         if told.liquid is not None:
             self._liquid = told.liquid
         if self.time_scale > SLOW and self._films.next_due is not None:
-            return  # a film of the pour before is shown
+            return  # playback of the previous pour is shown
         if (stands := (*told.joints, *told.pourer)) == self._stands:
             return
         self._stands = stands
         if told.joints and self._figure is not None:
-            self._moves.append((self._outlet.now, told.joints))
+            self._moves.append((self._sink.now, told.joints))
         elif told.pourer:
-            self._outlet.log(f"{PLACE}/pourer", shapes.placed(np.array(told.pourer)))
-            self._follow(told.pourer[:3], self._outlet.now)
+            self._sink.log(f"{PLACE}/pourer", shapes.placed(np.array(told.pourer)))
+            self._follow(told.pourer[:3], self._sink.now)
 
     def show(self) -> None:
-        """Show how the arm has moved. Several stances are worked out and sent in the time of one."""
+        """Log the arm's motion since the last call. Several poses are computed and sent at the cost of one."""
         if not self._moves or (figure := self._figure) is None:
             return
         moments, joints = [at for at, _ in self._moves], np.array([where for _, where in self._moves])
         self._moves = []
         tools = figure.tool(joints)
-        self._outlet.rows(f"{PLACE}/arm", moments, shapes.stances(figure.ends(joints)))
-        self._outlet.rows(f"{PLACE}/tool", moments, shapes.places(tools))
-        self._outlet.rows(f"{PLACE}/pourer", moments, shapes.places(figure.pourer(joints)))
+        self._sink.rows(f"{PLACE}/arm", moments, shapes.stances(figure.ends(joints)))
+        self._sink.rows(f"{PLACE}/tool", moments, shapes.places(tools))
+        self._sink.rows(f"{PLACE}/pourer", moments, shapes.places(figure.pourer(joints)))
         for at, tool in zip(moments, tools, strict=True):
             self._follow(tool[:3], at)
 
     def _follow(self, place: Sequence[float] | FloatArray, at: Moment) -> None:
-        """The path that was executed, as far as that [m]."""
+        """Extend the executed path to a point [m]."""
         self._trail.append([float(value) for value in place])
         if len(self._trail) % TRAILING == 2 and self.time_scale <= SLOW:
             line = self._line(np.array(self._trail), style.MEASURED, 3e-3)
-            self._outlet.log(f"{PLACE}/path/executed", line, at=at)
+            self._sink.log(f"{PLACE}/path/executed", line, at=at)
 
-    # ---- a pour that is over
+    # ---- a completed pour
 
     def finish(
         self,
@@ -162,16 +166,16 @@ class CellScene:
         beside: Callable[[FloatArray, FloatArray | None], Sequence[Track]],
         told: Callable[[], object],
     ) -> None:
-        """Show what was done and what the liquid did.
+        """Add the playback of a completed pour, with the arm's motion and the liquid.
 
         Args:
-            scene: what was poured.
-            measured: what came of it.
-            now: on the wall clock [s since 1970].
-            step: of the campaign.
-            beside: what else there is to say of moments of the pour (T,) [s], and of what a virtual bench's liquid has
-                spilled by then (T,) [kg], where that is known.
-            told: called when all that has been shown.
+            scene: scene of the pour.
+            measured: measurement of the pour.
+            now: wall clock [s since 1970].
+            step: step of the campaign.
+            beside: returns further tracks. Its arguments are times of the pour (T,) [s], and the mass that a virtual
+                bench's liquid has spilled by then (T,) [kg], if it is known.
+            told: called at the end of the playback.
         """
         self.show()
         moves = self._executed(measured)
@@ -180,7 +184,7 @@ class CellScene:
             return
         ends = [float(each[-1]) for each in (None if moves is None else moves[0], _times(liquid)) if each is not None]
         if self.time_scale <= SLOW and liquid is None:
-            return  # it was seen as it was made
+            return  # it was already shown live
         times = np.arange(0.0, max(ends) + 0.5 / MAXIMUM_RATE, 1.0 / MAXIMUM_RATE)
         path = self._path(moves, liquid)
         tracks = [] if moves is None else self._moved(times, *moves)
@@ -192,7 +196,7 @@ class CellScene:
 
         def begin() -> None:
             if len(path) > 1:
-                self._outlet.log(f"{PLACE}/path/executed", self._line(path, style.MEASURED, 3e-3))
+                self._sink.log(f"{PLACE}/path/executed", self._line(path, style.MEASURED, 3e-3))
 
         self._films.add(now, step, Playback(float(times[-1]), tracks, begin, told))
 
@@ -206,7 +210,7 @@ class CellScene:
         return np.zeros((0, 3)) if liquid is None else np.asarray(liquid.pourer_poses, float)[:, :3]
 
     def _moved(self, times: FloatArray, known: FloatArray, joints: FloatArray) -> list[Track]:
-        """The arm at moments (T,) [s] of a pour, whose joints (K, n) [rad] are known at others (K,) [s]."""
+        """Return the arm's tracks at times (T,) [s], from joints (K, n) [rad] known at other times (K,) [s]."""
         figure = self._figure
         assert figure is not None
         stands = np.column_stack([np.interp(times, known, column) for column in joints.T])
@@ -221,11 +225,11 @@ class CellScene:
     def _poured(
         self, times: FloatArray, liquid: RecordedFrames, volume: float, *, posed: bool
     ) -> tuple[list[Track], FloatArray]:
-        """The liquid at moments (T,) [s]; and the share of it that is spilled by then, shape (T,)."""
+        """Return the liquid's tracks at times (T,) [s], and the fraction of liquid spilled by then, shape (T,)."""
         radius = 0.5 * shapes.spacing(liquid.positions[0], volume)
         kept = np.asarray(liquid.times, dtype=float)
         at = np.clip(np.searchsorted(kept, times + 1e-6, side="left") - 1, 0, len(kept) - 1)
-        some = shapes.changes(at[:, None].astype(float))  # it is kept less often, or not as long
+        some = shapes.changes(at[:, None].astype(float))  # the liquid may be recorded less often, or for a shorter time
         states = {int(index): np.asarray(liquid.states[index]) for index in at}
         swarms = shapes.swarms([liquid.positions[i] for i in at[some]], [states[int(i)] for i in at[some]], radius)
         tracks = [Track(f"{PLACE}/liquid", times[some], swarms)]
@@ -235,12 +239,12 @@ class CellScene:
         spilled = {index: float(np.mean(each == ParticleState.SPILLED)) for index, each in states.items()}
         return tracks, np.array([spilled[int(index)] for index in at])
 
-    # ---- how
+    # ---- helpers
 
     def _stand(self, what: str, spec: VesselSpec) -> None:
         if self._shown.get(what) != (key := spec.content_hash()):
             self._shown[what] = key
-            self._outlet.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
+            self._sink.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
 
     def _tool_places(self, poses: FloatArray) -> FloatArray:
         return poses[:, :3] if self._figure is None else self._figure.tool_of(poses)
@@ -250,7 +254,7 @@ class CellScene:
 
 
 def planned_poses(scene: Scene, pour: Pour) -> FloatArray | None:
-    """Poses of the pourer along a planned pour, shape (T, 7); None where nothing can be planned."""
+    """Return poses of the pourer along a planned pour, shape (T, 7); None if planning fails."""
     from actors.bench.pour_feasibility import plan_pour
     from actors.interfaces import InvalidActionError
 

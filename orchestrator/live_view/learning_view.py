@@ -1,4 +1,7 @@
-"""What a campaign learns: losses against predictions, surrogates, θ, and whether the simulator is to be trusted."""
+"""Rows of a campaign's learning: losses and predictions, surrogates, θ, and the model check of the simulator.
+
+`LearningStage` writes curves and pictures; `map_images` draws the pictures.
+"""
 
 from __future__ import annotations
 
@@ -34,28 +37,29 @@ PLACE = "/learning"
 CALIBRATION = "calibration"
 
 MAPPED = 2
-"""Axes that one picture shows; of more, there is a picture of all pairs."""
+"""Number of axes that one picture shows; for more axes, a second picture shows all pairs."""
 
 SLICING_INTERVAL = 180.0
-"""As `DRAWING_INTERVAL`, for pictures whose surrogate has to be fitted once more [s]."""
+"""Like `DRAWING_INTERVAL`, for pictures that need another fit of the surrogate [s]."""
 
 DRAWING_INTERVAL = 60.0
-"""Least time between two drawings of one picture, unless something has come to its end [s]: a drawing takes 0.25 s of a
-core, which has to stay about a hundredth of it."""
+"""Shortest time between two drawings of one picture, except at the end of a stage [s]. A drawing takes 0.25 s of a
+core; the average load should be about a hundredth of it.
+"""
 
 
 class LearningStage:
-    """Rows and pictures of what is learnt. For one thread.
+    """Writes rows and pictures of the learning progress. For one thread.
 
     Args:
-        outlet: where rows go.
-        plan: of the campaign.
+        sink: sink of the rows.
+        plan: plan of the campaign.
     """
 
-    def __init__(self, outlet: RecordingSink, plan: CampaignPlan) -> None:
+    def __init__(self, sink: RecordingSink, plan: CampaignPlan) -> None:
         import rerun as rr
 
-        self._rr, self._outlet, self._plan = rr, outlet, plan
+        self._rr, self._sink, self._plan = rr, sink, plan
         self._names = receiver_names(plan)
         self._styled: set[str] = set()
         self._scene_of_stage: dict[str, str] = {}
@@ -63,12 +67,12 @@ class LearningStage:
         self._waiting: dict[str, Callable[[], bytes]] = {}
         self._least: dict[str, float] = {}
         self.best: dict[str, str] = {}
-        """What is shown of the best pour, by the receiver's name."""
+        """Text for the best pour so far, by the receiver's name."""
         self.trust = ""
-        """Whether the simulator is to be trusted, in words."""
+        """Result of the model check, as text."""
 
     def opened(self) -> None:
-        """A campaign begins: where pictures will come, a text says when."""
+        """Show placeholders at the start of a campaign, which state when each picture follows."""
         plan = self._plan
         if plan.calibration is not None:
             self._coming(f"{CALIBRATION}/surrogate", "The discrepancy over θ comes with the first simulations.")
@@ -83,14 +87,14 @@ class LearningStage:
 
     def _coming(self, place: str, text: str) -> None:
         picture = pictures.png(pictures.words(text))
-        self._outlet.log(f"{PLACE}/{place}", self._rr.EncodedImage(contents=picture, media_type="image/png"))
+        self._sink.log(f"{PLACE}/{place}", self._rr.EncodedImage(contents=picture, media_type="image/png"))
 
     def about(self, stage: str, scene: str) -> None:
-        """A stage has to do with a scene."""
+        """Associate a stage with a scene."""
         self._scene_of_stage[stage] = scene
 
     def poured(self, request: Pour, outcome: Poured) -> str:
-        """A pour was weighed; returns it in words."""
+        """Log a weighed pour; return a description."""
         measured, unit = outcome.measurement, unit_of_pour(self._plan, request)
         value = loss_of_pour(self._plan, request, measured)
         weights = f"{1e3 * measured.spilled:.1f} g spilled, {1e3 * measured.retained:.1f} g left in the pourer"
@@ -117,11 +121,11 @@ class LearningStage:
         self.best[name] = f"{least:.2f} {unit}"
 
     def suggested(self, event: RequestFinished, request: Suggest, outcome: Suggested) -> None:
-        """The optimiser answered: a picture of its surrogate, unless there was one just now."""
+        """Draw the surrogate of a suggestion, unless it was drawn recently."""
         problem, suggestion = request.problem, outcome.suggestion
         if suggestion.surrogate is None:
             return
-        # A space of actions belongs to the receiver in question, one of simulation parameters to the calibration.
+        # A space of actions belongs to the stage's receiver, a space of parameters to the calibration.
         acting = problem.space.names[0] in ACTION_DIMENSIONS
         scene = self._scene_of_stage.get(event.stage)
         deploying = acting and scene is not None and self._plan.deployment is not None
@@ -148,7 +152,7 @@ class LearningStage:
             )
 
     def learnt(self, result: StageResult, now: float) -> None:
-        """A strategy has learnt so much."""
+        """Log the current result of a strategy."""
         if isinstance(result, Calibrated) and result.found is not None:
             found = result.found
             if found.searched:
@@ -169,7 +173,7 @@ class LearningStage:
                 self._number(place, z, label, style.ESCAPED, marker=8.0)
 
     def flush(self, now: float) -> None:
-        """Draw what has waited for its turn."""
+        """Draw the pictures that were postponed."""
         for entity, draw in list(self._waiting.items()):
             self._draw(entity, now, draw)
 
@@ -182,17 +186,17 @@ class LearningStage:
     def _draw(self, entity: str, now: float, draw: Callable[[], bytes]) -> None:
         self._waiting.pop(entity, None)
         self._drawn[entity] = now
-        self._outlet.log(entity, self._rr.EncodedImage(contents=draw(), media_type="image/png"))
+        self._sink.log(entity, self._rr.EncodedImage(contents=draw(), media_type="image/png"))
 
     def _number(
         self, entity: str, value: float, name: str, colour: str, *, marker: float = 0.0, width: float = 3.0
     ) -> None:
         if entity not in self._styled:
             self._styled.add(entity)
-            looks = (
+            appearance = (
                 self._rr.SeriesPoints(names=name, colors=shapes.rgb(colour), marker_sizes=marker)
                 if marker
                 else self._rr.SeriesLines(names=name, colors=shapes.rgb(colour), widths=width)
             )
-            self._outlet.log(entity, looks, static=True)
-        self._outlet.number(entity, float(value))
+            self._sink.log(entity, appearance, static=True)
+        self._sink.number(entity, float(value))

@@ -1,14 +1,14 @@
-"""Campaigns watched while they run: one server for several campaigns, and any number of viewers in browsers.
+"""The live view of running campaigns: one server for several campaigns and any number of viewers in browsers.
 
     with LiveView() as live:
         print(live.url)
-        monitor = live.watcher_for(plan, directory)   # a watcher of the campaign, as any
+        monitor = live.watcher_for(plan, directory)   # a subscriber of the campaign
 
-Nobody who watches can hold anything up: a campaign's events go through a bounded queue to a process that writes them
-(`monitor.RerunMonitor`), and from there to a server in a third process, which viewers are connected to.
+Viewers can't slow a campaign down. Events pass through a bounded queue to a process that writes them (`RerunMonitor`),
+and from there to a server in a third process, which viewers connect to.
 
-Limitations: there is no password. Who reaches the ports can look, and can send to the same server; nothing of a
-campaign can be changed through it. So it listens on this machine only, unless told otherwise.
+Limitations: there is no password. Anyone who can reach the ports can watch, and can send to the same server, but can't
+change a campaign. By default, the server therefore listens on this machine only.
 """
 
 from __future__ import annotations
@@ -31,33 +31,33 @@ from sim_engine.resources import installed
 LOOPBACK = "127.0.0.1"
 
 WEB_PORT = 9090
-"""The port of the viewer's page, where it is free; else the next free one."""
+"""Port of the viewer's page if it is free; otherwise the next free one."""
 
 STREAM_PORT = 9876
-"""The port of the stream, likewise; Rerun's own default."""
+"""Port of the stream, likewise; Rerun's default."""
 
 MEMORY = "512MiB"
-"""Kept for those who come late; what is older is in the recording on disk."""
+"""Memory for viewers that connect late; older data are in the recording on disk."""
 
 RECORDING = "campaign.rrd"
-"""Name of a run's recording."""
+"""File name of a run's recording."""
 
 _START_TIME = 40.0
 _TRIED = 100
 
 
 class LiveError(RunError):
-    """The live view can't be served; the text says why."""
+    """The live view can't be served; the message gives the reason."""
 
 
 class LiveView:
-    """A Rerun server and its web viewer.
+    """A Rerun server with its web viewer.
 
     Args:
-        address: to listen on; '0.0.0.0' for all of this machine's.
-        web_port: of the viewer's page; None: `WEB_PORT`, or the next free one.
-        memory: that the server may keep, as '512MiB'.
-        shown: recordings on disk to be shown as well.
+        address: address to listen at; '0.0.0.0' for all addresses of this machine.
+        web_port: port of the viewer's page; None: `WEB_PORT`, or the next free one.
+        memory: memory limit of the server, such as '512MiB'.
+        shown: recordings on disk to show as well.
     """
 
     def __init__(
@@ -80,10 +80,10 @@ class LiveView:
         self.close()
 
     def open(self) -> str:
-        """Start serving; returns when a browser may be pointed to `url`, which is also what it returns.
+        """Start serving; return `url` as soon as a browser can open it.
 
         Raises:
-            LiveError: the port is taken, or the server does not start.
+            LiveError: the port is in use, or the server does not start.
         """
         if self._web_port is not None and not is_free(self.address, self._web_port):
             raise LiveError(
@@ -117,37 +117,37 @@ class LiveView:
 
     @property
     def host(self) -> str:
-        """Name of this machine for those who look from where they may: see `address`."""
+        """Name of this machine for viewers that can reach `address`."""
         return socket.gethostname() if self.address in ("0.0.0.0", "::") else self.address
 
     @property
     def stream(self) -> str:
-        """Where Rerun's own viewer connects to (`rerun --connect`), and campaigns send to."""
+        """URL of the stream for Rerun's own viewer (`rerun --connect`) and for campaigns."""
         return f"rerun+http://{self.host}:{self._ports[0]}/proxy"
 
     @property
     def url(self) -> str:
-        """The address of the viewer's page, for a browser."""
+        """URL of the viewer's page, for a browser."""
         return f"http://{self.host}:{self._ports[1]}/?url={quote(self.stream, safe='')}"
 
     @property
     def server_pid(self) -> int:
-        """The process id of Rerun's server; asked for once, since it is the first line of its output."""
+        """Process id of Rerun's server. Read it only once, since it is the first line of the server's output."""
         assert self._process is not None
         return int(self._process.read_line(_START_TIME))
 
     @property
     def alive(self) -> bool:
-        """Whether it still serves."""
+        """Whether the server is running."""
         return self._process is not None and self._process.alive
 
     def watcher_for(self, plan: CampaignPlan, run: Path, *, capacity: int = CAPACITY) -> RerunMonitor:
-        """A watcher that writes a run's recording and shows the same here. To be closed when the run has ended.
+        """Return a subscriber that writes a run's recording and sends it here. Close it when the run has ended.
 
         Args:
-            plan: of the campaign.
-            run: its folder.
-            capacity: events that may wait.
+            plan: plan of the campaign.
+            run: folder of the run.
+            capacity: largest number of waiting events.
 
         Raises:
             OSError: the recording can't be written.
@@ -155,14 +155,14 @@ class LiveView:
         return RerunMonitor(run / RECORDING, plan, url=self.stream, capacity=capacity)
 
     def close(self) -> None:
-        """Stop serving. Viewers keep what they have. May be called again."""
+        """Stop serving. Viewers keep the data they have received. May be called again."""
         process, self._process = self._process, None
         if process is not None:
             process.close(5.0)
 
 
 def is_free(address: str, port: int) -> bool:
-    """Whether a port can be listened on. Rerun only logs that it can't."""
+    """Whether a port is free. Rerun itself only logs if it is not."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -175,10 +175,10 @@ def is_free(address: str, port: int) -> bool:
 
 
 def free_port(address: str, first: int) -> int:
-    """The first free port from one on.
+    """Return the first free port at or after a given one.
 
     Raises:
-        LiveError: there is none near by, or the address is not this machine's.
+        LiveError: no port nearby is free, or the address is not this machine's.
     """
     for port in range(first, first + _TRIED):
         if is_free(address, port):
@@ -190,7 +190,7 @@ def free_port(address: str, first: int) -> int:
 
 
 def answers(host: str, port: int) -> bool:
-    """Whether somebody listens there."""
+    """Whether a server accepts connections there."""
     try:
         with socket.create_connection((host, port), timeout=1.0):
             return True
@@ -199,20 +199,20 @@ def answers(host: str, port: int) -> bool:
 
 
 def can_record(plan: CampaignPlan) -> bool:
-    """Whether a run of a campaign is recorded: the campaign wants it, and Rerun is installed."""
+    """Whether runs of a campaign are recorded: recording is enabled and Rerun is installed."""
     return plan.outputs.rrd and installed("rerun")
 
 
 def recorder_of(
     plan: CampaignPlan, run: Path, tell: Callable[[str], object], live: LiveView | None = None
 ) -> RerunMonitor | None:
-    """The watcher that writes a run's recording; None if the campaign wants none, or Rerun is not installed.
+    """Return the subscriber that writes a run's recording; None if recording is disabled or Rerun is not installed.
 
     Args:
-        plan: of the campaign.
-        run: its folder.
-        tell: called with the reason if a recording is wanted, but can't be made.
-        live: view that shows the same, if it is alive.
+        plan: plan of the campaign.
+        run: folder of the run.
+        tell: called with the reason if recording is enabled but impossible.
+        live: view that also shows the recording.
 
     Raises:
         OSError: the recording can't be written.

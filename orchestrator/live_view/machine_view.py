@@ -1,6 +1,7 @@
-"""The machine: who works at what, the queue, seconds for each simulation, waits, what was dropped; log and status.
+"""Rows of the machine: activity of each worker, queue, simulation times, waits and dropped events; log and status page.
 
-What is going on, for somebody who looks in from the door: a page of a few large lines.
+`MachineView` writes the rows. `StatusView` collects the state of a campaign on a page with a few large lines, which can
+be read from a distance.
 """
 
 from __future__ import annotations
@@ -44,20 +45,20 @@ _PURPOSES = {
     "tilt": style.BEST,
     "idle": style.PALE,
 }
-"""Colours of lanes that have one of their own; others get Rerun's."""
+"""Colours of activities; others get Rerun's default colours."""
 
 
 class MachineView:
-    """Rows of the machine. For one thread.
+    """Writes the rows of the machine. For one thread.
 
     Args:
-        outlet: where rows go.
+        sink: sink of the rows.
     """
 
-    def __init__(self, outlet: RecordingSink) -> None:
+    def __init__(self, sink: RecordingSink) -> None:
         import rerun as rr
 
-        self._rr, self._outlet = rr, outlet
+        self._rr, self._sink = rr, sink
         self._simulators = 1
         self._slots: dict[int, int] = {}
         self._styled: set[str] = set()
@@ -71,22 +72,22 @@ class MachineView:
             ("dropped", "events that watchers missed", style.ESCAPED),
         ):
             points = name in ("seconds", "wait")
-            looks = (
+            appearance = (
                 rr.SeriesPoints(names=label, colors=shapes.rgb(colour), marker_sizes=4.0)
                 if points
                 else rr.SeriesLines(names=label, colors=shapes.rgb(colour), widths=2.5)
             )
-            outlet.log(f"{PLACE}/{name}", looks, static=True)
+            sink.log(f"{PLACE}/{name}", appearance, static=True)
 
     def opened(self, simulators: int, *, arm: bool) -> None:
-        """The pool is so large, and there is an arm or not: nobody works yet."""
+        """Initialise the rows for a pool of simulators, the optimiser, and an arm if there is one; all are idle."""
         self._simulators = max(simulators, 1)
         for name in (*(["arm"] if arm else []), "optimiser", *(f"simulator {n + 1}" for n in range(self._simulators))):
             self.lane(name, None)
         self._load()
 
     def simulation_started(self, key: int, purpose: str) -> None:
-        """One was handed to the pool."""
+        """Log that a simulation was sent to the pool."""
         taken = set(self._slots.values())
         self._slots[key] = slot = next(i for i in range(len(taken) + 1) if i not in taken)
         if slot < self._simulators:
@@ -94,7 +95,7 @@ class MachineView:
         self._load()
 
     def simulation_finished(self, key: int, seconds: float) -> None:
-        """It came back, or not."""
+        """Log that a simulation has finished or failed."""
         slot = self._slots.pop(key, None)
         if slot is not None and slot < self._simulators:
             self.lane(f"simulator {slot + 1}", None)
@@ -103,45 +104,45 @@ class MachineView:
         self._load()
 
     def pour_started(self, now: float) -> None:
-        """The arm is given a pour."""
+        """Log that a pour starts."""
         if self._poured is not None:
             self._number("wait", now - self._poured)
 
     def pour_finished(self, now: float) -> None:
-        """It is over."""
+        """Log that a pour has ended."""
         self._poured = now
         self.lane("arm", None)
 
     def lane(self, name: str, doing: str | None) -> None:
-        """Somebody begins something, or (None) has ended it."""
+        """Log the start of an activity, or its end (None)."""
         entity = f"{PLACE}/lanes/{safe_name(name)}"
         if entity not in self._styled:
             self._styled.add(entity)
             known = list(_PURPOSES)
             colours = [shapes.rgb(_PURPOSES[each]) for each in known]
-            looks = self._rr.StateConfiguration(values=known, labels=known, colors=colours)
-            self._outlet.log(entity, looks, static=True)
-        self._outlet.log(entity, self._rr.StateChange(state=doing or IDLE))
+            appearance = self._rr.StateConfiguration(values=known, labels=known, colors=colours)
+            self._sink.log(entity, appearance, static=True)
+        self._sink.log(entity, self._rr.StateChange(state=doing or IDLE))
 
     def dropped(self, count: int) -> None:
-        """So many events were dropped so far."""
+        """Log the number of events dropped so far."""
         self._number("dropped", count)
 
     def line(self, text: str, level: str = "info", source: str = "campaign") -> None:
-        """A line of the log."""
+        """Add a line to the log."""
         log = self._rr.TextLogLevel
         levels = {"info": log.INFO, "warning": log.WARN, "error": log.ERROR}
-        self._outlet.log(f"{LOG}/{safe_name(source)}", self._rr.TextLog(text, level=levels.get(level, log.INFO)))
+        self._sink.log(f"{LOG}/{safe_name(source)}", self._rr.TextLog(text, level=levels.get(level, log.INFO)))
 
     def status(self, markdown: str) -> None:
-        """What is going on, in large letters; replaces what was there before."""
+        """Replace the status page."""
         if markdown != self._page:
             self._page = markdown
-            self._outlet.log(STATUS, self._rr.TextDocument(markdown, media_type="text/markdown"))
+            self._sink.log(STATUS, self._rr.TextDocument(markdown, media_type="text/markdown"))
 
     def outcome(self, markdown: str) -> None:
-        """How the run ended: the same at all times, wherever a viewer's time cursor is."""
-        self._outlet.log(OUTCOME, self._rr.TextDocument(markdown, media_type="text/markdown"), static=True)
+        """Log the outcome of the run, shown at every position of a viewer's time cursor."""
+        self._sink.log(OUTCOME, self._rr.TextDocument(markdown, media_type="text/markdown"), static=True)
 
     def _load(self) -> None:
         running = len(self._slots)
@@ -149,7 +150,7 @@ class MachineView:
         self._number("load/queue", max(running - self._simulators, 0))
 
     def _number(self, name: str, value: float) -> None:
-        self._outlet.number(f"{PLACE}/{name}", float(value))
+        self._sink.number(f"{PLACE}/{name}", float(value))
 
 
 _DOING = {
@@ -166,10 +167,10 @@ _DOING = {
 
 
 class StatusView:
-    """Collects what the page says.
+    """Collects the content of the status page.
 
     Args:
-        plan: of the campaign.
+        plan: plan of the campaign.
     """
 
     def __init__(self, plan: CampaignPlan) -> None:
@@ -189,7 +190,7 @@ class StatusView:
         return "REAL" if self._plan.laboratory.mode == "hardware" else "VIRTUAL"
 
     def take(self, event: Event) -> None:
-        """Take note of an event."""
+        """Process an event."""
         match event:
             case CampaignOpened():
                 self._stages = event.stages
@@ -226,7 +227,7 @@ class StatusView:
             self._pour, self._doing, self._pours = "", "", self._pours + 1
 
     def page(self) -> str:
-        """The page, as Markdown."""
+        """Return the page as Markdown."""
         lines = [f"# {self.reality}: {_plain(self._state)}", f"## {_plain(self._stage or self._plan.name)}"]
         if self._question:
             lines.append(f"## A question is open\n\n{_plain(self._question)}")

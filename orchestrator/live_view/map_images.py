@@ -1,4 +1,7 @@
-"""What Rerun has no axes for, as pictures: surrogates over two axes, and what is known of θ."""
+"""Pictures for which Rerun has no plot type: surrogates over two axes, and the posterior of θ.
+
+The functions return matplotlib figures; `png` encodes them.
+"""
 
 from __future__ import annotations
 
@@ -24,24 +27,24 @@ _DPI = 80
 
 
 def png(figure: Figure) -> bytes:
-    """A figure as the bytes of a PNG."""
+    """Encode a figure as PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     buffer = io.BytesIO()
     figure.set_dpi(_DPI)
-    # `savefig` would draw it twice, the first time for what only other formats need.
+    # `savefig` would draw it twice, the first time for layouts that PNG does not need.
     FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]
     return buffer.getvalue()
 
 
 def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: LossUnit, title: str) -> Figure:
-    """Mean, deviation and lower bound of a surrogate over two axes, with what was observed and what is asked for next.
+    """Draw mean, deviation and lower bound of a surrogate over two axes, with observations and the next points.
 
     Args:
-        problem: that was put to the optimiser.
-        suggestion: its answer, with a surrogate.
-        unit: of the cost.
-        title: what was searched for.
+        problem: suggestion query.
+        suggestion: result with a surrogate.
+        unit: unit of the cost.
+        title: title of the picture.
     """
     assert suggestion.surrogate is not None
     surrogate, space = suggestion.surrogate, problem.space
@@ -86,13 +89,13 @@ def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: Los
 
 
 def slices_picture(problem: SuggestProblem, suggestion: Suggestion, unit: LossUnit, title: str) -> Figure:
-    """A surrogate over every two of more axes: below the diagonal its mean, above it its deviation, with data and next.
+    """Draw a surrogate over each pair of axes: mean below the diagonal, deviation above it, with data and next points.
 
     Args:
-        problem: that was put to the optimiser, over more than two axes.
-        suggestion: its answer, with a surrogate.
-        unit: of the cost.
-        title: what was searched for.
+        problem: suggestion query with more than two axes.
+        suggestion: result with a surrogate.
+        unit: unit of the cost.
+        title: title of the picture.
     """
     maps = slices(problem, suggestion)
     names = [name for name in problem.space.names if any(name in one.axes for one in maps)]
@@ -112,7 +115,7 @@ def slices_picture(problem: SuggestProblem, suggestion: Suggestion, unit: LossUn
     drawn: dict[str, Any] = {}
     for one, mean, deviation in zip(maps, means, deviations, strict=True):
         low, high = (names.index(name) for name in one.axes)
-        # Below the diagonal the first axis lies across; above it the picture is turned over.
+        # Below the diagonal, the first axis is horizontal; above it, the panel is transposed.
         for kind, (row, column), values, every, colours in (
             ("mean", (high, low), mean, means, "viridis_r"),
             ("sd", (low, high), deviation.T, deviations, "cividis"),
@@ -152,7 +155,7 @@ def _key(problem: SuggestProblem, suggestion: Suggestion) -> str:
 
 
 def words(text: str) -> Figure:
-    """A line where a picture will come."""
+    """Draw a line of text as placeholder."""
     figure, axes = style.new_figure(size=(15.0, 5.2))
     axes.axis("off")
     axes.text(0.5, 0.5, text, ha="center", va="center", fontsize=26, color=style.GREY)
@@ -160,7 +163,7 @@ def words(text: str) -> Figure:
 
 
 def theta_picture(found: CalibratedTheta) -> Figure:
-    """θ*, and which other θ fit the pours: one panel for each parameter that was searched."""
+    """Draw θ* and its posterior: one panel for each searched parameter."""
     names = found.searched
     figure, axes = style.new_figure(1, len(names), size=(5.0 * max(len(names), 2), 4.2), squeeze=False)
     expected = f"expected |measured − simulated| {100 * max(found.predicted_discrepancy, 0.0):.1f} %"

@@ -1,8 +1,9 @@
-"""Films: what took place in simulated or bench time, shown at its own pace.
+"""Playback of motion that took place in simulated or bench time, at its original speed.
 
-On the timeline of simulated time films lie one behind the other. On the wall clock a film runs from when it became
-known, a second for a second: whoever watches live sees the liquid move, and a bench of scaled time is seen at the speed
-of a real one. Frames are kept back until they are due. What would run too far behind is left out of the wall clock.
+`Playback` is one recorded motion with its tracks; `PlaybackQueue` logs the frames when they are due. On the timeline of
+simulated time, playbacks follow one another. On the wall clock, a playback starts when it becomes known and runs in
+real time, so live viewers see the liquid move even if the bench runs in scaled time. Playbacks that would start too
+late are left out of the wall clock.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from numpy.typing import NDArray
 from orchestrator.live_view.recording_sink import Columns, RecordingSink, moment
 
 LONGEST_BACKLOG = 20.0
-"""Films that would begin later than so after they became known are not shown on the wall clock [s]."""
+"""Playbacks that would start later than this after they became known are not shown on the wall clock [s]."""
 
 PAUSE = 0.5
-"""Between two films [s]."""
+"""Pause between two playbacks [s]."""
 
 _SOON = 1e-6
 """Rounding of times [s]."""
@@ -30,11 +31,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Track:
-    """One entity of a film.
+    """One entity of a playback.
 
     Attributes:
-        entity: its path.
-        times: since the film's beginning, increasing, shape (T,) [s].
+        entity: path of the entity.
+        times: times since the start, increasing, shape (T,) [s].
         columns: components, T rows.
     """
 
@@ -49,13 +50,13 @@ def _nothing() -> None:
 
 @dataclass(frozen=True)
 class Playback:
-    """A film.
+    """A recorded motion.
 
     Attributes:
-        length: [s].
-        tracks: what is shown.
-        begin: logs what stands still, with the times of the beginning.
-        end: logs what is to be logged at the end, with its times.
+        length: duration [s].
+        tracks: entities that change.
+        begin: logs the static content, at the time of the start.
+        end: logs the final content, at the time of the end.
     """
 
     length: float
@@ -66,52 +67,52 @@ class Playback:
 
 @dataclass
 class _Showing:
-    """A film that is to be shown, or is."""
+    """A playback that is waiting or in progress."""
 
     film: Playback
     step: int
     wall: float | None
-    """Of its beginning [s since 1970]; None: it is not on the wall clock."""
+    """Wall time of its start [s since 1970]; None if it is not on the wall clock."""
     sim_time: float
-    """Likewise [s]."""
+    """Simulated time of its start [s]."""
     begun: bool = False
     shown: list[int] = field(default_factory=list)
-    """Rows of each track that were shown."""
+    """Number of rows of each track that were logged."""
 
     def times(self, after: float) -> dict[str, float | int]:
-        """So long after the beginning [s]."""
+        """Return the times at an offset from the start [s]."""
         wall: dict[str, float | int] = {} if self.wall is None else {"wall": self.wall + after}
         return {**wall, "step": self.step, "sim_time": self.sim_time + after}
 
 
 class PlaybackQueue:
-    """What is still to be shown. For one thread.
+    """Waiting playbacks. For one thread.
 
     Args:
-        outlet: that frames go to.
+        sink: sink of the frames.
     """
 
-    def __init__(self, outlet: RecordingSink) -> None:
-        self._outlet = outlet
+    def __init__(self, sink: RecordingSink) -> None:
+        self._sink = sink
         self._planned: deque[_Showing] = deque()
         self._free_at = 0.0
         self.end = 0.0
-        """The end of the last film on the timeline of simulated time [s]."""
+        """End of the last playback on the timeline of simulated time [s]."""
 
     def add(self, now: float, step: int, film: Playback) -> None:
-        """A film that became known.
+        """Add a playback.
 
         Args:
-            now: on the wall clock [s since 1970].
-            step: of the campaign.
-            film: to be shown.
+            now: wall clock [s since 1970].
+            step: step of the campaign.
+            film: playback to add.
         """
         begin = self.end + (PAUSE if self.end > 0.0 else 0.0)
         self.end = begin + film.length
         start = max(now, self._free_at)
         shown = [0] * len(film.tracks)
         if start - now > LONGEST_BACKLOG:
-            self._outlet.without("wall")
+            self._sink.without("wall")
             self._show(_Showing(film, step, None, begin, shown=shown), float("inf"))
             return
         self._free_at = start + film.length + PAUSE
@@ -119,7 +120,7 @@ class PlaybackQueue:
 
     @property
     def next_due(self) -> float | None:
-        """When the next frame is due [s since 1970]; None without one."""
+        """Time at which the next frame is due [s since 1970]; None if there is none."""
         if not self._planned:
             return None
         showing = self._planned[0]
@@ -129,7 +130,7 @@ class PlaybackQueue:
         return showing.wall + (min(following, default=showing.film.length) if showing.begun else 0.0)
 
     def play(self, now: float) -> None:
-        """Log all frames that are due by now."""
+        """Log all frames that are due."""
         while self._planned and (showing := self._planned[0]).wall is not None and showing.wall <= now:
             if over := now - showing.wall >= showing.film.length:
                 self._planned.popleft()
@@ -138,18 +139,18 @@ class PlaybackQueue:
                 return
 
     def _show(self, showing: _Showing, until: float) -> None:
-        """So much of a film [s]."""
+        """Log a playback up to an offset from its start [s]."""
         film = showing.film
         if not showing.begun:
             showing.begun = True
-            self._outlet.times(**showing.times(0.0))
+            self._sink.times(**showing.times(0.0))
             film.begin()
         for number, track in enumerate(film.tracks):
             first = showing.shown[number]
             showing.shown[number] = last = int(np.searchsorted(track.times, until + _SOON, side="right"))
             if last > first:
                 moments = [moment(**showing.times(float(each))) for each in track.times[first:last]]
-                self._outlet.rows(track.entity, moments, [(what, rows[first:last]) for what, rows in track.columns])
+                self._sink.rows(track.entity, moments, [(what, rows[first:last]) for what, rows in track.columns])
         if until >= film.length:
-            self._outlet.times(**showing.times(film.length))
+            self._sink.times(**showing.times(film.length))
             film.end()

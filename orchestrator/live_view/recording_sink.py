@@ -1,9 +1,8 @@
-"""One recording, written to a file and, where somebody may look, sent to a server: two streams that get the same.
+"""One recording, written to a file and optionally sent to a server, through two streams with the same rows.
 
-They are two, and not one with two ends, because Rerun completes a file only once the other end has taken everything: a
-server that hangs would leave a file that can't be opened quickly, or not at all.
-
-Rows are gathered, and those of one entity sent as columns: a call for each row and stream costs three times as much.
+`RecordingSink` takes rows and sends the rows of one entity together as columns, since a call for each row costs three
+times as much. Two separate streams are needed: Rerun completes a file only after all sinks of its stream have received
+everything, so a server that hangs would leave an incomplete file.
 """
 
 from __future__ import annotations
@@ -20,32 +19,32 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
 FILING = 2.0
-"""Rows of the file are kept together for so long [s]: packing each few of them costs more than making them."""
+"""Time for which rows of the file are collected [s]: packing a few rows at a time costs more than making them."""
 
 SENDING = 0.75
-"""Rows for those who watch, likewise: `RecordingSink.send` is called so often [s]."""
+"""Time for which rows for viewers are collected, likewise: `RecordingSink.send` is called at this interval [s]."""
 
 LAST_WORDS = 5.0
-"""How long a server may take for the last of it [s]."""
+"""Time that a server may take for the last rows [s]."""
 
 LARGEST = 2 << 20
-"""Rows of one entity are sent before they are more than that [bytes], but for a row that is: no message is huge."""
+"""Largest size of collected rows of one entity [bytes]; only a single larger row exceeds it."""
 
 Moment = Mapping[str, int]
-"""Times by timeline: 'wall' in nanoseconds since 1970, 'step' as it is, all others in nanoseconds."""
+"""Times by timeline: 'wall' in nanoseconds since 1970, 'step' as a number, all others in nanoseconds."""
 
 Columns = Sequence[tuple[Any, Any]]
-"""Components of some rows: descriptors, and Arrow lists as long as there are rows."""
+"""Components of some rows: descriptors, and Arrow lists with one element per row."""
 
 
 class RecordingSink:
-    """Where rows go. For one thread.
+    """The sink of all rows. For one thread.
 
     Args:
-        path: `.rrd` to write; its folder is made if needed.
-        application: recordings of one application share what a viewer has been set to show.
-        name: of the recording, for people.
-        url: of a Rerun server that gets the same; '' for none.
+        path: `.rrd` to write; its folder is created if needed.
+        application: recordings of one application share the settings of the viewer.
+        name: display name of the recording.
+        url: URL of a Rerun server that gets the same rows; '' for none.
 
     Raises:
         OSError: the file can't be written.
@@ -55,11 +54,11 @@ class RecordingSink:
         import rerun as rr
 
         path.parent.mkdir(parents=True, exist_ok=True)
-        # FileSink only logs that it can't write; find out while somebody still listens.
+        # FileSink only logs if it can't write; detect this while the caller can still report it.
         path.open("wb").close()
         self._now: dict[str, int] = {}
         recording_id = uuid.uuid4().hex
-        # What is static is logged row by row. A viewer chokes on many small pieces long before their bytes are many.
+        # Static rows are logged one by one. Many small chunks slow a viewer down more than their size does.
         filed, sent = rr.ChunkBatcherConfig(), rr.ChunkBatcherConfig()
         filed.flush_tick, sent.flush_tick = FILING, SENDING
         file = rr.RecordingStream(application, recording_id=recording_id, batcher_config=filed)
@@ -68,34 +67,34 @@ class RecordingSink:
         if url:
             live = rr.RecordingStream(application, recording_id=recording_id, batcher_config=sent)
             live.set_sinks(rr.GrpcSink(url))
-            self._ends.append(_End(live, 0.0))  # whoever calls `send` takes his time
+            self._ends.append(_End(live, 0.0))  # the caller of `send` sets the pace
         for end in self._ends:
             end.stream.set_log_tick_enabled(False)
             end.stream.set_log_time_enabled(False)
             end.stream.send_recording_name(name)
 
     def times(self, **times: float | int) -> None:
-        """Set the times of what follows: 'step' as it is, others in seconds, 'wall' since 1970."""
+        """Set the times of the following rows: 'step' as a number, others in seconds, 'wall' since 1970."""
         self._now |= moment(**times)
 
     def without(self, *names: str) -> None:
-        """What follows is not on these timelines."""
+        """Remove timelines from the following rows."""
         for name in names:
             self._now.pop(name, None)
 
     @property
     def now(self) -> Moment:
-        """The times of what is logged now."""
+        """The times of rows that are logged now."""
         return dict(self._now)
 
     def log(self, entity: str, *what: Any, static: bool = False, at: Moment | None = None) -> None:
-        """A row.
+        """Log a row.
 
         Args:
-            entity: its path.
+            entity: path of the entity.
             what: archetypes.
-            static: at all times.
-            at: its times, if not now's.
+            static: whether the row is valid at all times.
+            at: times of the row, if they differ from `now`.
         """
         if static:
             for end in self._ends:
@@ -112,18 +111,18 @@ class RecordingSink:
         self.rows(entity, [self.now if at is None else at], columns)
 
     def number(self, entity: str, value: float) -> None:
-        """A row of a curve. The same as to log a scalar; most rows are such."""
+        """Log one value of a curve; the same as logging a scalar, but faster, since most rows are of this kind."""
         at = self.now
         for end in self._ends:
             end.take_number(entity, at, value)
 
     def rows(self, entity: str, moments: Sequence[Moment], columns: Columns) -> None:
-        """Some rows, which are all on the same timelines.
+        """Log several rows on the same timelines.
 
         Args:
-            entity: its path.
-            moments: one for each.
-            columns: their components.
+            entity: path of the entity.
+            moments: times of each row.
+            columns: components of the rows.
         """
         size = sum(array.nbytes for _, array in columns)
         if size <= LARGEST or len(moments) == 1:
@@ -135,15 +134,15 @@ class RecordingSink:
             self.rows(entity, moments[part], [(what, array[part]) for what, array in columns])
 
     def clear(self, entity: str, *, recursive: bool = False) -> None:
-        """What was logged of an entity is not shown any more from now on.
+        """Hide the previous content of an entity from now on.
 
         Args:
-            entity: its path.
-            recursive: those below it as well.
+            entity: path of the entity.
+            recursive: also clear the entities below it.
         """
         import rerun as rr
 
-        # Of rows with the same time the last that was sent counts.
+        # If several rows have the same time, the last one sent is valid.
         for end in self._ends:
             end.send(entity)
         self.log(entity, rr.Clear(recursive=recursive))
@@ -151,10 +150,10 @@ class RecordingSink:
             end.send(entity)
 
     def send(self, *, everything: bool = False) -> None:
-        """Send what has been gathered for long enough.
+        """Send the rows that have been collected for long enough.
 
         Args:
-            everything: however short a time it has been.
+            everything: send all rows.
         """
         now = time.monotonic()
         for end in self._ends:
@@ -163,26 +162,26 @@ class RecordingSink:
 
     @property
     def wait(self) -> float | None:
-        """How long there is nothing to be sent [s]; None: until more is logged."""
+        """Time until there are rows to send [s]; None if no rows are waiting."""
         due = min(end.due for end in self._ends)
         return None if due == float("inf") else max(due - time.monotonic(), 0.0)
 
     def show(self, blueprint: rrb.Blueprint) -> None:
-        """What those who look now are shown from now on."""
+        """Set the layout for live viewers."""
         for end in self._ends[1:]:
             end.stream.send_blueprint(blueprint)
 
     def keep(self, blueprint: rrb.Blueprint) -> None:
-        """How the file is shown. One for each file: `rerun rrd optimize` shuffles several, and the last one counts."""
+        """Set the layout of the file. Call it once: `rerun rrd optimize` reorders layouts, and the last one is used."""
         self._ends[0].stream.send_blueprint(blueprint)
 
     @property
     def on_wall(self) -> bool:
-        """Whether what follows is on the wall clock."""
+        """Whether the following rows are on the wall clock."""
         return "wall" in self._now
 
     def close(self) -> None:
-        """Complete the file; the server gets a little time for the rest."""
+        """Complete the file; the server gets a limited time for the rest."""
         self.send(everything=True)
         file, *others = (end.stream for end in self._ends)
         file.disconnect()
@@ -193,12 +192,12 @@ class RecordingSink:
 
 
 def moment(**times: float | int) -> dict[str, int]:
-    """Times: 'step' as it is, others in seconds, 'wall' since 1970."""
+    """Convert times: 'step' as a number, others in seconds, 'wall' since 1970."""
     return {name: int(value) if name == "step" else round(1e9 * value) for name, value in times.items()}
 
 
 def columns_of(*parts: Iterable[Any]) -> Columns:
-    """What the `columns` of archetypes give, to be sent as rows of one entity."""
+    """Combine the `columns` of archetypes to rows of one entity."""
     return [(column.component_descriptor(), column.as_arrow_array()) for part in parts for column in part]
 
 
@@ -208,29 +207,29 @@ class _Gathered:
 
     moments: list[Moment] = field(default_factory=list)
     columns: list[list[Any]] = field(default_factory=list)
-    """Arrow lists of each component; none for rows of a curve."""
+    """Arrow lists of each component; empty for rows of a curve."""
     numbers: list[float] = field(default_factory=list)
-    """Rows of a curve."""
+    """Values of a curve."""
     size: int = 0
-    """[bytes]."""
+    """Size [bytes]."""
 
 
 class _End:
-    """A stream, and what is gathered for it.
+    """A stream with its collected rows.
 
     Args:
-        stream: where rows go.
-        every: so long they are gathered [s].
+        stream: Rerun's stream.
+        every: time for which rows are collected [s].
     """
 
     def __init__(self, stream: Any, every: float) -> None:
         self.stream, self._every = stream, every
         self._gathered: dict[tuple[str, tuple[str, ...], tuple[Any, ...]], _Gathered] = {}
         self.due = float("inf")
-        """When rows are to be sent [s of the monotonic clock]."""
+        """Time at which rows must be sent [s of the monotonic clock]."""
 
     def take(self, entity: str, moments: Sequence[Moment], columns: Columns, size: int) -> None:
-        """Gather some rows of some bytes."""
+        """Collect rows of a given size."""
         rows = self._rows_of(entity, moments[0], tuple(what for what, _ in columns))
         if rows.moments and rows.size + size > LARGEST:
             self.send(entity)
@@ -242,7 +241,7 @@ class _End:
             kept.append(array)
 
     def take_number(self, entity: str, at: Moment, value: float) -> None:
-        """Gather a row of a curve."""
+        """Collect one value of a curve."""
         rows = self._rows_of(entity, at, ())
         rows.moments.append(at)
         rows.numbers.append(value)
@@ -256,10 +255,10 @@ class _End:
         return rows
 
     def send(self, under: str = "") -> None:
-        """Send what is gathered.
+        """Send the collected rows.
 
         Args:
-            under: only what belongs to this entity and those below it.
+            under: only rows of this entity and of those below it.
         """
         chosen = [key for key in self._gathered if not under or f"{key[0]}/".startswith(f"{under}/")]
         for key in chosen:
@@ -282,7 +281,7 @@ class _End:
 
 @dataclass(frozen=True)
 class _Column:
-    """A column that is an Arrow list already; what `send_columns` asks of one."""
+    """A column that is already an Arrow list, with the interface that `send_columns` requires."""
 
     descriptor: Any
     array: Any

@@ -1,8 +1,8 @@
-"""The process that writes a campaign's recording, fed by `monitor.RerunMonitor`.
+"""The process that writes a campaign's recording; `RerunMonitor` starts it and sends events.
 
-It has a process of its own, for drawing and packing cost time that control doesn't have, and because whatever happens
-to it happens to nobody else. Its input is a stream of pickles from the process that started it: `Opening`, events,
-`Closing`. When that process dies, however it dies, the stream ends, and the recording is completed.
+A separate process is used, since drawing and packing take CPU time, and so that its failure does not affect the
+campaign. The input is a stream of pickles: `Opening`, events, `Missed` and `Closing`. If the parent process dies, the
+stream ends and the recording is completed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
 WAITING = 64
-"""Events that wait in this process; more wait in the pipe, then at the sender, who counts those that he drops."""
+"""Largest number of events waiting here. More wait in the pipe, then at the sender, which counts dropped events."""
 
 NICENESS = 5
 
@@ -39,8 +39,8 @@ class Opening:
     """The first message.
 
     Attributes:
-        path: of the `.rrd`.
-        url: of a Rerun server to send to as well; '' for none.
+        path: path of the `.rrd`.
+        url: URL of a Rerun server to send to as well; '' for none.
     """
 
     path: Path
@@ -50,22 +50,22 @@ class Opening:
 
 @dataclass(frozen=True)
 class Missed:
-    """So many events were dropped until now."""
+    """Number of events dropped so far."""
 
     dropped: int
 
 
 @dataclass(frozen=True)
 class Closing:
-    """The last message; `dropped` events never came."""
+    """The last message; `dropped` is the number of missing events."""
 
     dropped: int
 
 
 def main() -> None:
-    """Write until told to close, or until nobody is there any more; then say on stdout how it went, as JSON."""
+    """Write until closed or until the parent process has ended; then print the result as JSON on stdout."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # the end of the input says when to end
+        signal.signal(number, signal.SIG_IGN)  # the end of the input ends this process
     with contextlib.suppress(OSError):
         os.nice(NICENESS)
     opening = pickle.load(sys.stdin.buffer)
@@ -74,18 +74,18 @@ def main() -> None:
     recording = CampaignRecording(opening.path, opening.plan, url=opening.url)
     report = Writing(recording).run(sys.stdin.buffer)
     print(json.dumps(report), flush=True)
-    # Rerun's threads may still wait for a server that is gone; everything is written.
+    # Rerun's threads may still wait for a server that no longer exists; everything is written.
     os._exit(0)
 
 
 class Writing:
-    """Hands events to a recording, and what it has planned for later at its time.
+    """Passes events to a recording, and starts due playback.
 
-    It does so in rounds, each at least `SENDING` after the one before: whoever watches is shown nothing sooner, and to
-    wake up for each event costs as much as to draw it.
+    It works in rounds that are at least `SENDING` apart: viewers receive nothing earlier, and waking up for each event
+    costs as much as drawing it.
 
     Args:
-        recording: that takes them.
+        recording: recording that handles the events.
     """
 
     def __init__(self, recording: CampaignRecording) -> None:
@@ -97,10 +97,10 @@ class Writing:
         self.problem = ""
 
     def run(self, source: IO[bytes]) -> dict[str, Any]:
-        """Everything from the source to its end.
+        """Process all messages until the end.
 
         Returns:
-            'failed': events that could not be drawn; 'problem': the first reason.
+            'failed': number of events that could not be drawn; 'problem': the first reason.
         """
         threading.Thread(target=self._read, args=(source,), daemon=True).start()
         while True:
@@ -113,13 +113,13 @@ class Writing:
                     self._recording.missed(item.dropped)
                 else:
                     self._guard(lambda item=item: self._recording.handle(item))  # type: ignore[misc]
-                if not self._pause:  # much has come, or there was much to draw
+                if not self._pause:  # many events have arrived, or drawing took long
                     self._guard(self._recording.play)
                     self._next_round = time.monotonic() + SENDING
             self._guard(self._recording.play)
 
     def _round(self) -> list[Any]:
-        """What has come since the round before, once there is something to do."""
+        """Wait for work, and return the messages since the previous round."""
         items, wait = [], self._recording.wait
         with contextlib.suppress(queue.Empty):
             items.append(self._queue.get(timeout=None if wait is None else max(wait, self._pause)))
@@ -134,7 +134,7 @@ class Writing:
 
     @property
     def _pause(self) -> float:
-        """Until the next round [s]."""
+        """Time until the next round [s]."""
         return max(self._next_round - time.monotonic(), 0.0)
 
     def _read(self, source: IO[bytes]) -> None:
@@ -149,8 +149,8 @@ class Writing:
                     self._hurry.set()
                 self._queue.put(item)
         except (EOFError, OSError):
-            return  # whoever sent is dead
-        except Exception as error:  # half a message, or one that can't be read here
+            return  # the sender is dead
+        except Exception as error:  # an incomplete message, or one that can't be unpickled here
             self._note(error)
         finally:
             self._hurry.set()
@@ -170,9 +170,9 @@ class Writing:
 
 
 def optimise(path: Path) -> None:
-    """Rewrite a closed recording in few large pieces, which a viewer loads many times as fast.
+    """Rewrite a closed recording in few large chunks, which viewers load many times as fast.
 
-    The file is replaced at once or not at all: where there is no room for a second one it stays as it was.
+    The file is replaced atomically; if there is no space for a second file, it remains unchanged.
 
     Raises:
         OSError: it can't be rewritten.

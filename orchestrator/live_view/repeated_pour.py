@@ -1,4 +1,7 @@
-"""Pours of a run, simulated again with as many particles as one likes: from the journal, as the arm moved."""
+"""Repeats a run's pour in simulation, with any number of particles, from the journal and the arm's executed motion.
+
+`find_pour` reads a weighed pour; `task_of` makes the simulation task. The simulation itself is run by the caller.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ DETAIL = 30.0
 
 
 class NoSuchPourError(ValueError):
-    """The journal has no such pour; the text says which it has."""
+    """The journal has no such pour; the message lists the pours it has."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +31,8 @@ class PouredOnce:
     """A weighed pour.
 
     Attributes:
-        stage: that asked for it.
-        measured: what came of it.
+        stage: stage that requested it.
+        measured: its measurement.
     """
 
     stage: str
@@ -38,21 +41,21 @@ class PouredOnce:
 
     @property
     def title(self) -> str:
-        """For people."""
+        """Title for the viewer."""
         weighed = f"{1e3 * self.measured.spilled:.1f} g spilled when it was poured"
         return f"pour {self.request.number} of {self.stage}, simulated again ({weighed})"
 
 
 def find_pour(run: Path, number: int, stage: str | None = None) -> PouredOnce:
-    """A weighed pour of a run.
+    """Find a weighed pour of a run.
 
     Args:
-        run: its folder.
-        number: of the pour within its stage.
-        stage: that asked for it; the last that has such a pour, if none is given.
+        run: folder of the run.
+        number: number of the pour within its stage.
+        stage: stage that requested it; None: the last stage with such a pour.
 
     Raises:
-        NoSuchPourError: there is none.
+        NoSuchPourError: the run has no such pour.
         JournalError: the journal can't be read.
     """
     pours: dict[int, tuple[str, Pour]] = {}
@@ -74,13 +77,13 @@ def find_pour(run: Path, number: int, stage: str | None = None) -> PouredOnce:
 
 
 def task_of(plan: CampaignPlan, run: Path, pour: PouredOnce, particles: int | None = None) -> PourTask:
-    """What simulates a pour again: the motion that the arm executed, where it was read back, and the run's θ*.
+    """Make the task that simulates a pour again, with the arm's executed motion, if it was recorded, and the run's θ*.
 
     Args:
-        plan: of the run.
-        run: its folder.
-        pour: to be simulated.
-        particles: in place of θ's.
+        plan: plan of the run.
+        run: folder of the run.
+        pour: pour to simulate.
+        particles: number of particles instead of θ's.
     """
     theta = plan.parameters
     if (found := run / "theta.json").is_file():

@@ -1,4 +1,4 @@
-"""Our shapes as Rerun has them: vessels, poses, the bars of an arm, particles by their fate."""
+"""Conversion of Decant's shapes to Rerun's: vessels, poses, the links of an arm, and particles by their fate."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ TRAY = (205, 208, 212, 255)
 
 
 def rgb(colour: str) -> list[int]:
-    """'#0072b2' as three bytes."""
+    """Convert '#0072b2' to three bytes."""
     return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
 
 
 @functools.lru_cache(maxsize=16)
 def vessel(spec: VesselSpec) -> Vessel:
-    """A vessel, built once."""
+    """Build a vessel; the result is cached."""
     from sim_engine.vessel.vessel import build_vessel
 
     return build_vessel(spec)
 
 
 def mesh(spec: VesselSpec) -> Any:
-    """The true surface of a vessel."""
+    """Return the exact surface of a vessel."""
     import rerun as rr
 
     solid = vessel(spec)
     vertices, faces = np.asarray(solid.solid_vertices, np.float32), np.asarray(solid.solid_faces, np.uint32)
-    # Flat normals from unshared corners: rims and floors stay sharp.
+    # Unshared vertices with flat normals keep rims and bottoms sharp.
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
@@ -58,7 +58,7 @@ def mesh(spec: VesselSpec) -> Any:
 
 
 def placed(pose: FloatArray) -> Any:
-    """A pose (7,) x y z qw qx qy qz as a transform."""
+    """Convert a pose (7,) x y z qw qx qy qz to a transform."""
     import rerun as rr
 
     turn = rr.Quaternion(xyzw=[pose[4], pose[5], pose[6], pose[3]])
@@ -66,30 +66,30 @@ def placed(pose: FloatArray) -> Any:
 
 
 def places(poses: FloatArray) -> Columns:
-    """Poses (T, 7) as transforms at T moments."""
+    """Convert poses (T, 7) to transforms at T times."""
     import rerun as rr
 
     return columns_of(rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, [4, 5, 6, 3]]))
 
 
 def moving(entity: str, times: FloatArray, poses: FloatArray) -> Track:
-    """What moves along poses (T, 7) at times (T,) [s]; while it rests nothing is said."""
+    """Return a track of poses (T, 7) at times (T,) [s]; unchanged poses are left out."""
     some = changes(poses)
     return Track(entity, times[some], places(poses[some]))
 
 
 def changes(rows: FloatArray) -> NDArray[np.intp]:
-    """Which rows (T, n) differ from the one before; the first does, and the last is taken for one that does."""
+    """Return the indices of rows (T, n) that differ from the previous one, and of the first and the last."""
     differs = np.any(np.abs(np.diff(rows, axis=0)) > 1e-6, axis=1)
     return np.flatnonzero([True, *differs[:-1], True] if len(differs) else [True])
 
 
 def bars(figure: ArmFigure, ends: FloatArray) -> Any:
-    """What an arm's links look like, however they stand: capsules as long as they always are.
+    """Return an arm's links as capsules; their lengths do not depend on the joints.
 
     Args:
-        figure: of the arm.
-        ends: of its bars for any joints, shape (bars, 2, 3) [m].
+        figure: shape of the arm.
+        ends: ends of its links for any joints, shape (bars, 2, 3) [m].
     """
     import rerun as rr
 
@@ -104,17 +104,17 @@ def bars(figure: ArmFigure, ends: FloatArray) -> Any:
 
 
 def stances(ends: FloatArray) -> Columns:
-    """Where an arm's links are at some moments; what they look like is `bars`.
+    """Return poses of an arm's links at several times, for the capsules of `bars`.
 
     Args:
-        ends: of its bars, shape (T, bars, 2, 3) [m].
+        ends: ends of its links, shape (T, bars, 2, 3) [m].
     """
     import rerun as rr
 
     along = ends[..., 1, :] - ends[..., 0, :]
     axes = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
-    # A capsule lies along z; how it is turned about itself nobody sees. The turn from z to an axis a is the quaternion
-    # (z × a, 1 + z · a), but for an axis straight down, where any half turn will do.
+    # A capsule lies along z; rotations about its axis are invisible. The rotation from z to an axis a is the
+    # quaternion (z × a, 1 + z · a), except for an axis along −z, for which any half turn is valid.
     turns = np.stack([-axes[..., 1], axes[..., 0], np.zeros(axes.shape[:-1]), 1.0 + axes[..., 2]], axis=-1)
     turns[turns[..., 3] < 1e-9] = (1.0, 0.0, 0.0, 0.0)
     turns /= np.linalg.norm(turns, axis=-1, keepdims=True)
@@ -123,7 +123,7 @@ def stances(ends: FloatArray) -> Columns:
 
 
 def fates() -> Any:
-    """What the colours of particles mean."""
+    """Return the legend of the particles' colours."""
     import rerun as rr
 
     return rr.AnnotationContext(
@@ -135,7 +135,7 @@ def fates() -> Any:
 
 
 def swarms(positions: Sequence[NDArray[np.float32]], states: Sequence[NDArray[np.uint8]], radius: float) -> Columns:
-    """Particles by their fate at some moments, positions (N, 3) [m] and states (N,) for each."""
+    """Return particles by their fate at several times, with positions (N, 3) [m] and states (N,) for each."""
     import rerun as rr
 
     places = np.concatenate([np.asarray(each, np.float32) for each in positions])
@@ -145,5 +145,5 @@ def swarms(positions: Sequence[NDArray[np.float32]], states: Sequence[NDArray[np
 
 
 def spacing(positions: NDArray[np.float32], volume: float) -> float:
-    """Between particles that share a volume [m³] among them [m]."""
+    """Return the distance between particles that fill a volume [m³] evenly [m]."""
     return float((volume / max(len(positions), 1)) ** (1.0 / 3.0))

@@ -1,6 +1,7 @@
-"""The watcher that has a campaign's recording written, by a process of its own.
+"""The subscriber that records a campaign, in a process of its own.
 
-A bounded queue and one thread behind it: what watches may fall behind, never hold up.
+`RerunMonitor` takes events and starts the writer (`recording_writer`). `QueueThread` connects both with a bounded queue
+and one thread: the recording may be delayed, but it never delays the campaign.
 """
 
 from __future__ import annotations
@@ -28,15 +29,16 @@ Item = TypeVar("Item")
 
 
 class QueueThread(Generic[Item]):
-    """Runs `handle` on every item in a thread of its own.
+    """Runs `handle` on every item in a separate thread.
 
-    Items that find the queue full are dropped and counted; a handler that raises is counted, and reported once.
+    Items that arrive while the queue is full are dropped and counted. Errors of the handler are counted, and the first
+    one is logged.
 
     Args:
         handle: called in the thread, one item after the other.
         finish: called once in the thread after the last item.
-        capacity: items that may wait.
-        name: of the thread, and in reports.
+        capacity: largest number of waiting items.
+        name: name of the thread, also used in log messages.
     """
 
     def __init__(self, handle: Callable[[Item], None], finish: Callable[[], None], *, capacity: int, name: str) -> None:
@@ -44,15 +46,15 @@ class QueueThread(Generic[Item]):
         self._queue: queue.Queue[Item] = queue.Queue(maxsize=capacity)
         self._stop = threading.Event()
         self.dropped = 0
-        """Items that were not handled because the queue was full, or because the worker had been closed."""
+        """Items that were not handled because the queue was full or the thread had been closed."""
         self.failed = 0
         """Items whose handler raised."""
-        # A daemon: a disk that hangs must not keep the process alive.
+        # A daemon thread: a disk that hangs must not keep the process alive.
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     def put(self, item: Item) -> bool:
-        """Hand over an item; False if it was dropped. Never waits, never raises."""
+        """Add an item; return False if it was dropped. Never waits, never raises."""
         if self._stop.is_set():
             self.dropped += 1
             return False
@@ -64,7 +66,7 @@ class QueueThread(Generic[Item]):
         return True
 
     def close(self, timeout: float) -> bool:
-        """Handle what waits, finish, and end the thread; False if that took longer than `timeout` [s]."""
+        """Handle waiting items, finish, and end the thread; return False if that takes longer than `timeout` [s]."""
         self._stop.set()
         self._thread.join(timeout)
         return not self._thread.is_alive()
@@ -96,75 +98,75 @@ class QueueThread(Generic[Item]):
 
 
 CAPACITY = 4_000
-"""Events that may wait: minutes of a busy campaign."""
+"""Largest number of waiting events: minutes of a busy campaign."""
 
 PATIENCE = 30.0
-"""Longest wait for the recording to be completed [s]."""
+"""Longest time to wait until the recording is complete [s]."""
 
 
 class RerunMonitor:
-    """Has a campaign written into a Rerun recording: a watcher.
+    """Records a campaign with Rerun; a subscriber of its events.
 
-    Events go through a bounded queue to a thread, which only packs them for a process that draws and writes. Where that
-    process or its disk can't keep up, hangs, or dies, events are dropped and counted; nothing here waits for, or raises
-    into, the campaign.
+    Events pass through a bounded queue to a thread, which pickles them for a process that draws and writes. If that
+    process or its disk is too slow, hangs or dies, events are dropped and counted. The campaign never waits for the
+    recording, and no error of the recording reaches it.
 
     Args:
-        path: `.rrd` to write; if it exists (a resumed run), the next free name beside it is used.
-        plan: of the campaign.
-        url: of a Rerun server that gets the same, see `orchestrator.live_view.live_server`.
-        capacity: events that may wait.
+        path: `.rrd` to write; if it exists (a resumed run), the next free name next to it is used.
+        plan: plan of the campaign.
+        url: URL of a Rerun server that gets the same rows, see `orchestrator.live_view.live_server`.
+        capacity: largest number of waiting events.
 
     Raises:
-        OSError: the file can't be written (said before the campaign starts, while it can be mended).
+        OSError: the file can't be written (raised before the campaign starts, while the user can fix it).
 
-    Limitations: a resumed run's recording has everything that the journal knows, but no particles of simulations that
-    ran before the interruption; these are in the recording of that time.
+    Limitations: the recording of a resumed run contains everything in the journal, except particles of simulations
+    before the interruption; the earlier recording contains these.
     """
 
     def __init__(self, path: Path, plan: CampaignPlan, *, url: str = "", capacity: int = CAPACITY) -> None:
         self.path = free_path(path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        # The writer could only say so when nobody listens any more.
+        # The writer could report this only after the start of the campaign.
         self.path.open("wb").close()
         self._process = _start_writer()
         self._report: dict[str, Any] = {"failed": 0}
-        self._told = 0
+        self._reported = 0
         self._worker: QueueThread[Event | Opening] = QueueThread(
             self._send, self._finish, capacity=capacity, name=f"recording {self.path.name}"
         )
         self._worker.put(Opening(self.path, plan, url))
 
     def __call__(self, event: Event) -> None:
-        """Take note of an event. Returns at once."""
+        """Queue an event. Returns at once."""
         self._worker.put(event)
 
     @property
     def pid(self) -> int:
-        """The process id of the writer."""
+        """Process id of the writer."""
         return self._process.pid
 
     @property
     def dropped(self) -> int:
-        """Events that are missing from the recording because nobody could take them."""
+        """Events that are missing from the recording because they were dropped."""
         return self._worker.dropped
 
     @property
     def failed(self) -> int:
-        """Events that couldn't be written, as far as is known: all of them only after `close`."""
+        """Known number of events that couldn't be written; complete only after `close`."""
         return self._worker.failed + int(self._report["failed"])
 
     def close(self, timeout: float = PATIENCE) -> bool:
-        """Write out what waits; False if the file could not be completed within `timeout` [s]. Never raises."""
+        """Write waiting events; return False if the file could not be completed within `timeout` [s]. Never raises."""
         if not self._worker.close(timeout):
             _log.warning("recording %s: could not be completed within %g s", self.path.name, timeout)
-        self._process.kill()  # done, or past help
+        self._process.kill()  # finished, or beyond recovery
         self._worker.close(1.0)
         return self._report.get("complete", False) is True
 
     def _send(self, item: Event | Opening | Missed | Closing) -> None:
-        if (dropped := self._worker.dropped if isinstance(item, Event) else 0) > self._told:
-            self._told = dropped
+        if (dropped := self._worker.dropped if isinstance(item, Event) else 0) > self._reported:
+            self._reported = dropped
             self._send(Missed(dropped))
         self._process.write(pickle.dumps(item, protocol=pickle.HIGHEST_PROTOCOL))
 
@@ -186,14 +188,14 @@ class RerunMonitor:
 
 
 def _start_writer() -> ChildProcess:
-    # What is importable here is importable there: strategies and devices of others are among the settings.
+    # Everything importable here must be importable there, since plug-ins may be part of the settings.
     variables = environment() | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     command = [sys.executable, "-c", "from orchestrator.live_view.recording_writer import main; main()"]
     return ChildProcess(command, environment=variables, errors="dropped")
 
 
 def free_path(path: Path) -> Path:
-    """`path`, or the first of name-2, name-3 … that does not exist."""
+    """Return `path`, or the first of name-2, name-3 … that does not exist."""
     number, candidate = 2, path
     while candidate.exists():
         candidate = path.with_name(f"{path.stem}-{number}{path.suffix}")

@@ -1,7 +1,11 @@
-"""A campaign's recording: events in, Rerun rows out.
+"""A campaign's recording: converts events to Rerun rows.
 
-Three timelines: `wall`, when something was known; `step`, how many requests had been answered; `sim_time`, on which the
-films of simulations and pours lie one behind the other.
+`CampaignRecording` passes each event to the views of cell, balance, learning, machine and simulations. There are three
+timelines:
+
+- `wall`: wall clock; an event has the time at which it became known.
+- `step`: number of finished requests.
+- `sim_time`: simulated time, on which the playbacks of simulations and pours follow one another.
 """
 
 from __future__ import annotations
@@ -43,12 +47,12 @@ if TYPE_CHECKING:
 
 
 class CampaignRecording:
-    """Knows what each event means in a recording. For one thread.
+    """Handles the events of a campaign. For one thread.
 
     Args:
         path: `.rrd` to write.
-        plan: of the campaign.
-        url: of a Rerun server that gets the same; '' for none.
+        plan: plan of the campaign.
+        url: URL of a Rerun server that gets the same rows; '' for none.
 
     Raises:
         OSError: the file can't be written.
@@ -60,20 +64,20 @@ class CampaignRecording:
         self.path, self._plan = path, plan
         self._scenes = scenes_of(plan)
         self.status = StatusView(plan)
-        outlet = self._outlet = RecordingSink(
+        sink = self._sink = RecordingSink(
             path, application=f"decant {plan.name}", name=f"{plan.name} · {self.status.reality}", url=url
         )
         self._moment: Moment | None = None
-        outlet.keep(blueprint_of(plan, "replaying"))
+        sink.keep(blueprint_of(plan, "replaying"))
         self._show("calibrating" if plan.calibration is not None else "deploying")
-        outlet.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        outlet.times(step=0, sim_time=0.0)
-        self._films = PlaybackQueue(outlet)
-        self._simulated = SimulatedStage(outlet, self._films)
-        self._cell = CellScene(outlet, self._films, plan)
-        self._balance = BalanceStage(outlet, self._cell.time_scale)
-        self._learning = LearningStage(outlet, plan)
-        self._machine = MachineView(outlet)
+        sink.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        sink.times(step=0, sim_time=0.0)
+        self._films = PlaybackQueue(sink)
+        self._simulated = SimulatedStage(sink, self._films)
+        self._cell = CellScene(sink, self._films, plan)
+        self._balance = BalanceStage(sink, self._cell.time_scale)
+        self._learning = LearningStage(sink, plan)
+        self._machine = MachineView(sink)
         self._machine.outcome(
             f"# {self.status.reality}: no end\n\nThe run is under way, or its process was killed before it ended.\n"
         )
@@ -82,35 +86,35 @@ class CampaignRecording:
 
     @property
     def wait(self) -> float | None:
-        """How long `play` has nothing to do [s]; None: until there are events."""
+        """Time until `play` has work to do [s]; None if it must wait for events."""
         film = self._films.next_due
-        waits = (None if film is None else max(film - time.time(), 0.0), self._outlet.wait)
+        waits = (None if film is None else max(film - time.time(), 0.0), self._sink.wait)
         return min((each for each in waits if each is not None), default=None)
 
     def play(self) -> None:
-        """Write what is due by now. Best not after each event, but after what has come in half a second."""
+        """Write everything that is due. Call it about every half second rather than after each event."""
         self._films.play(time.time())
         self._cell.show()
-        self._outlet.send()
+        self._sink.send()
 
     def close(self, dropped: int = 0) -> None:
-        """Complete the recording; `dropped` events never came."""
+        """Complete the recording; `dropped` is the number of missing events."""
         self._films.play(float("inf"))
         self._cell.show()
         if dropped:
             self.missed(dropped)
             self._machine.line(f"{dropped} events are missing: the recording could not keep up", "warning", "recording")
-        self._outlet.close()
+        self._sink.close()
 
     def missed(self, dropped: int) -> None:
-        """So many events never came until now."""
+        """Log the number of events dropped so far."""
         self._machine.dropped(dropped)
 
     def handle(self, event: Event) -> None:
-        """Take note of an event."""
+        """Process an event."""
         if isinstance(event, RequestFinished):
             self._step += 1
-        self._outlet.times(wall=event.time, step=self._step, sim_time=self._films.end)
+        self._sink.times(wall=event.time, step=self._step, sim_time=self._films.end)
         self.status.take(event)
         match event:
             case CampaignOpened():
@@ -153,14 +157,14 @@ class CampaignRecording:
         self._machine.line(text, level, source or "campaign")
 
     def _show(self, moment: Moment) -> None:
-        """Arrange the views for a moment; not anew for one that is shown already, since people move views about."""
+        """Set the layout for a phase, unless it is already set, since users may have rearranged its views."""
         if self._moment == moment:
             return
         self._moment = moment
-        self._outlet.show(blueprint_of(self._plan, moment))
+        self._sink.show(blueprint_of(self._plan, moment))
 
     def _follow(self, request: Request) -> None:
-        """The views follow what is asked for."""
+        """Select the layout for a request."""
         if isinstance(request, Simulate | Pour) and self._moment != "replaying":
             deployed = self._plan.deployment is not None and request.scene in {
                 scene.name for scene in self._plan.deployment.scenes
@@ -183,7 +187,7 @@ class CampaignRecording:
                 if pour.predicted is not None:
                     unit = unit_of_pour(self._plan, pour)
                     expected = f", predicted {unit.text(pour.predicted.mean, pour.predicted.deviation)}"
-                if (action := self._action(pour)) not in self._decided:  # most strategies have just said so
+                if (action := self._action(pour)) not in self._decided:  # most strategies have just logged it
                     self._say(f"pour {pour.number}: {action}{expected}", source=event.stage)
 
     def _finished(self, event: RequestFinished) -> None:
@@ -238,7 +242,7 @@ class CampaignRecording:
 
 
 def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
-    """All scenes of a campaign, by name."""
+    """Return all scenes of a campaign by name."""
     scenes: dict[str, Scene] = {}
     if plan.calibration is not None:
         for records in (plan.calibration.records, plan.calibration.transfer):
@@ -251,7 +255,7 @@ def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
 
 
 def blueprint_of(plan: CampaignPlan, moment: Moment) -> rrb.Blueprint:
-    """What a viewer shows of a campaign at a moment."""
+    """Return the layout of a campaign for one phase."""
     calibration, deployment = plan.calibration, plan.deployment
     names = receiver_names(plan)
     receivers = {s.name: names[s.name] for s in deployment.scenes} if deployment is not None else {}

@@ -1,6 +1,7 @@
-"""A simulated pour on its own stage: vessels, particles by their fate, and how much of the liquid is where.
+"""Rows of simulated pours: vessels, particles by their fate, and the fractions of the liquid.
 
-One simulated pour as a recording, for `decant simulate --rrd`.
+`SimulatedStage` adds simulations to the playback of a campaign's recording. `simulation_rrd` writes one simulated pour
+as a recording of its own, for `decant simulate --rrd`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from sim_engine.outcome import RecordedFrames, SimulatedPour
 from sim_engine.scene import PourTask, Scene
 
 MAXIMUM_RATE = 10.0
-"""Frames per second of a film: 3 000 particles cost about 36 kB each."""
+"""Frames per second of playback: 3 000 particles take about 36 kB each."""
 
 PLACE = "/simulation"
 
@@ -28,32 +29,32 @@ SHARES = ("in the pourer", "falling", "received", "spilled")
 
 
 class SimulatedStage:
-    """Films of simulations. For one thread.
+    """Adds playbacks of simulations. For one thread.
 
     Args:
-        outlet: where rows go.
-        films: that they are shown by.
+        sink: sink of the rows.
+        films: playback queue.
     """
 
-    def __init__(self, outlet: RecordingSink, films: PlaybackQueue) -> None:
+    def __init__(self, sink: RecordingSink, films: PlaybackQueue) -> None:
         import rerun as rr
 
-        self._rr, self._outlet, self._films = rr, outlet, films
+        self._rr, self._sink, self._films = rr, sink, films
         self._shown: dict[tuple[str, bool], str] = {}
-        outlet.log(f"{PLACE}/liquid", shapes.fates(), static=True)
+        sink.log(f"{PLACE}/liquid", shapes.fates(), static=True)
         for state, name in enumerate(SHARES):
             colour = shapes.rgb(style.PARTICLE_STATES[state][1])
-            outlet.log(f"{PLACE}/share/{state}", rr.SeriesLines(names=name, colors=colour, widths=3), static=True)
+            sink.log(f"{PLACE}/share/{state}", rr.SeriesLines(names=name, colors=colour, widths=3), static=True)
 
     def film(self, frames: RecordedFrames, scene: Scene, title: str, *, now: float, step: int) -> None:
         """Show a simulation.
 
         Args:
-            frames: that were kept; thinned to `MAXIMUM_RATE`.
-            scene: what was simulated.
-            title: of it, for people.
-            now: on the wall clock [s since 1970].
-            step: of the campaign.
+            frames: recorded frames; subsampled to `MAXIMUM_RATE`.
+            scene: simulated scene.
+            title: title for the viewer.
+            now: wall clock [s since 1970].
+            step: step of the campaign.
         """
         times = np.asarray(frames.times, dtype=float)
         if len(times) == 0:
@@ -73,22 +74,22 @@ class SimulatedStage:
             float(moments[-1]),
             tracks,
             begin=lambda: self._set(scene, title),
-            end=lambda: self._outlet.clear(f"{PLACE}/share", recursive=True),  # no line to the next film
+            end=lambda: self._sink.clear(f"{PLACE}/share", recursive=True),  # no line to the next playback
         )
         self._films.add(now, step, film)
 
     def _set(self, scene: Scene, title: str) -> None:
-        self._outlet.log(f"{PLACE}/title", self._rr.TextDocument(f"### {title}", media_type="text/markdown"))
+        self._sink.log(f"{PLACE}/title", self._rr.TextDocument(f"### {title}", media_type="text/markdown"))
         for what, spec in (("pourer", scene.pourer), ("receiver", scene.receiver)):
-            # What is left out of the wall clock isn't there for those who watch by it.
-            key, place = spec.content_hash(), (what, self._outlet.on_wall)
+            # Viewers of the wall clock don't see rows that are left out of it.
+            key, place = spec.content_hash(), (what, self._sink.on_wall)
             if self._shown.get(place) != key:
                 self._shown[place] = self._shown[what, False] = key
-                self._outlet.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
+                self._sink.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
 
 
 def thinned(times: NDArray[np.float64]) -> list[int]:
-    """Which frames a film keeps: `MAXIMUM_RATE`, and the last one, which decides what was spilled."""
+    """Return the indices of frames to show: at most `MAXIMUM_RATE`, and the last, which shows the spilled liquid."""
     kept = [0]
     for index in range(1, len(times)):
         if times[index] - times[kept[-1]] >= 1.0 / MAXIMUM_RATE - 1e-6:
@@ -103,9 +104,9 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
 
     Args:
         path: `.rrd` to write; replaced if it exists.
-        task: what was simulated, with `record_rate` > 0.
-        result: what came of it.
-        title: of the recording; what is poured into what if not given.
+        task: simulated task, with `record_rate` > 0.
+        result: result of the simulation.
+        title: title of the recording; default: names of the vessels, and the seed.
 
     Returns:
         `path`.
@@ -120,13 +121,13 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
         raise ValueError("this simulation kept no frames to record; simulate it with a record rate above 0")
     scene, outcome = task.scene, result.outcome
     title = title or f"{scene.pourer.name} into {scene.receiver.name}, seed {task.seed}"
-    outlet = RecordingSink(path, application="decant simulation", name=title)
-    outlet.keep(simulation_blueprint())
-    outlet.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    films = PlaybackQueue(outlet)
+    sink = RecordingSink(path, application="decant simulation", name=title)
+    sink.keep(simulation_blueprint())
+    sink.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    films = PlaybackQueue(sink)
     now = time.time()
-    outlet.times(wall=now, step=0, sim_time=0.0)
-    SimulatedStage(outlet, films).film(result.frames, scene, title, now=now, step=0)
+    sink.times(wall=now, step=0, sim_time=0.0)
+    SimulatedStage(sink, films).film(result.frames, scene, title, now=now, step=0)
     films.play(float("inf"))
     for source, text in (
         ("action", style.display_values(task.action.values())),
@@ -138,6 +139,6 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
         ),
     ):
         level = rr.TextLogLevel.WARN if source == "outcome" and outcome.invalid is not None else rr.TextLogLevel.INFO
-        outlet.log(f"/log/{source}", rr.TextLog(text, level=level))
-    outlet.close()
+        sink.log(f"/log/{source}", rr.TextLog(text, level=level))
+    sink.close()
     return path

@@ -1,8 +1,7 @@
-"""Rerun's own server and web viewer, in a process that ends with the one that started it.
+"""Rerun's server and web viewer, in a process that ends with the one that started it.
 
-`python -m orchestrator.live_view.viewer_server ADDRESS PORT WEB_PORT MEMORY` runs it until its input ends. It is
-Rerun's own
-program and not its Python package, which serves the viewer's page on all addresses, asked or not.
+`python -m orchestrator.live_view.viewer_server ADDRESS PORT WEB_PORT MEMORY` runs it until its input ends. It runs
+Rerun's program instead of its Python package, since the package serves the viewer's page on all addresses.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ OPTIMISING_TIME = 120.0
 
 
 def rerun_program() -> str:
-    """Rerun's program, which its Python package brings.
+    """Return the path of Rerun's program, which is part of its Python package.
 
     Raises:
         ModuleNotFoundError: it is not installed.
@@ -33,16 +32,16 @@ def rerun_program() -> str:
 
 
 def environment() -> dict[str, str | None]:
-    """What the environment of processes that load Rerun differs in: there it sends no usage statistics.
+    """Return the changes to the environment of processes that load Rerun, so that it sends no usage statistics.
 
-    Rerun 0.41 reads its settings file and `CI`; `RERUN_ANALYTICS` has no effect. With `CI` it neither reads nor writes
-    that file, so that the user's own choice stays as it is.
+    Rerun 0.41 reads its settings file and `CI`; `RERUN_ANALYTICS` has no effect. With `CI`, it neither reads nor writes
+    that file, so the user's own setting is unchanged.
     """
     return {"CI": "1", "RUST_LOG": "warn", "FORCE_RERUN_ANALYTICS": None}
 
 
 def run_rerun(*arguments: str) -> Completed:
-    """Run one of its commands to its end.
+    """Run one of Rerun's commands to its end.
 
     Raises:
         OSError: it doesn't start, or takes longer than two minutes.
@@ -54,16 +53,16 @@ def run_rerun(*arguments: str) -> Completed:
 
 
 def serving(address: str, port: int, web_port: int, memory: str, shown: Sequence[str] = ()) -> list[str]:
-    """The command that serves.
+    """Return the command line of the server.
 
     Args:
-        address: to bind to.
-        port: for streams.
-        web_port: for the viewer's page.
-        memory: that the server may keep for those who come late, as '512MiB'.
-        shown: recordings that are opened from files.
+        address: address to listen at.
+        port: port of the streams.
+        web_port: port of the viewer's page.
+        memory: memory limit for viewers that connect late, such as '512MiB'.
+        shown: recordings to open from files.
     """
-    # Whoever comes late to a campaign wants what is going on, then what was; a file is shown from its beginning.
+    # Late viewers of a campaign need the current state first; a file is shown from its beginning.
     order = () if shown else ("--newest-first",)
     return [
         *(rerun_program(), "--serve-web", "--bind", address, "--port", str(port), "--web-viewer-port", str(web_port)),
@@ -74,12 +73,12 @@ def serving(address: str, port: int, web_port: int, memory: str, shown: Sequence
 def main(arguments: Sequence[str]) -> None:
     """Serve until stdin ends."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # the end of the input says when to end
+        signal.signal(number, signal.SIG_IGN)  # the end of the input ends this process
     with contextlib.suppress(OSError):
         os.nice(5)
     address, port, web_port, memory, *shown = arguments
     command = serving(address, int(port), int(web_port), memory, shown)
-    # One thread runs here, so that the kernel may be asked to end the server with it.
+    # This process has one thread, so that the kernel can end the server with it.
     process = ChildProcess(
         command, environment=environment(), input=False, output=False, errors="shown", dies_with_parent=True
     )

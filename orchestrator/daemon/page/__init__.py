@@ -1,6 +1,6 @@
-"""The operator's page: three files that the daemon serves by itself, which need nothing from elsewhere.
+"""The operator page: static files that the daemon serves, without resources from other servers.
 
-The page holds no data and needs no token; it talks to the API with the token that somebody gives it.
+The page contains no data and needs no token itself. It calls the API with the token that the user enters.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ FILES = {
     "/show.js": ("show.js", "text/javascript; charset=utf-8"),
     "/talk.js": ("talk.js", "text/javascript; charset=utf-8"),
 }
-"""Path → file and its type."""
+"""Path → file name and media type."""
 
 HEADERS = {
     "Content-Security-Policy": (
@@ -31,11 +31,11 @@ HEADERS = {
     "Permissions-Policy": "camera=(), microphone=(), geolocation=()",
     "Cache-Control": "no-cache",
 }
-"""Whatever finds its way into the page can load nothing, send nothing elsewhere, and stand in nobody's frame."""
+"""Security headers: injected content can't load resources, send data elsewhere, or run in a frame."""
 
 
 def page_router() -> APIRouter:
-    """The page's routes; they are no part of the API's description."""
+    """Return the page's routes; the API's description does not include them."""
     router = APIRouter(include_in_schema=False)
     for path, (name, kind) in FILES.items():
         content = files(__package__).joinpath(name).read_bytes()
@@ -43,7 +43,7 @@ def page_router() -> APIRouter:
     return router
 
 
-def _served(content: bytes, kind: str):  # type: ignore[no-untyped-def]  # FastAPI reads the signature of what it gets
+def _served(content: bytes, kind: str):  # type: ignore[no-untyped-def]  # FastAPI reads its result's signature
     async def serve() -> Response:
         return Response(content, media_type=kind, headers=HEADERS)
 
