@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Unpack
 
 from orchestrator.catalogue import queries as search
 from orchestrator.catalogue.catalogue_index import TABLES, Catalogue
-from orchestrator.catalogue.queries import Conditions, PourConditions
+from orchestrator.catalogue.query_conditions import Conditions, PourConditions
 from orchestrator.journal.run_record import Row
 from sim_engine.resources import require
 

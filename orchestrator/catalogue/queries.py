@@ -1,6 +1,5 @@
 """Queries of the catalogue: runs and pours by date, vessels, liquid, strategy and words, and comparisons of runs.
 
-- `CONDITIONS` declares all conditions once, for the command line, the API and notebooks.
 - `searching` creates a `CatalogueQuery` from text; `find_runs`, `find_pours` and `one_run` execute queries.
 - `differing_settings` and `outcomes` compare runs.
 """
@@ -13,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 from orchestrator.catalogue.catalogue_index import Catalogue, CatalogueError
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
@@ -248,39 +247,3 @@ def outcomes(run: Row) -> dict[str, Any]:
         shown |= {f"{receiver}: {name}": advice[name] for name in ("strategy", "best_loss", "predicted_loss")}
         shown |= {f"{receiver}: {name}": value for name, value in advice["action"].items()}
     return shown | theta
-
-
-CONDITIONS = {
-    "since": "Begun (of a pour: weighed) at that date or later: 2030-03-01, 2030-03 (a month), 7d (ago).",
-    "until": "… at that date or before; a day or month counts to its end.",
-    "campaign": "Name of the campaign.",
-    "pourer": "Vessel that was poured from, by name.",
-    "receiver": "Vessel that was poured into, by name.",
-    "liquid": "What was poured, by name.",
-    "strategy": "C1 to C4, D1 to D3, or one of a package.",
-    "mode": "'virtual' or 'real'.",
-    "state": "finished, paused, failed, unknown, interrupted …",
-    "tag": "A tag of the run.",
-}
-"""Conditions in addition to words, for the command line, the API and notebooks. Names may contain * and ?."""
-
-
-class Conditions(TypedDict, total=False):
-    """`CONDITIONS`, as keywords."""
-
-    since: str | None
-    until: str | None
-    campaign: str | None
-    pourer: str | None
-    receiver: str | None
-    liquid: str | None
-    strategy: str | None
-    mode: str | None
-    state: str | None
-    tag: str | None
-
-
-class PourConditions(Conditions, total=False):
-    """Conditions for pours."""
-
-    run: str | Path | None

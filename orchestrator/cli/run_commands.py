@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.catalogue.queries import CONDITIONS
+from orchestrator.catalogue.query_conditions import CONDITIONS
 from orchestrator.cli.command_options import Json, call, examples
 
 KEYWORD = inspect.Parameter.KEYWORD_ONLY

@@ -22,7 +22,8 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from orchestrator.catalogue.annotations import AnnotationsError, Note
 from orchestrator.catalogue.catalogue_client import LocalCatalogueClient
 from orchestrator.catalogue.catalogue_index import TABLES, Catalogue, Column
-from orchestrator.catalogue.queries import CONDITIONS, NoSuchRunError
+from orchestrator.catalogue.queries import NoSuchRunError
+from orchestrator.catalogue.query_conditions import CONDITIONS
 from orchestrator.daemon.access_control import Daemon, Operator, Viewer
 from orchestrator.daemon.run_readout import REPORT
 from orchestrator.daemon.supervisor import Supervisor
