@@ -1,10 +1,17 @@
-"""No two files need each other, directly or around corners: each can be read and tested after those below it."""
+"""No two files need each other, directly or around corners: each can be read and tested after those below it.
+
+Modules that import others by text name what exists.
+"""
 
 from __future__ import annotations
 
 import ast
+import re
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+from pkgutil import resolve_name
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = ("sim_engine", "actors", "orchestrator")
@@ -47,3 +54,18 @@ def test_no_file_is_needed_by_what_it_needs() -> None:
         order.prepare()
     except CycleError as error:
         raise AssertionError(" → ".join(error.args[1])) from None
+
+
+NAMED = re.compile(r"(?:actors|orchestrator|sim_engine)(?:\.\w+)+:\w+")
+
+
+def names_given_as_text() -> list[str]:
+    """'module:name' texts of the product, except in docstrings: what is imported by `resolve_name`."""
+    trees = [ast.parse(path.read_text()) for path in modules().values()]
+    texts = (node.value for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Constant))
+    return sorted({text for text in texts if isinstance(text, str) and NAMED.fullmatch(text)})
+
+
+@pytest.mark.parametrize("name", names_given_as_text())
+def test_a_name_given_as_text_exists(name: str) -> None:
+    assert resolve_name(name) is not None

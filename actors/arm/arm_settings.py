@@ -92,7 +92,7 @@ class ArmSpec(ABC):
     Attributes:
         kind: as registered in `decant.arms`, and as written in files.
         stand_in: 'module:callable' that makes of these settings what stands in for the arm on a virtual bench, see
-            `actors.bench.device_emulators.StandIn`; '' for a driver that moves nothing but numbers itself.
+            `actors.bench.device_emulators.ArmEmulator`; '' for a driver that moves nothing but numbers itself.
         time_scale: bench seconds per second of the clock; 1 for anything real, 0 waits for nothing.
         announcement: from a person's consent to the first movement [s].
         untilt_speed: at which a stopped, tilted pourer is brought upright [rad/s].
@@ -217,7 +217,7 @@ class UrArmSpec(ArmSpec):
     time_scale: float = 1.0
 
     kind: ClassVar[str] = "ur"
-    stand_in: ClassVar[str] = "actors.emulators.ur_controller.controller_process:UrStandIn"
+    stand_in: ClassVar[str] = "actors.emulators.ur_controller.controller_process:UrEmulator"
 
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
         """See `ArmSpec.driver`."""
@@ -265,5 +265,5 @@ class UrArmSpec(ArmSpec):
 
     def look(self) -> ArmDiagnostics:
         """See `ArmSpec.look`."""
-        look: ArmDiagnostics = resolve_name("actors.arm.ur.commissioning:UrLook").at(self)
+        look: ArmDiagnostics = resolve_name("actors.arm.ur.commissioning:UrDiagnostics").at(self)
         return look

@@ -103,7 +103,7 @@ class Settling:
 AUTO = "auto"
 """Dialect that is found out."""
 
-SERIAL_EMULATOR = "actors.emulators.serial_balance.balance_process:SerialStandIn"
+SERIAL_EMULATOR = "actors.emulators.serial_balance.balance_process:SerialBalanceEmulator"
 """Emulates a balance on a serial line of a virtual bench; a name, because drivers do not import emulators."""
 
 DRIFTING = 60.0

@@ -197,7 +197,7 @@ USUAL_DIALECT = "kcp"
 
 
 class SerialBalanceEmulator:
-    """See `actors.balance.balance_settings.BalanceStandIn`.
+    """See `actors.balance.balance_settings.BalanceEmulator`.
 
     Args:
         spec: which dialect at which pace.
