@@ -33,10 +33,9 @@ importlib.util.find_spec = lambda name, package=None: None if name in {sorted(EX
 
 
 HARNESS = """
-from decant.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
-from orchestrator.strategies.campaign_plan import DeploymentPlan
+from decant.plugins import DeploymentPlan, Loss
+from decant.plugins.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
 from orchestrator.strategies.deployment.d2 import D2Settings
-from sim_engine.outcome import Loss
 
 def spill(action, theta, rng):
     return abs(action.x_offset - 0.12)
@@ -53,7 +52,7 @@ print(len(StrategyHarness(spill).run(make()).pours), "pours")
 CONTRACT = """
 import pytest
 from actors.arm.simulated_arm import NumbersArm, NumbersSpec
-from decant.testing import ACTIONS, SCENE, ArmBench, ArmContract
+from decant.plugins.testing import ACTIONS, SCENE, ArmBench, ArmContract
 
 class TestMyArm(ArmContract):
     @pytest.fixture
@@ -131,9 +130,9 @@ def test_authors_of_plug_ins_test_them_with_what_the_wheel_carries(wheel: Path, 
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    where = "import decant.testing, orchestrator.strategy_harness as h; print(decant.testing.__file__, h.__file__)"
+    where = "import decant.plugins.testing as t, orchestrator.strategy_harness as h; print(t.__file__, h.__file__)"
     assert python("-c", where).split() == [
-        str(tmp_path / "site" / name) for name in ("decant/testing.py", "orchestrator/strategy_harness.py")
+        str(tmp_path / "site" / name) for name in ("decant/plugins/testing.py", "orchestrator/strategy_harness.py")
     ]
     assert "3 pours" in python("-c", HARNESS)
     reported = python("-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "-k", A_FEW, "test_my_arm.py")
@@ -213,7 +212,7 @@ def test_the_wheel_works_in_a_bare_environment(wheel: Path, tmp_path: Path) -> N
 
     done = run_python("-c", HARNESS)
     assert "3 pours" in done.stdout, done.stderr
-    assert "pip install pytest" in run_python("-c", "from decant.testing import ArmContract").stderr
+    assert "pip install pytest" in run_python("-c", "from decant.plugins.testing import ArmContract").stderr
     command = [python, "-m", "pip", "install", "-q", "pytest"]
     subprocess.run(command, check=True, cwd=tmp_path, timeout=600, env=child_environment())
     (tmp_path / "test_my_arm.py").write_text(CONTRACT, encoding="utf-8")

@@ -217,9 +217,8 @@ def test_the_doctor_asks_a_balance_and_an_arm_from_outside(site: Path, broken: P
 
 
 DIALECT = """
-from actors.balance.serial_balance import SerialBalance
-from actors.balance.balance_settings import SerialBalanceSpec
-from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
+from decant.plugins import SerialBalance, SerialBalanceSpec
+from decant.plugins.testing import VirtualSerialBalance
 
 far = VirtualSerialBalance.start("plain", baud=0, time_scale=20.0)
 balance = SerialBalance(SerialBalanceSpec(far.port, time_scale=20.0))
@@ -259,11 +258,7 @@ def test_the_tables_of_the_pages_know_what_is_installed(site: Path) -> None:
 
 UNFINISHED = """
 from typing import Literal
-from orchestrator.config.arm_file import ArmSettings
-from orchestrator.config.balance_file import BalanceDeviceSection
-from orchestrator.strategies.calibration.calibration_base import DesignSettings
-from orchestrator.strategies.deployment.objectives import Objective
-from sim_engine.vessel.shapes import Shape
+from decant.plugins import ArmSettings, BalanceDeviceSection, DesignSettings, Objective, Shape
 
 class Arm(ArmSettings):
     kind: Literal["arm"] = "arm"
