@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 from actors.runtime.child_process import child_environment
 from orchestrator.shipped import STARTING_SET
 from sim_engine.resources import EXTRAS
+from tests.plugins import test_plugins as example
 
 ROOT = Path(__file__).parents[1]
 
@@ -218,3 +220,24 @@ def test_the_wheel_works_in_a_bare_environment(wheel: Path, tmp_path: Path) -> N
     (tmp_path / "test_my_arm.py").write_text(CONTRACT, encoding="utf-8")
     done = run_python("-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", A_FEW, "test_my_arm.py")
     assert "2 passed, 1 skipped" in done.stdout, done.stdout + done.stderr
+
+    (packages,) = (tmp_path / "bare").glob("lib/python3*/site-packages")
+    (tmp_path / "example").mkdir()
+    example.install_example(packages, tmp_path / "example")
+    listed = json.loads(decant("plugins", "--json").stdout)
+    registered = {one["name"] for one in listed["plugins"] if one["package"] == "decant-example 1.0"}
+    assert registered == {"stand", "spring", "plain", "cone", "hypercube", "gentle"}
+    assert listed["broken"] == []
+    example.write_files(tmp_path)
+    wide = example.CAMPAIGN.replace("x_offset: [60 mm, 90 mm]", "x_offset: [100 mm, 130 mm]")
+    (tmp_path / "campaign.yaml").write_text(wide, encoding="utf-8")
+    done = decant("run", "campaign.yaml", "--json")
+    assert done.returncode == 0, done.stderr
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert json.loads((folder / "summary.json").read_text(encoding="utf-8"))["pours"] == 2
+    assert "decant-example" in json.loads((folder / "versions.json").read_text(encoding="utf-8"))["packages"]
+    for name in ("test_examples.py", "test_stand.py"):
+        text = (ROOT / "tests" / "plugins" / name).read_text(encoding="utf-8")
+        (tmp_path / name).write_text(text.replace("tests.plugins.decant_example", "decant_example"), encoding="utf-8")
+    done = run_python("-m", "pytest", "-q", "-p", "no:cacheprovider", "test_examples.py", "test_stand.py")
+    assert done.returncode == 0, done.stdout + done.stderr
