@@ -23,14 +23,13 @@ from machine import describe, pin, say, show
 from numpy.typing import NDArray
 
 from actors.optimizer.suggest import propose
-from orchestrator.config.action_ranges import PoseNoiseSection
 from orchestrator.config.file_loading import load_campaign, load_vessel
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning, RobustPlanning
 from orchestrator.strategies.deployment.deployment_result import Recommended
-from orchestrator.strategies.deployment.disturbances import RiskSettings
+from orchestrator.strategies.deployment.disturbances import PoseNoiseSection, RiskSettings
 from sim_engine.action import DEG, described
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseError, PourTask, Scene

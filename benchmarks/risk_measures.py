@@ -25,12 +25,11 @@ from scipy.stats import qmc
 from actors.optimizer.questions import Data, SuggestProblem
 from actors.optimizer.risk_measures import conditional_value_at_risk, tail_weights
 from actors.optimizer.suggest import propose
-from orchestrator.config.action_ranges import PoseNoiseSection
 from orchestrator.requests import Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning, RobustPlanning
 from orchestrator.strategies.deployment.deployment_result import Recommended
-from orchestrator.strategies.deployment.disturbances import RiskSettings
+from orchestrator.strategies.deployment.disturbances import PoseNoiseSection, RiskSettings
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import Loss, PourOutcome

@@ -19,7 +19,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from orchestrator.catalogue.catalogue_index import TABLES as CATALOGUE
-from orchestrator.config import action_ranges as pose
+from orchestrator.cli.solver_report import kept_records
 from orchestrator.config import arm_file as arm_sections
 from orchestrator.config import arm_file as cell
 from orchestrator.config import campaign_file as campaign
@@ -33,8 +33,8 @@ from orchestrator.config.weighed_pours import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.yaml.section_validation import sections_in
 from orchestrator.daemon import daemon_settings as daemon
 from orchestrator.daemon.notifications import NotifySection
-from orchestrator.results.solver_report import kept_records
 from orchestrator.states import State
+from orchestrator.strategies.deployment import disturbances as pose
 from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.disturbances import RiskSettings
 from orchestrator.strategies.deployment.model_check import TrustSettings

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from orchestrator.results import solver_report as physics
+from orchestrator.cli import solver_report as physics
 
 DOCS = Path(__file__).resolve().parent
 

@@ -1,6 +1,6 @@
 """Runs a strategy against plain functions, in milliseconds and without actors: for the tests of its author::
 
-    from decant.testing import StrategyHarness, check_strategy
+    from decant.plugins.testing import StrategyHarness, check_strategy
 
     run = StrategyHarness(narrow_cup).run(MyStrategy(plan, SCENE, THETA, seed=1))
     assert len(run.pours) == 8

@@ -1,5 +1,5 @@
-"""What others build on, as text: names of `import decant` and `decant.testing` with
-their signatures, entry-point groups.
+"""The public API as text: names of `decant`, `decant.plugins` and `decant.plugins.testing` with their signatures, and
+entry points.
 
 `python -m tests.public_api` writes it to tests/public-api.txt.
 """
@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import decant
-from decant import testing
+from decant import plugins
+from decant.plugins import testing
 
 ROOT = Path(__file__).parent.parent
 KEPT = Path(__file__).with_name("public-api.txt")
@@ -22,8 +23,12 @@ KEPT = Path(__file__).with_name("public-api.txt")
 
 def public_api() -> str:
     """One line for each name, sorted."""
-    lines = [line for name in decant.__all__ for line in _lines(f"decant.{name}", getattr(decant, name))]
-    lines += [line for name in testing.__all__ for line in _lines(f"decant.testing.{name}", getattr(testing, name))]
+    lines = [
+        line
+        for module in (decant, plugins, testing)
+        for name in module.__all__
+        for line in _lines(f"{module.__name__}.{name}", getattr(module, name))
+    ]
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     lines += [
         f"entry point {group}: {name}" for group, names in project["entry-points"].items() for name in sorted(names)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 from actors.runtime.child_process import child_environment
 from orchestrator.shipped import STARTING_SET
 from sim_engine.resources import EXTRAS
+from tests.plugins import test_plugins as example
 
 ROOT = Path(__file__).parents[1]
 
@@ -33,10 +35,9 @@ importlib.util.find_spec = lambda name, package=None: None if name in {sorted(EX
 
 
 HARNESS = """
-from decant.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
-from orchestrator.strategies.campaign_plan import DeploymentPlan
+from decant.plugins import DeploymentPlan, Loss
+from decant.plugins.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
 from orchestrator.strategies.deployment.d2 import D2Settings
-from sim_engine.outcome import Loss
 
 def spill(action, theta, rng):
     return abs(action.x_offset - 0.12)
@@ -52,8 +53,8 @@ print(len(StrategyHarness(spill).run(make()).pours), "pours")
 
 CONTRACT = """
 import pytest
-from actors.arm.simulated_arm import SimulatedArm, NumbersSpec
-from decant.testing import ACTIONS, SCENE, ArmBench, ArmContract
+from actors.arm.simulated_arm import NumbersSpec, SimulatedArm
+from decant.plugins.testing import ACTIONS, SCENE, ArmBench, ArmContract
 
 class TestMyArm(ArmContract):
     @pytest.fixture
@@ -131,9 +132,9 @@ def test_authors_of_plug_ins_test_them_with_what_the_wheel_carries(wheel: Path, 
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    where = "import decant.testing, orchestrator.strategy_harness as h; print(decant.testing.__file__, h.__file__)"
+    where = "import decant.plugins.testing as t, orchestrator.strategy_harness as h; print(t.__file__, h.__file__)"
     assert python("-c", where).split() == [
-        str(tmp_path / "site" / name) for name in ("decant/testing.py", "orchestrator/strategy_harness.py")
+        str(tmp_path / "site" / name) for name in ("decant/plugins/testing.py", "orchestrator/strategy_harness.py")
     ]
     assert "3 pours" in python("-c", HARNESS)
     reported = python("-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "-k", A_FEW, "test_my_arm.py")
@@ -213,9 +214,31 @@ def test_the_wheel_works_in_a_bare_environment(wheel: Path, tmp_path: Path) -> N
 
     done = run_python("-c", HARNESS)
     assert "3 pours" in done.stdout, done.stderr
-    assert "pip install pytest" in run_python("-c", "from decant.testing import ArmContract").stderr
+    assert "pip install pytest" in run_python("-c", "from decant.plugins.testing import ArmContract").stderr
     command = [python, "-m", "pip", "install", "-q", "pytest"]
     subprocess.run(command, check=True, cwd=tmp_path, timeout=600, env=child_environment())
     (tmp_path / "test_my_arm.py").write_text(CONTRACT, encoding="utf-8")
     done = run_python("-m", "pytest", "-q", "-p", "no:cacheprovider", "-k", A_FEW, "test_my_arm.py")
     assert "2 passed, 1 skipped" in done.stdout, done.stdout + done.stderr
+
+    (packages,) = (tmp_path / "bare").glob("lib/python3*/site-packages")
+    (tmp_path / "example").mkdir()
+    example.install_example(packages, tmp_path / "example")
+    listed = json.loads(decant("plugins", "--json").stdout)
+    registered = {one["name"] for one in listed["plugins"] if one["package"] == "decant-example 1.0"}
+    assert registered == {"stand", "spring", "plain", "cone", "hypercube", "gentle"}
+    assert listed["broken"] == []
+    example.write_files(tmp_path)
+    wide = example.CAMPAIGN.replace("x_offset: [60 mm, 90 mm]", "x_offset: [100 mm, 130 mm]")
+    (tmp_path / "campaign.yaml").write_text(wide, encoding="utf-8")
+    done = decant("run", "campaign.yaml", "--json")
+    assert done.returncode == 0, done.stderr
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert json.loads((folder / "summary.json").read_text(encoding="utf-8"))["pours"] == 2
+    assert "decant-example" in json.loads((folder / "versions.json").read_text(encoding="utf-8"))["packages"]
+    for name in ("test_examples.py", "test_stand.py"):
+        text = (ROOT / "tests" / "plugins" / name).read_text(encoding="utf-8")
+        (tmp_path / name).write_text(text.replace("tests.plugins.decant_example", "decant_example"), encoding="utf-8")
+    tests = ("-k", "not is_found", "test_examples.py", "test_stand.py")
+    done = run_python("-m", "pytest", "-q", "-p", "no:cacheprovider", *tests)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -28,8 +28,6 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
-import psutil
-
 from actors.interfaces import LaboratoryError
 from actors.laboratory_settings import LaboratorySpec, simulator_count
 from actors.runtime.child_process import ChildProcess, python_module
@@ -226,6 +224,8 @@ def forget_logs(private: PrivateRay) -> int:
     Returns:
         Number of files removed.
     """
+    import psutil
+
     removed = 0
     for path in private.folder.glob("session_*/logs/*-*"):
         found = _WORKER_LOG.fullmatch(path.name)

@@ -14,8 +14,10 @@ import signal
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a separate package
+if TYPE_CHECKING:
+    import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a package of their own
 
 MARK = "DECANT_RAY_CLUSTER"
 """Environment variable that all processes of one Ray cluster carry; its value is the cluster's folder."""
@@ -30,10 +32,14 @@ def cluster_processes(folder: Path) -> list[int]:
     Args:
         folder: the cluster's folder, as in `MARK`.
     """
+    import psutil
+
     return [p.pid for p in psutil.process_iter() if p.pid != os.getpid() and _belongs(p, folder)]
 
 
 def _belongs(process: psutil.Process, folder: Path) -> bool:
+    import psutil
+
     with contextlib.suppress(psutil.Error, OSError):
         if process.environ().get(MARK) == str(folder):
             return True

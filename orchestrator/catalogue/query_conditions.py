@@ -5,6 +5,7 @@ This module imports nothing heavy: `decant --help` needs it. `orchestrator.catal
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TypedDict
 
 CONDITIONS = {

@@ -24,7 +24,7 @@ def physics(
     from rich.console import Console
     from rich.progress import Progress
 
-    from orchestrator.results import solver_report as report
+    from orchestrator.cli import solver_report as report
     from orchestrator.results.console_view import PLAIN_WIDTH
     from sim_engine import solver_fingerprint as sources
     from sim_engine.simulator import PourSimulator

@@ -34,6 +34,9 @@ RULER, BALANCE, ANGLE = 5e-4, 5e-4, 0.005
 DOUBTFUL = 3.0
 """Number of standard deviations above which a check fails."""
 
+BAND = 2.0
+"""Standard deviations that the band shows to either side."""
+
 
 @dataclass(frozen=True)
 class Sources:
@@ -137,7 +140,6 @@ def _volume(sources: Sources, mass: float) -> float:
 
 def _turned(out: Path, name: str, sources: Sources) -> Made:
     """Make a surface of revolution from all measurements."""
-    from orchestrator.results.pour_figures import draw_outline
     from sim_engine.vessel.shapes import VesselSpec
     from sim_engine.vessel.vessel import build_vessel
     from sim_engine.vessel_acquisition.outline_fit import find_outline
@@ -174,7 +176,7 @@ def _turned(out: Path, name: str, sources: Sources) -> Made:
     build_vessel(spec)
     doubts = _doubts(outline, sources)
     used = [f"{fit.count} from the {fit.name}, {fit.rms:.1f} of their own deviations off" for fit in outline.fits]
-    picture = draw_outline(name, outline, evidence, out.with_suffix(".png"))
+    picture = _draw_outline(name, outline, evidence, out.with_suffix(".png"))
     out.write_text(_profile_file(name, outline, used, doubts))
     return Made(outline.capacity, outline.capacity_deviation, outline.radius_deviation, picture, notes + used, doubts)
 
@@ -349,6 +351,50 @@ def _profile_file(name: str, outline: FittedOutline, used: Sequence[str], doubts
         *(f"    - [{', '.join(f'{1e3 * x:.3g}' for x in row)}]" for row in shape.radius_deviations),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _draw_outline(name: str, outline: FittedOutline, evidence: Sequence[Evidence], path: Path) -> Path:
+    """The section of a turned vessel with its band, and the radii and levels that were measured."""
+    import numpy as np
+
+    from orchestrator.results import figure_style as style
+    from sim_engine.vessel.profile import outer_profile
+    from sim_engine.vessel_acquisition.measurements import FillTable, Radii
+
+    figure, axes = style.new_figure(size=(6.0, 5.0))
+    shape = outline.shape()
+    inner = np.array(shape.inner)
+    outer = outer_profile(inner, shape.wall, shape.floor)
+    solid = 1e3 * np.vstack([inner, outer[::-1], [0.0, -shape.floor]])
+    for side in (1.0, -1.0):
+        axes.fill(side * solid[:, 0], solid[:, 1], color=style.PALE, lw=0, zorder=1)
+    z, r, sd = 1e3 * outline.heights, 1e3 * outline.radii, 1e3 * BAND * outline.deviations
+    for side in (1.0, -1.0):
+        axes.fill_betweenx(z, side * (r - sd), side * (r + sd), color=style.PREDICTED, alpha=0.35, lw=0, zorder=2)
+        axes.plot(side * r, z, color=style.INK, lw=1.6, zorder=3)
+    axes.plot([-r[0], r[0]], [0.0, 0.0], color=style.INK, lw=1.6, zorder=3)
+    axes.fill([], [], color=style.PREDICTED, alpha=0.35, label=f"± {BAND:g} standard deviations of the radius")
+    marks = iter(("o", "s", "^"))
+    for piece in evidence:
+        if isinstance(piece, Radii):
+            axes.plot(
+                1e3 * piece.observed,
+                1e3 * piece.heights,
+                next(marks),
+                color=style.MEASURED,
+                ms=4 if len(piece.observed) < 15 else 2.5,
+                label=piece.name,
+                zorder=4,
+            )
+        elif isinstance(piece, FillTable):
+            levels = 1e3 * piece.levels
+            axes.plot(0.0 * levels, levels, "_", color=style.MEASURED, ms=12, label=f"levels of the {piece.name}")
+    title = f"{name}: {1e6 * outline.capacity:.0f} ± {1e6 * outline.capacity_deviation:.1f} mL"
+    style.dress(axes, title=title, x="distance from the axis [mm]", y="height above the inner floor [mm]")
+    axes.set_aspect("equal")
+    axes.margins(0.08)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False, fontsize=8)
+    return style.save(figure, path)
 
 
 # -- meshes ------------------------------------------------------------------------------------------------------------

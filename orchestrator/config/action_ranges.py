@@ -2,7 +2,6 @@
 
 - `RangeSection` and `ActionRangeSection`: bounds of a searched quantity, with scale and prior.
 - `MotionBase`: values of the motion that are not searched; `ActionsBase`: searched dimensions and their constraints.
-- `PoseErrorSection`, `PoseNoiseSection`: errors of a virtual bench, or errors that a plan under risk must tolerate.
 """
 
 from __future__ import annotations
@@ -261,47 +260,3 @@ def _actions_model() -> type[ActionsBase]:
 
 Motion = _motion_model()
 Actions = _actions_model()
-
-
-Offset = Annotated[float, Quantity("m", "1 mm", -0.05, 0.05)]
-Tilt = Annotated[float, Quantity("rad", "1 deg", -0.2, 0.2)]
-Factor = Annotated[float, Quantity("1", "1.02", 0.5, 1.5)]
-Spread = Annotated[float, Quantity("1", "0.01", 0.0, 0.5)]
-
-
-class PoseErrorSection(Section):
-    """Difference between the real and the intended placement."""
-
-    x: Offset = 0.0
-    """Offset of the receiver away from the pourer."""
-
-    y: Offset = 0.0
-    """Sideways offset of the receiver."""
-
-    z: Offset = 0.0
-    """Upward offset of the receiver."""
-
-    tilt: Tilt = 0.0
-    """Additional tilt of the pourer over the commanded one."""
-
-    speed_factor: Factor = 1.0
-    """Executed over commanded angular velocity."""
-
-
-class PoseNoiseSection(Section):
-    """Standard deviations of the execution errors from pour to pour."""
-
-    x: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
-    """Standard deviation of the distance."""
-
-    y: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
-    """Standard deviation of the sideways placement."""
-
-    z: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
-    """Standard deviation of the receiver's height."""
-
-    tilt: Annotated[float, Quantity("rad", "0.3 deg", 0.0, 0.2)] = 0.0
-    """Standard deviation of the tilt."""
-
-    speed_factor: Spread = 0.0
-    """Standard deviation of executed over commanded angular velocity."""

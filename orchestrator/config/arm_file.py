@@ -89,7 +89,7 @@ class ArmSettings(Section):
 
 def _arm(loaded: object, name: str) -> type[ArmSettings]:
     if not (isinstance(loaded, type) and issubclass(loaded, ArmSettings)):
-        raise TypeError("should be a class derived from orchestrator.config.arm_file.ArmSettings")
+        raise TypeError("should be a class derived from decant.plugins.ArmSettings")
     kind = loaded.model_fields.get("kind")
     if kind is None or kind.default != name:
         raise TypeError(f"its field 'kind' should be Literal['{name}'] = '{name}', as it is registered")

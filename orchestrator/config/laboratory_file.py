@@ -16,11 +16,11 @@ from pydantic_core import PydanticCustomError
 from actors.balance.balance_settings import BalanceSpec
 from actors.interfaces import OperatorSpec
 from actors.laboratory_settings import LaboratorySpec, RaySpec, VirtualBenchSpec
-from orchestrator.config.action_ranges import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.arm_file import ARMS, ArmSettings, CellSection
 from orchestrator.config.balance_file import any_balance, resolve_balance
 from orchestrator.config.parameter_ranges import parameter_quantity
 from orchestrator.config.yaml.yaml_source import Place, Report
+from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseError
 from sim_engine.settings.model import MADE, Count, Name, Section, Switch, tagged

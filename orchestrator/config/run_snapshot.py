@@ -11,7 +11,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from orchestrator.config.action_ranges import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.campaign_file import CalibrationSection, CampaignFile, LearningSection
 from orchestrator.config.laboratory_file import HiddenLiquid
 from orchestrator.config.parameter_ranges import Parameters
@@ -19,6 +18,7 @@ from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from orchestrator.config.yaml.yaml_writer import as_file
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
+from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
 from sim_engine.settings.model import Section
 from sim_engine.vessel.shapes import MeshShape, ProfileShape, VesselSpec
 

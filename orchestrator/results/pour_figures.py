@@ -2,12 +2,11 @@
 
 - `draw_pour` and `simulation_png`: snapshots of a pour from the side, and the shares of the liquid over time.
 - `section` and `place`: outlines of a mesh in its plane y = 0, and their transformation by a pose.
-- `draw_outline` and `draw_solid`: a measured vessel with its uncertainty and its measurements; a mesh.
+- `draw_solid`: a mesh of a vessel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 
 from orchestrator.results import figure_style as style
 from sim_engine.outcome import ParticleState
-from sim_engine.vessel.profile import outer_profile
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +22,6 @@ if TYPE_CHECKING:
     from sim_engine.outcome import SimulatedPour
     from sim_engine.scene import PourTask
     from sim_engine.vessel.vessel import Vessel
-    from sim_engine.vessel_acquisition.outline_fit import Evidence, FittedOutline
 
 Floats = NDArray[np.float64]
 
@@ -319,50 +316,6 @@ def _timeline(axes: Axes, times: Floats, shares: Floats, marks: Floats) -> None:
     axes.set_xlim(times[0], max(times[-1], times[0] + 1e-6))
     axes.set_ylim(0, 100)
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8.5, frameon=False, reverse=True)
-
-
-BAND = 2.0
-"""Half width of the uncertainty band, in standard deviations."""
-
-
-def draw_outline(name: str, outline: FittedOutline, evidence: Sequence[Evidence], path: Path) -> Path:
-    """The cross-section of a surface of revolution with its uncertainty band, and the measured radii and levels."""
-    from sim_engine.vessel_acquisition.measurements import FillTable, Radii
-
-    figure, axes = style.new_figure(size=(6.0, 5.0))
-    shape = outline.shape()
-    inner = np.array(shape.inner)
-    outer = outer_profile(inner, shape.wall, shape.floor)
-    solid = 1e3 * np.vstack([inner, outer[::-1], [0.0, -shape.floor]])
-    for side in (1.0, -1.0):
-        axes.fill(side * solid[:, 0], solid[:, 1], color=style.PALE, lw=0, zorder=1)
-    z, r, sd = 1e3 * outline.heights, 1e3 * outline.radii, 1e3 * BAND * outline.deviations
-    for side in (1.0, -1.0):
-        axes.fill_betweenx(z, side * (r - sd), side * (r + sd), color=style.PREDICTED, alpha=0.35, lw=0, zorder=2)
-        axes.plot(side * r, z, color=style.INK, lw=1.6, zorder=3)
-    axes.plot([-r[0], r[0]], [0.0, 0.0], color=style.INK, lw=1.6, zorder=3)
-    axes.fill([], [], color=style.PREDICTED, alpha=0.35, label=f"± {BAND:g} standard deviations of the radius")
-    marks = iter(("o", "s", "^"))
-    for piece in evidence:
-        if isinstance(piece, Radii):
-            axes.plot(
-                1e3 * piece.observed,
-                1e3 * piece.heights,
-                next(marks),
-                color=style.MEASURED,
-                ms=4 if len(piece.observed) < 15 else 2.5,
-                label=piece.name,
-                zorder=4,
-            )
-        elif isinstance(piece, FillTable):
-            levels = 1e3 * piece.levels
-            axes.plot(0.0 * levels, levels, "_", color=style.MEASURED, ms=12, label=f"levels of the {piece.name}")
-    title = f"{name}: {1e6 * outline.capacity:.0f} ± {1e6 * outline.capacity_deviation:.1f} mL"
-    style.dress(axes, title=title, x="distance from the axis [mm]", y="height above the inner floor [mm]")
-    axes.set_aspect("equal")
-    axes.margins(0.08)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False, fontsize=8)
-    return style.save(figure, path)
 
 
 def draw_solid(name: str, vessel: Vessel, path: Path) -> Path:

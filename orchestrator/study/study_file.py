@@ -17,7 +17,6 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, create_model
 
-from orchestrator.config.action_ranges import PoseErrorSection, PoseNoiseSection
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.laboratory_file import HiddenLiquid, LaboratoryFile
 from orchestrator.config.parameter_ranges import Parameters, ParametersBase
@@ -33,6 +32,7 @@ from orchestrator.strategies.campaign_plan import CampaignPlan, StrategySettings
 from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
 from orchestrator.strategies.strategy_registry import calibrations, deployments
 from orchestrator.study.study_plan import ALL, StudyPlan
 from orchestrator.study.study_resolution import bench_of, calibration_arms, deployment_arms, levels_of, written_levels

@@ -8,11 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from orchestrator.config.action_ranges import PoseNoiseSection
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.posterior_summary import PosteriorFound, RemainingDiscrepancy
 from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan
-from orchestrator.strategies.deployment.disturbances import RiskSettings
+from orchestrator.strategies.deployment.disturbances import PoseNoiseSection, RiskSettings
 from orchestrator.strategies.deployment.safe_window import WindowSettings
 from orchestrator.strategies.strategy_registry import STRATEGIES
 from orchestrator.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE

@@ -8,11 +8,8 @@ from decimal import Decimal
 
 import pytest
 
-from actors.balance.readings import LineError, Reading, ReadingStatus
-from actors.balance.simulated_balance import Load
-from decant.testing import BalanceBench, BalanceContract
-from sim_engine.vessel.shapes import VesselSpec
-from sim_engine.vessel.vessel import build_vessel
+from decant.plugins import LineError, Load, Reading, ReadingStatus, VesselSpec, build_vessel
+from decant.plugins.testing import BalanceBench, BalanceContract
 from tests.plugins.decant_example.balance import SpringBalance, SpringSpec
 from tests.plugins.decant_example.dialect import PLAIN
 from tests.plugins.decant_example.vessel import Cone

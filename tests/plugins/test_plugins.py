@@ -20,15 +20,19 @@ ROOT = Path(__file__).parents[2]
 Decant = Callable[..., subprocess.CompletedProcess[str]]
 
 
+def install_example(site: Path, source: Path) -> None:
+    """Install the example package into a folder of packages, from a copy in `source`, an empty folder."""
+    install = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-build-isolation", "--no-index", "--quiet"]
+    shutil.copy(ROOT / "tests" / "plugins" / "pyproject.toml", source)
+    shutil.copytree(ROOT / "tests" / "plugins" / "decant_example", source / "decant_example")
+    subprocess.run([*install, "--target", str(site), str(source)], check=True, env=child_environment())
+
+
 @pytest.fixture(scope="session")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The example, installed as any package is, in a folder of its own."""
     folder = tmp_path_factory.mktemp("site")
-    install = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-build-isolation", "--no-index", "--quiet"]
-    source = tmp_path_factory.mktemp("source")
-    shutil.copy(ROOT / "tests" / "plugins" / "pyproject.toml", source)
-    shutil.copytree(ROOT / "tests" / "plugins" / "decant_example", source / "decant_example")
-    subprocess.run([*install, "--target", str(folder), str(source)], check=True, env=child_environment())
+    install_example(folder, tmp_path_factory.mktemp("source"))
     return folder
 
 
@@ -91,10 +95,15 @@ CONE = "name: cone-1\ncone: {top: 45 mm, bottom: 30 mm, height: 100 mm}\n"
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A campaign that names the example's things."""
-    small.write_campaign(tmp_path)
-    (tmp_path / "example.yaml").write_text(LABORATORY)
-    (tmp_path / "cone.yaml").write_text(CONE)
+    write_files(tmp_path)
     return tmp_path
+
+
+def write_files(folder: Path) -> None:
+    """Write a laboratory and a vessel of the example, and the files that a campaign needs besides."""
+    small.write_campaign(folder)
+    (folder / "example.yaml").write_text(LABORATORY)
+    (folder / "cone.yaml").write_text(CONE)
 
 
 def test_what_is_installed_is_listed_with_its_package(decant: Decant) -> None:
@@ -217,9 +226,8 @@ def test_the_doctor_asks_a_balance_and_an_arm_from_outside(site: Path, broken: P
 
 
 DIALECT = """
-from actors.balance.serial_balance import SerialBalance
-from actors.balance.balance_settings import SerialBalanceSpec
-from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
+from decant.plugins import SerialBalance, SerialBalanceSpec
+from decant.plugins.testing import VirtualSerialBalance
 
 far = VirtualSerialBalance.start("plain", baud=0, time_scale=20.0)
 balance = SerialBalance(SerialBalanceSpec(far.port, time_scale=20.0))
@@ -259,11 +267,7 @@ def test_the_tables_of_the_pages_know_what_is_installed(site: Path) -> None:
 
 UNFINISHED = """
 from typing import Literal
-from orchestrator.config.arm_file import ArmSettings
-from orchestrator.config.balance_file import BalanceDeviceSection
-from orchestrator.strategies.calibration.calibration_base import DesignSettings
-from orchestrator.strategies.deployment.objectives import Objective
-from sim_engine.vessel.shapes import Shape
+from decant.plugins import ArmSettings, BalanceDeviceSection, DesignSettings, Objective, Shape
 
 class Arm(ArmSettings):
     kind: Literal["arm"] = "arm"

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from decant.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
-from orchestrator.strategies.campaign_plan import DeploymentPlan
-from orchestrator.strategies.deployment.objectives import Objectives, Spillage
-from sim_engine.outcome import Loss
+from decant.plugins import DeploymentPlan, Loss, Objectives
+from decant.plugins.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
+from orchestrator.strategies.deployment.objectives import Spillage
 from tests.orchestrator.toys import narrow_cup
 from tests.plugins.decant_example.objective import Gentle
 from tests.plugins.decant_example.strategy import Hypercube, HypercubeSettings

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,15 +11,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from actors.arm.arm_interface import ArmLostError, ArmStoppedError
-from actors.arm.planned_pour import ExecutedMotion, MotionPath
-from actors.interfaces import InvalidActionError
-from decant.testing import ArmBench, ArmContract
-from sim_engine.action import DEG, Action
-from sim_engine.liquids import Liquid
-from sim_engine.scene import Scene
-from sim_engine.vessel.shapes import cylinder
+from decant.plugins import (
+    Action,
+    ArmLostError,
+    ArmStoppedError,
+    ExecutedMotion,
+    InvalidActionError,
+    Liquid,
+    MotionPath,
+    Scene,
+    cylinder,
+)
+from decant.plugins.testing import ArmBench, ArmContract
 from tests.plugins.decant_example.arm import Drive, Stand, StandSpec, poses_of
+
+DEG = math.pi / 180.0
 
 SCENE = Scene(
     name="tumbler",

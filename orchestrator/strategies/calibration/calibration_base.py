@@ -27,7 +27,8 @@ from sim_engine.outcome import MINIMUM_POURED, normalised_spillage
 from sim_engine.settings.model import MOST_SIMULATIONS, PositiveSimulationCount, Problems
 from sim_engine.settings.quantity import Quantity
 
-MAP_RESOLUTION = 30
+THETA_MAP_RESOLUTION = 30
+"""Points per axis of the map that a calibration concludes with."""
 
 S = TypeVar("S", bound=CalibrationSettings)
 """Settings of a calibration."""

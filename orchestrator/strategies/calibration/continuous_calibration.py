@@ -14,7 +14,7 @@ from actors.optimizer.questions import Data, Point, Posterior, PosteriorQuestion
 from orchestrator.requests import Decision, Simulate
 from orchestrator.run_errors import LearningError
 from orchestrator.strategies.calibration.calibration_base import (
-    MAP_RESOLUTION,
+    THETA_MAP_RESOLUTION,
     Calibration,
     Kappa,
     TriedOnce,
@@ -204,7 +204,9 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             if self._trials.idle and self._knows_actions:
                 self._ask_posterior()
             elif self._trials.idle:
-                problem = self._problem(everything=True, acquisition="posterior_minimum", resolution=MAP_RESOLUTION)
+                problem = self._problem(
+                    everything=True, acquisition="posterior_minimum", resolution=THETA_MAP_RESOLUTION
+                )
                 self._questions.put(problem, "conclude", self._settle_at_minimum)
             return
         if len(self._trials) == 0:
@@ -252,7 +254,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             self._final = suggestion
             self._settle(point, suggestion.predictions[0], suggestion.prediction_deviations[0])
 
-        problem = self._problem(everything=True, resolution=MAP_RESOLUTION)
+        problem = self._problem(everything=True, resolution=THETA_MAP_RESOLUTION)
         self._questions.put(replace(problem, count=0, predict_at=(point,), map_at=point), "conclude", settle)
 
     def _live_resolution(self) -> int:

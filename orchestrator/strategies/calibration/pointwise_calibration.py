@@ -19,7 +19,7 @@ from typing import ClassVar, Literal, Self, TypeVar
 from actors.optimizer.questions import Data, Point, Suggestion, SuggestProblem
 from orchestrator.requests import Decision, Simulate
 from orchestrator.strategies.calibration.calibration_base import (
-    MAP_RESOLUTION,
+    THETA_MAP_RESOLUTION,
     Calibration,
     DesignSettings,
     Kappa,
@@ -138,7 +138,7 @@ class BestOfDesign(DiscrepancyOverPours[S]):
         self._settle(best.point, mean, math.sqrt(variance / len(known)))
         if 2 <= len(scored) <= MOST_MAPPED:
             data = Data(tuple(trial.point for _, trial in scored), tuple(score for score, _ in scored))
-            problem = SuggestProblem(self._plan.parameters, data, count=0, map_resolution=MAP_RESOLUTION)
+            problem = SuggestProblem(self._plan.parameters, data, count=0, map_resolution=THETA_MAP_RESOLUTION)
             self._questions.put(problem, "map", self._mapped)
 
     def _mapped(self, suggestion: Suggestion) -> None:
@@ -325,7 +325,7 @@ class BayesianCalibration(DiscrepancyOverPours[C3Settings]):
                 self._plan.parameters,
                 self._observed(everything=True),
                 acquisition="posterior_minimum",
-                map_resolution=MAP_RESOLUTION,
+                map_resolution=THETA_MAP_RESOLUTION,
             )
             self._questions.put(problem, "conclude", self._settle_at_minimum)
 

@@ -13,9 +13,9 @@ import pytest
 from matplotlib.text import Text
 from typer.testing import CliRunner
 
+from orchestrator.cli import solver_report as report
 from orchestrator.cli.app import app
 from orchestrator.results import figure_style as style
-from orchestrator.results import solver_report as report
 from orchestrator.results.figure_style import INK
 from sim_engine import solver_fingerprint as sources
 from sim_engine.validation import cases as suite

@@ -18,24 +18,28 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_geometry import Pose
-from actors.arm.arm_interface import (
+from decant.plugins import (
+    Action,
     ArmFacts,
     ArmLostError,
     ArmNotReleasedError,
     ArmPose,
     ArmRefusedError,
+    ArmSettings,
+    ArmSpec,
     ArmState,
     ArmStoppedError,
+    CellSection,
+    ExecutedMotion,
+    InvalidActionError,
+    MotionPath,
+    Place,
+    Pose,
+    Quantity,
+    Report,
+    Scene,
+    plan_pour,
 )
-from actors.arm.arm_settings import ArmSpec
-from actors.arm.planned_pour import ExecutedMotion, MotionPath
-from actors.bench.pour_feasibility import plan_pour
-from actors.interfaces import InvalidActionError
-from orchestrator.config.arm_file import ArmSettings
-from sim_engine.action import Action
-from sim_engine.scene import Scene
-from sim_engine.settings.quantity import Quantity
 
 HOME_HEIGHT = 0.05
 """Where the slide waits, above where it pours [m]."""
@@ -81,7 +85,7 @@ class StandSection(ArmSettings):
     fastest: Annotated[float, Quantity("rad/s", "90 deg/s", 0.0, 10.0, positive=True)] = StandSpec.fastest
     """That its motor turns."""
 
-    def resolve(self, cell: Any, place: Any, report: Any, *, mode: str) -> StandSpec | None:
+    def resolve(self, cell: CellSection | None, place: Place, report: Report, *, mode: str) -> StandSpec | None:
         """See `ArmSettings.resolve`."""
         if mode == "hardware":
             report.add(place.at("arm"), "this example has no motor; write 'mode: virtual'")
@@ -137,7 +141,7 @@ class Drive:
 
 
 class Stand:
-    """The driver: see `actors.arm.arm_interface.Arm`.
+    """The driver: see `decant.plugins.Arm`.
 
     Args:
         spec: its settings.

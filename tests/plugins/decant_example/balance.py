@@ -14,12 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from actors.balance.balance_interface import Weight
-from actors.balance.balance_settings import BalanceDevice
-from actors.balance.simulated_balance import Load
-from actors.interfaces import LaboratoryError
-from orchestrator.config.balance_file import BalanceDeviceSection
-from sim_engine.settings.quantity import Quantity
+from decant.plugins import BalanceDevice, BalanceDeviceSection, LaboratoryError, Load, Quantity, Weight
 
 PATIENCE = 20.0
 """How long it may take to come to rest [s of bench time]."""
@@ -65,7 +60,7 @@ class SpringSection(BalanceDeviceSection):
 
 
 class SpringBalance:
-    """The driver; see `actors.balance.balance_interface.BalanceDriver`."""
+    """The driver; see `decant.plugins.BalanceDriver`."""
 
     def __init__(self, spec: SpringSpec, name: str = "spring") -> None:
         self._spec, self._name = spec, name

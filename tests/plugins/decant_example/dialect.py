@@ -6,8 +6,7 @@ import re
 from dataclasses import dataclass
 from decimal import Decimal
 
-from actors.balance.dialects.dialect import Dialect
-from actors.balance.readings import LineError, Reading, ReadingStatus, Reply
+from decant.plugins import Dialect, LineError, Reading, ReadingStatus, Reply
 
 _LINE = re.compile(rb"(?P<value>-?[0-9]+\.[0-9]+) (?P<unit>k?g)(?P<moving>!?)")
 

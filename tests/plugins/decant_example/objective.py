@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from orchestrator.strategies.deployment.objectives import Objective
-from sim_engine.action import ACTION_DIMENSIONS, Action
-from sim_engine.outcome import Fractions
-from sim_engine.scene import Scene
-from sim_engine.search_space import Space
-from sim_engine.settings.quantity import Quantity
+from decant.plugins import ACTION_DIMENSIONS, Action, Fractions, Objective, Quantity, Scene, Space
 
 
 class Gentle(Objective):

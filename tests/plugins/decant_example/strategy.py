@@ -6,12 +6,16 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from orchestrator.strategies.campaign_plan import DeploymentPlan, DeploymentSettings
-from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment
-from orchestrator.strategies.strategy import Strategy
-from sim_engine.liquids import SimulationParameters
-from sim_engine.scene import Scene
-from sim_engine.settings.model import Switch
+from decant.plugins import (
+    MAP_RESOLUTION,
+    Deployment,
+    DeploymentPlan,
+    DeploymentSettings,
+    Scene,
+    SimulationParameters,
+    Strategy,
+    Switch,
+)
 
 
 class HypercubeSettings(DeploymentSettings):

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from sim_engine.settings.model import Section
-from sim_engine.settings.quantity import Quantity
-from sim_engine.vessel.shapes import ProfileShape, Shape, VesselError
+from decant.plugins import ProfileShape, Quantity, Settings, Shape, VesselError
 
 Length = Annotated[float, Quantity("m", "40 mm", 5e-3, 0.5)]
 
 
-class Cone(Shape, Section):
+class Cone(Shape, Settings):
     """A cone that opens upwards, cut off at its floor."""
 
     required: ClassVar[dict[str, str]] = {"top": "40 mm"}

@@ -1,10 +1,10 @@
 """For the tests of your own plug-ins: contracts of arms and balances, and the harness of strategies::
 
-    from decant.testing import ArmBench, ArmContract            # needs pytest
-    from decant.testing import BalanceBench, BalanceContract    # needs pytest
-    from decant.testing import StrategyHarness, check_strategy
+    from decant.plugins.testing import ArmBench, ArmContract            # needs pytest
+    from decant.plugins.testing import BalanceBench, BalanceContract    # needs pytest
+    from decant.plugins.testing import StrategyHarness, check_strategy
 
-How to use them: docs/extending.md. Everything here is imported when it is used first.
+How to use them: docs/extending.md. Each name is imported on first use.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from actors.contract_tests.arm_contract import ArmBench, ArmContract
     from actors.contract_tests.balance_contract import BalanceBench, BalanceContract
+    from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
     from orchestrator.strategy_harness import (
         ACTIONS,
         CALIBRATION_ACTIONS,
@@ -42,6 +43,7 @@ __all__ = [
     "BalanceContract",
     "SpillModel",
     "StrategyHarness",
+    "VirtualSerialBalance",
     "check_strategy",
     "failures",
     "outcome_of",
@@ -55,14 +57,23 @@ _CONTRACTS = {
     "BalanceContract": "actors.contract_tests.balance_contract",
 }
 
+_SOURCE_OF = dict.fromkeys(__all__, "orchestrator.strategy_harness") | {
+    **_CONTRACTS,
+    "VirtualSerialBalance": "actors.emulators.serial_balance.balance_process",
+}
+"""Name → the module that provides it."""
 
-def __getattr__(name: str) -> Any:
-    """Import a name when it is used first (PEP 562)."""
-    if name not in __all__:
-        raise AttributeError(f"module 'decant.testing' has no attribute '{name}'; it has {', '.join(__all__)}")
-    if name in _CONTRACTS and find_spec("pytest") is None:
-        raise ImportError(f"{name} is run by pytest, which is not installed: pip install pytest")
-    return getattr(import_module(_CONTRACTS.get(name, "orchestrator.strategy_harness")), name)
+if not TYPE_CHECKING:  # otherwise a type checker would accept misspelt names as Any
+
+    def __getattr__(name: str) -> Any:
+        """Import a name on first use (PEP 562)."""
+        if name not in _SOURCE_OF:
+            raise AttributeError(
+                f"module 'decant.plugins.testing' has no attribute '{name}'; it has {', '.join(__all__)}"
+            )
+        if name in _CONTRACTS and find_spec("pytest") is None:
+            raise ImportError(f"{name} is run by pytest, which is not installed: pip install pytest")
+        return getattr(import_module(_SOURCE_OF[name]), name)
 
 
 def __dir__() -> list[str]:

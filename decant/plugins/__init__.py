@@ -1,0 +1,324 @@
+"""Names for authors of plug-ins: strategies, objectives, balances, arms and sources of vessels. See docs/extending.md.
+
+::
+
+    from decant.plugins import Deployment, DeploymentSettings, Quantity
+
+A plug-in imports nothing else of Decant but `decant` and, in its tests, `decant.plugins.testing`: other modules may
+change without notice. Each name is imported on first use, so `import decant.plugins` itself loads no other package.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from actors.arm.arm_interface import (
+        Arm,
+        ArmFacts,
+        ArmLostError,
+        ArmNotReleasedError,
+        ArmPose,
+        ArmRefusedError,
+        ArmState,
+        ArmStoppedError,
+        PathReport,
+        PlannedPour,
+        Pose,
+    )
+    from actors.arm.arm_settings import ArmDiagnostics, ArmSpec
+    from actors.arm.planned_pour import ExecutedMotion, MotionPath
+    from actors.balance.balance_interface import BalanceDriver, Weight
+    from actors.balance.balance_settings import BalanceDevice, BalanceEmulator, SerialBalanceSpec
+    from actors.balance.dialects.dialect import Dialect, LineSettings
+    from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingStatus, Reply
+    from actors.balance.serial_balance import SerialBalance
+    from actors.balance.simulated_balance import Load
+    from actors.bench.device_emulators import ArmEmulator, History
+    from actors.bench.pour_feasibility import plan_pour
+    from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
+    from actors.optimizer.questions import Data, Suggestion, SuggestProblem
+    from orchestrator.config.arm_file import ArmSettings, CellSection
+    from orchestrator.config.balance_file import BalanceDeviceSection
+    from orchestrator.config.yaml.yaml_source import Place, Report
+    from orchestrator.requests import (
+        Answered,
+        Ask,
+        Decision,
+        Failed,
+        Outcome,
+        Pour,
+        Poured,
+        Request,
+        Simulate,
+        Simulated,
+        Slots,
+        Suggest,
+        Suggested,
+    )
+    from orchestrator.run_errors import LearningError
+    from orchestrator.strategies.calibration.calibration_base import THETA_MAP_RESOLUTION, Calibration, DesignSettings
+    from orchestrator.strategies.calibration.pointwise_calibration import DiscrepancyOverPours
+    from orchestrator.strategies.campaign_plan import (
+        CalibrationPlan,
+        CalibrationSettings,
+        DeploymentPlan,
+        DeploymentSettings,
+        MeasuredPour,
+    )
+    from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
+    from orchestrator.strategies.deployment.objectives import Objective, Objectives
+    from orchestrator.strategies.optimizer_queries import OptimizerQueries
+    from orchestrator.strategies.stage_result import ResultPart, StageResult
+    from orchestrator.strategies.strategy import Progress, Strategy
+    from orchestrator.strategies.trials import SeedStream, Trial, Trials
+    from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
+    from sim_engine.liquids import Liquid, SimulationParameters
+    from sim_engine.outcome import Fractions, Loss, PourMeasurement, PourOutcome
+    from sim_engine.resources import load_arrays, store_arrays
+    from sim_engine.scene import PoseError, Scene
+    from sim_engine.search_space import Axis, Space
+    from sim_engine.settings.model import (
+        FREE,
+        Choice,
+        Count,
+        Name,
+        Number,
+        PositiveCount,
+        Problems,
+        Switch,
+        Text,
+    )
+    from sim_engine.settings.model import (
+        Section as Settings,
+    )
+    from sim_engine.settings.quantity import Quantity
+    from sim_engine.vessel.distance_grid import SignedDistanceGrid
+    from sim_engine.vessel.shapes import ProfileShape, Shape, VesselError, VesselSpec, cylinder
+    from sim_engine.vessel.vessel import Vessel, build_vessel
+
+__all__ = [
+    "ACTION_DIMENSIONS",
+    "FREE",
+    "MAP_RESOLUTION",
+    "THETA_MAP_RESOLUTION",
+    "Acknowledgement",
+    "Action",
+    "Answered",
+    "Arm",
+    "ArmDiagnostics",
+    "ArmEmulator",
+    "ArmFacts",
+    "ArmLostError",
+    "ArmNotReleasedError",
+    "ArmPose",
+    "ArmRefusedError",
+    "ArmSettings",
+    "ArmSpec",
+    "ArmState",
+    "ArmStoppedError",
+    "Ask",
+    "Axis",
+    "BalanceDevice",
+    "BalanceDeviceSection",
+    "BalanceDriver",
+    "BalanceEmulator",
+    "Calibration",
+    "CalibrationPlan",
+    "CalibrationSettings",
+    "CellSection",
+    "Choice",
+    "Count",
+    "Data",
+    "Decision",
+    "Deployment",
+    "DeploymentPlan",
+    "DeploymentSettings",
+    "DesignSettings",
+    "DeviceCheck",
+    "Dialect",
+    "Dimension",
+    "DiscrepancyOverPours",
+    "ExecutedMotion",
+    "Failed",
+    "Fractions",
+    "History",
+    "InvalidActionError",
+    "LaboratoryError",
+    "LearningError",
+    "LineError",
+    "LineSettings",
+    "Liquid",
+    "Load",
+    "Loss",
+    "MeasuredPour",
+    "MotionPath",
+    "Name",
+    "Number",
+    "Objective",
+    "Objectives",
+    "OptimizerQueries",
+    "Outcome",
+    "PathReport",
+    "Place",
+    "PlannedPour",
+    "Pose",
+    "PoseError",
+    "PositiveCount",
+    "Pour",
+    "PourMeasurement",
+    "PourOutcome",
+    "Poured",
+    "Problems",
+    "ProfileShape",
+    "Progress",
+    "Quantity",
+    "Reading",
+    "ReadingStatus",
+    "Reply",
+    "Report",
+    "Request",
+    "ResultPart",
+    "Scene",
+    "SearchSettings",
+    "SeedStream",
+    "SerialBalance",
+    "SerialBalanceSpec",
+    "Settings",
+    "Shape",
+    "SignedDistanceGrid",
+    "Simulate",
+    "Simulated",
+    "SimulationParameters",
+    "Slots",
+    "Space",
+    "StageResult",
+    "Strategy",
+    "Suggest",
+    "SuggestProblem",
+    "Suggested",
+    "Suggestion",
+    "Switch",
+    "Text",
+    "Trial",
+    "Trials",
+    "Vessel",
+    "VesselError",
+    "VesselSpec",
+    "Weight",
+    "build_vessel",
+    "cylinder",
+    "load_arrays",
+    "plan_pour",
+    "store_arrays",
+]
+
+_SOURCES = {
+    # Settings
+    "sim_engine.settings.model": (
+        "FREE",
+        "Choice",
+        "Count",
+        "Name",
+        "Number",
+        "PositiveCount",
+        "Problems",
+        "Settings",
+        "Switch",
+        "Text",
+    ),
+    "sim_engine.settings.quantity": ("Quantity",),
+    # Pours: values that strategies, objectives and arms have in common
+    "actors.interfaces": ("DeviceCheck", "InvalidActionError", "LaboratoryError"),
+    "sim_engine.action": ("ACTION_DIMENSIONS", "Action", "Dimension"),
+    "sim_engine.liquids": ("Liquid", "SimulationParameters"),
+    "sim_engine.outcome": ("Fractions", "Loss", "PourMeasurement", "PourOutcome"),
+    "sim_engine.scene": ("PoseError", "Scene"),
+    "sim_engine.search_space": ("Axis", "Space"),
+    # Strategies
+    "actors.optimizer.questions": ("Data", "SuggestProblem", "Suggestion"),
+    "orchestrator.requests": (
+        "Answered",
+        "Ask",
+        "Decision",
+        "Failed",
+        "Outcome",
+        "Pour",
+        "Poured",
+        "Request",
+        "Simulate",
+        "Simulated",
+        "Slots",
+        "Suggest",
+        "Suggested",
+    ),
+    "orchestrator.run_errors": ("LearningError",),
+    "orchestrator.strategies.calibration.calibration_base": ("THETA_MAP_RESOLUTION", "Calibration", "DesignSettings"),
+    "orchestrator.strategies.calibration.pointwise_calibration": ("DiscrepancyOverPours",),
+    "orchestrator.strategies.campaign_plan": (
+        "CalibrationPlan",
+        "CalibrationSettings",
+        "DeploymentPlan",
+        "DeploymentSettings",
+        "MeasuredPour",
+    ),
+    "orchestrator.strategies.deployment.deployment_base": ("MAP_RESOLUTION", "Deployment", "SearchSettings"),
+    "orchestrator.strategies.optimizer_queries": ("OptimizerQueries",),
+    "orchestrator.strategies.stage_result": ("ResultPart", "StageResult"),
+    "orchestrator.strategies.strategy": ("Progress", "Strategy"),
+    "orchestrator.strategies.trials": ("SeedStream", "Trial", "Trials"),
+    # Objectives
+    "orchestrator.strategies.deployment.objectives": ("Objective", "Objectives"),
+    # Balances
+    "actors.balance.balance_interface": ("BalanceDriver", "Weight"),
+    "actors.balance.balance_settings": ("BalanceDevice", "BalanceEmulator", "SerialBalanceSpec"),
+    "actors.balance.dialects.dialect": ("Dialect", "LineSettings"),
+    "actors.balance.readings": ("Acknowledgement", "LineError", "Reading", "ReadingStatus", "Reply"),
+    "actors.balance.serial_balance": ("SerialBalance",),
+    "actors.balance.simulated_balance": ("Load",),
+    "orchestrator.config.balance_file": ("BalanceDeviceSection",),
+    # Arms
+    "actors.arm.arm_interface": (
+        "Arm",
+        "ArmFacts",
+        "ArmLostError",
+        "ArmNotReleasedError",
+        "ArmPose",
+        "ArmRefusedError",
+        "ArmState",
+        "ArmStoppedError",
+        "PathReport",
+        "PlannedPour",
+        "Pose",
+    ),
+    "actors.arm.arm_settings": ("ArmDiagnostics", "ArmSpec"),
+    "actors.arm.planned_pour": ("ExecutedMotion", "MotionPath"),
+    "actors.bench.device_emulators": ("ArmEmulator", "History"),
+    "actors.bench.pour_feasibility": ("plan_pour",),
+    "orchestrator.config.arm_file": ("ArmSettings", "CellSection"),
+    "orchestrator.config.yaml.yaml_source": ("Place", "Report"),
+    # Sources of vessels
+    "sim_engine.resources": ("load_arrays", "store_arrays"),
+    "sim_engine.vessel.distance_grid": ("SignedDistanceGrid",),
+    "sim_engine.vessel.shapes": ("ProfileShape", "Shape", "VesselError", "VesselSpec", "cylinder"),
+    "sim_engine.vessel.vessel": ("Vessel", "build_vessel"),
+}
+"""Module → the names that it provides."""
+
+_SOURCE_OF = {name: module for module, names in _SOURCES.items() for name in names}
+
+_RENAMED = {"Settings": "Section"}
+"""Public name → the name in its module, if they differ."""
+
+if not TYPE_CHECKING:  # otherwise a type checker would accept misspelt names as Any
+
+    def __getattr__(name: str) -> Any:
+        """Import a name on first use (PEP 562)."""
+        if name not in _SOURCE_OF:
+            raise AttributeError(f"module 'decant.plugins' has no attribute '{name}'; it has {', '.join(__all__)}")
+        return getattr(import_module(_SOURCE_OF[name]), _RENAMED.get(name, name))
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
