@@ -14,6 +14,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from actors.arm.arm_geometry import Pose
     from actors.arm.arm_interface import (
         Arm,
         ArmFacts,
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
         ArmStoppedError,
         PathReport,
         PlannedPour,
-        Pose,
     )
     from actors.arm.arm_settings import ArmDiagnostics, ArmSpec
     from actors.arm.planned_pour import ExecutedMotion, MotionPath
@@ -279,6 +279,7 @@ _SOURCES = {
     "actors.balance.simulated_balance": ("Load",),
     "orchestrator.config.balance_file": ("BalanceDeviceSection",),
     # Arms
+    "actors.arm.arm_geometry": ("Pose",),
     "actors.arm.arm_interface": (
         "Arm",
         "ArmFacts",
@@ -290,7 +291,6 @@ _SOURCES = {
         "ArmStoppedError",
         "PathReport",
         "PlannedPour",
-        "Pose",
     ),
     "actors.arm.arm_settings": ("ArmDiagnostics", "ArmSpec"),
     "actors.arm.planned_pour": ("ExecutedMotion", "MotionPath"),
