@@ -75,7 +75,7 @@ class Pour:
     Attributes:
         number: 1, 2, … within the stage.
         seed: of the virtual bench's hidden noise for this pour; a real bench ignores it.
-        predicted: what the strategy expects, for people and for the trust check.
+        predicted: what the strategy expects, for people.
     """
 
     scene: str

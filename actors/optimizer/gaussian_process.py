@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -126,9 +126,6 @@ class Surrogate(Protocol):
 CONSTANT_PRIOR = HyperPrior()
 RESIDUAL_PRIOR = HyperPrior(signal=(0.4, 0.7), noise=(0.07, 1.0))
 """Prior of what reality adds to the simulation: smaller than the cost itself, but free to be as large."""
-
-POOLED_PRIOR = HyperPrior(noise=(0.05, 0.4), simulated_noise=(0.3, 1.0))
-"""Pours have little noise, simulations much: where they contradict each other the simulations must give way."""
 
 SCALED_PRIOR = HyperPrior(rho=(1.0, 1.0), delta_signal=(0.6, 0.7))
 """Wide, so that a simulation that is the wrong way round can be found out."""
@@ -381,22 +378,15 @@ def joint_process(
     points: Array,
     costs: Array,
     *,
-    scaled: bool,
     varying: bool = False,
-    widening: float = 1.0,
     search: HyperparameterSearch = AFRESH,
 ) -> GaussianProcess:
-    """GP of the real cost from simulations and real observations at once.
-
-    Pooled, simulations are observations of the same cost but for a constant, with a noise of their own that also holds
-    their discrepancy: f_r = f_s + β. Scaled, f_r = ρ f_s + β + δ, with ρ and δ fitted. See `covariance.py`.
+    """GP of the real cost from simulations and real observations at once: f_r = ρ f_s + β + δ. See `covariance.py`.
 
     Args:
         simulated: (k, dimension), k ≥ 1, and their costs (k,).
         points: (n, dimension), n ≥ 0, and their costs (n,).
-        scaled: which of the two.
         varying: whether the noise of real observations may vary.
-        widening: factor on the median of the prior of the simulations' noise.
         search: for the hyperparameters.
 
     Source: Kennedy & O'Hagan, Predicting the output from a complex computer code when fast approximations are
@@ -404,13 +394,9 @@ def joint_process(
     """
     both, values = np.concatenate([simulated, points]), np.concatenate([simulated_costs, costs])
     centre = float(simulated_costs.mean())
-    terms = {"real": np.arange(len(both)) >= len(simulated), "scaled": scaled}
+    real = np.arange(len(both)) >= len(simulated)
     scale = _scale(values - centre, values)
-    prior = SCALED_PRIOR if scaled else POOLED_PRIOR
-    if widening != 1.0:
-        median, deviation = prior.simulated_noise
-        prior = replace(prior, simulated_noise=(widening * median, deviation))
-    return _fitted(both, values, _constant(centre), scale, varying, prior, search, **terms)
+    return _fitted(both, values, _constant(centre), scale, varying, SCALED_PRIOR, search, real=real)
 
 
 def _fitted(

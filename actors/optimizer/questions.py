@@ -97,7 +97,7 @@ class DiscrepancyFound:
 Point = tuple[float, ...]
 """A point of the unit cube."""
 
-MeanName = Literal["constant", "zero", "simulated", "pooled", "scaled", "adaptive"]
+MeanName = Literal["constant", "zero", "simulated", "scaled", "adaptive"]
 AcquisitionName = Literal["lcb", "posterior_minimum", "random", "sobol", "knowledge", "least_loss"]
 NoiseName = Literal["constant", "varying"]
 
@@ -254,10 +254,9 @@ class SuggestProblem:
         count: how many points are wanted; 0 asks for `best_point`, map and predictions only.
         seed: of every random choice in the answer.
         mean: prior mean of the surrogate: 'constant' (fitted), 'zero' (the paper's), 'simulated' (posterior mean of a
-            GP over `simulated`, the paper's D3), 'pooled' (`simulated` and `data` in one GP, simulations with a noise
-            and an offset of their own), 'scaled' (real cost = ρ · simulated cost + remainder, fitted at once),
-            'adaptive' (an average over the ways in which the simulator may be wrong, see `mismatch`).
-        simulated: cheap observations of the same cost, for the last four.
+            GP over `simulated`, the paper's D3), 'scaled' (real cost = ρ · simulated cost + remainder, fitted at once:
+            for 'knowledge'), 'adaptive' (an average over the ways in which the simulator may be wrong, see `mismatch`).
+        simulated: cheap observations of the same cost, for the last three.
         acquisition: 'lcb' minimises m(x) − κ s(x); 'posterior_minimum' minimises m(x) (further points of the same
             answer the penalised 'lcb'); 'random' and 'sobol' only draw. 'knowledge' looks for *simulations*: where one
             more of them would teach most about which action is best (a mean that knows simulations is needed).
@@ -281,7 +280,6 @@ class SuggestProblem:
             point is one that is likely to be made.
         constraints: that every proposal meets.
         noise: of real observations: 'constant', or 'varying' with the expected cost where the observations show it.
-        widening: 'pooled': factor on what the simulations' noise, which holds their discrepancy, is expected to be.
         posterior: with a context: weighed pours, for draws of the searched parameters given them.
         design: with a posterior: which pour to weigh next.
         risk: if given, the observations are of requests as they were executed, disturbances included: points of `data`
@@ -311,7 +309,6 @@ class SuggestProblem:
     failed: tuple[Point, ...] = ()
     constraints: tuple[Linear, ...] = ()
     noise: NoiseName = "constant"
-    widening: float = 1.0
     posterior: PosteriorQuestion | None = None
     design: DesignQuestion | None = None
     risk: Risk | None = None

@@ -12,13 +12,11 @@ import time
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 from threadpoolctl import threadpool_limits
 
 from actors.optimizer import acquisition
 from actors.optimizer.experimental_design import WeighedDesign, expected_reductions
 from actors.optimizer.feasible_region import Feasibility, Region
-from actors.optimizer.gaussian_process import constant_mean_process
 from actors.optimizer.knowledge_gradient import KnowledgeGradient, found, most_instructive, proposals
 from actors.optimizer.question_checks import Asked, array, check, tuples
 from actors.optimizer.questions import (
@@ -228,7 +226,7 @@ def _answer(problem: SuggestProblem) -> Suggestion:
 
 def _candidates(problem: SuggestProblem, asked: Asked, model: Model, rng: np.random.Generator) -> Array:
     """Places to think about: all over the region, and around the best of those observed."""
-    seen = asked.seen if problem.mean in ("simulated", "pooled", "scaled", "adaptive") else asked.known
+    seen = asked.seen if problem.mean in ("simulated", "scaled", "adaptive") else asked.known
     if problem.risk is not None:
         seen = np.clip(seen, 0.0, 1.0)  # what was executed may lie beside the box
     means = model.surrogate.predict(seen)[0]
@@ -265,22 +263,14 @@ def _looks_round(problem: SuggestProblem, asked: Asked, model: Model, index: int
     """Whether the next point only fills space: every third one, while the costs could as well be noise.
 
     On a plateau the luckiest pours look like a slope, and following them, mostly along the faces of the cube, would
-    take the whole budget. The same holds where every pour came to more than half of all simulations did, and pours
-    alone show no structure: what simulation promised isn't there. The paper's ways (`plain`, 'zero', 'simulated'),
-    contexts and risks are left alone.
+    take the whole budget. The paper's ways (`plain`, 'zero', 'simulated'), contexts and risks are left alone.
     """
     if problem.plain:
         return False
     number = len(asked.known) + len(asked.busy) + index
     if problem.acquisition != "lcb" or problem.context or problem.risk or number % FILL_EVERY != FILL_EVERY - 1:
         return False
-    if problem.mean == "constant":
-        return model.process.evidence < STRUCTURE
-    if problem.mean not in ("pooled", "scaled") or len(asked.known) < 2 or len(asked.simulated) < 2:
-        return False
-    if asked.costs.min() <= _promised(problem, asked):
-        return False
-    return constant_mean_process(asked.points, asked.costs).evidence < STRUCTURE
+    return problem.mean == "constant" and model.process.evidence < STRUCTURE
 
 
 def _kappa(problem: SuggestProblem, model: Model) -> float:
@@ -292,19 +282,6 @@ def _kappa(problem: SuggestProblem, model: Model) -> float:
     adapts = problem.mean == "constant" and not problem.context and not problem.plain
     settled = adapts and model.process.evidence >= STRUCTURE
     return problem.kappa * (SETTLED if settled else 1.0)
-
-
-def _promised(problem: SuggestProblem, asked: Asked) -> float:
-    """What pours should at least come to, by the simulations.
-
-    That is their median. Where they are made by what they are worth (`effort`), most of them lie in the valley: there
-    each counts for the part of the region that it is nearest to, and it is half-way from the least to the median.
-    """
-    if problem.effort is None:
-        return float(np.median(asked.simulated_costs))
-    everywhere = asked.region.draw(256, np.random.default_rng(0), even=True)
-    typical = np.median(asked.simulated_costs[cdist(everywhere, asked.simulated).argmin(axis=1)])
-    return 0.5 * float(asked.simulated_costs.min() + typical)
 
 
 MOST_AXES = 4

@@ -19,8 +19,8 @@ Answer = Annotated[
     str | None,
     typer.Option(
         help="With --resume: what came of the pour that was under way: 'lost', 'weighed 3.2 0.4' (g spilled, g "
-        "retained), or on the virtual bench 'repeat'. Or, where a D3 asks whether to trust its simulator: 'D2', "
-        "'widen' or 'go on'.",
+        "retained), or on the virtual bench 'repeat'. Or, where a D3 asks how to go on: 'go on' or "
+        "'stop'.",
         show_default=False,
     ),
 ]

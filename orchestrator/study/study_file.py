@@ -147,7 +147,7 @@ class DeploymentsBase(Section):
     """D2 as in the paper: a surrogate with a zero mean."""
 
     D3: D3ArmSection | None = None
-    """Real pours with a simulated prior, the campaign's model of it and check of trust."""
+    """Real pours with a simulated prior, and the campaign's model of it."""
 
     D3_paper: D3ArmSection | None = None
     """D3 as in the paper: a GP of the residual around the simulations' mean, always trusted."""

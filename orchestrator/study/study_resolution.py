@@ -32,7 +32,7 @@ BUDGETS = (
 
 AS_IN_THE_PAPER: dict[str, dict[str, Any]] = {
     "D2_paper": {"mean": "zero"},
-    "D3_paper": {"model": "residual", "trust": "always"},
+    "D3_paper": {"model": "residual"},
 }
 """What the paper's forms have otherwise than ours."""
 

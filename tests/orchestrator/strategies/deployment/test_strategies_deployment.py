@@ -175,7 +175,7 @@ def test_a_failed_pour_counts_and_enters_the_data_as_told(policy, entered):
     ("name", "changes", "warns"),
     [
         ("D2", {}, True),
-        ("D3", {"model": "scaled"}, True),
+        ("D3", {"model": "adaptive"}, True),
         ("D3", {"model": "residual"}, False),
         ("D2", {"on_failed_pour": "ignore"}, False),
     ],
@@ -206,7 +206,7 @@ def test_touching_vessels_are_avoided_and_cost_no_pour():
     assert result.refused_pours > 0
     assert len(played.real_spills) == 8
     assert [r.number for r in result.pours if r.status == "weighed"] == list(range(1, 9))
-    hybrid = make("D3", 1, pours=4, model="scaled")
+    hybrid = make("D3", 1, pours=4, model="adaptive")
     StrategyHarness(touches_when_near).run(hybrid)
     assert hybrid.result().refused_pours <= 1  # simulations have told most of it
     assert hybrid.best_values["x_offset"] >= 0.10

@@ -1,0 +1,50 @@
+"""What version 0.2 wrote and this one no longer has: journals, results and recorded campaigns are read without it.
+
+Version 0.2 had two further models of D3, `pooled` and `scaled`, and a check of the simulator by the first pours
+(`trust`). Its runs can be listed and reported. A run that used any of that can't be resumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+Data = Mapping[str, Any]
+
+
+def upgraded_request(data: Data) -> Data:
+    """A request as this version reads it. A question with the mean 'pooled' has 'scaled', the nearest one."""
+    problem = data.get("problem")
+    if not isinstance(problem, Mapping) or "widening" not in problem:
+        return data
+    problem = {key: value for key, value in problem.items() if key != "widening"}
+    return {**data, "problem": {**problem, "mean": {"pooled": "scaled"}.get(problem["mean"], problem["mean"])}}
+
+
+def upgraded_result(data: Data) -> Data:
+    """A stage's result as this version reads it. Of a comparison of pours with simulations its scores are left."""
+    trust = data.get("trust")
+    if not isinstance(trust, Mapping) or "mean_z" not in trust:
+        return data
+    return {**data, "trust": {key: trust[key] for key in ("z_scores", "alarm")}}
+
+
+def upgraded_fingerprint(data: dict[str, Any]) -> dict[str, Any]:
+    """A journal's fingerprint, comparable with one of this version where the campaign means the same in both."""
+    deployment = data.get("deployment")
+    settings = deployment.get("settings") if isinstance(deployment, Mapping) else None
+    if not isinstance(settings, Mapping) or settings.get("strategy") != "D3" or "trust" not in settings:
+        return data
+    if settings["trust"] != {"adaptive": None, "residual": "always"}.get(settings["model"], "another"):
+        return data
+    kept = {key: value for key, value in settings.items() if key != "trust"}
+    return {**data, "deployment": {**data["deployment"], "settings": kept}}
+
+
+def upgraded_campaign(data: Any) -> Any:
+    """A recorded campaign as this version loads it, for all but resuming. A retired model becomes the default one."""
+    deployment = data.get("deployment") if isinstance(data, Mapping) else None
+    if not isinstance(deployment, Mapping) or deployment.get("strategy") != "D3":
+        return data
+    retired = {"trust"} | ({"model"} if deployment.get("model") in ("pooled", "scaled") else set())
+    return {**data, "deployment": {key: value for key, value in deployment.items() if key not in retired}}
