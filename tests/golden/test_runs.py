@@ -35,10 +35,12 @@ from orchestrator.progress.console_progress import ProgressDisplay
 from orchestrator.requests import Request
 from orchestrator.results.console_view import summary_table
 from orchestrator.results.publishing import publish
+from orchestrator.results.stage_views import deployments_of
 from orchestrator.runs.events import Event, PourProgressed, StrategyProgressed
 from orchestrator.runs.replay import ToldStep, read_history
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import stages_of
+from orchestrator.strategies.deployment.real_pours import Foretold
 from orchestrator.strategies.stage_result import StageResult
 from tests.golden import old_runs
 from tests.golden.golden import ROOT, Golden, agree, compact, line, normalised
@@ -225,6 +227,26 @@ def test_old_run_is_published_again_as_it_was(name: str, runs: Path, golden: Gol
     for file in ("summary.json", "theta.json"):
         again = json.loads((folder / file).read_text(encoding="utf-8"))
         golden.check(f"old_runs/{name}-{file}", normalised(_indented(timeless(compact(again))), places))
+
+
+def test_old_run_with_a_model_that_is_retired_is_listed_and_reported_but_not_resumed(runs: Path) -> None:
+    """D3 with `model: pooled` and `trust: {policy: widen}`, as version 0.2 made it."""
+    folder = runs / "runs" / "pooled"
+    shutil.copytree(ROOT / "tests" / "data" / "retired_runs" / "pooled", folder)
+    assert "pooled" in typed(runs, "runs", "add", "runs") + typed(runs, "runs", "list")
+    assert typed(runs, "report", "runs/pooled", "-o", "page.html").endswith("exit 0\n\n")
+    page = page_of(runs / "page.html", runs)
+    assert "reduced" not in page
+    assert "pooled" in page, "the page says what the run was, though this version has no such model"
+    run = decant.open_run(folder)
+    assert (run.result.state, run.result.pours, len(run.pours)) == ("finished", 4, 4)
+    (found,) = deployments_of(run.result.results).values()
+    assert isinstance(found.trust, Foretold)
+    (runs / "pooled.yaml").write_text((folder / "resolved.json").read_text(encoding="utf-8"), encoding="utf-8")
+    refused = typed(runs, "run", "pooled.yaml", "--resume")
+    assert refused.endswith("exit 2\n\n")
+    assert re.search(r"pooled\.yaml:\d+:\d+: deployment\.model: 'pooled' was retired; write 'adaptive'", refused)
+    assert re.search(r"pooled\.yaml:\d+:\d+: deployment\.trust: was retired; remove it", refused)
 
 
 @pytest.mark.parametrize("name", RUNS)
