@@ -1,7 +1,8 @@
 """What version 0.2 wrote and this one no longer has: journals, results and recorded campaigns are read without it.
 
-Version 0.2 had two further models of D3, `pooled` and `scaled`, and a check of the simulator by the first pours
-(`trust`). Its runs can be listed and reported. A run that used any of that can't be resumed.
+Version 0.2 had two further models of D3, `pooled` and `scaled`, a check of the simulator by the first pours (`trust`),
+and a price of simulations for as long as no outcome told one. Its runs can be listed and reported. One that used such a
+model or check can't be resumed.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def upgraded_fingerprint(data: dict[str, Any]) -> dict[str, Any]:
         return data
     if settings["trust"] != {"adaptive": None, "residual": "always"}.get(settings["model"], "another"):
         return data
-    kept = {key: value for key, value in settings.items() if key != "trust"}
+    kept = _without_retired(settings, "trust")
     return {**data, "deployment": {**data["deployment"], "settings": kept}}
 
 
@@ -46,5 +47,13 @@ def upgraded_campaign(data: Any) -> Any:
     deployment = data.get("deployment") if isinstance(data, Mapping) else None
     if not isinstance(deployment, Mapping) or deployment.get("strategy") != "D3":
         return data
-    retired = {"trust"} | ({"model"} if deployment.get("model") in ("pooled", "scaled") else set())
-    return {**data, "deployment": {key: value for key, value in deployment.items() if key not in retired}}
+    model = ("model",) if deployment.get("model") in ("pooled", "scaled") else ()
+    return {**data, "deployment": _without_retired(deployment, "trust", *model)}
+
+
+def _without_retired(settings: Data, *retired: str) -> dict[str, Any]:
+    """D3's settings without some keys, and without the price of a simulation, which decided nothing."""
+    kept = {key: value for key, value in settings.items() if key not in retired}
+    if isinstance(prices := kept.get("prices"), Mapping):
+        kept["prices"] = {key: value for key, value in prices.items() if key != "simulation"}
+    return kept

@@ -9,7 +9,7 @@ import statistics
 from collections import deque
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from orchestrator.requests import Failed, Outcome, Simulated
 from orchestrator.strategies.campaign_plan import DeploymentPlan
@@ -101,15 +101,19 @@ class Costing:
 LEARNT_FROM = 25
 """Latest simulations whose median is their price: one that was slow by accident changes nothing."""
 
+WITHOUT_OUTCOME = 2.0
+"""CPU seconds of a simulation while no outcome has any."""
+
 
 class PricesSettings(Section):
     """D3 with `per_pour: free`: what things cost, by which simulations are chosen and ended."""
 
+    retired: ClassVar[dict[str, str]] = {
+        "simulation": "was retired; remove it: outcomes say what a simulation costs before anything depends on it"
+    }
+
     pour: Annotated[float, Quantity("s", "90 s", 0.0, 86400.0, positive=True)] = 90.0
     """Time that a pour takes, refilling and wiping included."""
-
-    simulation: Annotated[float, Quantity("s", "2 s", 0.0, 3600.0, positive=True)] = 2.0
-    """CPU time of a simulation, until their outcomes tell."""
 
     worth: Annotated[float, Quantity("1", "0.005", 0.0, 1.0)] = 0.005
     """Share of the worst loss: where all simulations that fit beside a pour promise less together, the pool rests."""
@@ -138,7 +142,7 @@ class Prices:
 
     def simulation(self, width: int) -> float:
         """Seconds from one simulated outcome to the next with `width` of them at a time."""
-        return (statistics.median(self._seen) if self._seen else self._settings.simulation) / max(width, 1)
+        return (statistics.median(self._seen) if self._seen else WITHOUT_OUTCOME) / max(width, 1)
 
     def prefers_pour(self, simulation: float, pour: float, width: int) -> bool:
         """Whether a pour is worth more per second than a simulation, given what each is worth."""

@@ -279,7 +279,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           pours: 6
           prior_simulations: 11
           per_pour: free
-          prices: {{pour: 75 s, simulation: 4 s, worth: 0.01}}
+          prices: {{pour: 75 s, worth: 0.01}}
           kappa: 3
           initial: 4
           on_failed_pour: ignore
@@ -338,7 +338,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
         pours=6,
         prior_simulations=11,
         per_pour="free",
-        prices=PricesSettings(pour=75.0, simulation=4.0, worth=0.01),
+        prices=PricesSettings(pour=75.0, worth=0.01),
         kappa=3.0,
         initial=4,
         on_failed_pour="ignore",

@@ -137,15 +137,6 @@ def test_d3_asks_for_a_pour_and_the_simulations_beside_it_together():
     assert [len(q.data) for q in questions] == [0, 1, 2, 3]
 
 
-def test_d3_simulates_freely_while_a_pour_is_under_way():
-    strategy = make("D3", pours=3, per_pour="free")
-    played = StrategyHarness(narrow_cup, slots=2, beside=9).run(strategy)
-    assert len(played.pours) == 3
-    assert sum(r.purpose == "refine" for r in played.simulations) > 8
-    questions = [r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour"]
-    assert len(questions[-1].simulated) > 24
-
-
 def test_failed_simulations_and_pours_never_poison_a_fit():
     def flaky(action, theta, rng):
         return math.nan if rng.random() < 0.3 else narrow_cup(action, theta, rng)

@@ -93,7 +93,7 @@ def test_the_pool_rests_when_simulations_promise_nothing_and_goes_on_when_someth
 
 
 def test_the_price_of_a_simulation_is_what_outcomes_say() -> None:
-    prices = Prices(PricesSettings(pour=90.0, simulation=2.0), worst=1.0)
+    prices = Prices(PricesSettings(pour=90.0), worst=1.0)
     assert prices.simulation(2) == 1.0
     for seconds in (10.0, 500.0, 12.0, 0.0):
         prices.learn(seconds)
