@@ -122,7 +122,7 @@ OF_SECTIONS = {
     "RiskSettings": "[risk](#risk-and-the-safe-window)",
     "WindowSettings": "[window](#risk-and-the-safe-window)",
     "PricesSettings": "[prices](#prices)",
-    "IgnoranceSettings": "[ignorance](#ignorance-limits-and-the-end)",
+    "DiscrepancyPolicySettings": "[ignorance](#ignorance-limits-and-the-end)",
     "RiskLimitSettings": "[risk_limit](#ignorance-limits-and-the-end)",
     "StopSettings": "[stop](#ignorance-limits-and-the-end)",
     "DataSection": "[data](#existing-data)",
