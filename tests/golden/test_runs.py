@@ -27,7 +27,7 @@ from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.event_feed import PASSING as PASSED_BY
 from orchestrator.daemon.event_feed import event_json
-from orchestrator.journal.codec import encode_request
+from orchestrator.journal.codec import encode_request, first_difference
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
 from orchestrator.journal.run_record import read_result
 from orchestrator.journal.upgrade import upgraded_request
@@ -37,6 +37,7 @@ from orchestrator.results.console_view import summary_table
 from orchestrator.results.publishing import publish
 from orchestrator.results.stage_views import deployments_of
 from orchestrator.runs.events import Event, PourProgressed, StrategyProgressed
+from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.replay import ToldStep, read_history
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import stages_of
@@ -277,6 +278,15 @@ def test_old_run_is_replayed(name: str, runs: Path) -> None:
                 assert agree(before, _sorted(strategy.result().model_dump(mode="json")))
                 results[stage.name] = history.result
     assert asked > 0
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_old_run_has_the_fingerprint_of_its_campaign(name: str, runs: Path) -> None:
+    """So that it can be resumed: of D3's settings those that are retired are left out on both sides."""
+    folder = runs / "runs" / name
+    with JournalReader(folder / JOURNAL_NAME) as journal:
+        written = journal.header.fingerprint
+    assert first_difference(written, fingerprint(load_campaign(folder / "resolved.json"))) is None
 
 
 def _sorted(value: Any) -> str:
