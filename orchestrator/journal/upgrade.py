@@ -31,15 +31,20 @@ def upgraded_result(data: Data) -> Data:
 
 
 def upgraded_fingerprint(data: dict[str, Any]) -> dict[str, Any]:
-    """A journal's fingerprint, comparable with one of this version where the campaign means the same in both."""
-    deployment = data.get("deployment")
-    settings = deployment.get("settings") if isinstance(deployment, Mapping) else None
+    """A fingerprint of a campaign or study, comparable with one of this version where it means the same in both."""
+    data = {**data, "deployment": _upgraded_plan(data["deployment"])} if "deployment" in data else data
+    if isinstance(arms := data.get("deployments"), Mapping):  # of a study
+        data = {**data, "deployments": {label: _upgraded_plan(plan) for label, plan in arms.items()}}
+    return data
+
+
+def _upgraded_plan(plan: Any) -> Any:
+    settings = plan.get("settings") if isinstance(plan, Mapping) else None
     if not isinstance(settings, Mapping) or settings.get("strategy") != "D3" or "trust" not in settings:
-        return data
+        return plan
     if settings["trust"] != {"adaptive": None, "residual": "always"}.get(settings["model"], "another"):
-        return data
-    kept = _without_retired(settings, "trust")
-    return {**data, "deployment": {**data["deployment"], "settings": kept}}
+        return plan
+    return {**plan, "settings": _without_retired(settings, "trust")}
 
 
 def upgraded_campaign(data: Any) -> Any:
