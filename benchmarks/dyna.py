@@ -2,7 +2,7 @@
 
     python benchmarks/dyna.py [--worlds right half ...] [--problem spill2] [--arms fixed priced ...] [--seeds 30]
                               [--first 0] [--simulation 1.5] [--slots 2] [--pour 90] [--pours 15] [--prior 37]
-                              [--model scaled] [--no-trust] [--json]
+                              [--model adaptive] [--json]
 
 Toy worlds (`optimiser_problems.py`, and simulators that know them more or less as in `hybrid_models.py`) behind the
 real strategy, scheduler, journal and optimiser, in one process, on a clock that leaves waiting out
@@ -46,7 +46,6 @@ from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.deployment.model_check import TrustSettings
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss, PourMeasurement, SimulatedPour
 from sim_engine.scene import PourTask, Scene
@@ -57,18 +56,15 @@ SIMULATORS: dict[str, Callable[[Instance, Floats, Floats], float]] = {
     **WORLDS,
     "shifted by 0.04": lambda world, u, sign: world.true(u + 0.04 * sign),
 }
-TRUST = TrustSettings()
 
 
 def arms(asked: argparse.Namespace, space: Space) -> dict[str, DeploymentPlan]:
     """What is compared."""
-    trust = "always" if asked.no_trust else TRUST
     settings = D3Settings(
         pours=asked.pours,
         prior_simulations=asked.prior,
         per_pour="free",
         model=asked.model,
-        trust=None if asked.model == "adaptive" else trust,
     )
     free, prices = DeploymentPlan(settings, (SCENE,), space, Loss()), PricesSettings(pour=asked.pour)
     return {
@@ -236,8 +232,7 @@ def main() -> None:
     parser.add_argument("--pour", type=float, default=90.0)
     parser.add_argument("--pours", type=int, default=15)
     parser.add_argument("--prior", type=int, default=37)
-    parser.add_argument("--model", choices=["adaptive", "residual", "pooled", "scaled"], default="scaled")
-    parser.add_argument("--no-trust", action="store_true", help="never fall back on pours alone")
+    parser.add_argument("--model", choices=["adaptive", "residual"], default="adaptive")
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
     pin(None)

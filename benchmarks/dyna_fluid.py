@@ -34,7 +34,6 @@ from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.deployment.model_check import Compared
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_plan import StudyPlan
 from sim_engine.errors import InvalidSceneError
@@ -161,7 +160,7 @@ def campaign(study: StudyPlan, arm: DeploymentPlan, seed: int, fluid: Fluid, ask
         "longest wait, ms": 1e3 * max(fluid.occupancy.waits, default=0.0),
         "mean wait, ms": 1e3 * float(np.mean(fluid.occupancy.waits)),
         "longest answer, ms": 1e3 * max(fluid.answers),
-        "alarm": float(isinstance(stage.trust, Compared) and stage.trust.followed is not None),
+        "alarm": float(stage.trust.alarm),
         "apart, s": fluid.apart,
     }
     for pours in (n for n in AFTER if n <= asked.pours):

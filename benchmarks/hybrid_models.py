@@ -2,7 +2,7 @@
 
 Toy pours after toy simulations:
 
-    python benchmarks/hybrid_models.py [--worlds right far ...] [--models simulated pooled scaled constant] [--seeds 8]
+    python benchmarks/hybrid_models.py [--worlds right far ...] [--models simulated scaled constant] [--seeds 8]
                                        [--simulations 37] [--pours 15] [--json]
 
 A world is `spill2` of `optimiser_problems.py`, and a simulator that knows it more or less. The optimiser chooses the
@@ -79,9 +79,9 @@ def campaign(model: str, world: Instance, simulated: Data, pours: int) -> dict[s
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    models = ["simulated", "pooled", "scaled", "constant"]
+    models = ["simulated", "scaled", "constant"]
     parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=list(WORLDS))
-    parser.add_argument("--models", nargs="+", choices=models, default=models[:3])
+    parser.add_argument("--models", nargs="+", choices=models, default=models[:2])
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--simulations", type=int, default=37)
     parser.add_argument("--pours", type=int, default=15)

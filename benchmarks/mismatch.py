@@ -1,6 +1,6 @@
-"""What a wrong simulator costs: D2, D3 as in the paper, D3 with its trust alarm, and D3 that averages over mistakes.
+"""What a wrong simulator costs: D2, D3 as in the paper, and D3 that averages over mistakes.
 
-    python benchmarks/mismatch.py [--levels none small ...] [--arms D2 paper alarm adaptive] [--seeds 24] [--first 1000]
+    python benchmarks/mismatch.py [--levels none small ...] [--arms D2 paper adaptive] [--seeds 24] [--first 1000]
                                   [--pours 15] [--simulations 37] [--out FILE]
                                   [--receivers] [--write]
 
@@ -14,7 +14,7 @@ Primary questions, written before any of it was run. Seeds below 1000 are for tu
 
 1. Mean of 15 pours of `adaptive` at no, small, moderate and large mismatch: at most 0.05, 0.08, 0.10, 0.25?
 2. Its pours that lose more than 10 % after the first that lost less than 1 %: at most 0.2 a campaign?
-3. The action it recommends in the end: never more than 0.01 worse than that of D2 or of `alarm`?
+3. The action it recommends in the end: never more than 0.01 worse than that of D2?
 4. With an anti-correlated simulator: its pours from the fourth on no worse than D2's; best of the first three at most
    0.4?
 5. (`--receivers`, six pours each.) With what was learnt of the bench before: fewer pours into receiver 3 until one
@@ -39,23 +39,18 @@ from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.deployment.deployment_base import Deployment
-from orchestrator.strategies.deployment.model_check import TrustSettings
 from orchestrator.strategies.stage_result import StageResult
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 
 ARMS: dict[str, Callable[[int, int], Any]] = {
     "D2": lambda pours, _: D2Settings(pours=pours),
-    "paper": lambda pours, prior: D3Settings(pours=pours, prior_simulations=prior, model="residual", trust="always"),
-    "alarm": lambda pours, prior: D3Settings(
-        pours=pours, prior_simulations=prior, model="scaled", trust=TrustSettings()
-    ),
+    "paper": lambda pours, prior: D3Settings(pours=pours, prior_simulations=prior, model="residual"),
     "adaptive": lambda pours, prior: D3Settings(pours=pours, prior_simulations=prior),
 }
 NAMES = {
     "D2": "D2",
     "paper": "D3, `residual` (the paper's)",
-    "alarm": "D3, `scaled` with alarm",
     "adaptive": "D3, `adaptive`",
 }
 GOOD, BAD = 0.01, 0.10

@@ -214,7 +214,6 @@ def speed() -> list[dict[str, Any]]:
             ("constant", "constant"),
             ("constant", "varying"),
             ("simulated", "constant"),
-            ("pooled", "constant"),
             ("scaled", "constant"),
         )
         for mean, noise in models:

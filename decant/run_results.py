@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.file_loading import recorded_campaign
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.journal.run_record import CampaignResult, RequestOutcome, Row, answers, pour_row, read_result
 from orchestrator.journal.stage_results import Results
@@ -243,7 +243,7 @@ def open_run(directory: Path | str, campaign: CampaignPlan | None = None) -> Run
     folder = Path(directory).expanduser()
     if not (folder / JOURNAL_NAME).is_file():
         raise FileNotFoundError(f"{folder}: there is no run in this folder (no {JOURNAL_NAME})")
-    plan = load_campaign(folder / "resolved.json") if campaign is None else campaign
+    plan = recorded_campaign(folder / "resolved.json") if campaign is None else campaign
     with JournalReader(folder / JOURNAL_NAME) as journal:
         return Run(plan, read_result(journal, folder))
 

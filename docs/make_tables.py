@@ -37,7 +37,6 @@ from orchestrator.states import State
 from orchestrator.strategies.deployment import disturbances as pose
 from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.disturbances import RiskSettings
-from orchestrator.strategies.deployment.model_check import TrustSettings
 from orchestrator.strategies.deployment.model_monitoring import (
     DiscrepancyPolicySettings,
     RiskLimitSettings,
@@ -63,7 +62,6 @@ SECTIONS: dict[str, type[Section]] = {
     "pours": campaign.PoursSection,
     "transfer": campaign.TransferSection,
     "deployment": campaign.DeploymentSection,
-    "trust": TrustSettings,
     "risk": RiskSettings,
     "window": WindowSettings,
     "prices": PricesSettings,
@@ -121,7 +119,6 @@ OF_SECTIONS = {
     "LossSection": "[loss](#losses)",
     "Objective": "[objective](#objectives)",
     **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
-    "TrustSettings": "[trust](#trust)",
     "RiskSettings": "[risk](#risk-and-the-safe-window)",
     "WindowSettings": "[window](#risk-and-the-safe-window)",
     "PricesSettings": "[prices](#prices)",

@@ -81,7 +81,7 @@ class Pour:
     Attributes:
         number: 1, 2, … within the stage.
         seed: seed of the virtual bench's hidden noise for this pour; a real bench ignores it.
-        predicted: the strategy's prediction, for display and for the model check.
+        predicted: the strategy's prediction, for display.
     """
 
     scene: str

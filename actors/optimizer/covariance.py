@@ -4,8 +4,7 @@
     f_r = ρ f_s + β + δ                     the real one: β ~ N(0, τ²), δ ~ GP(0, σ_δ² M_ℓδ)
     y_i = f + ε_i,  ε_i ~ N(0, n_i²)        n_i: one per source, and it may depend on the action
 
-M is the Matérn 5/2 correlation. Without simulations only σ, ℓ and n are left: ordinary regression. The pooled model has
-ρ = 1 and δ = 0; the simulations' n then includes their discrepancy.
+M is the Matérn 5/2 correlation. Without simulations only σ, ℓ and n are left: ordinary regression.
 """
 
 from __future__ import annotations
@@ -115,7 +114,6 @@ class Covariance:
         prior: HyperPrior,
         *,
         real: Mask | None = None,
-        scaled: bool = False,
         growth: Array | None = None,
         known: PriorCovariance | None = None,
         unit: float = 1.0,
@@ -126,7 +124,6 @@ class Covariance:
             points: (n, dimension).
             prior: over the hyperparameters.
             real: (n,), which observations are real; None: all, and the model has no simulation.
-            scaled: whether ρ and δ are fitted; otherwise ρ = 1 and δ = 0.
             growth: (n, q): log n_i grows with these features; None: constant noise.
             known: further covariance of the real cost.
             unit: of the costs here, for `known`.
@@ -135,7 +132,7 @@ class Covariance:
         self._real = real
         self._loads = np.ones(len(points)) if real is None else real.astype(np.float64)
         self._mask = self._loads > 0.5
-        self._scaled, self._growth, self._known, self._unit = scaled, growth, known, unit
+        self._growth, self._known, self._unit = growth, known, unit
         self._constant = None if known is None else known.covariance(points, points) / unit**2
         dimension = points.shape[1]
         rows: list[tuple[str, tuple[float, float], tuple[float, float], bool]] = [
@@ -147,9 +144,6 @@ class Covariance:
             rows += [
                 ("simulated_noise", prior.simulated_noise, NOISE_BOUNDS, True),
                 ("offset", prior.offset, OFFSET_BOUNDS, True),
-            ]
-        if scaled:
-            rows += [
                 ("rho", prior.rho, RHO_BOUNDS, False),
                 ("delta_signal", prior.delta_signal, SIGNAL_BOUNDS, True),
                 ("delta_length", prior.delta_length, LENGTH_BOUNDS, True),
@@ -191,11 +185,11 @@ class Covariance:
         variance = self.value(theta, "signal") ** 2
         base = variance * correlation
         a = np.where(mask, rho, 1.0)
-        K = base * np.outer(a, a) if self._scaled else base.copy()
+        joint = self._real is not None
+        K = base * np.outer(a, a) if joint else base.copy()
         offset = self.value(theta, "offset") ** 2
-        if self._real is not None:
+        if joint:
             K += offset * np.outer(real, real)
-        if self._scaled:
             own = self.points[mask]
             delta_length = self.value(theta, "delta_length")
             delta, delta_slope = matern(own, own, np.full(d, delta_length))
@@ -207,14 +201,13 @@ class Covariance:
         K[np.diag_indices_from(K)] += noise + 1e-8
 
         def pullback(W: Array) -> Array:
-            weighted = W * np.outer(a, a) if self._scaled else W
+            weighted = W * np.outer(a, a) if joint else W
             diagonal = 2.0 * np.diagonal(W) * noise
             gradient = [2.0 * float(np.vdot(weighted, base))]
             gradient += list(variance * _by_length(self.points, weighted * slope) / lengths**2)
             gradient.append(float(diagonal[mask].sum()))
-            if self._real is not None:
+            if joint:
                 gradient += [float(diagonal[~mask].sum()), 2.0 * offset * float(real @ W @ real)]
-            if self._scaled:
                 block = W[np.ix_(mask, mask)]
                 gradient.append(2.0 * float(real @ (W * base) @ a))
                 gradient.append(2.0 * delta_variance * float(np.vdot(block, delta)))
@@ -265,7 +258,7 @@ class Covariance:
     def _remainder(self, theta: Array, first: Array, second: Array) -> Array | float:
         """Covariance of β + δ."""
         offset = self.value(theta, "offset") ** 2
-        if not self._scaled:
+        if self._real is None:
             return offset
         lengths = np.full(first.shape[1], self.value(theta, "delta_length"))
         return offset + self.value(theta, "delta_signal") ** 2 * matern_correlation(first, second, lengths)

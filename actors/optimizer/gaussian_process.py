@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -127,9 +127,6 @@ class Surrogate(Protocol):
 CONSTANT_PRIOR = HyperPrior()
 RESIDUAL_PRIOR = HyperPrior(signal=(0.4, 0.7), noise=(0.07, 1.0))
 """Prior of the difference between reality and simulation: smaller than the cost itself, but free to be as large."""
-
-POOLED_PRIOR = HyperPrior(noise=(0.05, 0.4), simulated_noise=(0.3, 1.0))
-"""Pours have little noise, simulations much: if they contradict each other, the pours dominate."""
 
 SCALED_PRIOR = HyperPrior(rho=(1.0, 1.0), delta_signal=(0.6, 0.7))
 """Wide, so that a simulation with the opposite trend can be detected."""
@@ -386,22 +383,15 @@ def joint_process(
     points: Array,
     costs: Array,
     *,
-    scaled: bool,
     varying: bool = False,
-    widening: float = 1.0,
     search: HyperparameterSearch = AFRESH,
 ) -> GaussianProcess:
-    """GP of the real cost from simulations and real observations together.
-
-    Pooled, simulations are observations of the same cost except for a constant, with a separate noise that includes
-    their discrepancy: f_r = f_s + β. Scaled, f_r = ρ f_s + β + δ, with ρ and δ fitted. See `covariance.py`.
+    """GP of the real cost from simulations and real observations together: f_r = ρ f_s + β + δ. See `covariance.py`.
 
     Args:
         simulated: (k, dimension), k ≥ 1, and their costs (k,).
         points: (n, dimension), n ≥ 0, and their costs (n,).
-        scaled: whether to use the scaled model.
         varying: whether the noise of real observations may vary.
-        widening: factor on the median of the prior of the simulations' noise.
         search: for the hyperparameters.
 
     Source: Kennedy & O'Hagan, Predicting the output from a complex computer code when fast approximations are
@@ -409,13 +399,9 @@ def joint_process(
     """
     both, values = np.concatenate([simulated, points]), np.concatenate([simulated_costs, costs])
     centre = float(simulated_costs.mean())
-    terms = {"real": np.arange(len(both)) >= len(simulated), "scaled": scaled}
+    real = np.arange(len(both)) >= len(simulated)
     scale = _scale(values - centre, values)
-    prior = SCALED_PRIOR if scaled else POOLED_PRIOR
-    if widening != 1.0:
-        median, deviation = prior.simulated_noise
-        prior = replace(prior, simulated_noise=(widening * median, deviation))
-    return _fitted(both, values, _constant(centre), scale, varying, prior, search, **terms)
+    return _fitted(both, values, _constant(centre), scale, varying, SCALED_PRIOR, search, real=real)
 
 
 def _fitted(

@@ -63,9 +63,7 @@ def check(problem: SuggestProblem) -> None:
             raise ValueError(f"{name} = {value} is outside 0 … {limit}")
     if not (math.isfinite(problem.kappa) and 0.0 <= problem.kappa <= 100.0):
         raise ValueError(f"kappa = {problem.kappa} is outside 0 … 100")
-    if not (math.isfinite(problem.widening) and 0.01 <= problem.widening <= 100.0):
-        raise ValueError(f"widening = {problem.widening} is outside 0.01 … 100")
-    if problem.acquisition == "knowledge" and problem.mean not in ("simulated", "pooled", "scaled"):
+    if problem.acquisition == "knowledge" and problem.mean not in ("simulated", "scaled"):
         raise ValueError(f"acquisition='knowledge' is over simulations, and mean={problem.mean!r} knows none")
     if (problem.mean == "adaptive") != (problem.mismatch is not None):
         raise ValueError("mean='adaptive' needs a mismatch, and no other mean knows one")

@@ -99,7 +99,7 @@ class DiscrepancyFound:
 Point = tuple[float, ...]
 """A point of the unit cube."""
 
-MeanName = Literal["constant", "zero", "simulated", "pooled", "scaled", "adaptive"]
+MeanName = Literal["constant", "zero", "simulated", "scaled", "adaptive"]
 AcquisitionName = Literal["lcb", "posterior_minimum", "random", "sobol", "knowledge", "least_loss"]
 NoiseName = Literal["constant", "varying"]
 
@@ -257,10 +257,10 @@ class SuggestProblem:
         count: number of requested points; 0 requests only `best_point`, map and predictions.
         seed: of every random choice in the answer.
         mean: prior mean of the surrogate. 'constant' is fitted; 'zero' is the paper's. 'simulated' is the posterior
-            mean of a GP over `simulated`, the paper's D3. 'pooled' has `simulated` and `data` in one GP, with a
-            separate noise and an offset for simulations. 'scaled' has real cost = ρ · simulated cost + remainder,
-            fitted together. 'adaptive' averages over the ways in which the simulator may be wrong, see `mismatch`.
-        simulated: cheap observations of the same cost, for the last four.
+            mean of a GP over `simulated`, the paper's D3. 'scaled' has real cost = ρ · simulated cost + remainder,
+            fitted together (for 'knowledge'). 'adaptive' averages over the ways in which the simulator may be wrong,
+            see `mismatch`.
+        simulated: cheap observations of the same cost, for the last three.
         acquisition: 'lcb' minimises m(x) − κ s(x). 'posterior_minimum' minimises m(x); further points of the same
             answer use the penalised 'lcb'. 'random' and 'sobol' only draw. 'knowledge' chooses *simulations*: those
             most informative about the best action (needs a mean with simulations). 'least_loss' (for 'adaptive'): the
@@ -283,7 +283,6 @@ class SuggestProblem:
             point is one that is likely to succeed.
         constraints: kept by every proposal.
         noise: of real observations: 'constant', or 'varying' with the expected cost if the observations support it.
-        widening: 'pooled': factor on the expected noise of simulations, which includes their discrepancy.
         posterior: with a context: weighed pours, for draws of the searched parameters given them.
         design: with a posterior: which pour to weigh next.
         risk: if given, the observations are of requests as executed, disturbances included: points of `data` have
@@ -313,7 +312,6 @@ class SuggestProblem:
     failed: tuple[Point, ...] = ()
     constraints: tuple[Linear, ...] = ()
     noise: NoiseName = "constant"
-    widening: float = 1.0
     posterior: PosteriorQuestion | None = None
     design: DesignQuestion | None = None
     risk: Risk | None = None

@@ -11,13 +11,11 @@ import time
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 from threadpoolctl import threadpool_limits
 
 from actors.optimizer import acquisition
 from actors.optimizer.experimental_design import WeighedDesign, expected_reductions
 from actors.optimizer.feasible_region import Feasibility, Region
-from actors.optimizer.gaussian_process import constant_mean_process
 from actors.optimizer.knowledge_gradient import KnowledgeGradient, found, most_instructive, proposals
 from actors.optimizer.question_checks import Asked, array, check, tuples
 from actors.optimizer.questions import (
@@ -226,7 +224,7 @@ def _answer(problem: SuggestProblem) -> Suggestion:
 
 def _candidates(problem: SuggestProblem, asked: Asked, model: Model, rng: np.random.Generator) -> Array:
     """Candidates for the search: all over the region, and around the best observations."""
-    seen = asked.seen if problem.mean in ("simulated", "pooled", "scaled", "adaptive") else asked.known
+    seen = asked.seen if problem.mean in ("simulated", "scaled", "adaptive") else asked.known
     if problem.risk is not None:
         seen = np.clip(seen, 0.0, 1.0)  # executed points may lie outside the box
     means = model.surrogate.predict(seen)[0]
@@ -263,22 +261,14 @@ def _fills_space(problem: SuggestProblem, asked: Asked, model: Model, index: int
     """Whether the next point only fills space: every third one, while the costs may be pure noise.
 
     On a plateau the best pours look like a slope by chance. Following them, mostly along the faces of the cube, would
-    use up the whole budget. The same holds if every pour costs more than `_expected_cost`, and the pours alone show no
-    structure: the simulated optimum is not confirmed. The paper's methods (`plain`, 'zero', 'simulated'), contexts and
-    risks are excluded.
+    use up the whole budget. The paper's methods (`plain`, 'zero', 'simulated'), contexts and risks are excluded.
     """
     if problem.plain:
         return False
     number = len(asked.known) + len(asked.busy) + index
     if problem.acquisition != "lcb" or problem.context or problem.risk or number % FILL_EVERY != FILL_EVERY - 1:
         return False
-    if problem.mean == "constant":
-        return model.process.evidence < STRUCTURE
-    if problem.mean not in ("pooled", "scaled") or len(asked.known) < 2 or len(asked.simulated) < 2:
-        return False
-    if asked.costs.min() <= _expected_cost(problem, asked):
-        return False
-    return constant_mean_process(asked.points, asked.costs).evidence < STRUCTURE
+    return problem.mean == "constant" and model.process.evidence < STRUCTURE
 
 
 def _kappa(problem: SuggestProblem, model: Model) -> float:
@@ -290,20 +280,6 @@ def _kappa(problem: SuggestProblem, model: Model) -> float:
     adapts = problem.mean == "constant" and not problem.context and not problem.plain
     settled = adapts and model.process.evidence >= STRUCTURE
     return problem.kappa * (SETTLED if settled else 1.0)
-
-
-def _expected_cost(problem: SuggestProblem, asked: Asked) -> float:
-    """Cost that pours should at least reach according to the simulations.
-
-    It is the median of the simulated costs. If simulations are chosen by their value (`effort`), most of them lie in
-    the valley. Each then counts for the part of the region to which it is nearest, and the result is half-way between
-    minimum and median.
-    """
-    if problem.effort is None:
-        return float(np.median(asked.simulated_costs))
-    everywhere = asked.region.draw(256, np.random.default_rng(0), even=True)
-    typical = np.median(asked.simulated_costs[cdist(everywhere, asked.simulated).argmin(axis=1)])
-    return 0.5 * float(asked.simulated_costs.min() + typical)
 
 
 MOST_AXES = 4

@@ -80,7 +80,7 @@ class Model:
 def fit(problem: SuggestProblem, asked: Asked) -> Model | None:
     """Fit the surrogate of the problem; None with too few observations."""
     points, costs = asked.points, asked.costs
-    informed = problem.mean in ("simulated", "pooled", "scaled", "adaptive") and len(asked.simulated) >= 2
+    informed = problem.mean in ("simulated", "scaled", "adaptive") and len(asked.simulated) >= 2
     varying = problem.noise == "varying"
     first = _search_for(problem, 0)
     if informed and problem.mean == "simulated":
@@ -100,9 +100,7 @@ def fit(problem: SuggestProblem, asked: Asked) -> Model | None:
             asked.simulated_costs,
             points,
             costs,
-            scaled=problem.mean == "scaled",
             varying=varying,
-            widening=problem.widening,
             search=first,
         )
         return Model(process, process, process.lengths, (process,))

@@ -81,7 +81,7 @@ def _nothing_there(folder: Path) -> str:
 
 
 def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
-    from orchestrator.config.file_loading import load_campaign
+    from orchestrator.config.file_loading import recorded_campaign
     from orchestrator.config.yaml.yaml_errors import ConfigError
     from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
     from orchestrator.journal.journal_check import check_journal
@@ -96,7 +96,7 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
         say(f"warning: {problem}")
     try:
         try:
-            plan = load_campaign(folder / RESOLVED)
+            plan = recorded_campaign(folder / RESOLVED)
             with JournalReader(folder / JOURNAL_NAME) as journal:
                 result = read_result(journal, folder)
         except (ConfigError, RunError) as error:

@@ -184,12 +184,12 @@ def _run_of(what: Path) -> Path:
 
 
 def _plan_of(run: Path) -> CampaignPlan:
-    from orchestrator.config.file_loading import load_campaign
+    from orchestrator.config.file_loading import recorded_campaign
     from orchestrator.config.yaml.yaml_errors import ConfigError
     from orchestrator.runs.run_folder import RESOLVED
 
     with Refused(ConfigError, at="the run's own campaign can't be read:\n"):
-        return load_campaign(run / RESOLVED)
+        return recorded_campaign(run / RESOLVED)
 
 
 def live_view(plan: CampaignPlan, *, live: bool, at: str | None) -> LiveView | None:

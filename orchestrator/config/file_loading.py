@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,6 +22,7 @@ from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
+from orchestrator.journal.upgrade import upgraded_campaign
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.liquids import SimulationParameters
 from sim_engine.settings.model import MADE, Section
@@ -41,6 +43,18 @@ def load_campaign(path: Path | str, laboratory: Path | str | None = None, seed: 
     """
     other = None if laboratory is None else Path(laboratory)
     return campaign_from(Document.read(resolved(Path(path))), other, seed)
+
+
+def recorded_campaign(path: Path | str) -> CampaignPlan:
+    """The plan of a run's `resolved.json`, also of one that version 0.2 wrote: to report it, not to resume it.
+
+    Raises:
+        ConfigError: as `load_campaign`.
+    """
+    document = Document.read(resolved(Path(path)))
+    written, document.data = document.data, upgraded_campaign(document.data)
+    plan = campaign_from(document)
+    return plan if document.data == written else replace(plan, resolved=written)
 
 
 def campaign_from(document: Document, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:

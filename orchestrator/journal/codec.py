@@ -21,6 +21,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
+from orchestrator.journal.upgrade import upgraded_request
 from orchestrator.requests import Outcome, Request
 from orchestrator.run_errors import RunError
 
@@ -40,7 +41,7 @@ def encode_request(request: Request) -> dict[str, Any]:
 
 def decode_request(data: Mapping[str, Any]) -> Request:
     """Inverse of `encode_request`. Raises CodecError."""
-    return typing.cast(Request, from_json(data, Request))
+    return typing.cast(Request, from_json(upgraded_request(data), Request))
 
 
 def encode_outcome(outcome: Outcome) -> dict[str, Any]:

@@ -47,6 +47,7 @@ from orchestrator.journal.journal_file import (
     take_lock,
 )
 from orchestrator.journal.pour_ledger import BEGUN, LEDGER_NAME, LedgerLine, PourLedger, read_ledger
+from orchestrator.journal.upgrade import upgraded_fingerprint
 from orchestrator.states import State
 
 JOURNAL_NAME = "journal.sqlite"
@@ -188,7 +189,7 @@ class JournalReader:
             raise JournalError(f"{self.path}: the journal has no header; it is damaged")
         check_format(row[0], self.path)
         try:
-            return Header(row[1], json.loads(row[2]), row[3])
+            return Header(row[1], upgraded_fingerprint(json.loads(row[2])), row[3])
         except ValueError as error:
             raise JournalError(f"{self.path}: the journal's header is damaged ({error})") from None
 

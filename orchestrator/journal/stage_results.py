@@ -13,6 +13,7 @@ from typing import Any, TypeVar, cast
 from pydantic import ValidationError
 
 from orchestrator.journal.codec import from_json, to_json
+from orchestrator.journal.upgrade import upgraded_result
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.stage_result import StageResult
 
@@ -66,7 +67,7 @@ def decode_result(data: Mapping[str, Any]) -> StageResult:
             f"Known are: {', '.join(sorted(StageResult.KINDS))}"
         )
     try:
-        return known.model_validate(from_json(data))
+        return known.model_validate(from_json(upgraded_result(data)))
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])

@@ -27,7 +27,6 @@ from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_monitoring import Believed
-from orchestrator.strategies.deployment.real_pours import Foretold
 from orchestrator.strategies.stage_result import StageResult
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.prediction_band import LEVEL
@@ -159,10 +158,9 @@ class LearningStage:
                 draw = f"{PLACE}/{CALIBRATION}/theta"
                 self._picture(draw, now, lambda: pictures.png(pictures.theta_picture(found)))
         if isinstance(result, Deployed):
-            if not isinstance(result.trust, Foretold):
-                self.trust = result.trust.text
             place = f"{PLACE}/{safe_name(result.scene)}/trust"
             if isinstance(result.trust, Believed):
+                self.trust = result.trust.text
                 if result.trust.after:
                     share = result.trust.after[-1].ignorance
                     label = "probability that the simulator says nothing of this bench"

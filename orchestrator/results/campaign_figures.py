@@ -15,7 +15,6 @@ from orchestrator.journal.stage_results import Results
 from orchestrator.results import figure_style as style
 from orchestrator.results.figure_style import safe_name
 from orchestrator.results.loss_units import deployment_unit
-from orchestrator.results.model_check_figures import draw_trust
 from orchestrator.results.spillage_figures import draw_discrepancy, draw_spillage
 from orchestrator.results.stage_views import (
     calibration_of,
@@ -30,7 +29,6 @@ from orchestrator.results.stage_views import (
 )
 from orchestrator.results.surrogate_figures import draw_posterior, draw_surrogate, draw_trials, draw_window
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.deployment.model_check import Compared
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -109,10 +107,5 @@ def _jobs(directory: Path, plan: CampaignPlan, results: Results) -> dict[str, Ca
                 picture, name = deployment_picture(plan, result), receiver_name(plan, scene)
                 jobs[f"safe window {name}"] = lambda r=result, p=picture, n=name: draw_window(  # type: ignore[misc]
                     directory / f"window-{safe_name(n)}.png", r, p, unit=unit, receiver=n
-                )
-            if isinstance(trust := result.trust, Compared) and trust.pours:
-                name = receiver_name(plan, scene)
-                jobs[f"trust {name}"] = lambda t=trust, n=name: draw_trust(  # type: ignore[misc]
-                    directory / f"trust-{safe_name(n)}.png", t, unit=unit, receiver=n
                 )
     return jobs

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from orchestrator.results import figure_style as style
 from orchestrator.results.loss_units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit
-from orchestrator.results.model_check_figures import trust_line
 from orchestrator.results.pool_occupancy import occupancy_lines
 from orchestrator.results.run_summary import ReceiverSummary, RunSummary
 from orchestrator.results.stage_views import SPLITS
 from orchestrator.results.surrogate_figures import posterior_lines
-from orchestrator.results.wording import risk_line, window_line
+from orchestrator.results.wording import risk_line, trust_line, window_line
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.deployment.confirmation import Confirmed
 from orchestrator.strategies.deployment.deployment_result import ParetoAction

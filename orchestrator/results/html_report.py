@@ -263,10 +263,6 @@ _FIGURES: dict[str, tuple[str, str]] = {
         "which it is kept.",
         "How far the action may be missed before too much is spilled.",
     ),
-    "trust": (
-        "First pours beside what simulations said of their actions.",
-        "Whether the first pours bear out the simulator.",
-    ),
 }
 """Alt text and caption of a figure, by the beginning of its name."""
 

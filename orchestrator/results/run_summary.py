@@ -20,7 +20,6 @@ from orchestrator.strategies.calibration.calibration_scores import CalibrationGa
 from orchestrator.strategies.calibration.posterior_summary import PosteriorSummary
 from orchestrator.strategies.deployment.confirmation import Confirmed
 from orchestrator.strategies.deployment.deployment_result import ParetoAction, RiskFound
-from orchestrator.strategies.deployment.model_check import Compared
 from orchestrator.strategies.deployment.model_monitoring import Believed
 from orchestrator.strategies.deployment.real_pours import Foretold
 from orchestrator.strategies.deployment.safe_window import WindowFound
@@ -135,7 +134,7 @@ class ReceiverSummary(ResultPart):
     predicted_spillage: float | None
     predicted_spillage_deviation: float | None
     untrustworthy_simulation: bool
-    trust: Compared | Foretold | Believed
+    trust: Foretold | Believed
     gave_up: str | None
     ended: str | None
     front: tuple[ParetoAction, ...] | None

@@ -14,17 +14,31 @@ from dataclasses import dataclass
 from orchestrator.journal.run_record import Record
 from orchestrator.results import figure_style as style
 from orchestrator.results.loss_units import DISCREPANCY, LossUnit, deployment_unit
-from orchestrator.results.model_check_figures import trust_line
 from orchestrator.results.run_summary import ReceiverSummary, RunSummary
 from orchestrator.results.stage_views import SPLITS
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.deployment_result import RiskFound
-from orchestrator.strategies.deployment.model_check import Compared
 from orchestrator.strategies.deployment.model_monitoring import DOUBT, Believed
+from orchestrator.strategies.deployment.real_pours import Foretold
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from sim_engine.scene import Scene
 from sim_engine.search_space import Axis
+
+
+def trust_line(trust: Foretold | Believed) -> str | None:
+    """What the pours say of the simulator; None where that is nothing.
+
+    Args:
+        trust: of a deployment's result.
+    """
+    if isinstance(trust, Believed):
+        return trust.text or None
+    return (
+        "the first pours were far from what was predicted; the simulator may not fit this vessel"
+        if trust.alarm
+        else None
+    )
 
 
 def risk_line(risk: RiskFound, unit: LossUnit) -> str:
@@ -146,11 +160,6 @@ def _open(row: ReceiverSummary, unit: LossUnit) -> list[str]:
     said = []
     if not _is_confirmed(row) and (alarm := trust_line(row.trust)) is not None:
         said.append(_sentence(alarm))
-    if isinstance(row.trust, Compared) and row.trust.better:
-        said.append(
-            "The first pours came out better than simulated, by more than the simulations' scatter explains: the "
-            "simulator is wrong here, if on the safe side."
-        )
     poured_again = 0 if row.confirmed is None or row.confirmed.loss is None else row.confirmed.loss.count
     if not row.pours and not poured_again:
         said.append("Nothing was poured into this receiver: what is expected of the action is simulated, not weighed.")

@@ -153,7 +153,7 @@ class DeploymentsBase(Section):
     """D2 as in the paper: a surrogate with a zero mean."""
 
     D3: D3ArmSection | None = None
-    """Real pours with a simulated prior; the campaign selects the model of the prior and its check."""
+    """Real pours with a simulated prior; the campaign selects the model of the prior."""
 
     D3_paper: D3ArmSection | None = None
     """D3 as in the paper: a GP of the residual around the simulations' mean, without a check."""

@@ -39,7 +39,7 @@ BUDGETS = (
 
 AS_IN_THE_PAPER: dict[str, dict[str, Any]] = {
     "D2_paper": {"mean": "zero"},
-    "D3_paper": {"model": "residual", "trust": "always"},
+    "D3_paper": {"model": "residual"},
 }
 """Settings in which the paper's forms differ from the defaults."""
 

@@ -231,6 +231,9 @@ class Section(BaseModel):
     required: ClassVar[dict[str, str]] = {}
     """Mandatory keys, each with an example."""
 
+    retired: ClassVar[dict[str, str]] = {}
+    """Keys, and values as 'key: value', of earlier versions, each with what to write instead."""
+
     recorded_as_given: ClassVar[bool] = False
     """Whether a run's record omits keys that were omitted, because some keys exclude others."""
 
@@ -286,15 +289,6 @@ def tagged(variants: Mapping[str, type[Section]], *, default: str = "") -> Any:
 
     union = functools.reduce(operator.or_, (Annotated[model, Tag(name)] for name, model in variants.items()))
     return Annotated[union, Discriminator(word)]
-
-
-def word_or(word: str, model: type[Section]) -> Any:
-    """A section, or a word instead of it."""
-
-    def form(value: Any) -> str:
-        return "word" if isinstance(value, str) else "section"
-
-    return Annotated[Annotated[Literal[word], Tag("word")] | Annotated[model, Tag("section")], Discriminator(form)]
 
 
 PathOr = Annotated[

@@ -18,7 +18,7 @@ from orchestrator.journal.codec import from_json, to_json
 from sim_engine.search_space import Axis, Space
 
 PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
-INFORMED = ("simulated", "pooled", "scaled")
+INFORMED = ("simulated", "scaled")
 
 
 def points_of(count, seed=0):
@@ -65,7 +65,7 @@ def test_a_simulation_removes_as_much_doubt_as_was_foretold(mean):
     def fitted(points, costs, thetas=(None, None)):
         searches = [HyperparameterSearch() if theta is None else HyperparameterSearch(theta, 0) for theta in thetas]
         if mean != "simulated":
-            return joint_process(points, costs, real, cup(real), scaled=mean == "scaled", search=searches[0])
+            return joint_process(points, costs, real, cup(real), search=searches[0])
         prior = constant_mean_process(points, costs, search=searches[0])
         process = simulated_mean_process(prior, real, cup(real), search=searches[1])
         process.prior = prior
@@ -131,20 +131,3 @@ def test_a_start_of_another_model_is_refused():
         propose(asked(effort=SearchEffort(((0.0, 0.0),), 4)))
     with pytest.raises(ValueError, match="must be finite"):
         propose(asked(effort=SearchEffort(((math.nan,),), 4)))
-
-
-def test_pours_are_held_against_what_simulations_promise_everywhere_not_only_where_they_are_dense():
-    """Simulations that were made where they pay lie in the valley: their median would call every pour a failure."""
-    rng = np.random.default_rng(3)
-    dense = np.concatenate([points_of(15, 1), 0.05 * rng.standard_normal((40, 2)) + (0.35, 0.6)])
-    real = np.array([(0.38, 0.62), (0.42, 0.55)])
-    question = SuggestProblem(
-        PLANE,
-        data_of(real, (0.04, 0.05)),
-        mean="scaled",
-        simulated=data_of(dense, np.maximum(cup(dense), 0.0)),
-        acquisition="lcb",
-        effort=SearchEffort(),
-    )
-    (point,) = propose(question).points  # the third: every third fills space where simulation's promise is not kept
-    assert math.dist(point, (0.35, 0.6)) < 0.35

@@ -49,10 +49,10 @@ def error(answer):
     return float(np.sqrt(np.mean((np.array(answer.predictions) - cup(ASK)) ** 2)))
 
 
-@pytest.mark.parametrize("kind", [{}, {"joint": 1}, {"joint": 1, "scaled": True}, {"growth": 1}])
+@pytest.mark.parametrize("kind", [{}, {"joint": 1}, {"growth": 1}])
 def test_the_likelihoods_gradient_is_that_of_the_likelihood(kind):
     points, costs = points_of(20, 3, 3), np.random.default_rng(4).standard_normal(20)
-    terms = {"scaled": kind.get("scaled", False)}
+    terms = {}
     if "joint" in kind:
         terms["real"] = np.arange(20) >= 13
     if "growth" in kind:
@@ -64,13 +64,13 @@ def test_the_likelihoods_gradient_is_that_of_the_likelihood(kind):
     assert exact == pytest.approx(numeric, rel=1e-3, abs=1e-3)
 
 
-@pytest.mark.parametrize("mean", ["simulated", "pooled", "scaled"])
+@pytest.mark.parametrize("mean", ["simulated", "scaled"])
 def test_a_right_simulation_makes_a_few_pours_worth_many(mean):
     alone = error(propose(replace(asked(mean, cup), mean="constant")))
     assert error(propose(asked(mean, cup))) < 0.6 * alone
 
 
-@pytest.mark.parametrize("mean", ["simulated", "pooled", "scaled"])
+@pytest.mark.parametrize("mean", ["simulated", "scaled"])
 def test_a_simulation_that_is_off_by_a_constant_is_corrected(mean):
     answer = propose(asked(mean, lambda p: cup(p) + 0.4))
     assert error(answer) < 0.15
@@ -90,18 +90,8 @@ def test_a_simulation_that_is_the_wrong_way_round_gets_a_negative_scale():
     assert error(answer) < error(propose(asked("simulated", lambda p: 1.0 - cup(p), pours=14)))
 
 
-def test_pooled_simulations_that_contradict_the_pours_are_taken_for_noisy():
-    def unrelated(points):
-        return np.random.default_rng(7).random(len(points))
-
-    agreeing = propose(asked("pooled", cup, pours=12)).hyperparameters["simulated_noise"]
-    doubted = propose(asked("pooled", unrelated, pours=12)).hyperparameters["simulated_noise"]
-    assert doubted > 5 * agreeing
-
-
-@pytest.mark.parametrize("mean", ["pooled", "scaled"])
-def test_before_the_first_pour_simulations_alone_are_believed_with_more_doubt(mean):
-    question = replace(asked(mean, cup), data=Data())
+def test_before_the_first_pour_simulations_alone_are_believed_with_more_doubt():
+    question = replace(asked("scaled", cup), data=Data())
     joint, alone = propose(question), propose(replace(question, mean="simulated"))
     assert joint.predictions == pytest.approx(alone.predictions, abs=0.15)
     assert min(joint.prediction_deviations) > max(0.05, min(alone.prediction_deviations))
@@ -110,17 +100,18 @@ def test_before_the_first_pour_simulations_alone_are_believed_with_more_doubt(me
     assert propose(replace(question, simulated=Data())).predictions == ()
 
 
-@pytest.mark.parametrize("mean", ["pooled", "scaled"])
 @pytest.mark.parametrize(("simulated", "pours"), [(2, 0), (2, 1), (3, 5), (0, 2), (1, 3), (0, 0)])
-def test_any_few_simulations_and_pours_are_enough_for_an_answer(mean, simulated, pours):
+def test_any_few_simulations_and_pours_are_enough_for_an_answer(simulated, pours):
     cheap, dear = points_of(simulated, 1), points_of(pours, 2)
-    problem = SuggestProblem(PLANE, data_of(dear, cup(dear)), mean=mean, simulated=data_of(cheap, cup(cheap)), count=2)
+    problem = SuggestProblem(
+        PLANE, data_of(dear, cup(dear)), mean="scaled", simulated=data_of(cheap, cup(cheap)), count=2
+    )
     answer = propose(problem)
     assert len(answer.points) == 2
     assert all(map(math.isfinite, (*answer.means, *answer.deviations, *answer.noises)))
 
 
-@pytest.mark.parametrize("mean", ["simulated", "pooled", "scaled"])
+@pytest.mark.parametrize("mean", ["simulated", "scaled"])
 def test_the_best_point_is_one_that_was_poured(mean):
     problem = asked(mean, cup)
     assert propose(problem).best_point in problem.data.points
@@ -162,7 +153,7 @@ def test_a_few_pours_cannot_tell_and_noise_stays_constant():
 def test_around_simulations_the_pours_noise_may_vary_too():
     data = scattered(60, lambda cost: 0.01 + 0.3 * cost, 5)
     simulated = data_of(points_of(30, 9), cup(points_of(30, 9)))
-    for mean in ("simulated", "pooled", "scaled"):
+    for mean in ("simulated", "scaled"):
         problem = SuggestProblem(PLANE, data, mean=mean, simulated=simulated, acquisition="posterior_minimum")
         varying, constant = propose(replace(problem, noise="varying")), propose(problem)
         assert varying.noises[0] < 0.6 * constant.noises[0], mean

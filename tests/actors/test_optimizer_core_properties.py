@@ -13,7 +13,7 @@ from actors.optimizer.suggest import propose
 from sim_engine.search_space import Axis, Space
 from tests.depth import examples
 
-MEANS = ("constant", "zero", "simulated", "pooled", "scaled")
+MEANS = ("constant", "zero", "simulated", "scaled")
 axes = st.sampled_from(
     [
         Axis("", 0.0, 1.0),
@@ -50,7 +50,7 @@ def questions(draw):
         constraints = (Linear(((axis.name, 1.0),), middle),)
     mean = draw(st.sampled_from(MEANS))
     acquisitions = ["lcb", "posterior_minimum", "random", "sobol"]
-    acquisitions += ["knowledge"] if mean in ("simulated", "pooled", "scaled") else []
+    acquisitions += ["knowledge"] if mean in ("simulated", "scaled") else []
     return SuggestProblem(
         space,
         data(12),
@@ -85,7 +85,6 @@ SQUARES_TO_ZERO = SuggestProblem(
 @given(question=questions())
 @example(question=SQUARES_TO_ZERO)
 @example(question=replace(SQUARES_TO_ZERO, count=2))
-@example(question=replace(SQUARES_TO_ZERO, mean="pooled", count=1))
 @example(question=replace(SQUARES_TO_ZERO, mean="scaled", count=1))
 @example(question=replace(SQUARES_TO_ZERO, data=SQUARES_TO_ZERO.simulated, count=1))
 @example(question=replace(SQUARES_TO_ZERO, data=SQUARES_TO_ZERO.simulated, mean="zero", acquisition="lcb", count=1))

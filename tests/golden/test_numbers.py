@@ -129,7 +129,6 @@ PROBLEMS: dict[str, SuggestProblem] = {
     "lcb, constant mean": replace(PLAIN, count=3, pending=points(2, 7), map_resolution=6),
     "lcb, zero mean, plain": replace(PLAIN, mean="zero", plain=True, kappa=1.5),
     "lcb, simulated mean": replace(INFORMED, mean="simulated", plain=True),
-    "lcb, pooled mean, widened": replace(INFORMED, mean="pooled", widening=2.0),
     "lcb, scaled mean": replace(INFORMED, mean="scaled"),
     "lcb, varying noise": replace(PLAIN, data=data(20, 8), noise="varying"),
     "posterior minimum": replace(PLAIN, acquisition="posterior_minimum", count=2, effort=SearchEffort()),
@@ -137,7 +136,6 @@ PROBLEMS: dict[str, SuggestProblem] = {
     "refusals and failures": replace(PLAIN, infeasible=points(3, 9), refused=points(2, 10), failed=POURED.points[:1]),
     "a constraint": replace(PLAIN, constraints=(Linear((("x_offset", 1.0), ("angular_velocity", 0.05)), 0.17),)),
     "knowledge, simulated mean": replace(INFORMED, mean="simulated", acquisition="knowledge", count=2),
-    "knowledge, pooled mean": replace(INFORMED, mean="pooled", acquisition="knowledge", pouring=points(1, 13)),
     "knowledge, scaled mean": replace(INFORMED, mean="scaled", acquisition="knowledge"),
     "least loss, adaptive mean": replace(ADAPTIVE, acquisition="least_loss", count=3),
     "least loss within a limit": replace(

@@ -27,17 +27,21 @@ from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.event_feed import PASSING as PASSED_BY
 from orchestrator.daemon.event_feed import event_json
-from orchestrator.journal.codec import encode_request
+from orchestrator.journal.codec import encode_request, first_difference
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
 from orchestrator.journal.run_record import read_result
+from orchestrator.journal.upgrade import upgraded_request
 from orchestrator.progress.console_progress import ProgressDisplay
 from orchestrator.requests import Request
 from orchestrator.results.console_view import summary_table
 from orchestrator.results.publishing import publish
+from orchestrator.results.stage_views import deployments_of
 from orchestrator.runs.events import Event, PourProgressed, StrategyProgressed
+from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.replay import ToldStep, read_history
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import stages_of
+from orchestrator.strategies.deployment.real_pours import Foretold
 from orchestrator.strategies.stage_result import StageResult
 from tests.golden import old_runs
 from tests.golden.golden import ROOT, Golden, agree, compact, line, normalised
@@ -226,6 +230,26 @@ def test_old_run_is_published_again_as_it_was(name: str, runs: Path, golden: Gol
         golden.check(f"old_runs/{name}-{file}", normalised(_indented(timeless(compact(again))), places))
 
 
+def test_old_run_with_a_model_that_is_retired_is_listed_and_reported_but_not_resumed(runs: Path) -> None:
+    """D3 with `model: pooled` and `trust: {policy: widen}`, as version 0.2 made it."""
+    folder = runs / "runs" / "pooled"
+    shutil.copytree(ROOT / "tests" / "data" / "retired_runs" / "pooled", folder)
+    assert "pooled" in typed(runs, "runs", "add", "runs") + typed(runs, "runs", "list")
+    assert typed(runs, "report", "runs/pooled", "-o", "page.html").endswith("exit 0\n\n")
+    page = page_of(runs / "page.html", runs)
+    assert "reduced" not in page
+    assert "pooled" in page, "the page says what the run was, though this version has no such model"
+    run = decant.open_run(folder)
+    assert (run.result.state, run.result.pours, len(run.pours)) == ("finished", 4, 4)
+    (found,) = deployments_of(run.result.results).values()
+    assert isinstance(found.trust, Foretold)
+    (runs / "pooled.yaml").write_text((folder / "resolved.json").read_text(encoding="utf-8"), encoding="utf-8")
+    refused = typed(runs, "run", "pooled.yaml", "--resume")
+    assert refused.endswith("exit 2\n\n")
+    assert re.search(r"pooled\.yaml:\d+:\d+: deployment\.model: 'pooled' was retired; write 'adaptive'", refused)
+    assert re.search(r"pooled\.yaml:\d+:\d+: deployment\.trust: was retired; remove it", refused)
+
+
 @pytest.mark.parametrize("name", RUNS)
 def test_old_run_is_replayed(name: str, runs: Path) -> None:
     """Strategies that are told what the journal has ask again for what it has."""
@@ -246,7 +270,7 @@ def test_old_run_is_replayed(name: str, runs: Path) -> None:
                 requests = strategy.ask(step.slots)
                 assert len(requests) == len(step.ids)
                 for key, request in zip(step.ids, requests, strict=True):
-                    before, now = _sorted(history.requests[key]), _sorted(encode_request(request))
+                    before, now = _sorted(upgraded_request(history.requests[key])), _sorted(encode_request(request))
                     assert agree(before, now), f"stage {stage.name}, request {key}:\n- {before}\n+ {now}"
                     open_[key], asked = request, asked + 1
             if history.result is not None:
@@ -254,6 +278,15 @@ def test_old_run_is_replayed(name: str, runs: Path) -> None:
                 assert agree(before, _sorted(strategy.result().model_dump(mode="json")))
                 results[stage.name] = history.result
     assert asked > 0
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_old_run_has_the_fingerprint_of_its_campaign(name: str, runs: Path) -> None:
+    """So that it can be resumed: of D3's settings those that are retired are left out on both sides."""
+    folder = runs / "runs" / name
+    with JournalReader(folder / JOURNAL_NAME) as journal:
+        written = journal.header.fingerprint
+    assert first_difference(written, fingerprint(load_campaign(folder / "resolved.json"))) is None
 
 
 def _sorted(value: Any) -> str:

@@ -58,7 +58,9 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
                     cut = True
                     continue
                 unknown = detail["type"] == "extra_forbidden"
-                if unknown and (owners := _owners(model, loc, data)):
+                if (unknown or detail["type"] == "literal_error") and (retired := _retired(model, loc, data)):
+                    report.add(place.at(*loc), retired, key=unknown)
+                elif unknown and (owners := _owners(model, loc, data)):
                     if loc[:-1] not in guessed:
                         here = _variant(_sections_at(model, loc[:-1], data), _node(data, loc[:-1]))
                         names = " and ".join(sorted({_tag(owner) for owner in owners}))
@@ -96,6 +98,19 @@ def _guess_variant(variants: set[type[Section]], data: dict[str, Any], place: Pl
 def _tag(section: type[Section]) -> str:
     """The word that selects a variant."""
     return section.variant or str(section.model_fields[section.tag].default)
+
+
+def _retired(model: type[Section], loc: Loc, data: Any) -> str:
+    """What to write in place of a key or value that earlier versions had; empty where none had it."""
+    if not loc or _loc_in(data, loc) != loc:
+        return ""
+    key, value = loc[-1], _node(data, loc)
+    for section in _sections_at(model, loc[:-1], data):
+        if key in section.retired:
+            return section.retired[str(key)]
+        if text := section.retired.get(f"{key}: {value}"):
+            return f"{value!r} {text}"
+    return ""
 
 
 def _variant(sections: set[type[Section]], data: Any) -> set[type[Section]]:

@@ -12,7 +12,7 @@ import statistics
 from collections import deque
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from orchestrator.requests import Failed, Outcome, Simulated
 from orchestrator.strategies.campaign_plan import DeploymentPlan
@@ -104,15 +104,19 @@ class Costing:
 LEARNT_FROM = 25
 """Number of latest simulations whose median is the cost of a simulation; the median ignores single slow ones."""
 
+WITHOUT_OUTCOME = 2.0
+"""CPU seconds of a simulation while no outcome has any."""
+
 
 class PricesSettings(Section):
     """D3 with `per_pour: free`: costs by which simulations are chosen and ended."""
 
+    retired: ClassVar[dict[str, str]] = {
+        "simulation": "was retired; remove it: outcomes say what a simulation costs before anything depends on it"
+    }
+
     pour: Annotated[float, Quantity("s", "90 s", 0.0, 86400.0, positive=True)] = 90.0
     """Duration of a pour, including refilling and wiping."""
-
-    simulation: Annotated[float, Quantity("s", "2 s", 0.0, 3600.0, positive=True)] = 2.0
-    """CPU time of a simulation, used until outcomes provide it."""
 
     worth: Annotated[float, Quantity("1", "0.005", 0.0, 1.0)] = 0.005
     """Fraction of the worst loss. If all simulations that fit into one pour promise less in total, the workers stay
@@ -142,7 +146,7 @@ class Prices:
 
     def simulation(self, width: int) -> float:
         """Seconds between two simulated outcomes with `width` simulations in parallel."""
-        return (statistics.median(self._seen) if self._seen else self._settings.simulation) / max(width, 1)
+        return (statistics.median(self._seen) if self._seen else WITHOUT_OUTCOME) / max(width, 1)
 
     def prefers_pour(self, simulation: float, pour: float, width: int) -> bool:
         """Whether a pour has more value per second than a simulation, given the value of each."""

@@ -15,7 +15,6 @@ from actors.optimizer.questions import (
     AcquisitionName,
     Data,
     Limit,
-    MeanName,
     ModelDiscrepancy,
     Point,
     SearchEffort,
@@ -28,7 +27,6 @@ from orchestrator.strategies.deployment.bench_offset import play_of, thinned
 from orchestrator.strategies.deployment.costing import Prices, PricesSettings
 from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.deployment.model_check import Compared, TrustCheck, TrustOrAlways, TrustSettings
 from orchestrator.strategies.deployment.model_monitoring import (
     Believed,
     DiscrepancyPolicySettings,
@@ -53,6 +51,14 @@ class D3Settings(SearchSettings):
     """D3: real pours with a simulated prior."""
 
     required: ClassVar[dict[str, str]] = {"strategy": "D3"}
+    retired: ClassVar[dict[str, str]] = {
+        "trust": (
+            "was retired; remove it: 'model: adaptive' weighs the simulator by every pour ('ignorance' says what "
+            "follows), 'model: residual' always believes it"
+        ),
+        "model: pooled": "was retired; write 'adaptive', or 'residual' for the paper's",
+        "model: scaled": "was retired; write 'adaptive', or 'residual' for the paper's",
+    }
 
     strategy: Literal["D3"] = "D3"
     """Real pours with a simulated prior."""
@@ -66,13 +72,9 @@ class D3Settings(SearchSettings):
     prices: PricesSettings | None = None
     """With 'per_pour: free': what a pour and a simulation cost."""
 
-    model: Literal["adaptive", "residual", "pooled", "scaled"] = "adaptive"
+    model: Literal["adaptive", "residual"] = "adaptive"
     """How simulations enter the surrogate of pours; 'adaptive' averages over ways in which the simulator may be wrong,
-    'residual' is the paper's."""
-
-    trust: TrustOrAlways | None = None
-    """For the other models: when the first pours say that the simulator is wrong, and what follows; 'always' believes
-    it, as the paper."""
+    'residual' is the paper's, which always believes it."""
 
     ignorance: DiscrepancyPolicySettings | None = None
     """With 'model: adaptive': what follows when the simulator seems to say nothing of this bench."""
@@ -95,18 +97,6 @@ class D3Settings(SearchSettings):
     def adaptive(self) -> bool:
         """Whether it averages over the ways in which the simulator may be wrong."""
         return self.model == "adaptive"
-
-    @property
-    def checked(self) -> TrustSettings | None:
-        """When the simulator is called wrong; None if it never is, or if every pour weighs it."""
-        if self.adaptive or self.trust == "always":
-            return None
-        return self.trust if isinstance(self.trust, TrustSettings) else TrustSettings()
-
-    @property
-    def plain(self) -> bool:
-        """Simulations before the first pour are chosen as in the paper, with a constant κ, and warn of nothing."""
-        return self.model == "residual"
 
     @property
     def order(self) -> Order:
@@ -142,10 +132,6 @@ class D3Settings(SearchSettings):
         for key in () if self.adaptive else ("ignorance", "risk_limit", "stop", "good_enough"):
             if getattr(self, key) is not None:
                 complaints.add(f"needs 'model: adaptive', not '{self.model}'", key, key=True)
-        if self.trust is not None and self.adaptive:
-            complaints.add(
-                "decides nothing with 'model: adaptive', which weighs the simulator by every pour", "trust", key=True
-            )
 
     @property
     def learns_of_benches(self) -> bool:
@@ -169,13 +155,6 @@ class D3Settings(SearchSettings):
         return (FreeHybrid if self.beside is None else Hybrid)(plan, scene, parameters, seed)
 
 
-MEANS: dict[str, MeanName] = {"residual": "simulated", "pooled": "pooled", "scaled": "scaled"}
-"""How the optimiser calls the models."""
-
-WIDENING = 3.0
-"""Factor on the noise that simulations are expected to have, once they were found wrong."""
-
-
 class Hybrid(Deployment[D3Settings]):
     """D3: as D2, but the surrogate's prior mean is learnt from m2 simulations, and goes on learning between pours.
 
@@ -187,18 +166,15 @@ class Hybrid(Deployment[D3Settings]):
     most, which are simulated beside the pour and enter the prior: learning from real trials interleaved with planning
     in a model (Dyna). With `per_pour = 'free'`, simulations go on for as long as the pour takes.
 
-    Unless `trust` is 'always', the first pours are compared with the simulations (`TrustCheck`). One that is wrong is
-    then forgotten, believed less, or put to a person. `model` says how simulations enter the surrogate; the above is
-    'residual', the paper's.
+    `model` says how simulations enter the surrogate. The above is 'residual', the paper's, which always believes the
+    simulator; 'adaptive' averages over the ways in which it may be wrong, and weighs them by every pour.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D3; m2 = 37, 15 pours).
-    Limitations: a prior from an untrustworthy simulator is worse than none; pours made before that is known are lost.
+    Limitations: with 'residual' a prior from an untrustworthy simulator is worse than none.
     """
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         super().__init__(plan, scene, parameters, seed)
-        checked = self._settings.checked
-        self._check = None if checked is None else TrustCheck(checked, self._costing.worst)
         self._rules = self._settings.rules(self._costing.worst)
         self._trust = Trust(self._rules, plan.actions, self._costing.worst) if self._settings.adaptive else None
         self._then: Callable[[str], None] | None = None
@@ -222,51 +198,19 @@ class Hybrid(Deployment[D3Settings]):
             return
         if request != self._asked or not isinstance(outcome, Answered):
             raise ValueError(f"this was not asked, or not answered: {request.question}")
-        self._asked, then, self._then = None, self._then, None
-        if then is not None:
-            then(outcome.answer)
-        elif self._check is not None:
-            self._settle(self._check, outcome.answer)
+        self._asked, then = None, self._then
+        assert then is not None
+        then(outcome.answer)
 
     def _next(self, free_simulations: int) -> None:
-        if self._check is not None and self._pouring is None and (pours := self._check.due(self._pours)):
-            self._compare(self._check, pours)
-        elif self._spent < self._settings.prior_simulations and not self._pours:
+        if self._spent < self._settings.prior_simulations and not self._pours:
             self._next_prior()
-        elif self._pouring is not None:
-            if self._settings.beside is None and free_simulations > 0 and self._followed != "D2":
-                self._refine(free_simulations)
+        elif self._pouring is not None or not self._trials.idle:
+            return
         elif self._pours_left:
-            if self._trials.idle or (self._settings.beside is None and self._pours):
-                self._next_pour()
-        elif self._trials.idle:
+            self._next_pour()
+        else:
             self._questions.put(self._hybrid(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
-
-    def _compare(self, check: TrustCheck, pours: list[PourTrial]) -> None:
-        """Ask what the simulations alone say of the actions poured, and go by it."""
-        self._compromise.weigh(exploring=False)
-
-        def answered(suggestion: Suggestion) -> None:
-            check.compare(pours, suggestion)
-            self._unasked = check.question
-            self._heard(check)
-
-        simulated = self._trials.data(everything=True)
-        places = tuple(pour.point for pour in pours)
-        self._questions.put(self._problem(simulated, count=0, predict_at=places), "trust", answered)
-
-    def _settle(self, check: TrustCheck, answer: str) -> None:
-        check.settle(answer)
-        self._heard(check)
-
-    def _heard(self, check: TrustCheck) -> None:
-        self.decisions += check.decisions
-        check.decisions.clear()
-
-    @property
-    def _followed(self) -> str | None:
-        """What followed on an alarm."""
-        return None if self._check is None else self._check.policy
 
     def _next_prior(self) -> None:
         def simulate(suggestion: Suggestion) -> None:
@@ -277,14 +221,15 @@ class Hybrid(Deployment[D3Settings]):
             self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
         elif self._trials.ready:
             self._compromise.weigh(exploring=True)
-            known, pending, plain = self._simulated(), self._trials.pending(), self._settings.plain
+            # in the paper κ is constant, and no simulation only fills space
+            known, pending, plain = self._simulated(), self._trials.pending(), not self._settings.adaptive
             problem = self._problem(known, everything=False, pending=pending, plain=plain)
             self._questions.put(problem, "prior", simulate)
 
     def _next_pour(self) -> None:
         """The next pour, and with it the simulations that run beside it."""
         problem = self._hybrid(
-            count=1 + (0 if self._followed == "D2" else self._settings.simulations_beside),
+            count=1 + self._settings.simulations_beside,
             acquisition=self._acquisition,
             map_resolution=MAP_RESOLUTION,
         )
@@ -346,33 +291,19 @@ class Hybrid(Deployment[D3Settings]):
             return "least_loss"
         return "lcb" if self._pours or self._former else "posterior_minimum"
 
-    def _refine(self, count: int) -> None:
-        """More simulations while the pour takes its time."""
-
-        def simulate(suggestion: Suggestion) -> None:
-            self._simulate(suggestion, "refine")
-
-        problem = self._hybrid(count=count, pending=(*self._trials.pending(everything=True), self._pours[-1].point))
-        self._questions.put(problem, "refine", simulate)
-
     def _hybrid(self, **changes: Any) -> SuggestProblem:
         self._compromise.weigh(exploring=changes.get("count") != 0)
         return self._informed(self._real(), self._simulated(everything=True), **changes)
 
     def _informed(self, poured: Data, simulated: Data, **changes: Any) -> SuggestProblem:
-        """A question about the real cost, with what the simulations are still good for."""
-        match self._followed:
-            case "D2":
-                return self._problem(poured, **changes)
-            case "widen":
-                return self._problem(poured, mean="pooled", widening=WIDENING, simulated=simulated, **changes)
-            case _ if not self._settings.adaptive:
-                return self._problem(poured, mean=MEANS[self._settings.model], simulated=simulated, **changes)
-            case _ if changes.get("acquisition") == "knowledge":  # what one more simulation is worth beside a pour
-                return self._problem(poured, mean="scaled", simulated=simulated, **changes)
-            case _:
-                changes |= {"mean": "adaptive", "mismatch": self._mismatch}
-                return self._problem(poured, simulated=simulated, **changes)
+        """A question about the real cost, with what the simulations say of it."""
+        if not self._settings.adaptive:
+            changes["mean"] = "simulated"
+        elif changes.get("acquisition") == "knowledge":  # what one more simulation is worth beside a pour
+            changes["mean"] = "scaled"
+        else:
+            changes |= {"mean": "adaptive", "mismatch": self._mismatch}
+        return self._problem(poured, simulated=simulated, **changes)
 
     @property
     def _mismatch(self) -> ModelDiscrepancy:
@@ -396,14 +327,12 @@ class Hybrid(Deployment[D3Settings]):
 
     @property
     def _warned(self) -> bool:
-        return not self._settings.plain
+        return self._settings.adaptive
 
     # -- results ---------------------------------------------------------------------------------------------------
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold | Believed:
-        if self._trust is not None:
-            return self._trust.result()
-        return super()._trusted(weighed) if self._check is None else self._check.result()
+    def _trusted(self, weighed: Sequence[PourTrial]) -> Foretold | Believed:
+        return super()._trusted(weighed) if self._trust is None else self._trust.result()
 
     def result(self) -> Deployed:
         """What was learnt so far, of the bench too."""
@@ -415,7 +344,7 @@ class Hybrid(Deployment[D3Settings]):
         simulations = self._settings.prior_simulations + self._plan.pours * self._settings.simulations_beside
         answered = self._trials.answered - self._unspent
         done = min(answered, simulations) if self._settings.beside is None else answered
-        if self._followed == "D2" or self._ended is not None:  # those that will not be made any more
+        if self._ended is not None:  # those that will not be made any more
             simulations = done
         pours = self._counted if self._ended is not None else self._plan.pours
         return Progress(done, simulations, min(self._counted, pours), pours)
@@ -445,8 +374,7 @@ class FreeHybrid(Hybrid):
 
     Nobody waits. The next simulations are chosen ahead, so that a slot that falls free has one at once. Questions
     carry the hyperparameters of the last answer and a limited number of simulations; with each, the fit follows the
-    data by a few steps. The picture of the surrogate, and what simulations alone say of the pour that is under way,
-    are asked for beside it.
+    data by a few steps. The picture of the surrogate is asked for beside a pour.
 
     Limitations: in completion order the clock decides what is asked for; only the journal repeats a run. A front is
     looked for without prices, with fits afresh.
@@ -462,7 +390,6 @@ class FreeHybrid(Hybrid):
         self._map_due = False
         self._fitted: dict[tuple[str, bool], tuple[tuple[float, ...], ...]] = {}
         self._around: Point | None = None
-        self._foreseen: tuple[tuple[Point, ...], Suggestion | None] = ((), None)
 
     # -- listening -------------------------------------------------------------------------------------------------
 
@@ -473,21 +400,6 @@ class FreeHybrid(Hybrid):
             self._prices.learn(outcome.outcome.cpu_s)
         if isinstance(request, Pour):
             self._rested_at = None
-            self._judge()
-
-    def _judge(self) -> None:
-        """Compare the pours with the simulations, if what those say of them is known already."""
-        if self._check is None or self._pouring is not None:
-            return
-        places, said = self._foreseen
-        pours = self._check.due(self._pours)
-        if pours and said is not None and places == tuple(pour.point for pour in pours):
-            self._check.compare(pours, said)
-            self._unasked = self._check.question
-            self._heard(self._check)
-            if self._followed == "D2":
-                self._trials.withdraw()
-                self._rest("its simulations are forgotten", 0.0, 0.0)
 
     # -- what to ask next ------------------------------------------------------------------------------------------
 
@@ -497,16 +409,12 @@ class FreeHybrid(Hybrid):
 
     def _next(self, free_simulations: int) -> None:
         if self._pouring is None:
-            if self._check is not None and self._check.due(self._pours):
-                self._foresee()
-                return
             if not self._pours_left:
                 self._wind_up()
                 return
             if self._may_pour and "pour" not in self._out:
                 self._next_pour()
-        if self._followed != "D2":
-            self._look_ahead()
+        self._look_ahead()
 
     @property
     def _may_pour(self) -> bool:
@@ -522,12 +430,10 @@ class FreeHybrid(Hybrid):
 
     def _look_ahead(self) -> None:
         """Choose simulations before there is a slot for them."""
-        if self._out & {"start", "prior", "refine", "trust"}:
+        if self._out & {"start", "prior", "refine"}:
             return
         if self._awaited is None and not self._pours:
             self._next_prior()
-        elif self._pouring is not None and self._foresee():
-            pass
         elif self._trials.waiting < self._trials.width and self._rested_at != self._trials.answered:
             self._refine(self._trials.width)
 
@@ -570,7 +476,7 @@ class FreeHybrid(Hybrid):
                 self._rest(f"what is left to learn, only pours tell: {self._comparison(one, pour)}", one, pour)
             elif self._trials.lost_in_a_row >= LOST_IN_A_ROW:
                 self._rest(f"the last {LOST_IN_A_ROW} simulations came to nothing", one, pour)
-            elif self._followed != "D2":
+            else:
                 self._simulate(suggestion, "refine")
 
         mapped, self._map_due = self._map_due, False
@@ -592,27 +498,7 @@ class FreeHybrid(Hybrid):
             self._rested_at, self._map_due = None, True
 
         acquisition = self._acquisition
-        if self._followed == "D2":
-            self._put(self._hybrid(count=1, acquisition=acquisition, map_resolution=MAP_RESOLUTION), "pour", pour)
-        else:
-            self._ask_quickly("pour", lambda answer: self._judged(answer, pour), count=1, acquisition=acquisition)
-
-    def _foresee(self) -> bool:
-        """Ask what the simulations alone say of the pours to be compared next; whether that was necessary."""
-        if self._check is None or "trust" in self._out:
-            return False
-        self._compromise.weigh(exploring=False)
-        places = tuple(pour.point for pour in self._check.foreseen(self._pours))
-        if not places or places == self._foreseen[0]:
-            return False
-
-        def answered(suggestion: Suggestion) -> None:
-            self._foreseen = (places, suggestion)
-            self._judge()
-
-        self._foreseen = (places, None)
-        self._put(self._problem(self._simulated(), count=0, predict_at=places), "trust", answered)
-        return True
+        self._ask_quickly("pour", lambda answer: self._judged(answer, pour), count=1, acquisition=acquisition)
 
     # -- questions -------------------------------------------------------------------------------------------------
 

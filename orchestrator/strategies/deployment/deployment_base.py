@@ -15,7 +15,6 @@ from orchestrator.strategies.calibration.calibration_base import Kappa
 from orchestrator.strategies.campaign_plan import DeploymentPlan, DeploymentSettings
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Deployed, Recommended, RiskFound, SimulatedAction
-from orchestrator.strategies.deployment.model_check import Compared
 from orchestrator.strategies.deployment.model_monitoring import Believed
 from orchestrator.strategies.deployment.objectives import Vector
 from orchestrator.strategies.deployment.real_pours import Foretold, PourTrial, expecting, former_pours, trust
@@ -296,7 +295,7 @@ class Deployment(ABC, Generic[S]):
         """Steps done, steps in all."""
         return Progress(pours=min(self._counted, self._plan.pours), of_pours=self._plan.pours)
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> Compared | Foretold | Believed:
+    def _trusted(self, weighed: Sequence[PourTrial]) -> Foretold | Believed:
         """How far the first pours bore out what was predicted."""
         return trust(weighed)
 

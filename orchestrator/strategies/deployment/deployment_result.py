@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Literal
 
 from actors.optimizer.questions import Suggestion
-from orchestrator.strategies.deployment.model_check import Compared
 from orchestrator.strategies.deployment.model_monitoring import Believed, BenchFound
 from orchestrator.strategies.deployment.real_pours import Foretold, PourRow
 from orchestrator.strategies.deployment.safe_window import WindowFound
@@ -155,8 +154,8 @@ class Deployed(StageResult):
     failed_pours: int
     """Pours that went wrong."""
 
-    trust: Compared | Foretold | Believed
-    """How far the first pours were from what was simulated or predicted, or what all of them say of the simulator."""
+    trust: Foretold | Believed
+    """How far the first pours were from what was predicted, or what all of them say of the simulator."""
 
     gave_up: str | None = None
     """Why it ended early."""

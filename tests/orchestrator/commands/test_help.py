@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from orchestrator.cli.app import app
 from orchestrator.cli.command_options import Answer
 from orchestrator.runs.unknown_pours import LOST, REPEAT
-from orchestrator.strategies.deployment.model_check import OPTIONS
+from orchestrator.strategies.deployment.model_monitoring import OPTIONS
 from tests.orchestrator.commands.typed import ROOT, invoke, write_inputs
 
 HELP = {

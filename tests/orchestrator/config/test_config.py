@@ -279,7 +279,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           pours: 6
           prior_simulations: 11
           per_pour: free
-          prices: {{pour: 75 s, simulation: 4 s, worth: 0.01}}
+          prices: {{pour: 75 s, worth: 0.01}}
           kappa: 3
           initial: 4
           on_failed_pour: ignore
@@ -338,7 +338,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
         pours=6,
         prior_simulations=11,
         per_pour="free",
-        prices=PricesSettings(pour=75.0, simulation=4.0, worth=0.01),
+        prices=PricesSettings(pour=75.0, worth=0.01),
         kappa=3.0,
         initial=4,
         on_failed_pour="ignore",
@@ -361,10 +361,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
         ("strategy: D3\n  pours: 9\n  per_pour: 0", D3Settings(pours=9, per_pour=0)),
         ("strategy: D3\n  pours: 9", D3Settings(pours=9, per_pour=2, prior_simulations=37, model="adaptive")),
         ("strategy: D3\n  pours: 9\n  per_pour: free", D3Settings(pours=9, per_pour="free")),
-        (
-            "strategy: D3\n  pours: 9\n  model: scaled\n  trust: always",
-            D3Settings(pours=9, model="scaled", trust="always"),
-        ),
+        ("strategy: D3\n  pours: 9\n  model: residual", D3Settings(pours=9, model="residual")),
     ],
 )
 def test_strategies_have_their_own_budgets(keys: str, expected: DeploymentSettings, tmp_path: Path) -> None:

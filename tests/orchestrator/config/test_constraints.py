@@ -140,8 +140,8 @@ def spill(action: Action, theta: SimulationParameters, rng: np.random.Generator)
 DEPLOYMENTS: dict[str, tuple[type[Any], dict[str, Any]]] = {
     "D1": (OneShotPlanning, {"iterations": 8}),
     "D2": (RealOnly, {"pours": 8, "initial": 3}),
-    "D3": (Hybrid, {"model": "scaled", "per_pour": 2}),
-    "D3-free": (FreeHybrid, {"model": "scaled", "per_pour": "free", "prices": PricesSettings()}),
+    "D3": (Hybrid, {"model": "adaptive", "per_pour": 2}),
+    "D3-free": (FreeHybrid, {"model": "adaptive", "per_pour": "free", "prices": PricesSettings()}),
 }
 
 

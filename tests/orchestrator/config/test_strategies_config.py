@@ -231,3 +231,28 @@ def test_confirming_pours_are_part_of_the_plan_whatever_the_strategy(tmp_path: P
 def test_confirming_pours_need_a_bench(tmp_path: Path) -> None:
     problem = refusal(tmp_path, CONFIRMED.replace("laboratories/virtual.yaml", "laboratories/planning.yaml"))
     assert "campaign.yaml:11:12: deployment.confirm: laboratory 'planning' has no bench to pour on" in problem
+
+
+# -- what was retired ----------------------------------------------------------------------------------------------
+
+
+def test_retired_keys_and_values_are_refused_together_with_their_places(tmp_path: Path) -> None:
+    text = DEPLOYED.replace("strategy: D1", "strategy: D3\n  pours: 5") + (
+        "  model: scaled\n  trust: {pours: 4, policy: widen}\n  per_pour: free\n  prices: {simulation: 2 s}\n"
+    )
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, text)
+    lines = [line for line in str(caught.value).splitlines() if "campaign.yaml:" in line]
+    line = text[: text.index("  model")].count("\n") + 1
+    assert [one.partition("campaign.yaml:")[2].partition(";")[0] for one in lines] == [
+        f"{line}:10: deployment.model: 'scaled' was retired",
+        f"{line + 1}:3: deployment.trust: was retired",
+        f"{line + 3}:12: deployment.prices.simulation: was retired",
+    ]
+    assert "write 'adaptive', or 'residual'" in lines[0]
+    assert "remove it: 'model: adaptive' weighs the simulator by every pour" in lines[1]
+
+
+def test_a_retired_key_of_another_strategy_is_said_to_be_retired(tmp_path: Path) -> None:
+    text = DEPLOYED.replace("strategy: D1", "strategy: D2\n  pours: 5")
+    assert "deployment.trust: was retired; remove it" in refusal(tmp_path, text + "  trust: always\n")

@@ -18,7 +18,6 @@ from orchestrator.results.campaign_figures import draw_figures
 from orchestrator.results.console_view import summary_table
 from orchestrator.results.figure_style import display_value, display_values, log_ticks
 from orchestrator.results.loss_units import loss_unit
-from orchestrator.results.model_check_figures import draw_trust, trust_title
 from orchestrator.results.spillage_figures import DiscrepancyGroup, PourSeries, draw_discrepancy, draw_spillage
 from orchestrator.results.stage_views import (
     calibration_picture,
@@ -29,7 +28,6 @@ from orchestrator.results.stage_views import (
 )
 from orchestrator.results.summarise import summarise
 from orchestrator.results.surrogate_figures import SurrogatePicture, draw_posterior, draw_surrogate, draw_trials
-from orchestrator.strategies.deployment.model_check import Compared, PourComparison
 from sim_engine.action import DEG, Action
 from sim_engine.outcome import Loss
 from sim_engine.search_space import Axis, Space
@@ -299,34 +297,6 @@ def test_simulations_stand_beside_the_pours_of_a_loss_map(
     crosses = [c for c in drawn[0].axes[0].collections if c.get_label() == "simulation"]
     assert [len(c.get_offsets()) for c in crosses] == [len(picture.simulated)]
     assert strays(drawn[0]) == []
-
-
-def compared(rows: list[tuple[float, float, float]], limit: float = 2.5) -> Compared:
-    """A trust result of (simulated, deviation, weighed)."""
-    pours = tuple(PourComparison(number, *row) for number, row in enumerate(rows, start=1))
-    mean = sum(max(pour.z, 0.0) for pour in pours) / len(pours)
-    return Compared(
-        z_scores=tuple(pour.z for pour in pours),
-        alarm=mean > limit,
-        better=False,
-        mean_z=mean,
-        limit=limit,
-        policy="D2",
-        followed=None,
-        pours=pours,
-        text="",
-    )
-
-
-def test_the_title_of_the_first_pours_says_which_were_worse_and_which_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    one_bad = compared([(0.016, 0.015, 0.15), (0.028, 0.01, 0.03), (0.027, 0.012, 0.02)])
-    assert trust_title(one_bad) == "pours 2 and 3 as simulated, pour 1 worse by 8.9 σ: alarm"
-    assert trust_title(compared([(0.02, 0.01, 0.021), (0.02, 0.01, 0.015)])) == "pours 1 and 2 as simulated"
-    assert trust_title(compared([(0.5, 0.01, 0.1)])) == "pour 1 better by 40.0 σ"
-    drawn = kept(monkeypatch)
-    draw_trust(Path("trust.png"), one_bad, unit=loss_unit(Loss()), receiver="narrow")
-    assert strays(drawn[0]) == []
-    assert len([line for line in drawn[0].axes[1].lines if line.get_linestyle() == "--"]) == 1  # the mean is a bar
 
 
 def test_predictors_that_have_nothing_to_say_get_no_bar_and_no_word(monkeypatch: pytest.MonkeyPatch) -> None:

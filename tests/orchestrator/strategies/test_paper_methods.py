@@ -53,7 +53,7 @@ def on_the_toy(plan: DeploymentPlan | None) -> DeploymentPlan:
     return replace(plan, scenes=(SCENE,), actions=ACTIONS)
 
 
-@pytest.mark.parametrize(("keys", "plain"), [("model: residual", True), ("model: scaled", False)])
+@pytest.mark.parametrize(("keys", "plain"), [("model: residual", True), ("model: adaptive", False)])
 def test_the_simulations_before_the_first_pour_keep_kappa_in_the_papers_model_alone(
     folder: Path, keys: str, plain: bool
 ) -> None:
@@ -137,9 +137,8 @@ def test_a_study_has_the_papers_methods_beside_ours(tmp_path: Path) -> None:
     own, papers_own = (plan.deployment(label).plan.settings for label in ("D3", "D3-paper"))
     assert isinstance(own, D3Settings)
     assert isinstance(papers_own, D3Settings)
-    assert (own.model, own.per_pour, own.plain) == ("adaptive", 2, False)
-    assert (papers_own.model, papers_own.per_pour, papers_own.plain) == ("residual", 0, True)
-    assert papers_own.trust == "always"
+    assert (own.model, own.per_pour) == ("adaptive", 2)
+    assert (papers_own.model, papers_own.per_pour) == ("residual", 0)
     cells = {cell.id: cell for cell in cells_of(plan)}
     assert "calibration.small.C4-paper.01" in cells
     assert "calibration.large.C4-paper.01" not in cells, "it is compared at one level, and nobody uses its θ*"

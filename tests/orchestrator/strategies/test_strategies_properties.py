@@ -53,7 +53,7 @@ CALIBRATIONS: dict[str, tuple[Any, dict[str, Any]]] = {
 }
 BOTH = Objectives((Spillage(), Retained()), pareto=True)
 RISK = plans.risk("cvar", 0.8, PoseError(x=3e-3, speed_factor=0.05))
-FREE = {"pours": 3, "prior_simulations": 12, "per_pour": "free", "prices": PricesSettings(), "model": "scaled"}
+FREE = {"pours": 3, "prior_simulations": 12, "per_pour": "free", "prices": PricesSettings(), "model": "adaptive"}
 DEPLOYMENTS: dict[str, tuple[Any, dict[str, Any]]] = {
     "D1": (OneShotPlanning, {"iterations": 6}),
     "D1, risk": (RobustPlanning, {"iterations": 4, "simulations_per_iteration": 2, "risk": RISK}),

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Suggest
 from orchestrator.runs.stages import DEPLOYMENT, with_bench
+from orchestrator.runs.unknown_pours import OperatorNeededError
 from orchestrator.strategies.deployment.bench_offset import displacement, play_of
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.deployment_result import Deployed
@@ -22,9 +26,14 @@ from orchestrator.strategies.deployment.model_monitoring import (
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import Loss
 from sim_engine.search_space import Axis, Space
 from tests.orchestrator import plans
 from tests.orchestrator.plans import deployment_plan
+from tests.orchestrator.test_stages import laboratory
+from tests.orchestrator.toy import SCENE as TOY_SCENE
+from tests.orchestrator.toy import SPACE as TOY_SPACE
+from tests.orchestrator.toy import ToyLaboratory, answering, run_toy, toy_plan
 from tests.orchestrator.toys import narrow_cup, narrow_cup_biased
 
 
@@ -33,7 +42,7 @@ def upside_down(action: Any, theta: Any, rng: Any) -> float:
 
 
 def adaptive(seed: int = 1, **changes: Any) -> Hybrid:
-    plan = deployment_plan(**{"model": "adaptive", "trust": None, "per_pour": 1, **changes})
+    plan = deployment_plan(**{"model": "adaptive", "per_pour": 1, **changes})
     strategy = plan.settings.build(plan, SCENE, THETA, seed)
     assert isinstance(strategy, Hybrid)
     return strategy
@@ -183,11 +192,10 @@ def test_rules_of_one_model_are_refused_with_another() -> None:
     from orchestrator.strategies.campaign_plan import Premises
 
     heard = Heard()
-    deployment_plan(model="scaled", stop=StopSettings(), good_enough=0.01).settings.check(Premises(None, False), heard)
+    deployment_plan(model="residual", stop=StopSettings(), good_enough=0.01).settings.check(
+        Premises(None, False), heard
+    )
     assert heard.at == [("stop",), ("good_enough",)]
-    heard = Heard()
-    deployment_plan(model="adaptive", trust="always").settings.check(Premises(None, False), heard)
-    assert heard.at == [("trust",)]
 
 
 # -- the bench -------------------------------------------------------------------------------------------------------
@@ -211,7 +219,7 @@ def test_a_displacement_is_where_the_simulator_does_what_the_bench_does() -> Non
 
 
 def test_what_was_learnt_with_one_receiver_is_known_for_the_next() -> None:
-    plan = deployment_plan(model="adaptive", trust=None, pours=4, per_pour=1)
+    plan = deployment_plan(model="adaptive", pours=4, per_pour=1)
     first = adaptive(pours=4)
     StrategyHarness(narrow_cup_biased, narrow_cup).run(first)
     learnt = first.result()
@@ -224,7 +232,7 @@ def test_what_was_learnt_with_one_receiver_is_known_for_the_next() -> None:
     pour = next(r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour")
     assert pour.mismatch is not None
     assert pour.mismatch.drawn == told.bench
-    assert with_bench(replace(plan, settings=plan.settings.model_copy(update={"model": "scaled"})),
+    assert with_bench(replace(plan, settings=plan.settings.model_copy(update={"model": "residual"})),
                       {DEPLOYMENT + "first": again}, THETA).bench == ()  # fmt: skip
 
 
@@ -234,8 +242,95 @@ def test_a_calibration_that_searched_where_the_receiver_stands_is_known_too() ->
     found = plans.calibrated(best, rows)
     assert found.found is not None
     found = found.model_copy(update={"found": found.found.model_copy(update={"searched": ("receiver_x",)})})
-    told = with_bench(deployment_plan(model="adaptive", trust=None), {"calibration": found}, best)
+    told = with_bench(deployment_plan(model="adaptive"), {"calibration": found}, best)
     shifts = np.array([one.shifts[1] for one in told.bench]) * 0.07
     assert np.abs(shifts).max() == pytest.approx(0.001)
     nothing = plans.calibrated(best, rows)  # it searched something else
-    assert with_bench(deployment_plan(model="adaptive", trust=None), {"calibration": nothing}, best).bench == ()
+    assert with_bench(deployment_plan(model="adaptive"), {"calibration": nothing}, best).bench == ()
+
+
+# -- asked on resume -------------------------------------------------------------------------------------------------
+
+
+def asking(directory: Path, policy: Any = "ask") -> Any:
+    deployment = plans.deployment(
+        scenes=(TOY_SCENE,),
+        actions=TOY_SPACE,
+        loss=Loss(),
+        pours=5,
+        prior_simulations=6,
+        per_pour=1,
+        model="adaptive",
+        ignorance=DiscrepancyPolicySettings(limit=0.1, policy=policy),
+    )
+    return toy_plan(directory, deployment=deployment)
+
+
+def wrong_laboratory() -> ToyLaboratory:
+    """Its simulators say that nothing is spilled anywhere."""
+    room = laboratory()
+    honest = room.simulators.simulate
+
+    async def rosy(task: Any) -> Any:
+        result = await honest(task)
+        return replace(result, outcome=replace(result.outcome, received=1.0, spilled=0.0))
+
+    room.simulators.simulate = rosy  # type: ignore[method-assign]
+    return room
+
+
+def run(directory: Path, policy: Any = "ask", **arguments: Any) -> Any:
+    return asyncio.run(run_toy(directory, wrong_laboratory(), plan=asking(directory, policy), stages=None, **arguments))
+
+
+def asked_for(directory: Path) -> list[Any]:
+    """Everything that was asked of the laboratory, in order."""
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        requests = [entry.body["request"] for entry in journal.entries(kinds=[Kind.REQUESTED])]
+    return [request for request in requests if request["type"] != "Ask"]
+
+
+def test_a_campaign_that_asks_pauses_and_goes_on_as_answered(tmp_path: Path) -> None:
+    directory = tmp_path / "asked"
+    with pytest.raises(OperatorNeededError, match=r"How to go on.*--answer 'go on'") as caught:
+        run(directory)
+    assert caught.value.exit_code == 3
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        assert journal.state() == "paused"
+    with pytest.raises(OperatorNeededError):  # nobody there: the same question
+        run(directory, resume=True)
+    with pytest.raises(OperatorNeededError):
+        run(directory, resume=True, ask_operator=answering("lost"))
+    result = run(directory, resume=True, ask_operator=answering("Go on"))
+    assert result.state == "finished"
+    assert next(iter(result.results.values())).trust.followed == "go on"
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        assert [e.body["answer"] for e in journal.entries(kinds=[Kind.OPERATOR_ANSWERED])] == ["go on"]
+    # what it asked for is what a campaign asks for that has decided so beforehand
+    run(tmp_path / "decided", "go on")
+    assert asked_for(directory) == asked_for(tmp_path / "decided")
+
+
+def test_an_answer_is_replayed_exactly(tmp_path: Path) -> None:
+    """Paused again after the answer, the run repeats it from its journal and asks nobody."""
+    directory = tmp_path / "run"
+
+    async def paused_after_the_answer() -> None:
+        def watch(event: Any) -> None:
+            if type(event).__name__ == "PourProgressed":
+                task.cancel()
+
+        plan = asking(directory)
+        task = asyncio.create_task(
+            run_toy(directory, wrong_laboratory(), plan=plan, stages=None, resume=True,
+                    ask_operator=answering("go on"), watchers=[watch])
+        )  # fmt: skip
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    with pytest.raises(OperatorNeededError):
+        run(directory)
+    asyncio.run(paused_after_the_answer())
+    result = run(directory, resume=True)
+    assert result.state == "finished"
+    assert next(iter(result.results.values())).trust.followed == "go on"

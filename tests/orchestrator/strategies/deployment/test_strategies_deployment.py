@@ -137,15 +137,6 @@ def test_d3_asks_for_a_pour_and_the_simulations_beside_it_together():
     assert [len(q.data) for q in questions] == [0, 1, 2, 3]
 
 
-def test_d3_simulates_freely_while_a_pour_is_under_way():
-    strategy = make("D3", pours=3, per_pour="free")
-    played = StrategyHarness(narrow_cup, slots=2, beside=9).run(strategy)
-    assert len(played.pours) == 3
-    assert sum(r.purpose == "refine" for r in played.simulations) > 8
-    questions = [r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour"]
-    assert len(questions[-1].simulated) > 24
-
-
 def test_failed_simulations_and_pours_never_poison_a_fit():
     def flaky(action, theta, rng):
         return math.nan if rng.random() < 0.3 else narrow_cup(action, theta, rng)
@@ -175,7 +166,7 @@ def test_a_failed_pour_counts_and_enters_the_data_as_told(policy, entered):
     ("name", "changes", "warns"),
     [
         ("D2", {}, True),
-        ("D3", {"model": "scaled"}, True),
+        ("D3", {"model": "adaptive"}, True),
         ("D3", {"model": "residual"}, False),
         ("D2", {"on_failed_pour": "ignore"}, False),
     ],
@@ -206,7 +197,7 @@ def test_touching_vessels_are_avoided_and_cost_no_pour():
     assert result.refused_pours > 0
     assert len(played.real_spills) == 8
     assert [r.number for r in result.pours if r.status == "weighed"] == list(range(1, 9))
-    hybrid = make("D3", 1, pours=4, model="scaled")
+    hybrid = make("D3", 1, pours=4, model="adaptive")
     StrategyHarness(touches_when_near).run(hybrid)
     assert hybrid.result().refused_pours <= 1  # simulations have told most of it
     assert hybrid.best_values["x_offset"] >= 0.10
