@@ -227,7 +227,8 @@ class Session:
         self.discard()
         spec = self._spec
         self._worker = WorkerProcess()
-        # Only a virtual controller has scaled time; the machine may suspend its process, unlike a real controller.
+        # Only a virtual controller has scaled time; the operating system may delay its process, unlike a real
+        # controller.
         silence = SILENCE if spec.time_scale == 1.0 else 8.0 * SILENCE
         try:
             self.ask("open", spec.address, spec.rate, silence, deadline=OPEN_TIME)
