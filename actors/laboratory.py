@@ -174,16 +174,16 @@ class _OpenLaboratory:
         self._bench: Bench | None = None
         self._bench_problem: str | None = None
         self._notices: list[Notice] = []
-        self._hear: Callable[[Notice], None] = self._notices.append
+        self._subscriber: Callable[[Notice], None] = self._notices.append
 
     def listen(self, hear: Callable[[Notice], None]) -> None:
         """See `Telling.listen`."""
-        self._hear = hear
+        self._subscriber = hear
         while self._notices:
             hear(self._notices.pop(0))
 
-    def _tell(self, notice: Notice) -> None:
-        self._hear(notice)
+    def _report(self, notice: Notice) -> None:
+        self._subscriber(notice)
 
     @property
     def simulators(self) -> SimulatorPool:
@@ -231,7 +231,7 @@ class _OpenLaboratory:
         return DeviceOptimizer(proposer)
 
     async def _open_bench(self, make: MakeDevice, liquid: SimulatorPool | None) -> None:
-        self._opened = await open_bench(self._spec, make, liquid, self._operator, self._tell)
+        self._opened = await open_bench(self._spec, make, liquid, self._operator, self._report)
         self._devices += self._opened.devices
         self._bench = self._opened.bench
 
@@ -290,7 +290,7 @@ class RayLaboratory(_OpenLaboratory):
 
     _cluster: JoinedCluster | None = None
     _liquid: RaySimulatorPool | None = None
-    _watching: asyncio.Task[None] | None = None
+    _monitoring: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> RayLaboratory:
         from actors.runtime.ray_runtime import keep_signals, start_ray
@@ -309,10 +309,10 @@ class RayLaboratory(_OpenLaboratory):
             if self._spec.ray is not None:
                 from actors.runtime.ray_cluster import JoinedCluster
 
-                self._cluster = JoinedCluster(self._spec.ray, self._tell, self._lose_bench, self._lose_all)
+                self._cluster = JoinedCluster(self._spec.ray, self._report, self._lose_bench, self._lose_all)
                 await self._cluster.open(need_bench=self._needs_bench)
             else:
-                self._watching = asyncio.create_task(watch_ray(self._ray_died))
+                self._monitoring = asyncio.create_task(watch_ray(self._ray_died))
             await self._open_all()
         except BaseException:
             await self.__aexit__()
@@ -337,7 +337,7 @@ class RayLaboratory(_OpenLaboratory):
         from actors.runtime.cluster_nodes import versions
 
         def tell(text: str) -> None:
-            self._tell(Notice("warning", text))
+            self._report(Notice("warning", text))
 
         if self._cluster is None:
             return RaySimulatorPool(simulator_count(self._spec), make=self._make, tell=tell)
@@ -378,13 +378,13 @@ class RayLaboratory(_OpenLaboratory):
                 device.abandon(reason)
 
     def _ray_died(self, reason: str) -> None:
-        self._tell(Notice("error", reason))
+        self._report(Notice("error", reason))
         self._lose_all(reason)
 
     async def __aexit__(self, *exc: object) -> None:
         try:
-            if self._watching is not None:
-                self._watching.cancel()
+            if self._monitoring is not None:
+                self._monitoring.cancel()
             await self._close_all()
             if self._cluster is not None:
                 await self._cluster.close()

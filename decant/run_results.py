@@ -252,7 +252,7 @@ def publish(run: Run) -> Published:
     """Write a run's figures, `theta.json`, `summary.json` and report into its folder, as `decant run` does at its end.
 
     Raises:
-        OSError: a file can't be written.
+        OSError: a file cannot be written.
     """
     return write(run.campaign, run.result)
 

@@ -273,7 +273,7 @@ def lip_flow(vessel: Vessel, volume: float, times: Floats, tilts: Floats, *, dis
         discharge: coefficient C_d.
 
     Raises:
-        ValueError: volume outside 0 … capacity, or times that don't increase.
+        ValueError: volume outside 0 … capacity, or times that do not increase.
     """
     _check_volume(vessel, volume)
     times, tilts = np.asarray(times, dtype=float), np.asarray(tilts, dtype=float)
@@ -304,7 +304,7 @@ def tilting_cup_outflow(
         Volume that has left, shape (T,) [m³], never decreasing.
 
     Raises:
-        ValueError: volume outside 0 … capacity, or times that don't increase.
+        ValueError: volume outside 0 … capacity, or times that do not increase.
     """
     flow = lip_flow(vessel, volume, times, tilts, discharge=discharge)
     return np.asarray(np.interp(np.asarray(times, dtype=float), flow.times, volume - flow.inside), dtype=float)

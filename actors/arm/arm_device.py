@@ -26,7 +26,7 @@ LOOK_INTERVAL = 0.1
 Follow = Callable[[ArmState], None]
 
 
-def _nobody(state: ArmState) -> None:
+def _ignore(state: ArmState) -> None:
     """Default callback, which ignores the arm's state."""
 
 
@@ -58,7 +58,7 @@ class DeviceArm:
         """Allow the arm to move, after an operator's consent."""
         await self.device.call("release", deadline=PATIENCE, urgent=True)
 
-    async def move_to_start(self, path: PlannedPour, follow: Follow = _nobody) -> None:
+    async def move_to_start(self, path: PlannedPour, follow: Follow = _ignore) -> None:
         """Move from home to the pour's start. `follow` is called periodically with the arm's state."""
         async with self._followed(follow):
             await self.device.call("move_to_start", path, deadline=self._deadline(path.approach_time))
@@ -75,7 +75,7 @@ class DeviceArm:
             executed: Executed = await self.device.call("execute", path, deadline=deadline)
             return executed
 
-    async def retreat(self, path: PlannedPour, follow: Follow = _nobody) -> None:
+    async def retreat(self, path: PlannedPour, follow: Follow = _ignore) -> None:
         """Move home from any upright pose on the way to or from the pour; `follow` as in `move_to_start`."""
         async with self._followed(follow):
             await self.device.call("retreat", path, deadline=self._deadline(3.0 * path.retreat_time))
@@ -114,17 +114,17 @@ class DeviceArm:
     @contextlib.asynccontextmanager
     async def _followed(self, follow: Follow) -> AsyncIterator[None]:
         """Call `follow` with the arm's state while the body runs."""
-        if follow is _nobody:
+        if follow is _ignore:
             yield
             return
-        watching = asyncio.create_task(self._watch(follow))
+        polling = asyncio.create_task(self._poll(follow))
         try:
             yield
         finally:
-            watching.cancel()
-            await asyncio.gather(watching, return_exceptions=True)
+            polling.cancel()
+            await asyncio.gather(polling, return_exceptions=True)
 
-    async def _watch(self, follow: Follow) -> None:
+    async def _poll(self, follow: Follow) -> None:
         while True:
             await asyncio.sleep(LOOK_INTERVAL)
             with contextlib.suppress(LaboratoryError):

@@ -243,14 +243,14 @@ class SimulatedArm:
             reached = 0.0
             while reached < duration:
                 phase, tilt = where(reached)
-                self._tell(ArmState(True, False, reached, reached / duration, phase, tilt, pourer=pose(reached)))
+                self._report(ArmState(True, False, reached, reached / duration, phase, tilt, pourer=pose(reached)))
                 going_on = self._pace.nap(_STEP)
                 reached = min(self._pace.now, duration)
                 if not going_on:
                     break
             phase, tilt = where(reached)
             share = reached / duration if duration > 0.0 else 1.0
-            self._tell(ArmState(False, self._pace.interrupted, reached, share, "idle", tilt))
+            self._report(ArmState(False, self._pace.interrupted, reached, share, "idle", tilt))
             return reached
         finally:
             self._working.release()
@@ -263,7 +263,7 @@ class SimulatedArm:
         poses[:, :3] += np.random.default_rng(self._grip.seed).normal(0.0, POSITION_NOISE, (len(times), 3))
         return ExecutedMotion(times, poses, completed=reached >= executed.duration)
 
-    def _tell(self, state: ArmState) -> None:
+    def _report(self, state: ArmState) -> None:
         with self._lock:
             self._state = state
 

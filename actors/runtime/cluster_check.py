@@ -31,7 +31,7 @@ JOIN_DEADLINE = 60.0
 WORKER_DEADLINE = 40.0
 """Longest time for a node to start a Python process [s]."""
 
-_IMPATIENT = {
+_SHORT_TIMEOUTS = {
     "RAY_NUM_REDIS_GET_RETRIES": "3",
     "RAY_gcs_server_request_timeout_seconds": "10",
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
@@ -74,7 +74,7 @@ def check_cluster(spec: RaySpec, *, need_bench: bool) -> list[NodeFacts]:
         LaboratoryError: with the problem and its remedy.
     """
     _check_answers(spec.address)
-    found = _ask(spec.address)
+    found = _read_cluster(spec.address)
     if "error" in found:
         raise LaboratoryError(f"Ray cluster at {spec.address}: {found['error']}")
     nodes = [
@@ -99,10 +99,10 @@ def _check_answers(address: str) -> None:
         ) from None
 
 
-def _ask(address: str) -> dict[str, Any]:
+def _read_cluster(address: str) -> dict[str, Any]:
     try:
         command = python_module("actors.runtime.cluster_check", address)
-        process = run(command, timeout=JOIN_DEADLINE, environment=_IMPATIENT)
+        process = run(command, timeout=JOIN_DEADLINE, environment=_SHORT_TIMEOUTS)
     except TimeoutError:
         return {
             "error": f"it could not be joined within {JOIN_DEADLINE:g} s; is it Ray that answers there, and can this "
@@ -144,7 +144,7 @@ def _check_bench(spec: RaySpec, nodes: list[NodeFacts], available: dict[str, flo
         raise LaboratoryError(f"{where}: '{name}' is in use; another program has the bench")
 
 
-def _look_around(address: str) -> dict[str, Any]:
+def _collect(address: str) -> dict[str, Any]:
     """The facts that the separate process collects."""
     import logging
 
@@ -155,10 +155,10 @@ def _look_around(address: str) -> dict[str, Any]:
     except Exception as error:
         return {"error": _why(error)}
     nodes = _living()
-    asked = [_ask_versions(node.id) for node in nodes]
-    ray.wait(asked, num_returns=len(asked), timeout=WORKER_DEADLINE)
+    requested = [_request_versions(node.id) for node in nodes]
+    ray.wait(requested, num_returns=len(requested), timeout=WORKER_DEADLINE)
     still = {node.id for node in _living()}  # Ray needs some time to notice that a node is dead
-    found = [_with_versions(node, ref) for node, ref in zip(nodes, asked, strict=True) if node.id in still]
+    found = [_with_versions(node, ref) for node, ref in zip(nodes, requested, strict=True) if node.id in still]
     answer = {"nodes": [dataclasses.asdict(node) for node in found], "available": ray.available_resources()}
     ray.shutdown()
     return answer
@@ -179,7 +179,7 @@ def _living() -> list[NodeFacts]:
     ]
 
 
-def _ask_versions(node: str) -> Any:
+def _request_versions(node: str) -> Any:
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -232,4 +232,4 @@ def _why(error: BaseException) -> str:
 
 
 if __name__ == "__main__":
-    print(json.dumps(_look_around(sys.argv[1])), flush=True)
+    print(json.dumps(_collect(sys.argv[1])), flush=True)

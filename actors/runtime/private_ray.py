@@ -39,7 +39,7 @@ _LONGEST_FOLDER = 40
 _WORKER_LOG = re.compile(r"(?:worker-|python-core-worker-).*[-_](\d+)\.(?:out|err|log)")
 """Name of a worker's log; the number is its process id."""
 
-_NEEDLESS = ("start_api_server", "start_monitor", "start_log_monitor")
+_UNUSED_PARTS = ("start_api_server", "start_monitor", "start_log_monitor")
 """Parts of a Ray node that are not used here: the dashboard's server, the autoscaler and the log monitor."""
 
 _TOKEN = secrets.token_hex(32)
@@ -187,7 +187,7 @@ def _bare_ray() -> Iterator[None]:
     def left_out(node: Node, **settings: object) -> None:
         """Start nothing."""
 
-    before = {name: getattr(Node, name) for name in _NEEDLESS if hasattr(Node, name)}
+    before = {name: getattr(Node, name) for name in _UNUSED_PARTS if hasattr(Node, name)}
     for name in before:
         setattr(Node, name, left_out)
     try:

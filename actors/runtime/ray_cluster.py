@@ -48,7 +48,7 @@ class JoinedCluster:
     _nodes: dict[str, Node] = field(default_factory=dict)
     _dead: set[str] = field(default_factory=set)
     _bundle: Any = None
-    _watching: asyncio.Task[None] | None = None
+    _polling: asyncio.Task[None] | None = None
 
     @property
     def cpus(self) -> int:
@@ -68,16 +68,16 @@ class JoinedCluster:
             if bench_node not in self._nodes:
                 raise LaboratoryError(f"Ray cluster at {self.spec.address}: the bench's machine was lost; try again")
             self.bench = PinnedNode(self._nodes[bench_node], options)
-        self._watching = asyncio.create_task(self._watch())
+        self._polling = asyncio.create_task(self._poll())
         bench = "" if self.bench is None else f"; the bench is on {self.bench.node.host}"
         nodes = f"{len(self._nodes)} node(s), {self.cpus} core(s)"
         self.tell(Notice("info", f"on the Ray cluster at {self.spec.address}: {nodes}{bench}"))
 
     async def close(self) -> None:
         """Release the bench."""
-        if self._watching is not None:
-            self._watching.cancel()
-            await asyncio.wait({self._watching})
+        if self._polling is not None:
+            self._polling.cancel()
+            await asyncio.wait({self._polling})
         if self._bundle is not None:
             from ray.util.placement_group import remove_placement_group
 
@@ -104,7 +104,7 @@ class JoinedCluster:
         strategy = PlacementGroupSchedulingStrategy(self._bundle, placement_group_bundle_index=0)
         return node, {"scheduling_strategy": strategy}
 
-    async def _watch(self) -> None:
+    async def _poll(self) -> None:
         """Compare the nodes with those of the previous poll."""
         while True:
             await asyncio.sleep(LOOK_INTERVAL)

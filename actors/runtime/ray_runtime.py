@@ -193,11 +193,11 @@ def _start_keeper(cluster: _Cluster, spec: LaboratorySpec) -> None:
 def _keep(cluster: _Cluster, spec: LaboratorySpec) -> None:
     settings = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"} if cluster.private is None else cluster.private.settings()
     with ray_settings(**settings):
-        speaks = None
+        messenger = None
         try:
             if cluster.private is None:
                 _join(cluster)
-                speaks = speaker(str(cluster.address))
+                messenger = speaker(str(cluster.address))
             else:
                 start_private(cluster.private, spec)
         except Exception as error:
@@ -206,15 +206,15 @@ def _keep(cluster: _Cluster, spec: LaboratorySpec) -> None:
             cluster.failure.__cause__ = error
         cluster.ready.set()
         if cluster.failure is None:
-            _watch(cluster)
+            _monitor(cluster)
         import ray
 
         ray.shutdown()
-        if speaks is not None:
-            dismiss(speaks)
+        if messenger is not None:
+            dismiss(messenger)
 
 
-def _watch(cluster: _Cluster) -> None:
+def _monitor(cluster: _Cluster) -> None:
     """Monitor Ray until it is to be ended. Callers that wait for a reply use `ray_lost` to find out whether one can
     arrive.
     """

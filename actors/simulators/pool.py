@@ -108,7 +108,7 @@ def look_away(answer: asyncio.Future[Any]) -> None:
 RESTART_PAUSE = 20.0
 """Pause after a worker's process failed to start [s], because the cause may last."""
 
-_TELLING_PAUSE = 1.0
+_REPORT_PAUSE = 1.0
 """Losses within this time are reported together [s]: a lost node loses many workers."""
 
 
@@ -132,7 +132,7 @@ class WorkerPool:
         changed: Callable[[], None],
         tell: Callable[[str], None],
     ) -> None:
-        self._start, self._expected, self._changed, self._tell = start, expected, changed, tell
+        self._start, self._expected, self._changed, self._report = start, expected, changed, tell
         self._loop = asyncio.get_running_loop()
         self._members: dict[int, Member] = {}
         self._numbers = 0
@@ -177,7 +177,7 @@ class WorkerPool:
         """
         self._remove(member)
         if not self._losses:
-            self._loop.call_later(_TELLING_PAUSE, self._tell_losses)
+            self._loop.call_later(_REPORT_PAUSE, self._report_losses)
         self._losses.append(("" if member.greeting is None else member.greeting.host, orphans))
         self._add()
 
@@ -227,19 +227,19 @@ class WorkerPool:
         self._remove(member)
         if problem != self.problem:
             self.problem = problem
-            self._tell(problem)
+            self._report(problem)
         self._loop.call_later(RESTART_PAUSE, self._add)
 
     def _remove(self, member: Member) -> None:
         self._members.pop(member.number, None)
         _kill(member)
 
-    def _tell_losses(self) -> None:
+    def _report_losses(self) -> None:
         losses, self._losses = self._losses, []
         if self._closed:
             return
         hosts = ", ".join(sorted({host for host, _ in losses if host}))
-        self._tell(
+        self._report(
             f"{len(losses)} simulator(s) lost{f' on {hosts}' if hosts else ''}: "
             f"{sum(count for _, count in losses)} simulation(s) are repeated by others; "
             f"{len(self.up)} of {self.size} are up"
@@ -312,16 +312,16 @@ class RaySimulatorPool:
         self._packer = Packer()
         self._meshes: dict[Path, Any] = {}
         self._account = Account(size)
-        self._hopeless: asyncio.TimerHandle | None = None
+        self._wait_timer: asyncio.TimerHandle | None = None
         self._abandoned: LaboratoryError | None = None
         self._closed = False
         start = partial(simulator_actor, make, cpus=cpus, placement=placement or {})
-        self._crew = WorkerPool(size, start, expected=expected, changed=self._dispatch, tell=tell)
+        self._workers = WorkerPool(size, start, expected=expected, changed=self._dispatch, tell=tell)
 
     @property
     def size(self) -> int:
         """Number of workers, including those that are not up yet."""
-        return self._crew.size
+        return self._workers.size
 
     @property
     def separate(self) -> bool:
@@ -334,12 +334,12 @@ class RaySimulatorPool:
 
     def grow(self, size: int) -> None:
         """Increase the number of workers to at least `size`."""
-        self._crew.grow(size)
-        self._account.resize(self._crew.size)
+        self._workers.grow(size)
+        self._account.resize(self._workers.size)
 
     async def pids(self) -> list[int]:
         """Process ids of the workers; waits for those that are starting."""
-        return [greeting.pid for greeting in await self._crew.greeted()]
+        return [greeting.pid for greeting in await self._workers.greeted()]
 
     async def simulate(self, task: PourTask) -> SimulatedPour:
         """See `SimulatorPool.simulate`.
@@ -351,13 +351,13 @@ class RaySimulatorPool:
             raise SimulationError("the pool of simulators is closed")
         if self._abandoned is not None:
             raise self._abandoned
-        packed, parcels = self._packer.pack(task)
-        for parcel in parcels:
-            if parcel.key not in self._meshes:
+        packed, serialized = self._packer.pack(task)
+        for mesh in serialized:
+            if mesh.key not in self._meshes:
                 import ray
 
-                self._meshes[parcel.key] = ray.put(parcel)
-        job = SimulationJob(packed, [self._meshes[parcel.key] for parcel in parcels], self._loop.create_future())
+                self._meshes[mesh.key] = ray.put(mesh)
+        job = SimulationJob(packed, [self._meshes[mesh.key] for mesh in serialized], self._loop.create_future())
         self._waiting.append(job)
         self._dispatch()
         try:
@@ -372,15 +372,15 @@ class RaySimulatorPool:
             self._send(self._waiting.popleft(), member)
         if not self._waiting:
             self._level()
-        self._keep_hope()
+        self._limit_wait()
 
     def _next_member(self) -> Member | None:
         """The worker that is expected to begin another job first."""
-        free = [member for member in self._crew.up if len(member.sent) <= AHEAD]
+        free = [member for member in self._workers.up if len(member.sent) <= AHEAD]
         return min(free, key=lambda member: (len(member.sent), member.begun), default=None)
 
     def _level(self) -> None:
-        members = self._crew.up
+        members = self._workers.up
         for idle in [member for member in members if not member.sent]:
             busy = next((member for member in members if member.spare is not None), None)
             if busy is None or (spare := busy.spare) is None:
@@ -412,7 +412,7 @@ class RaySimulatorPool:
         import ray
 
         error = answer.exception()
-        if member not in self._crew:
+        if member not in self._workers:
             return  # its jobs are at other workers
         if isinstance(error, ray.exceptions.RayActorError):
             self._lose(member)
@@ -442,14 +442,14 @@ class RaySimulatorPool:
         if job in self._waiting:
             self._waiting.remove(job)
             return
-        for member in self._crew.up:
+        for member in self._workers.up:
             for sent in member.sent:
                 if sent.job is job and not sent.recalled:
                     _recall(member, sent)
                     self._loop.call_later(DRAIN_DEADLINE, self._still_draining, member, sent)
 
     def _still_draining(self, member: Member, sent: SentJob) -> None:
-        if member in self._crew and member.sent and member.sent[0] is sent:
+        if member in self._workers and member.sent and member.sent[0] is sent:
             self._lose(member)
 
     def _lose(self, member: Member) -> None:
@@ -469,24 +469,24 @@ class RaySimulatorPool:
                 )
                 del orphans[0]
         self._waiting.extendleft(reversed(orphans))
-        self._crew.lose(member, len(orphans))
+        self._workers.lose(member, len(orphans))
         self._dispatch()
 
-    def _keep_hope(self) -> None:
+    def _limit_wait(self) -> None:
         """Limit the wait of jobs while no worker is up. If none is starting, they fail at once."""
-        if not self._waiting or self._crew.up:
-            if self._hopeless is not None:
-                self._hopeless.cancel()
-                self._hopeless = None
-        elif self._crew.hopeless:
+        if not self._waiting or self._workers.up:
+            if self._wait_timer is not None:
+                self._wait_timer.cancel()
+                self._wait_timer = None
+        elif self._workers.hopeless:
             self._fail_waiting()
-        elif self._hopeless is None:
-            self._hopeless = self._loop.call_later(START_DEADLINE, self._fail_waiting)
+        elif self._wait_timer is None:
+            self._wait_timer = self._loop.call_later(START_DEADLINE, self._fail_waiting)
 
     def _fail_waiting(self) -> None:
         """Fail waiting jobs with an error of the laboratory, not of their simulations."""
-        self._hopeless = None
-        reason = self._crew.problem or (
+        self._wait_timer = None
+        reason = self._workers.problem or (
             f"no simulator was up for {START_DEADLINE:g} s; is there a free core, and memory, for one?"
         )
         while self._waiting:
@@ -499,7 +499,7 @@ class RaySimulatorPool:
             error: the reason.
         """
         self._abandoned = error
-        for member in self._crew.up:
+        for member in self._workers.up:
             self._waiting.extend(sent.job for sent in member.sent if not sent.recalled)
             for sent in member.sent:
                 sent.recalled = True
@@ -511,9 +511,9 @@ class RaySimulatorPool:
         if self._closed:
             return
         self._closed = True
-        if self._hopeless is not None:
-            self._hopeless.cancel()
-        busy = [member for member in self._crew.up if member.sent]
+        if self._wait_timer is not None:
+            self._wait_timer.cancel()
+        busy = [member for member in self._workers.up if member.sent]
         for member in busy:
             member.drop_timer()
             for sent in [sent for sent in member.sent if not sent.recalled]:
@@ -522,7 +522,7 @@ class RaySimulatorPool:
         while self._waiting:
             self._waiting.popleft().fail(SimulationError("the pool of simulators is closed"))
         patience = CLOSE_DEADLINE + (DRAIN_DEADLINE if busy else 0.0)
-        await self._crew.close(0.0 if self._abandoned is not None else patience)
+        await self._workers.close(0.0 if self._abandoned is not None else patience)
 
 
 def _recall(member: Member, sent: SentJob) -> None:

@@ -61,16 +61,16 @@ class ProcessRunner:
         Raises:
             SimulationError: every process that tried the job died.
         """
-        last_words = ""
+        last_errors = ""
         for _ in range(RETRIES + 1):
             if cancelled():
                 raise JobCancelledError
             try:
-                answer = self._ask(task, cancelled)
+                answer = self._request(task, cancelled)
             except (EOFError, OSError):
                 self._child.kill()
-                said = f" (it said: {self._child.errors_kept})" if self._child.errors_kept else ""
-                last_words = f"(status {self._child.status} at last){said}"
+                messages = f" (it said: {self._child.errors_kept})" if self._child.errors_kept else ""
+                last_errors = f"(status {self._child.status} at last){messages}"
                 self._child.connection.close()
                 self._child.release()
                 self._start()
@@ -78,9 +78,9 @@ class ProcessRunner:
             if isinstance(answer, SimulatedPour):
                 return answer
             raise answer
-        raise SimulationError(f"the simulator's process died {RETRIES + 1} times over it {last_words}")
+        raise SimulationError(f"the simulator's process died {RETRIES + 1} times over it {last_errors}")
 
-    def _ask(self, task: PourTask, cancelled: Callable[[], bool]) -> Any:
+    def _request(self, task: PourTask, cancelled: Callable[[], bool]) -> Any:
         self._child.connection.send(task)
         while not self._child.connection.poll(LOOK):
             if cancelled():

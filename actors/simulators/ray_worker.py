@@ -67,17 +67,17 @@ class SimulatorProcess:
 
         return Greeting(os.getpid(), f"{socket.gethostname()} ({ray.util.get_node_ip_address()})", versions())
 
-    def simulate(self, number: int, task: PourTask, *parcels: SerializedMesh) -> WorkerReply:
+    def simulate(self, number: int, task: PourTask, *meshes: SerializedMesh) -> WorkerReply:
         """See `JobRunner.simulate`.
 
         Args:
             number: unique number by which the job can be recalled.
             task: as `Packer.pack` made it.
-            parcels: its meshes.
+            meshes: its meshes.
         """
         begin = time.monotonic()
         try:
-            result = self._runner.simulate(unpack(task, parcels), lambda: number in self._recalled)
+            result = self._runner.simulate(unpack(task, meshes), lambda: number in self._recalled)
         finally:
             self._recalled.discard(number)
         return WorkerReply(result, time.monotonic() - begin)

@@ -132,11 +132,11 @@ class WarmSimulators:
         tell: Callable[[str], None] = lambda text: None,
     ) -> None:
         self._spec = LaboratorySpec("warm", simulators=simulators, in_process=in_process)
-        self._make, self._tell = make, tell
+        self._make, self._report = make, tell
         self._pool: ClosablePool | None = None
         self._fair: FairPool | None = None
         self._proposer: Device | None = None
-        self._watching: asyncio.Task[None] | None = None
+        self._monitoring: asyncio.Task[None] | None = None
         self._opening = asyncio.Lock()
 
     @property
@@ -169,7 +169,7 @@ class WarmSimulators:
                     pool.abandon(LaboratoryError(reason))
                     proposer.abandon(reason)
 
-                self._watching = asyncio.create_task(watch_ray(died))
+                self._monitoring = asyncio.create_task(watch_ray(died))
             self._fair = FairPool(self._pool)
 
     async def _open_ray(self) -> RaySimulatorPool:
@@ -185,7 +185,7 @@ class WarmSimulators:
                 await asyncio.to_thread(stop_ray)
             raise
         keep_signals()
-        return RaySimulatorPool(simulator_count(self._spec), make=self._make, tell=self._tell)
+        return RaySimulatorPool(simulator_count(self._spec), make=self._make, tell=self._report)
 
     def share(self) -> Share:
         """Return a share for one laboratory, for as long as the laboratory is open.
@@ -230,8 +230,8 @@ class WarmSimulators:
             pool, self._pool, self._fair = self._pool, None, None
             if pool is None:
                 return
-            if self._watching is not None:
-                self._watching.cancel()
+            if self._monitoring is not None:
+                self._monitoring.cancel()
             proposer, self._proposer = self._proposer, None
             if proposer is not None:
                 await proposer.close()

@@ -56,18 +56,18 @@ class Packer:
         Raises:
             SimulationError: a mesh cannot be read.
         """
-        parcels: list[SerializedMesh] = []
+        meshes: list[SerializedMesh] = []
 
         def packed(vessel: VesselSpec) -> VesselSpec:
             if not isinstance(vessel.shape, MeshShape):
                 return vessel
-            parcel = self._parcel(vessel.shape)
-            parcels.append(parcel)
-            return _with_path(vessel, vessel.shape, parcel.key)
+            mesh = self._serialized(vessel.shape)
+            meshes.append(mesh)
+            return _with_path(vessel, vessel.shape, mesh.key)
 
-        return _with_vessels(task, packed(task.scene.pourer), packed(task.scene.receiver)), parcels
+        return _with_vessels(task, packed(task.scene.pourer), packed(task.scene.receiver)), meshes
 
-    def _parcel(self, shape: MeshShape) -> SerializedMesh:
+    def _serialized(self, shape: MeshShape) -> SerializedMesh:
         if shape not in self._parcels:
             try:
                 content = shape.path.read_bytes()
@@ -78,19 +78,19 @@ class Packer:
         return self._parcels[shape]
 
 
-def unpack(task: PourTask, parcels: Sequence[SerializedMesh]) -> PourTask:
+def unpack(task: PourTask, meshes: Sequence[SerializedMesh]) -> PourTask:
     """Return a packed task with its meshes as files of this machine.
 
     Args:
         task: as `Packer.pack` made it.
-        parcels: its meshes.
+        meshes: its meshes.
 
     Raises:
         OSError: the cache directory cannot be written.
     """
-    if not parcels:
+    if not meshes:
         return task
-    paths = {parcel.key: _laid_out(parcel) for parcel in parcels}
+    paths = {mesh.key: _laid_out(mesh) for mesh in meshes}
 
     def unpacked(vessel: VesselSpec) -> VesselSpec:
         shape = vessel.shape
@@ -99,13 +99,13 @@ def unpack(task: PourTask, parcels: Sequence[SerializedMesh]) -> PourTask:
     return _with_vessels(task, unpacked(task.scene.pourer), unpacked(task.scene.receiver))
 
 
-def _laid_out(parcel: SerializedMesh) -> Path:
+def _laid_out(mesh: SerializedMesh) -> Path:
     """Write the mesh to a file. Other processes of this machine may write the same one."""
-    path = cache_directory() / FOLDER / parcel.key
-    if not path.exists() or path.stat().st_size != parcel.content.size:
+    path = cache_directory() / FOLDER / mesh.key
+    if not path.exists() or path.stat().st_size != mesh.content.size:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-            file.write(parcel.content.tobytes())
+            file.write(mesh.content.tobytes())
         Path(file.name).replace(path)
     return path
 

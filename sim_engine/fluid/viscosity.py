@@ -72,7 +72,7 @@ from sim_engine.fluid.walls import to_vessel
 
 LAYERED = 1.14
 """The sum over pairs is that of the continuum among disordered particles, and 0.76 of it among layers that slide over
-each other, as next to walls. This factor is between the two."""
+each other, as next to walls. The factor lies between the corrections for the two."""
 PAIRS = LAYERED * 200.0 * SIGMA / SUPPORT**5
 """Coefficient of a pair: 10 V (σ/h⁵) 20 in units of 1/d²."""
 NEAREST = 0.25

@@ -122,7 +122,7 @@ def _over_the_rim(ray: Floats, inner: Floats, last: float, corners: Floats, rim:
 
 
 def _inner_radius(grid: SignedDistanceGrid, ray: Floats, levels: Floats) -> Floats:
-    """Distance from the axis to the cavity's far wall, shape (directions, levels) [m]; 0 where there is none."""
+    """Distance from the axis to the cavity's far wall, shape (directions, levels) [m]; 0 if there is none."""
     step = 0.5 * grid.spacing
     r = np.arange(0.0, float(np.abs([grid.origin[:2], grid.upper[:2]]).max()), step)
     points = np.empty((len(ray), len(levels), len(r), 3))

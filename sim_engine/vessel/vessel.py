@@ -33,7 +33,7 @@ class Vessel:
     """One vessel, ready for the solver. Build it with `sim_engine.vessel.vessel.build_vessel`.
 
     Attributes:
-        spec: what it was built from.
+        spec: the specification from which it was built.
         solid_vertices: of the closed surface of the solid, shape (V, 3) [m].
         solid_faces: triangles of it, normals outwards, shape (F, 3).
         grid: signed distance to the solid and the cavity's mask.

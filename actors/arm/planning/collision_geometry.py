@@ -79,19 +79,19 @@ class Nearest:
     name: str = ""
 
 
-def nearest_to_receiver(stretch: SampledPath, until: float, pourer: Vessel, receiver: Vessel) -> Nearest:
+def nearest_to_receiver(sampled: SampledPath, until: float, pourer: Vessel, receiver: Vessel) -> Nearest:
     """Smallest distance between the pourer and the receiver.
 
     Near the receiver, no point of the pourer moves by more than `FINE` between two checked poses. In between, the
     pourer may therefore be nearer by at most half of that.
 
     Args:
-        stretch: the path.
+        sampled: the path.
         until: time after which no new poses occur [s].
         pourer, receiver: geometry.
     """
-    last = int(np.searchsorted(stretch.times, until + 1e-9))
-    poses = stretch.poses[:last]
+    last = int(np.searchsorted(sampled.times, until + 1e-9))
+    poses = sampled.poses[:last]
     way = way_of(poses, pourer)
     coarse = thinned(way, COARSE)
     away = clearance(pourer, receiver, poses[coarse])
@@ -99,7 +99,7 @@ def nearest_to_receiver(stretch: SampledPath, until: float, pourer: Vessel, rece
     least = np.minimum(away[:-1], away[1:]) - 0.5 * np.diff(way[coarse])
     # beyond the range of a vessel's grid only a lower bound of the distance is known
     known = least - np.maximum(np.minimum(away[:-1], away[1:]) - MARGIN, 0.0)
-    doubtful = (known < stretch.spec.limits.clearance) | (least < float(away.min()))
+    doubtful = (known < sampled.spec.limits.clearance) | (least < float(away.min()))
     dense = thinned(way, FINE)
     gap = np.clip(np.searchsorted(coarse, dense, side="right") - 1, 0, len(doubtful) - 1)
     fine = dense[doubtful[gap]]
@@ -109,16 +109,16 @@ def nearest_to_receiver(stretch: SampledPath, until: float, pourer: Vessel, rece
     return Nearest(float(away[best]), int(indices[best]))
 
 
-def nearest_links(stretch: SampledPath, receiver: Vessel) -> tuple[Nearest, Nearest]:
+def nearest_links(sampled: SampledPath, receiver: Vessel) -> tuple[Nearest, Nearest]:
     """Smallest distances of the arm's links from the table, and from the receiver as a cylinder."""
-    points = stretch.links
-    world = cell_transforms(stretch.spec).world.inverse
+    points = sampled.links
+    world = cell_transforms(sampled.spec).world.inverse
     table, cup = [], []
     along = np.linspace(0.0, 1.0, 13)[:, None]
     for name, first, second, radius in LINKS:
         a, b = points[:, first, None], points[:, second, None]
         line = a + (b - a) * along
-        above = line[..., 2].min(axis=1) - radius - stretch.spec.cell.table
+        above = line[..., 2].min(axis=1) - radius - sampled.spec.cell.table
         table.append(Nearest(float(above.min()), int(np.argmin(above)), name))
         inside = world.apply(line.reshape(-1, 3)).reshape(line.shape)
         aside = np.hypot(inside[..., 0], inside[..., 1]) - receiver.outer_radius

@@ -87,7 +87,7 @@ def _wrists(rotation: FloatArray, position: FloatArray, m: RobotModel) -> Iterat
     w = position - m.d6 * r[:, :, 2]
     radius = np.hypot(w[:, 0], w[:, 1])
     with np.errstate(invalid="ignore", divide="ignore"):
-        # inside the cylinder about the base that the wrist can't enter there is no solution: asin gives NaN
+        # there is no solution inside the cylinder about the base that the wrist cannot enter: asin gives NaN
         offset = np.arcsin(np.where(radius < m.d4 - 1e-9, np.nan, np.minimum(1.0, m.d4 / radius)))
     bearing = np.arctan2(w[:, 1], w[:, 0])
     for q1 in (bearing + offset, bearing + np.pi - offset):

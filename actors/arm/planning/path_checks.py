@@ -152,25 +152,25 @@ LARGEST_STEP = math.radians(15.0)
 """The largest step of a joint between two waypoints [rad]; a larger one is a jump."""
 
 
-def check_stretch(stretch: SampledPath, pourer: Vessel, receiver: Vessel) -> list[str]:
+def check_stretch(sampled: SampledPath, pourer: Vessel, receiver: Vessel) -> list[str]:
     """Problems of a path, except the distance of the pourer from the receiver."""
     points = hull(pourer)
-    problems = [*_tilts(stretch), *_places(stretch, points)]
-    if stretch.unreached is not None:
-        return [*_speeds(stretch, points), *problems]
-    problems = [*_ranges(stretch), *_singular(stretch), *problems, *_links(stretch, receiver)]
-    if stretch.margins.min() < THROUGH:
+    problems = [*_tilts(sampled), *_places(sampled, points)]
+    if sampled.unreached is not None:
+        return [*_speeds(sampled, points), *problems]
+    problems = [*_ranges(sampled), *_singular(sampled), *problems, *_links(sampled, receiver)]
+    if sampled.margins.min() < THROUGH:
         return problems  # joints then move too fast, but that is not the cause
-    return [*_joint_speeds(stretch), *_speeds(stretch, points), *problems]
+    return [*_joint_speeds(sampled), *_speeds(sampled, points), *problems]
 
 
-def check_clearance(stretch: SampledPath, until: float, pourer: Vessel, receiver: Vessel) -> tuple[Nearest, list[str]]:
+def check_clearance(sampled: SampledPath, until: float, pourer: Vessel, receiver: Vessel) -> tuple[Nearest, list[str]]:
     """Smallest distance of the pourer from the receiver until a time [s], and the problems with it."""
-    nearest = nearest_to_receiver(stretch, until, pourer, receiver)
-    least = stretch.spec.limits.clearance
+    nearest = nearest_to_receiver(sampled, until, pourer, receiver)
+    least = sampled.spec.limits.clearance
     if nearest.distance >= least:
         return nearest, []
-    tilt = math.degrees(float(stretch.tilts[nearest.index]))
+    tilt = math.degrees(float(sampled.tilts[nearest.index]))
     apart = 1e3 * nearest.distance
     how = "would touch the receiver"
     if apart >= 0.05:
@@ -178,7 +178,7 @@ def check_clearance(stretch: SampledPath, until: float, pourer: Vessel, receiver
     elif apart <= -0.05:
         how = f"would run {-apart:.1f} mm into the receiver"
     return nearest, [
-        f"the pourer {how} at a tilt of {tilt:.0f} deg, {stretch.when(nearest.index)}; "
+        f"the pourer {how} at a tilt of {tilt:.0f} deg, {sampled.when(nearest.index)}; "
         f"{1e3 * least:.0f} mm have to stay free: a larger x_offset or height clears it"
     ]
 
@@ -220,33 +220,33 @@ def check_way(racing: RacingJointError, spec: UrArmSpec) -> str:
     )
 
 
-def report(stretches: list[SampledPath], clearance: float, pourer: Vessel, deviation: float) -> PathReport:
+def report(parts: list[SampledPath], clearance: float, pourer: Vessel, deviation: float) -> PathReport:
     """Results of the checks of a whole path.
 
     Args:
-        stretches: approach, pour, retreat.
+        parts: approach, pour, retreat.
         clearance: smallest distance of pourer and receiver [m].
         pourer: geometry.
         deviation: of the tilt from the requested one [rad].
     """
-    joint_speeds = np.array([s.joint_speeds.max(axis=0) for s in stretches]).max(axis=0)
+    joint_speeds = np.array([s.joint_speeds.max(axis=0) for s in parts]).max(axis=0)
     points = hull(pourer)
     lows, highs = [], []
-    for s in stretches:
+    for s in parts:
         lows += [s.tool.min(axis=0), [_support(s, axis, points)[0].min() for axis in np.eye(3)]]
         highs += [s.tool.max(axis=0), [-_support(s, -axis, points)[0].min() for axis in np.eye(3)]]
     low, high = np.min(lows, axis=0), np.max(highs, axis=0)
     return PathReport(
         joint_speed=float(joint_speeds.max()),
         fastest_joint=int(np.argmax(joint_speeds)),
-        tool_speed=max(float(s.point_speeds(points).max()) for s in stretches),
-        tilt=max(float(s.tilts.max()) for s in stretches),
-        tilt_speed=max(float(s.turning.max()) for s in stretches),
-        singularity=min(float(s.margins.min()) for s in stretches),
+        tool_speed=max(float(s.point_speeds(points).max()) for s in parts),
+        tilt=max(float(s.tilts.max()) for s in parts),
+        tilt_speed=max(float(s.turning.max()) for s in parts),
+        singularity=min(float(s.margins.min()) for s in parts),
         clearance=clearance,
         low=(float(low[0]), float(low[1]), float(low[2])),
         high=(float(high[0]), float(high[1]), float(high[2])),
-        duration=sum(float(s.times[-1]) for s in stretches),
+        duration=sum(float(s.times[-1]) for s in parts),
         deviation=deviation,
     )
 
@@ -270,8 +270,8 @@ def recheck(path: JointPath, spec: UrArmSpec) -> None:
         row, joint = divmod(int(np.argmax(jumps)), 6)
         degrees = math.degrees(jumps.max())
         problems.append(f"{JOINT_NAMES[joint]} would jump by {degrees:.0f} deg, {times[row]:.2f} s into the path")
-    stretch = SampledPath.of("path", path, spec)
-    problems += [*_ranges(stretch), *_joint_speeds(stretch), *_places(stretch, np.zeros((1, 3)))]
+    sampled = SampledPath.of("path", path, spec)
+    problems += [*_ranges(sampled), *_joint_speeds(sampled), *_places(sampled, np.zeros((1, 3)))]
     if problems:
         raise InvalidActionError(refusal(problems))
 

@@ -146,17 +146,17 @@ def _approach(
         path: JointPath | None = None
         try:
             path = travel(knots, np.array(spec.home), spec)
-            stretch = SampledPath.of("approach", path, spec)
+            sampled = SampledPath.of("approach", path, spec)
         except OutOfReachError as error:
-            stretch = SampledPath.beyond(
+            sampled = SampledPath.beyond(
                 "approach", np.linspace(0.0, STEP * len(error.poses), len(error.poses)), error.poses, spec
             )
-            found, distance = [check_reach(stretch)], np.inf
+            found, distance = [check_reach(sampled)], np.inf
         except RacingJointError as error:
             found, distance = [check_way(error, spec)], np.inf
         else:
-            nearest, found = check_clearance(stretch, path.duration, pourer, receiver)
-            found += check_stretch(stretch, pourer, receiver)
+            nearest, found = check_clearance(sampled, path.duration, pourer, receiver)
+            found += check_stretch(sampled, pourer, receiver)
             distance = nearest.distance
         if best is None or len(found) < len(best[2]):
             best = (path, distance, found)

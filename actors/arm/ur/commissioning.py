@@ -288,18 +288,18 @@ def _software(found: Findings) -> DeviceCheck:
     )
 
 
-def _dashboard(spec: UrArmSpec, found: Findings, said: dict[str, str]) -> list[DeviceCheck]:
+def _dashboard(spec: UrArmSpec, found: Findings, responses: dict[str, str]) -> list[DeviceCheck]:
     checks = [
         DeviceCheck("model", "ok", f"{found.model.upper()}, serial number {found.serial}")
         if found.model == spec.model
         else DeviceCheck(
             "model",
             "fail",
-            f"the controller says {found.model or said.get('get robot model', 'nothing')}, the file {spec.model}",
+            f"the controller says {found.model or responses.get('get robot model', 'nothing')}, the file {spec.model}",
             "is this the right controller? Lengths and limits differ between models: correct 'model' or 'address'",
         )
     ]
-    remote = said.get("is in remote control", "").lower()
+    remote = responses.get("is in remote control", "").lower()
     if found.software and found.software[0] < 5:
         checks.append(DeviceCheck("remote control", "ok", "a CB3 controller always takes programs"))
     elif remote == "true":
@@ -314,16 +314,16 @@ def _dashboard(spec: UrArmSpec, found: Findings, said: dict[str, str]) -> list[D
                 "System, Remote Control)",
             )
         )
-    checks += [_robot_mode(_value(said, "robotmode")), _safety_mode(_value(said, "safetystatus"))]
-    program = said.get("programState", "").split(" ")[0]
+    checks += [_robot_mode(_value(responses, "robotmode")), _safety_mode(_value(responses, "safetystatus"))]
+    program = responses.get("programState", "").split(" ")[0]
     idle = program in ("STOPPED", "")
     advice = "" if idle else "stop it on the teach pendant, unless Decant runs there now"
     checks.append(DeviceCheck("program", "ok" if idle else "fail", f"{program.lower() or 'not told'}", advice))
     return checks
 
 
-def _value(said: dict[str, str], question: str) -> str:
-    return said.get(question, "").partition(":")[2].strip()
+def _value(responses: dict[str, str], question: str) -> str:
+    return responses.get(question, "").partition(":")[2].strip()
 
 
 def _robot_mode(mode: str) -> DeviceCheck:

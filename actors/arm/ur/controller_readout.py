@@ -188,23 +188,23 @@ class _Rtde:
         return self._waiting.pop(0)
 
 
-def _exchange(talk: _Rtde, rate: float, seconds: float) -> Exchange:
-    if talk.ask(rtde.REQUEST_PROTOCOL_VERSION, struct.pack(">H", 2)) != b"\x01":
+def _exchange(connection: _Rtde, rate: float, seconds: float) -> Exchange:
+    if connection.ask(rtde.REQUEST_PROTOCOL_VERSION, struct.pack(">H", 2)) != b"\x01":
         raise OSError("it doesn't know protocol 2")
     trips = []
     version: tuple[int, ...] = ()
     for _ in range(ROUND_TRIPS):
         asked = time.monotonic()
-        version = struct.unpack(">4I", talk.ask(rtde.GET_URCONTROL_VERSION)[:16])
+        version = struct.unpack(">4I", connection.ask(rtde.GET_URCONTROL_VERSION)[:16])
         trips.append(time.monotonic() - asked)
     names = ("timestamp", "payload", "payload_cog", "actual_tool_accelerometer", *STATUS)
-    known = _known(talk, names, rate)
-    if talk.ask(rtde.START) != b"\x01":
+    known = _known(connection, names, rate)
+    if connection.ask(rtde.START) != b"\x01":
         raise OSError("it doesn't begin to send")
     layout = struct.Struct(">B" + "".join(rtde.FORMATS[kind][0] for kind in known.values()))
     arrivals, package, begin = [], b"", time.monotonic()
     while time.monotonic() - begin < seconds:
-        kind, payload = talk.next()
+        kind, payload = connection.next()
         if kind == rtde.DATA_PACKAGE:
             arrivals.append(time.monotonic())
             package = payload
@@ -230,10 +230,10 @@ def _exchange(talk: _Rtde, rate: float, seconds: float) -> Exchange:
     )
 
 
-def _known(talk: _Rtde, names: Sequence[str], rate: float) -> dict[str, str]:
+def _known(connection: _Rtde, names: Sequence[str], rate: float) -> dict[str, str]:
     """The requested values that this controller has, with their types; it sends them from now on."""
     while True:
-        answer = talk.ask(rtde.SETUP_OUTPUTS, struct.pack(">d", rate) + ",".join(names).encode("ascii"))
+        answer = connection.ask(rtde.SETUP_OUTPUTS, struct.pack(">d", rate) + ",".join(names).encode("ascii"))
         kinds = rtde.names(answer[1:])
         found = {name: kind for name, kind in zip(names, kinds, strict=False) if kind in rtde.FORMATS}
         if len(found) == len(names):
@@ -269,8 +269,8 @@ class Findings:
         """Version of the controller's software; empty if unknown."""
         if self.exchange is not None:
             return self.exchange.version
-        told = re.search(r"(\d+)\.(\d+)\.(\d+)", (self.dashboard or {}).get("PolyscopeVersion", ""))
-        return tuple(int(part) for part in told.groups()) if told else ()
+        match = re.search(r"(\d+)\.(\d+)\.(\d+)", (self.dashboard or {}).get("PolyscopeVersion", ""))
+        return tuple(int(part) for part in match.groups()) if match else ()
 
     @property
     def serial(self) -> str:

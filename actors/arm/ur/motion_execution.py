@@ -78,15 +78,15 @@ class MotionMonitor:
         owner_seen: Callable[[], float],
     ) -> None:
         self._client, self._address, self._motion = client, address, motion
-        self._tell, self._owner_seen = tell, owner_seen
+        self._report, self._owner_seen = tell, owner_seen
         self._ordered = threading.Event()
         self._samples: list[Sample] = []
         self._clock, self._slider = 0.0, 1.0
         self._joints: tuple[float, ...] = motion.start
         self._began = 0.0
         self._went = False
-        self._beats, self._next_beat, self._last_beat, self._longest_pause = 0, 0.0, 0.0, 0.0
-        self._next_tell = 0.0
+        self._heartbeats, self._next_heartbeat, self._last_heartbeat, self._longest_pause = 0, 0.0, 0.0, 0.0
+        self._next_report = 0.0
         self._standing: float | None = None
         self._answered: float | None = None
 
@@ -121,14 +121,14 @@ class MotionMonitor:
             raise TroubleError("refused", why)
 
     def _through(self, primary: Primary) -> MotionOutcome:
-        self._beat()
+        self._write_heartbeat()
         try:
             primary.upload(self._motion.program)
             refusal = self._until_ready(primary)
             if refusal:
                 self._end_program()
-                said = "; ".join(primary.complaints)
-                raise TroubleError("refused", refusal + (f" (the controller says: {said})" if said else ""))
+                messages = "; ".join(primary.complaints)
+                raise TroubleError("refused", refusal + (f" (the controller says: {messages})" if messages else ""))
             if self._ordered.is_set():
                 return self._broken_off("operator", "stopped by the operator")
             self._began = self._client.fresh().time
@@ -221,9 +221,9 @@ class MotionMonitor:
             return self._broken_off(
                 "watchdog", f"the heartbeat paused for {self._longest_pause:.2f} s: this computer is too busy"
             )
-        said = "; ".join(primary.complaints)
+        messages = "; ".join(primary.complaints)
         return self._broken_off(
-            "program ended", "the program was ended on the controller" + (f": {said}" if said else "")
+            "program ended", "the program was ended on the controller" + (f": {messages}" if messages else "")
         )
 
     def _broken_off(self, kind: str, text: str) -> MotionOutcome:
@@ -265,7 +265,7 @@ class MotionMonitor:
     # ---- each iteration
 
     def _look(self) -> DataPackage:
-        self._beat()
+        self._write_heartbeat()
         reading = self._client.look(1.0 if self._went else AT_REST)
         self._joints = reading.joints
         if self._went:
@@ -275,20 +275,20 @@ class MotionMonitor:
             if not self._samples or reading.time > self._samples[-1][0]:
                 self._samples.append((reading.time, reading.joints, reading.clock))
         now = time.monotonic()
-        if now > self._next_tell:
-            self._next_tell = now + TELL_INTERVAL
-            self._tell(MotionProgress(self._clock, reading.joints, not reading.stands))
+        if now > self._next_report:
+            self._next_report = now + TELL_INTERVAL
+            self._report(MotionProgress(self._clock, reading.joints, not reading.stands))
         return reading
 
-    def _beat(self) -> None:
+    def _write_heartbeat(self) -> None:
         now = time.monotonic()
-        if now < self._next_beat:
+        if now < self._next_heartbeat:
             return
-        if self._last_beat:
-            self._longest_pause = max(self._longest_pause, now - self._last_beat)
-        self._last_beat, self._next_beat = now, now + BEAT_INTERVAL
-        self._beats += 1
-        self._client.beat(self._beats)
+        if self._last_heartbeat:
+            self._longest_pause = max(self._longest_pause, now - self._last_heartbeat)
+        self._last_heartbeat, self._next_heartbeat = now, now + BEAT_INTERVAL
+        self._heartbeats += 1
+        self._client.beat(self._heartbeats)
 
 
 def _near(a: tuple[float, ...], b: tuple[float, ...], tolerance: float) -> bool:
@@ -314,12 +314,12 @@ def _not_remote(address: str) -> str:
             answer = dashboard.ask("is in remote control")
     except DashboardError as error:
         raise TroubleError("lost", str(error)) from None
-    # The older generation does not know this command, and its response says so.
+    # The older generation does not have this command, and reports that.
     return "the robot is in local control; switch it to remote control" if answer.lower() == "false" else ""
 
 
 UNLOCK_DELAY = 5.5
-"""A protective stop can't be unlocked earlier [s of controller time]."""
+"""A protective stop cannot be unlocked earlier [s of controller time]."""
 
 POWER_TIME = 60.0
 """Longest wait for power and brakes [s of controller time]."""

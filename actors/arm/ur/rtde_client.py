@@ -54,7 +54,7 @@ previous connection was cut.
 AT_REST = 8.0
 """Factor of the longest silence while nothing moves, because a controller may be loading a program."""
 
-_LOOKS = 10
+_SAME_READINGS = 10
 """Number of readings with the same time before data count as stale: a single late reading proves nothing."""
 
 _VARIABLES = [
@@ -98,7 +98,7 @@ class RtdeClient:
         self._silence = silence
         self._writing = threading.Lock()
         self._last: DataPackage | None = None
-        self._looks = 0
+        self._same_readings = 0
 
     # ---- reading
 
@@ -118,8 +118,8 @@ class RtdeClient:
             time_before = r.getTimestamp()
             last = self._last
             if last is not None and time_before == last.time:
-                self._looks += 1
-                if self._looks >= _LOOKS and time.monotonic() - last.seen > patience * self._silence:
+                self._same_readings += 1
+                if self._same_readings >= _SAME_READINGS and time.monotonic() - last.seen > patience * self._silence:
                     raise TroubleError(
                         "lost", f"the controller has said nothing new for {patience * self._silence:g} s"
                     )
@@ -141,7 +141,7 @@ class RtdeClient:
                 tool=tuple(r.getOutputDoubleRegister(TOOL + k) for k in range(6)),
             )
             if r.getTimestamp() == time_before:
-                self._last, self._looks = reading, 0
+                self._last, self._same_readings = reading, 0
                 return reading
         raise TroubleError("lost", "packages come faster than they can be read")
 
@@ -152,7 +152,7 @@ class RtdeClient:
             TroubleError: none arrives.
         """
         before = self._receive.getTimestamp()
-        self._last, self._looks = None, 0
+        self._last, self._same_readings = None, 0
         while True:
             time.sleep(0.004)
             reading = self.look(AT_REST)

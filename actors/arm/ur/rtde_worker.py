@@ -46,7 +46,7 @@ class Worker:
         self._requests: queue.SimpleQueue[tuple[int, str, tuple[Any, ...]]] = queue.SimpleQueue()
         self._client: RtdeClient | None = None
         self._address = ""
-        self._watch: MotionMonitor | None = None
+        self._monitor: MotionMonitor | None = None
         self._stops = 0
         self._owner_seen = time.monotonic()
 
@@ -54,7 +54,7 @@ class Worker:
 
     def serve(self) -> None:
         """Serve requests until the driver closes the connection."""
-        threading.Thread(target=self._hear, name="hear", daemon=True).start()
+        threading.Thread(target=self._receive, name="hear", daemon=True).start()
         parent = os.getppid()
         while True:
             try:
@@ -72,15 +72,15 @@ class Worker:
                 answer = (number, False, TroubleError("lost", f"{method}: {error!r}"))
             self._send(answer)
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         with contextlib.suppress(EOFError, OSError):
             while True:
                 request = self._connection.recv()
                 self._owner_seen = time.monotonic()
                 if request[0] == "stop":
                     self._stops = max(self._stops, request[1])
-                    if (watch := self._watch) is not None:
-                        watch.order_stop()
+                    if (monitor := self._monitor) is not None:
+                        monitor.order_stop()
                 elif request[0] == "call":
                     self._requests.put(request[1:])
         os._exit(0)  # the heartbeat ends with the process, and any motion with the heartbeat
@@ -92,7 +92,7 @@ class Worker:
             except OSError:
                 os._exit(0)
 
-    def _tell(self, progress: MotionProgress) -> None:
+    def _report(self, progress: MotionProgress) -> None:
         self._send(progress)
 
     # ---- requests
@@ -135,14 +135,14 @@ class Worker:
 
     def run(self, motion: MotionOrder) -> MotionOutcome:
         """Execute a motion."""
-        watch = MotionMonitor(self.client, self._address, motion, self._tell, lambda: self._owner_seen)
-        self._watch = watch
+        monitor = MotionMonitor(self.client, self._address, motion, self._report, lambda: self._owner_seen)
+        self._monitor = monitor
         try:
             if self._stops > motion.stops:
-                watch.order_stop()
-            return watch.run()
+                monitor.order_stop()
+            return monitor.run()
         finally:
-            self._watch = None
+            self._monitor = None
 
     def hands_in(self) -> None:
         """End any program, and check that none runs."""

@@ -71,7 +71,7 @@ class UrArm:
         self._stops = Stops()
         self._stopped = False
         self.last_stop: StopTimes | None = None
-        self._leg: MotionSegment | None = None
+        self._segment: MotionSegment | None = None
         self._announced = False
         self._last_pour: PourPath | None = None
         self._tilt = 0.0
@@ -94,7 +94,7 @@ class UrArm:
     def joints(self) -> Joints:
         """Measured joints [rad]; during a motion as last reported, about twenty times a second."""
         progress = self._session.progress
-        if self._leg is not None and progress is not None:
+        if self._segment is not None and progress is not None:
             a, b, c, d, e, f = progress.joints
             return a, b, c, d, e, f
         with self._at_work("asking for joints"):
@@ -133,18 +133,18 @@ class UrArm:
 
     def state(self) -> ArmState:
         """See `Arm.state`."""
-        leg, progress = self._leg, self._session.progress
-        if leg is None:
+        segment, progress = self._segment, self._session.progress
+        if segment is None:
             joints = () if progress is None else progress.joints
             return ArmState(stopped=self._stopped, tilt=self._tilt, joints=joints)
-        clock = 0.0 if progress is None or self._announced else min(progress.clock, leg.path.duration)
+        clock = 0.0 if progress is None or self._announced else min(progress.clock, segment.path.duration)
         return ArmState(
             moving=not self._announced,
             stopped=self._stopped,
             time=clock,
-            fraction=clock / leg.path.duration,
-            phase="announced" if self._announced else leg.phase(clock),
-            tilt=leg.tilt(clock),
+            fraction=clock / segment.path.duration,
+            phase="announced" if self._announced else segment.phase(clock),
+            tilt=segment.tilt(clock),
             joints=() if progress is None else progress.joints,
         )
 
@@ -267,12 +267,12 @@ class UrArm:
             raise ArmNotReleasedError("the arm is locked: an operator has to release it before it moves")
         return released
 
-    def _go(self, leg: MotionSegment) -> ExecutedPath:
+    def _go(self, segment: MotionSegment) -> ExecutedPath:
         """Execute one motion to its end."""
         stops = self._stops.count  # before consent is checked, so that a stop in between counts
         released, spec = self._consent(), self._spec
-        path = leg.path
-        if leg.name != "jog":  # a jog has its own checks, since it may be the way back inside the limits
+        path = segment.path
+        if segment.name != "jog":  # a jog has its own checks, since it may be the way back inside the limits
             recheck(path, spec)
         facts = self._session.facts
         if facts is None:
@@ -282,14 +282,14 @@ class UrArm:
         program = path_program(path, settings, number, cb3=not facts.e_series)
         start, end = (tuple(map(float, path.joints[k])) for k in (0, -1))
         motion = MotionOrder(program, number, start, end, path.duration, settings, stops)
-        self._announced, self._leg = True, leg
+        self._announced, self._segment = True, segment
         self._session.forget_progress()
         self._stops.begin()
         try:
-            self._announce(released, leg, stops)
+            self._announce(released, segment, stops)
             self._announced = False
-            outcome = self._run(motion, leg)
-            return self._judge(outcome, leg)
+            outcome = self._run(motion, segment)
+            return self._evaluate(outcome, segment)
         except LaboratoryError:
             raise
         except BaseException:  # e.g. a keyboard interrupt: the caller does not wait for the motion any more
@@ -298,41 +298,41 @@ class UrArm:
             self._stopped = True
             raise
         finally:
-            self._announced, self._leg = False, None
+            self._announced, self._segment = False, None
             self._stops.end()
 
-    def _announce(self, released: float, leg: MotionSegment, stops: int) -> None:
+    def _announce(self, released: float, segment: MotionSegment, stops: int) -> None:
         until = released + self._spec.announcement / self._spec.time_scale
         if self._stops.wait_for_one(stops, until - time.monotonic()):
-            raise ArmStoppedError("stopped before it moved", "operator", "announced", 0.0, leg.tilt(0.0))
+            raise ArmStoppedError("stopped before it moved", "operator", "announced", 0.0, segment.tilt(0.0))
 
-    def _run(self, motion: MotionOrder, leg: MotionSegment) -> MotionOutcome:
+    def _run(self, motion: MotionOrder, segment: MotionSegment) -> MotionOutcome:
         deadline = MOTION_MARGIN + 2.0 * motion.duration / self._spec.time_scale
         try:
             outcome = self._session.ask("run", motion, deadline=deadline)
         except ArmRefusedError as error:
-            raise ArmRefusedError(f"{leg.name} refused: {error}") from None
+            raise ArmRefusedError(f"{segment.name} refused: {error}") from None
         except ArmLostError as error:
             progress = self._session.progress
             clock = 0.0 if progress is None else progress.clock
             self._stops.lost()
-            self._tilt, self._stopped = leg.tilt(clock), True
-            raise ArmLostError(f"{error}. {leg.last_seen(clock)}") from None
+            self._tilt, self._stopped = segment.tilt(clock), True
+            raise ArmLostError(f"{error}. {segment.last_seen(clock)}") from None
         assert isinstance(outcome, MotionOutcome)
         return outcome
 
-    def _judge(self, outcome: MotionOutcome, leg: MotionSegment) -> ExecutedPath:
+    def _evaluate(self, outcome: MotionOutcome, segment: MotionSegment) -> ExecutedPath:
         self._stops.came_to(outcome)
         executed = executed_path(
-            outcome.samples, leg.path, self._spec, completed=outcome.kind == "completed", slider=outcome.slider
+            outcome.samples, segment.path, self._spec, completed=outcome.kind == "completed", slider=outcome.slider
         )
         if outcome.kind == "completed":
             return executed
-        self._tilt, self._stopped = leg.tilt_left(outcome), True
+        self._tilt, self._stopped = segment.tilt_left(outcome), True
         if outcome.kind == "lost":
             self._session.kill()
-            raise ArmLostError(f"{outcome.text}. {leg.last_seen(outcome.clock)}", executed)
-        raise leg.stopped(outcome, executed)
+            raise ArmLostError(f"{outcome.text}. {segment.last_seen(outcome.clock)}", executed)
+        raise segment.stopped(outcome, executed)
 
 
 class AcceptedArm(UrArm):

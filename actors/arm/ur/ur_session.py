@@ -69,28 +69,28 @@ class UrFacts(ArmFacts):
         return int(self.version.split(".")[0]) >= 5
 
 
-def facts_of(told: Facts) -> UrFacts:
+def facts_of(worker_facts: Facts) -> UrFacts:
     """Convert the worker's facts."""
-    r = told.reading
+    r = worker_facts.reading
     a, b, c, d, e, f = r.joints
     x, y, z = r.centre
     return UrFacts(
-        model=told.model,
-        serial=told.serial,
-        version=".".join(map(str, told.version)),
+        model=worker_facts.model,
+        serial=worker_facts.serial,
+        version=".".join(map(str, worker_facts.version)),
         problem=why_not_ready(r.robot_mode, r.safety_mode, r.runtime, r.slider),
         robot_mode=ROBOT_MODES.get(r.robot_mode, str(r.robot_mode)),
         safety_mode=SAFETY_MODES.get(r.safety_mode, str(r.safety_mode)),
-        remote=told.remote,
-        checksum=told.checksum,
-        tool=Pose(*told.tool),
+        remote=worker_facts.remote,
+        checksum=worker_facts.checksum,
+        tool=Pose(*worker_facts.tool),
         payload=r.payload,
         payload_centre=(x, y, z),
         joints=(a, b, c, d, e, f),
         slider=r.slider,
-        program=told.program,
-        joint_ranges=told.ranges,
-        joint_speeds=told.speeds,
+        program=worker_facts.program,
+        joint_ranges=worker_facts.ranges,
+        joint_speeds=worker_facts.speeds,
     )
 
 
@@ -115,7 +115,7 @@ class WorkerProcess:
         self._number = 0
         self._gone = threading.Event()
         self.progress: MotionProgress | None = None
-        threading.Thread(target=self._hear, name="arm-worker", daemon=True).start()
+        threading.Thread(target=self._receive, name="arm-worker", daemon=True).start()
 
     @property
     def alive(self) -> bool:
@@ -169,7 +169,7 @@ class WorkerProcess:
         with self._sending, contextlib.suppress(OSError):
             self._connection.send(message)
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         with contextlib.suppress(EOFError, OSError):
             while True:
                 message = self._connection.recv()
@@ -228,7 +228,8 @@ class Session:
         self.discard()
         spec = self._spec
         self._worker = WorkerProcess()
-        # Only a virtual controller has scaled time; the machine may suspend its process, unlike a real controller.
+        # Only a virtual controller has scaled time; the operating system may delay its process, unlike a real
+        # controller.
         silence = SILENCE if spec.time_scale == 1.0 else 8.0 * SILENCE
         try:
             self.ask("open", spec.address, spec.rate, silence, deadline=OPEN_TIME)
