@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import sys
 import termios
 import threading
@@ -20,34 +19,6 @@ if TYPE_CHECKING:
     from actors.laboratory_settings import LaboratorySpec
 
 T = TypeVar("T")
-
-
-@contextlib.contextmanager
-def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
-    """A laboratory with its addresses: on hardware its own, else those of what is started for as long as this.
-
-    Raises:
-        LaboratoryError: a package that it needs is not installed, or what is started does not start.
-    """
-    from actors.laboratory import check_bench_packages
-
-    check_bench_packages(spec)
-    if spec.mode == "hardware":
-        yield spec
-        return
-    from actors.bench.device_emulators import BenchEmulators
-
-    assert spec.arm is not None
-    stand_ins = BenchEmulators(spec.arm, None if spec.balance is None else spec.balance.device)
-    try:
-        where = stand_ins.found()
-        stand_ins.install()
-        balance = spec.balance
-        if balance is not None:
-            balance = dataclasses.replace(balance, device=where.balance)
-        yield dataclasses.replace(spec, arm=where.arm, balance=balance)
-    finally:
-        stand_ins.close()
 
 
 @contextlib.contextmanager

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from actors.interfaces import LaboratoryError
+from actors.laboratory import reached
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, say
 from orchestrator.cli.doctor import read_laboratory, without_arm
-from orchestrator.cli.hands_on import accepted_for, connected, reached, stoppable, typed_line
+from orchestrator.cli.hands_on import accepted_for, connected, stoppable, typed_line
 from orchestrator.cli.motion_approval import confirm, require_flag
 
 if TYPE_CHECKING:

@@ -2,47 +2,33 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from typing import Any
 
 from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState
-from orchestrator.requests import Pour
-from orchestrator.runs.events import CampaignStateChanged, Event, PourProgressed, RequestFinished, StageOpened
-from orchestrator.states import State
+from orchestrator.runs.events import Event, StageOpened
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
 
 class CampaignProgress:
-    """A watcher.
-
-    Attributes:
-        checkpoint: of the pour that is under way; '' between pours.
-        winding_down: set once the run has taken note that it is to end.
-    """
+    """A subscriber."""
 
     def __init__(self, plan: CampaignPlan) -> None:
         self._tally = ProgressState(plan)
-        self.checkpoint = ""
-        self.winding_down = asyncio.Event()
         self._stage, self._index, self._count = "", 0, 0
 
     def __call__(self, event: Event) -> None:
         """Take note of an event."""
         self._tally(event)
-        match event:
-            case PourProgressed():
-                self.checkpoint = event.progress.checkpoint
-            case RequestFinished(request=Pour()):
-                self.checkpoint = ""
-            case StageOpened():
-                self._stage, self._index, self._count = event.stage, event.index, event.count
-            case CampaignStateChanged():
-                if event.after in (State.PAUSING, State.PAUSED, State.UNKNOWN, State.FAILED, State.STOPPING):
-                    self.winding_down.set()
+        if isinstance(event, StageOpened):
+            self._stage, self._index, self._count = event.stage, event.index, event.count
 
-    def progress(self) -> dict[str, Any]:
-        """JSON-ready: stage, counts, the pour in words, and how long it still takes [s] where that is known."""
+    def progress(self, checkpoint: str) -> dict[str, Any]:
+        """JSON-ready: stage, counts, the pour in words, and how long it still takes [s] where that is known.
+
+        Args:
+            checkpoint: of the pour that is under way; '' between pours.
+        """
         tally = self._tally
         stage = tally.stages.get(self._stage)
         done = stage.progress if stage is not None else None
@@ -59,8 +45,8 @@ class CampaignProgress:
             "simulators_busy": tally.busy,
             "line": tally.counts_line(),
             "pour": tally.pour_line(),
-            "checkpoint": self.checkpoint,
-            "checkpoint_words": CHECKPOINT_WORDS.get(self.checkpoint, ""),
+            "checkpoint": checkpoint,
+            "checkpoint_words": CHECKPOINT_WORDS.get(checkpoint, ""),
             "fraction": pour.progress.fraction if pour is not None and pour.progress is not None else None,
             "seconds_left": left,
         }

@@ -21,7 +21,7 @@ from orchestrator.journal.journal_file import whole_copy
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
 CAMPAIGN, THETA = "campaign.yaml", "theta.yaml"
-"""The campaign's file, and the file of the θ that it is planned with (`orchestrator.runs.run_tasks.read_theta`)."""
+"""The campaign's file, and the file of the θ that it is planned with (`orchestrator.run_service.read_theta`)."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}(/[A-Za-z0-9][A-Za-z0-9._-]{0,79}){0,3}")
 _FILES = 100

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from orchestrator.catalogue.run_reading import read_run
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
@@ -20,6 +20,7 @@ from orchestrator.results.pool_occupancy import occupancies
 from orchestrator.results.run_summary import SUMMARY_NAME, PoolUse, RunSummary, Totals, write_summary
 from orchestrator.results.stage_views import evaluation_of, receiver_names, theta_of
 from orchestrator.results.summarise import summarise
+from orchestrator.runs.events import Recorder
 from orchestrator.runs.run_folder import read_versions
 from orchestrator.states import State
 from orchestrator.strategies.calibration.calibration_base import CalibratedTheta
@@ -41,24 +42,6 @@ KEPT_THETAS = 50
 _log = logging.getLogger(__name__)
 
 
-class Recording(Protocol):
-    """The recording of a run, as far as publishing goes."""
-
-    @property
-    def path(self) -> Path:
-        """Its file."""
-        ...
-
-    @property
-    def dropped(self) -> int:
-        """Events that are missing in it."""
-        ...
-
-    def close(self) -> object:
-        """Write what is left, and end it; may be called twice."""
-        ...
-
-
 @dataclass(frozen=True)
 class Published:
     """What was written about a run.
@@ -76,7 +59,9 @@ class Published:
     report: Path | None = None
 
 
-def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | None = None) -> Published:
+def publish(
+    plan: CampaignPlan, result: CampaignResult, recording: Recorder | None = None, *, report_only: bool = False
+) -> Published:
     """Close a run's recording, and write its figures (if the plan wants any), `theta.json`, `summary.json` and the
     report. A run that stands still may be published, too: its report says where it stands.
 
@@ -86,6 +71,7 @@ def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | N
         plan: of the campaign.
         result: what it came to, as `run_campaign` or `read_result` has it.
         recording: that watched it.
+        report_only: write neither `theta.json` nor `summary.json`.
 
     Raises:
         OSError: a file can't be written.
@@ -93,7 +79,7 @@ def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | N
     if recording is not None:
         recording.close()
         return _write(plan, result, recording.path, recording.dropped)
-    return _write(plan, result, None, 0)
+    return _write(plan, result, None, 0, report_only=report_only)
 
 
 def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
@@ -113,7 +99,9 @@ def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
     return True
 
 
-def _write(plan: CampaignPlan, result: CampaignResult, recording: Path | None, dropped: int) -> Published:
+def _write(
+    plan: CampaignPlan, result: CampaignResult, recording: Path | None, dropped: int, *, report_only: bool = False
+) -> Published:
     directory = result.directory
     figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
     summary = summary_of(
@@ -123,8 +111,9 @@ def _write(plan: CampaignPlan, result: CampaignResult, recording: Path | None, d
         recording=recording,
         dropped_events=dropped,
     )
-    write_summary(directory, summary)
-    found = theta_of(result.results)
+    found = None if report_only else theta_of(result.results)
+    if not report_only:
+        write_summary(directory, summary)
     theta = None if found is None else directory / THETA_FILE
     if theta is not None and found is not None:
         written = theta_file(found, evaluation_of(result.results))
@@ -133,6 +122,8 @@ def _write(plan: CampaignPlan, result: CampaignResult, recording: Path | None, d
     try:
         write_report(directory / REPORT_NAME, plan, summary, directory)
     except Exception as error:  # days of pouring don't end in a traceback about a page
+        if report_only:
+            raise
         _log.warning("the report was not written: %s: %s", type(error).__name__, error)
         report = None
     return Published(summary, figures, recording, theta, report)

@@ -19,7 +19,7 @@ from orchestrator.daemon.rig_worker import job_of
 from orchestrator.daemon.run_readout import Pours
 from orchestrator.daemon.submission_bundle import pack
 from orchestrator.daemon.submissions import Submission, SubmissionError, prepare
-from orchestrator.runs.run_tasks import RunTask
+from orchestrator.run_service import RunRequest
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.end_to_end.small import NARROW, write_campaign
 from tests.orchestrator.daemon.served import CAMPAIGN, HeldLaboratory, campaign_in, held, run, serving
@@ -45,7 +45,7 @@ def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
 ) -> None:
     read: list[str] = []
 
-    def counted(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunTask:
+    def counted(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunRequest:
         read.append(item.id)
         return job_of(settings, item, rig)
 
