@@ -12,8 +12,9 @@ import csv
 import json
 import tempfile
 import warnings
-from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -34,7 +35,7 @@ from orchestrator.run_service import (
     read_theta,
     task_request,
 )
-from orchestrator.runs.events import Event, Watcher
+from orchestrator.runs.events import Watcher as Watch
 from orchestrator.runs.run_folder import create_run
 from orchestrator.runs.stages import POSTERIOR_DRAWS, posterior_draws
 from orchestrator.shipped import shipped, starting_set
@@ -75,9 +76,6 @@ def run_coroutine(work: Coroutine[Any, Any, T]) -> T:
         return asyncio.run(work)
     with ThreadPoolExecutor(1, thread_name_prefix="decant") as thread:
         return thread.submit(asyncio.run, work).result()
-
-
-Watch = Callable[[Event], object]
 
 
 def run(
@@ -234,7 +232,7 @@ def _checked(request: RunRequest, watch: Sequence[Watch], in_process: bool) -> R
         _warn(text)
     resources = RunResources(
         in_process=in_process,
-        subscribers=[_watcher(one) for one in watch],
+        subscribers=watch,
         recorder=lambda plan, run: recorder_of(plan, run, _warn),
     )
     service.check_laboratory(request, resources)
@@ -247,16 +245,9 @@ def _warn(text: str) -> None:
 
 def _run(request: RunRequest, resources: RunResources) -> Run:
     """Run what was checked, record it, and publish it."""
-    with RunService().start(request, resources) as handle:
+    with closing(RunService().start(request, resources)) as handle:
         result = run_coroutine(handle.wait())
     return Run(request.campaign, result, handle.publish())
-
-
-def _watcher(watch: Watch) -> Watcher:
-    def watcher(event: Event) -> None:
-        watch(event)
-
-    return watcher
 
 
 def _rows(table: Any) -> list[dict[str, Any]]:

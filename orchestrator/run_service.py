@@ -2,7 +2,7 @@
 
     request = task_request(plan, "run")
     report = RunService().check(request)          # problems and warnings; nothing is written or started
-    with RunService().start(request, RunResources(in_process=True)) as handle:
+    with closing(RunService().start(request, RunResources(in_process=True))) as handle:
         result = await handle.wait()
     published = handle.publish()
 
@@ -16,8 +16,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal
 
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
 from actors.laboratory_settings import LaboratorySpec
@@ -26,7 +25,7 @@ from orchestrator.journal.journal_check import check_journal, has_begun
 from orchestrator.journal.run_record import CampaignResult, read_result
 from orchestrator.requests import Pour
 from orchestrator.run_errors import RunError
-from orchestrator.runs.events import CampaignStateChanged, Event, PourProgressed, Recorder, RequestFinished, Watcher
+from orchestrator.runs.events import CampaignStateChanged, Event, PourProgressed, RequestFinished, Watcher
 from orchestrator.runs.run_folder import create_run
 from orchestrator.runs.stages import (
     POSTERIOR_DRAWS,
@@ -43,6 +42,7 @@ from orchestrator.strategies.campaign_plan import CampaignPlan
 if TYPE_CHECKING:
     from actors.laboratory import ClosablePool
     from orchestrator.config.yaml.yaml_errors import Problem
+    from orchestrator.live_view.rerun_subscriber import RerunMonitor
     from orchestrator.results.publishing import Published
     from sim_engine.liquids import SimulationParameters
     from sim_engine.vessel.shapes import VesselSpec
@@ -119,7 +119,7 @@ class RunResources:
     ask_operator: AskOperator | None = None
     approved_checksum: str = ""
     subscribers: Sequence[Watcher] = ()
-    recorder: Callable[[CampaignPlan, Path], Recorder | None] | None = None
+    recorder: Callable[[CampaignPlan, Path], RerunMonitor | None] | None = None
     laboratory: Callable[[LaboratorySpec, bool], Laboratory] | None = None
 
     def settings(self, campaign: CampaignPlan) -> LaboratorySpec:
@@ -155,14 +155,10 @@ class CheckReport:
             raise RunTaskError("\n".join(self.problems))
 
 
-def _ignore(text: object) -> None:
-    """Default of a callback."""
-
-
 class RunService:
     """Checks, starts and publishes runs. It has no state: every call stands alone."""
 
-    def check(self, request: RunRequest, *, doing: Callable[[str], None] = _ignore) -> CheckReport:
+    def check(self, request: RunRequest, *, doing: Callable[[str], None] = lambda text: None) -> CheckReport:
         """Check everything that needs no laboratory: draws of θ, vessels, loads, motions. Writes and starts nothing.
 
         Args:
@@ -237,12 +233,11 @@ class RunService:
         recorder = None if resources.recorder is None else resources.recorder(request.campaign, request.folder)
         return RunHandle(request, resources, laboratory, request.folder, recorder)
 
-    def publish_so_far(self, request: RunRequest, *, report_only: bool = False) -> Published | None:
+    def publish_so_far(self, request: RunRequest) -> Published | None:
         """Publish the results of a run that has stopped, from its journal.
 
         Args:
             request: with the folder of the run.
-            report_only: write the figures and the report, but neither `summary.json` nor `theta.json`.
 
         Returns:
             None if the run has no journal.
@@ -253,16 +248,15 @@ class RunService:
         """
         from orchestrator.results.publishing import publish
 
-        folder = request.folder
-        if folder is None or not (folder / JOURNAL_NAME).is_file():
+        if request.folder is None or not (request.folder / JOURNAL_NAME).is_file():
             return None
-        with JournalReader(folder / JOURNAL_NAME) as journal:
-            result = read_result(journal, folder)
-        return publish(request.campaign, result, report_only=report_only)
+        with JournalReader(request.folder / JOURNAL_NAME) as journal:
+            result = read_result(journal, request.folder)
+        return publish(request.campaign, result)
 
 
 class RunHandle:
-    """One run of this process, which `wait` runs once. Use it as a context manager, or call `close` after `wait`.
+    """One run of this process, which `wait` runs once. Call `close` afterwards, however it ends.
 
     The methods that end it sooner may be called before `wait`, too.
 
@@ -277,7 +271,7 @@ class RunHandle:
         resources: RunResources,
         laboratory: Laboratory,
         folder: Path,
-        recorder: Recorder | None,
+        recorder: RerunMonitor | None,
     ) -> None:
         self._request, self._laboratory, self._recorder = request, laboratory, recorder
         self.folder, self.checkpoint = folder, ""
@@ -289,12 +283,6 @@ class RunHandle:
         self._winding_down = asyncio.Event()
         self._result: CampaignResult | None = None
         self._task: asyncio.Task[CampaignResult] | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self.close()
 
     def _note(self, event: Event) -> None:
         match event:
@@ -336,7 +324,7 @@ class RunHandle:
             self._recorder.close()
 
     def publish(self) -> Published:
-        """Write figures, summary, θ* and report of the finished run. May take seconds; call it outside the event loop.
+        """Close the recording; write figures, summary, θ* and report of the finished run. Blocks for seconds.
 
         Raises:
             OSError: a file can't be written.
@@ -344,7 +332,9 @@ class RunHandle:
         from orchestrator.results.publishing import publish
 
         assert self._result is not None, "publish() follows wait()"
-        return publish(self._request.campaign, self._result, self._recorder)
+        self.close()
+        recorded = () if self._recorder is None else (self._recorder.path, self._recorder.dropped)
+        return publish(self._request.campaign, self._result, *recorded)
 
     # ---- ending it sooner
 

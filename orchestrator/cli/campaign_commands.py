@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, print_json
 from orchestrator.cli.foreground_run import (
-    Finished,
     check_campaign_can_run,
     check_laboratory_answers,
     read_campaign,
@@ -17,6 +16,8 @@ from orchestrator.cli.foreground_run import (
 )
 
 if TYPE_CHECKING:
+    from orchestrator.journal.run_record import CampaignResult
+    from orchestrator.results.publishing import Published
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
 
@@ -60,20 +61,20 @@ def run(path: Path, options: RunOptions) -> None:
     """The whole campaign."""
     from orchestrator.results.run_summary import summary_json
 
-    finished = _run("run", path, options)
+    result, published = _run("run", path, options)
     if options.as_json:
-        summary = summary_json(finished.published.summary)
-        print_json({"run": finished.result.directory.name, "report": finished.published.report, **summary})
+        summary = summary_json(published.summary)
+        print_json({"run": result.directory.name, "report": published.report, **summary})
 
 
 def calibrate(path: Path, options: RunOptions) -> None:
     """Only what finds θ*, and how good it is beside its rivals."""
-    finished = _run("calibrate", path, options)
+    result, published = _run("calibrate", path, options)
     if options.as_json:
-        print_json(calibration_json(finished))
+        print_json(calibration_json(result, published))
 
 
-def calibration_json(finished: Finished) -> dict[str, Any]:
+def calibration_json(result: CampaignResult, published: Published) -> dict[str, Any]:
     """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see
     `CalibrationEvaluation`."""
     from orchestrator.journal.stage_results import result_of
@@ -82,7 +83,7 @@ def calibration_json(finished: Finished) -> dict[str, Any]:
     from orchestrator.strategies.calibration.calibration_base import Calibrated
     from orchestrator.strategies.calibration.calibration_scores import CALIBRATED, Scores
 
-    results = finished.result.results
+    results = result.results
     theta, calibration = calibrated_theta(results).theta, result_of(results, CALIBRATION, Calibrated)
     evaluation = result_of(results, EVALUATION, Scores)
     ours = evaluation.discrepancy[CALIBRATED]
@@ -98,13 +99,13 @@ def calibration_json(finished: Finished) -> dict[str, Any]:
             data |= {f"{split}_discrepancy_{name}": values.get(split) for name, values in rivals.items()}
     return {
         **data,
-        "simulations": finished.result.simulations,
+        "simulations": result.simulations,
         "calibration_simulations": calibration.simulations,
-        "cpu_s": finished.result.cpu_s,
-        "run": str(finished.result.directory),
-        "figures": finished.published.figures,
-        "recording": finished.published.recording,
-        "report": finished.published.report,
+        "cpu_s": result.cpu_s,
+        "run": str(result.directory),
+        "figures": published.figures,
+        "recording": published.recording,
+        "report": published.report,
     }
 
 
@@ -144,7 +145,7 @@ def plan_pour(
         mention(
             f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})"
         )
-    finished = run_in_front_of_people(
+    run_result, published = run_in_front_of_people(
         dataclasses.replace(request, stages=stages, folder=directory),
         resources,
         again=f"Plan anew: decant plan {path}",
@@ -152,14 +153,14 @@ def plan_pour(
     )
     answers = []
     for stage in planning:
-        result = result_of(finished.result.results, stage.name, Deployed)
+        result = result_of(run_result.results, stage.name, Deployed)
         recommended = result.recommended
         if recommended is None:
             raise RefusalError(f"{stage.name}: no action could be planned; every simulation failed. See {directory}")
         receiver_name = stage.name.removeprefix(DEPLOYMENT)
-        repeated = result_of(finished.result.results, PREDICTION + receiver_name, Foreseen).over_seeds
+        repeated = result_of(run_result.results, PREDICTION + receiver_name, Foreseen).over_seeds
         spillage = repeated.get("spillage")
-        told = finished.published.summary.receivers[result.scene]
+        told = published.summary.receivers[result.scene]
         answers.append(
             {
                 "receiver": receiver_name,
@@ -175,7 +176,7 @@ def plan_pour(
         )
     theta = plan.parameters.model_dump()
     if as_json:
-        totals = {"simulations": finished.result.simulations, "cpu_s": finished.result.cpu_s, "run": str(directory)}
+        totals = {"simulations": run_result.simulations, "cpu_s": run_result.cpu_s, "run": str(directory)}
         first = answers[0]
         print_json({**first, "theta": theta, **totals, **({"plans": answers} if len(answers) > 1 else {})})
 
@@ -205,7 +206,7 @@ def planning_plan(
         return planned(plan, given, None if receiver is None else load_vessel(receiver), iterations)
 
 
-def _run(task: Literal["run", "calibrate"], path: Path, options: RunOptions) -> Finished:
+def _run(task: Literal["run", "calibrate"], path: Path, options: RunOptions) -> tuple[CampaignResult, Published]:
     from orchestrator.cli.foreground_run import check_somebody_is_there
     from orchestrator.cli.motion_approval import arm_campaign
     from orchestrator.cli.view_command import live_view
@@ -230,16 +231,16 @@ def _run(task: Literal["run", "calibrate"], path: Path, options: RunOptions) -> 
     flag += "" if options.seed is None else f" --seed {options.seed}"
     flag += " --arm" if plan.laboratory.mode == "hardware" else ""
     again = f"decant {task} {path} --resume --run {directory.name}{flag}"
-    finished = run_in_front_of_people(
+    result, published = run_in_front_of_people(
         dataclasses.replace(request, folder=directory, resume="yes" if options.resume else "no"),
         resources,
         again=again,
         answer=options.answer,
         live=live,
     )
-    if finished.published.theta is not None:
-        mention(f"the parameters to use are in {finished.published.theta}; give them with --parameters")
-    return finished
+    if published.theta is not None:
+        mention(f"the parameters to use are in {published.theta}; give them with --parameters")
+    return result, published
 
 
 def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:

@@ -14,7 +14,7 @@ import signal
 import sys
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -127,14 +127,6 @@ def _why_not_opened(path: Path) -> str | None:
     return None
 
 
-@dataclass(frozen=True)
-class Finished:
-    """A campaign that ran to its end, and what was written about it."""
-
-    result: CampaignResult
-    published: Published
-
-
 def run_in_front_of_people(
     request: RunRequest,
     resources: RunResources,
@@ -143,7 +135,7 @@ def run_in_front_of_people(
     not_resumed: str = "",
     answer: str | None = None,
     live: LiveView | None = None,
-) -> Finished:
+) -> tuple[CampaignResult, Published]:
     """Run a campaign with a live display, a recording, figures and a summary.
 
     Args:
@@ -153,6 +145,9 @@ def run_in_front_of_people(
         not_resumed: … where nothing resumes: what is not, and what of it is kept.
         answer: what came of a pour that was under way when the run died; else a person at the terminal is asked.
         live: view to open while it runs.
+
+    Returns:
+        The result of the run, and what was written about it.
 
     Raises:
         RefusalError: it failed, was interrupted, or needs a person.
@@ -223,7 +218,7 @@ def run_in_front_of_people(
         raise RefusalError(f"interrupted{finished_without_report(directory)}", INTERRUPTED) from None
     if published.report is not None:
         mention(f"report  {published.report}")
-    return Finished(result, published)
+    return result, published
 
 
 def _close(handle: RunHandle | None, live: LiveView | None) -> None:
@@ -339,15 +334,14 @@ def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
     """
     from orchestrator.journal.codec import digest
     from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-    from orchestrator.run_service import RunRequest, RunService
+    from orchestrator.journal.run_record import read_result
+    from orchestrator.results.publishing import report_on
     from orchestrator.runs.fingerprint import fingerprint
 
-    with contextlib.suppress(Exception, KeyboardInterrupt):
-        with JournalReader(directory / JOURNAL_NAME) as journal:
-            if digest(journal.header.fingerprint) != digest(fingerprint(plan)):
-                return None  # it was refused, since this is another campaign
-        published = RunService().publish_so_far(RunRequest(plan, (), directory), report_only=True)
-        return None if published is None else published.report
+    with contextlib.suppress(Exception, KeyboardInterrupt), JournalReader(directory / JOURNAL_NAME) as journal:
+        if digest(journal.header.fingerprint) != digest(fingerprint(plan)):
+            return None  # it was refused, since this is another campaign
+        return report_on(plan, read_result(journal, directory), draw=plan.outputs.figures)[0]
     return None
 
 

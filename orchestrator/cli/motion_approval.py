@@ -1,20 +1,30 @@
-"""Hardware moves for one run, after somebody at the terminal has read what it will do and typed its name."""
+"""Motion of an arm for one command at the terminal.
+
+Hardware moves after a person has read what it will do and has typed its name. The arm is connected, its safety
+settings are compared, and Ctrl-C stops it.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import termios
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, TypeVar
 
+from actors.arm.arm_interface import NotAcceptedError
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, say
 from orchestrator.runs.motion_envelope import campaign_pours, envelope, envelope_lines, pour_count
 from orchestrator.runs.safety_approval import SafetyRecordError, required_checksum
 
 if TYPE_CHECKING:
+    from actors.arm.arm_interface import Arm, ArmFacts
     from actors.laboratory_settings import LaboratorySpec
     from orchestrator.runs.stages import StageDefinition
     from orchestrator.strategies.campaign_plan import CampaignPlan
+
+T = TypeVar("T")
 
 
 def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed: bool, verb: str) -> str | None:
@@ -101,3 +111,69 @@ def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
     if typed.strip() != laboratory.name:
         raise RefusalError(f"not armed: '{typed.strip()}' was typed; nothing has moved", BAD_INPUT)
     say(f"armed, for this run only: {laboratory.name}")
+
+
+@contextlib.contextmanager
+def connected(spec: LaboratorySpec, accepted: str | None) -> Iterator[tuple[Arm, ArmFacts]]:
+    """The arm's driver, connected and locked; it is stopped and let go of in any case.
+
+    Args:
+        spec: of a laboratory that was reached.
+        accepted: checksum of the safety settings that people have accepted; not asked for where nothing is hardware.
+
+    Raises:
+        RefusalError: the arm isn't ready, or its safety settings are others.
+        LaboratoryError: it can't be reached.
+    """
+    assert spec.arm is not None
+    cls, arguments = spec.arm.driver((accepted or "") if spec.mode == "hardware" else None)
+    arm: Arm = cls(*arguments)
+    try:
+        with Refused(NotAcceptedError):
+            facts = arm.connect()
+        if facts.problem:
+            raise RefusalError(f"{spec.arm.title}: {facts.problem}; 'decant doctor' says what to do about it")
+        yield arm, facts
+    finally:
+        arm.close()
+
+
+def stoppable(arm: Arm, motion: Callable[[], T]) -> T:
+    """Do something that moves the arm; Ctrl-C stops it, and the error that the stop causes is raised.
+
+    The motion runs in a thread: an interrupt must reach the arm as an order to stop, not tear the driver apart.
+    """
+    result: list[T] = []
+    failure: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            result.append(motion())
+        except BaseException as error:
+            failure.append(error)
+
+    thread = threading.Thread(target=work, name="motion", daemon=True)
+    thread.start()
+    while thread.is_alive():
+        try:
+            thread.join(0.1)
+        except KeyboardInterrupt:
+            say("\nstopping the arm …")
+            arm.stop()
+    if failure:
+        raise failure[0]
+    return result[0]
+
+
+def typed_line(prompt: str) -> str:
+    """A line from the terminal; keys pressed before it was asked for are thrown away: they meant something else.
+
+    Raises:
+        EOFError: there are no more.
+    """
+    termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
+    print(prompt, end="", file=sys.stderr, flush=True)
+    line = sys.stdin.readline()
+    if not line:
+        raise EOFError
+    return line

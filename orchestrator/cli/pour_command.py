@@ -21,8 +21,7 @@ from actors.interfaces import LaboratoryError
 from actors.laboratory import reached
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, mention, print_json, say
 from orchestrator.cli.foreground_run import check_output, read_campaign
-from orchestrator.cli.hands_on import connected, stoppable, typed_line
-from orchestrator.cli.motion_approval import confirm, require_flag
+from orchestrator.cli.motion_approval import confirm, connected, require_flag, stoppable, typed_line
 from orchestrator.cli.pour_prediction import scene_to_simulate, wanted_in
 from orchestrator.runs.motion_envelope import report_lines
 from orchestrator.runs.safety_approval import SafetyRecordError, required_checksum
@@ -250,13 +249,13 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
     resources = RunResources(in_process=in_process, approved_checksum=checksum)
     check_laboratory_answers(request, resources)
     directory = run_directory(plan, resume=False, run_id=None)
-    finished = run_in_front_of_people(
+    finished, _ = run_in_front_of_people(
         dataclasses.replace(request, folder=directory),
         resources,
         again=again,
         not_resumed="this pour is not resumed; what was weighed of it",
     )
-    result = result_of(finished.result.results, STAGE, OnePoured)
+    result = result_of(finished.results, STAGE, OnePoured)
     if result.weighed is None:
         raise RefusalError(result.failed or "nothing was poured", FAILED)
     if as_json:

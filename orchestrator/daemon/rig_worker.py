@@ -18,7 +18,6 @@ from actors.bench.bench_factory import needs_person
 from actors.interfaces import LaboratoryError
 from actors.simulators.shared_pool import WarmSimulators
 from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.daemon.campaign_progress import CampaignProgress
 from orchestrator.daemon.daemon_settings import DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
@@ -30,10 +29,11 @@ from orchestrator.journal.journal_file import JournalError
 from orchestrator.journal.run_record import CampaignResult
 from orchestrator.live_view.live_server import LiveView, recorder_of
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
+from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState
 from orchestrator.results.publishing import not_simulated
 from orchestrator.run_errors import RunError
-from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService, Task, read_theta, task_request
-from orchestrator.runs.events import CampaignStateChanged
+from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService, read_theta, task_request
+from orchestrator.runs.events import CampaignStateChanged, StageOpened
 from orchestrator.runs.request_executor import PourUnknownError, RequestExecutorError
 from orchestrator.runs.stages import scenes_of
 from orchestrator.runs.unknown_pours import OperatorNeededError
@@ -66,8 +66,7 @@ def job_of(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunRequest:
     given = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
     # A daemon never repeats a pour by itself: whoever is there is asked, whatever the campaign says.
     plan = replace(plan, on_unknown="ask", outputs=replace(plan.outputs, directory=settings.runs))
-    task: Task = item.verb  # type: ignore[assignment]  # written by us
-    request = task_request(plan, task, given=given)
+    request = task_request(plan, item.verb, given=given)  # type: ignore[arg-type]  # written by us
     if item.run is None:
         return request
     return replace(request, folder=settings.runs / item.run, resume="if begun")
@@ -104,7 +103,8 @@ class Running:
 
     def __init__(self, common: Common, item: QueueItem, rig: Rig) -> None:
         self._common, self.item, self._rig = common, item, rig
-        self._watching: CampaignProgress | None = None
+        self._tally: ProgressState | None = None
+        self._stage = StageOpened(stage="", index=0, count=0)
         self._handle: RunHandle | None = None
         self._asked_to_end = False
 
@@ -126,7 +126,7 @@ class Running:
         await self._common.warm.open()
         if self.item.run != request.folder.name:
             self.note_run(request.folder)
-        self._watching = CampaignProgress(request.campaign)
+        self._tally = ProgressState(request.campaign)
         self._handle = handle = RunService().start(request, self._resources(request, checksum))
         if self._asked_to_end:
             handle.pause()
@@ -142,7 +142,7 @@ class Running:
         plan, live = request.campaign, self._common.live
         load = next(iter(scenes_of(plan).values())).liquid.mass  # a campaign has one liquid
         asks = request.pours and needs_person(plan.laboratory)
-        assert self._watching is not None
+        assert self._tally is not None
 
         def recorder(plan: CampaignPlan, run: Path) -> RerunMonitor | None:
             return recorder_of(plan, run, self._log_warning, live if live is not None and live.alive else None)
@@ -154,7 +154,7 @@ class Running:
             operator=RemoteOperator(asking, key, rig, self._announce) if asks else None,
             ask_operator=RunQuestions(asking, self._common.store, key, rig, load, lambda: self._look(plan)),
             approved_checksum=checksum,
-            subscribers=[self._common.feed.watcher(key), self._watching, self._note_state],
+            subscribers=[self._common.feed.watcher(key), self._tally, self._note_state],
             recorder=recorder,
         )
 
@@ -167,7 +167,9 @@ class Running:
         self._common.feed.tell("LogLine", {"level": "warning", "text": text, "stage": ""}, self.item.id)
 
     def _note_state(self, event: Any) -> None:
-        if isinstance(event, CampaignStateChanged):
+        if isinstance(event, StageOpened):
+            self._stage = event
+        elif isinstance(event, CampaignStateChanged):
             # Finished is what has been published: killed before that, it is taken up again for it.
             done = event.after == State.FINISHED
             state, reason = ("running", "being published") if done else (event.after, event.reason)
@@ -230,8 +232,32 @@ class Running:
         return "" if self._handle is None else self._handle.checkpoint
 
     def progress(self) -> dict[str, Any] | None:
-        """Where it stands; None before it has begun."""
-        return None if self._watching is None else self._watching.progress(self.checkpoint)
+        """JSON-ready: stage, counts, the pour in words, and how long it still takes [s] where that is known.
+
+        None before it has begun.
+        """
+        tally = self._tally
+        if tally is None:
+            return None
+        stage = tally.stages.get(self._stage.stage)
+        done = stage.progress if stage is not None else None
+        pour = tally.pour
+        return {
+            "stage": self._stage.stage,
+            "stage_index": self._stage.index,
+            "stage_count": self._stage.count,
+            "simulations": done.simulations if done else 0,
+            "of_simulations": done.of_simulations if done else 0,
+            "pours": done.pours if done else 0,
+            "of_pours": done.of_pours if done else 0,
+            "simulators_busy": tally.busy,
+            "line": tally.counts_line(),
+            "pour": tally.pour_line(),
+            "checkpoint": self.checkpoint,
+            "checkpoint_words": CHECKPOINT_WORDS.get(self.checkpoint, ""),
+            "fraction": pour.progress.fraction if pour is not None and pour.progress is not None else None,
+            "seconds_left": tally.forecast.left(time.time()),
+        }
 
     @property
     def pouring(self) -> bool:

@@ -20,7 +20,6 @@ from orchestrator.results.pool_occupancy import occupancies
 from orchestrator.results.run_summary import SUMMARY_NAME, PoolUse, RunSummary, Totals, write_summary
 from orchestrator.results.stage_views import evaluation_of, receiver_names, theta_of
 from orchestrator.results.summarise import summarise
-from orchestrator.runs.events import Recorder
 from orchestrator.runs.run_folder import read_versions
 from orchestrator.states import State
 from orchestrator.strategies.calibration.calibration_base import CalibratedTheta
@@ -60,26 +59,38 @@ class Published:
 
 
 def publish(
-    plan: CampaignPlan, result: CampaignResult, recording: Recorder | None = None, *, report_only: bool = False
+    plan: CampaignPlan, result: CampaignResult, recording: Path | None = None, dropped_events: int = 0
 ) -> Published:
-    """Close a run's recording, and write its figures (if the plan wants any), `theta.json`, `summary.json` and the
-    report. A run that stands still may be published, too: its report says where it stands.
+    """Write a run's figures (if the plan wants any), `theta.json`, `summary.json` and the report.
 
-    Safe to call again: the files are then written anew.
+    A run that has not finished may be published, too: its report says where it stands. Safe to call again: the files
+    are then written again.
 
     Args:
         plan: of the campaign.
-        result: what it came to, as `run_campaign` or `read_result` has it.
-        recording: that watched it.
-        report_only: write neither `theta.json` nor `summary.json`.
+        result: of the run, as `run_campaign` or `read_result` returns it.
+        recording: its file, closed; None if there is none.
+        dropped_events: missing in the recording.
 
     Raises:
         OSError: a file can't be written.
     """
-    if recording is not None:
-        recording.close()
-        return _write(plan, result, recording.path, recording.dropped)
-    return _write(plan, result, None, 0, report_only=report_only)
+    directory = result.directory
+    figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
+    summary = summary_of(plan, result, figures, recording=recording, dropped_events=dropped_events)
+    write_summary(directory, summary)
+    found = theta_of(result.results)
+    theta = None if found is None else directory / THETA_FILE
+    if theta is not None and found is not None:
+        written = theta_file(found, evaluation_of(result.results))
+        theta.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
+    report: Path | None = directory / REPORT_NAME
+    try:
+        write_report(directory / REPORT_NAME, plan, summary, directory)
+    except Exception as error:  # days of pouring don't end in a traceback about a page
+        _log.warning("the report was not written: %s: %s", type(error).__name__, error)
+        report = None
+    return Published(summary, figures, recording, theta, report)
 
 
 def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
@@ -95,38 +106,8 @@ def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
     if result.state is not State.FINISHED or all((result.directory / name).is_file() for name in expected):
         return False
     recording = result.directory / "campaign.rrd"
-    _write(plan, result, recording if recording.is_file() else None, 0)
+    publish(plan, result, recording if recording.is_file() else None)
     return True
-
-
-def _write(
-    plan: CampaignPlan, result: CampaignResult, recording: Path | None, dropped: int, *, report_only: bool = False
-) -> Published:
-    directory = result.directory
-    figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
-    summary = summary_of(
-        plan,
-        result,
-        figures,
-        recording=recording,
-        dropped_events=dropped,
-    )
-    found = None if report_only else theta_of(result.results)
-    if not report_only:
-        write_summary(directory, summary)
-    theta = None if found is None else directory / THETA_FILE
-    if theta is not None and found is not None:
-        written = theta_file(found, evaluation_of(result.results))
-        theta.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
-    report: Path | None = directory / REPORT_NAME
-    try:
-        write_report(directory / REPORT_NAME, plan, summary, directory)
-    except Exception as error:  # days of pouring don't end in a traceback about a page
-        if report_only:
-            raise
-        _log.warning("the report was not written: %s: %s", type(error).__name__, error)
-        report = None
-    return Published(summary, figures, recording, theta, report)
 
 
 def summary_of(
@@ -151,19 +132,25 @@ def summary_of(
 
 
 def report_on(
-    plan: CampaignPlan, result: CampaignResult, path: Path | None = None, formats: tuple[str, ...] = (".svg",)
+    plan: CampaignPlan,
+    result: CampaignResult,
+    path: Path | None = None,
+    formats: tuple[str, ...] = (".svg",),
+    *,
+    draw: bool = True,
 ) -> tuple[Path, dict[str, Path]]:
     """Draw a run's figures anew, and write the page about it, wherever the run stands.
 
     Args:
         path: of the page; in the run's folder unless given.
         formats: of the figures.
+        draw: whether figures are drawn; the page has none otherwise.
 
     Raises:
         OSError: a file can't be written.
         RunError: the journal can't be read.
     """
-    figures = draw_figures(result.directory / FIGURES, plan, result.results, formats)
+    figures = draw_figures(result.directory / FIGURES, plan, result.results, formats) if draw else {}
     summary = summary_of(plan, result, figures)
     return write_report(path or result.directory / REPORT_NAME, plan, summary, result.directory), figures
 

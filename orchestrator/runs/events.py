@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 from actors.interfaces import PourProgress
 from orchestrator.journal.stage_results import Results
@@ -168,29 +168,7 @@ class LogLine(Event):
     asked: bool = False
 
 
-Watcher = Callable[[Event], None]
-
-
-class Recorder(Protocol):
-    """A subscriber that writes the recording of a run."""
-
-    def __call__(self, event: Event) -> None:
-        """Record an event."""
-        ...
-
-    @property
-    def path(self) -> Path:
-        """Its file."""
-        ...
-
-    @property
-    def dropped(self) -> int:
-        """Events that are missing in it."""
-        ...
-
-    def close(self) -> object:
-        """Write the remaining events and close the file; may be called twice."""
-        ...
+Watcher = Callable[[Event], object]
 
 
 class Watchers:
