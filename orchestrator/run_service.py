@@ -178,7 +178,7 @@ class RunService:
         """Check that packages and machines which the laboratory needs are there. Starts nothing that stays.
 
         Raises:
-            LaboratoryError: with what is missing.
+            LaboratoryError: something is missing; the text names it.
         """
         from actors.laboratory import check_laboratory
 
@@ -418,7 +418,7 @@ def _lacking_posterior(plan: CampaignPlan) -> str | None:
     )
 
 
-# ---- tasks: what a command makes of a campaign
+# ---- tasks: the stages and the plan that a command runs
 
 
 @dataclass(frozen=True)

@@ -73,10 +73,10 @@ def check_campaign_can_run(request: RunRequest) -> None:
 
 
 def check_laboratory_answers(request: RunRequest, resources: RunResources) -> None:
-    """What the laboratory needs, here and from other machines, before anything starts.
+    """The requirements of the laboratory, on this machine and on others, before anything starts.
 
     Raises:
-        RefusalError: with what is missing, exit code 2.
+        RefusalError: something is missing; exit code 2.
     """
     from actors.interfaces import LaboratoryError
     from orchestrator.run_service import RunService
@@ -141,13 +141,13 @@ def run_in_front_of_people(
     Args:
         request: with the folder of the run.
         resources: to run it with; operator, display and recorder are added here.
-        again: the command that resumes, for the message after an interruption; or that begins anew …
-        not_resumed: … where nothing resumes: what is not, and what of it is kept.
-        answer: what came of a pour that was under way when the run died; else a person at the terminal is asked.
+        again: the command that resumes the run, or starts another one, for the message after an interruption.
+        not_resumed: for a run that can't be resumed: its name, and the part of it that is kept.
+        answer: outcome of a pour that was under way when the run died; None: a person at the terminal is asked.
         live: view to open while it runs.
 
     Returns:
-        The result of the run, and what was written about it.
+        The result of the run, and the files written about it.
 
     Raises:
         RefusalError: it failed, was interrupted, or needs a person.

@@ -23,12 +23,12 @@ from sim_engine.scene import Scene
 from sim_engine.search_space import Space
 
 CORNERS, INTERIOR = 32, 12
-"""Actions of each space whose paths are planned for the envelope, beside its middle."""
+"""Actions of each space whose paths are planned for the envelope, in addition to its middle."""
 
 
 @dataclass(frozen=True)
 class Envelope:
-    """What the paths of some actions keep within.
+    """Limits of the paths of some actions.
 
     Attributes:
         reports: of the paths that can be executed.
@@ -117,7 +117,7 @@ def _pouring(stages: Sequence[StageDefinition]) -> tuple[bool, int]:
 
 
 def envelope_lines(found: Envelope) -> list[str]:
-    """What the paths keep within, for people."""
+    """The limits of the paths as text."""
     lines = report_lines(found.worst)
     total = len(found.reports) + len(found.refused)
     lines.append(
