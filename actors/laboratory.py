@@ -7,12 +7,15 @@ can be opened. The bench itself is made by `actors.bench`.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 from actors.balance.balance_settings import SerialBalanceSpec
 from actors.bench.bench_factory import MakeDevice, OpenBench, needs_person, open_bench
+from actors.bench.device_emulators import BenchEmulators
 from actors.interfaces import (
     Bench,
     BenchLostError,
@@ -84,6 +87,30 @@ def check_bench_packages(spec: LaboratorySpec) -> None:
             f"laboratory {spec.name}: arm and balance need {names}, not installed here: pip install "
             f"'decant[{EXTRAS[missing[0]]}]'"
         )
+
+
+@contextlib.contextmanager
+def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
+    """A laboratory with its addresses: on hardware its own, else those of what is started for as long as this.
+
+    Raises:
+        LaboratoryError: a package that it needs is not installed, or what is started does not start.
+    """
+    check_bench_packages(spec)
+    if spec.mode == "hardware":
+        yield spec
+        return
+    assert spec.arm is not None
+    stand_ins = BenchEmulators(spec.arm, None if spec.balance is None else spec.balance.device)
+    try:
+        where = stand_ins.found()
+        stand_ins.install()
+        balance = spec.balance
+        if balance is not None:
+            balance = replace(balance, device=where.balance)
+        yield replace(spec, arm=where.arm, balance=balance)
+    finally:
+        stand_ins.close()
 
 
 def _without_ray(spec: LaboratorySpec, *, need_bench: bool, brief: bool) -> bool:

@@ -26,7 +26,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -86,11 +85,9 @@ class KeptPours(InProcessSimulatorPool):
 
 def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
     """One campaign: every pour with what was expected of it, what it recommends, and why it ended."""
-    from actors.laboratory import open_laboratory
     from decant.running import build_campaign, load_campaign
     from orchestrator.results.stage_views import deployments_of
-    from orchestrator.runs.run_engine import run_campaign
-    from orchestrator.runs.run_folder import create_run
+    from orchestrator.run_service import RunResources, RunService, task_request
     from sim_engine.solver_fingerprint import solver_fingerprint
 
     ARMS[arm]()
@@ -101,10 +98,8 @@ def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
         content["laboratory"]["bench"]["time_scale"] = 3000  # nobody watches; the numbers are the same
         content["calibration"]["random_baseline"] = 0
         campaign = build_campaign(content, folder)
-        spec = replace(campaign.laboratory, in_process=True)
-        result = asyncio.run(
-            run_campaign(campaign, open_laboratory(spec, need_bench=True, kept=pool), create_run(campaign))
-        )
+        handle = RunService().start(task_request(campaign), RunResources(in_process=True, simulators=pool))
+        result = asyncio.run(handle.wait())
         asyncio.run(pool.close())
     (found,) = deployments_of(result.results).values()
     assert campaign.deployment is not None

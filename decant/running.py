@@ -12,33 +12,32 @@ import csv
 import json
 import tempfile
 import warnings
-from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from actors.laboratory import check_laboratory, open_laboratory
-from actors.laboratory_settings import LaboratorySpec
 from decant.run_results import Run
 from orchestrator.config.file_loading import campaign_from, load_campaign, load_vessel
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document
 from orchestrator.live_view.live_server import recorder_of
-from orchestrator.results.publishing import not_simulated, publish
+from orchestrator.results.publishing import not_simulated
 from orchestrator.results.stage_views import evaluation_of
-from orchestrator.runs.events import Event, Watcher
-from orchestrator.runs.run_engine import run_campaign
-from orchestrator.runs.run_folder import create_run
-from orchestrator.runs.run_tasks import PREDICTION_SEEDS, GivenTheta, check_job, job, planned, read_theta
-from orchestrator.runs.stages import (
-    POSTERIOR_DRAWS,
-    StageDefinition,
-    deployment_stages,
-    posterior_draws,
-    prediction_stages,
-    stages_of,
+from orchestrator.run_service import (
+    PREDICTION_SEEDS,
+    GivenTheta,
+    RunRequest,
+    RunResources,
+    RunService,
+    read_theta,
+    task_request,
 )
+from orchestrator.runs.events import Watcher as Watch
+from orchestrator.runs.run_folder import create_run
+from orchestrator.runs.stages import POSTERIOR_DRAWS, posterior_draws
 from orchestrator.shipped import shipped, starting_set
 from orchestrator.strategies.calibration.calibration_scores import shift_left_over
 from orchestrator.strategies.campaign_plan import CampaignPlan
@@ -79,9 +78,6 @@ def run_coroutine(work: Coroutine[Any, Any, T]) -> T:
         return thread.submit(asyncio.run, work).result()
 
 
-Watch = Callable[[Event], object]
-
-
 def run(
     campaign: CampaignPlan,
     *,
@@ -106,10 +102,11 @@ def run(
         LaboratoryError: the laboratory can't be opened.
         RunError: the run can't begin, go on or end; the text says what is kept, and what to do.
     """
-    stages = stages_of(campaign)
-    _check(campaign, stages, in_process)
-    directory = create_run(campaign) if resume is None else Path(resume).expanduser()
-    return _begun(campaign, stages, watch, directory, in_process, resume=resume is not None)
+    request = task_request(campaign)
+    resources = _checked(request, watch, in_process)
+    if resume is not None:
+        request = replace(request, folder=Path(resume).expanduser(), resume="yes")
+    return _run(request, resources)
 
 
 def calibrate(
@@ -146,11 +143,11 @@ def calibrate(
             raise ConfigError(
                 replace(one, path=shown) if one.path == table else one for one in error.problems
             ) from None
-        _check(checked, job(checked, "calibrate").stages, in_process)
+        resources = _checked(task_request(checked, "calibrate"), watch, in_process)
     directory = create_run(campaign)
     _write_table(directory / table.name, rows)
-    work = job(_calibration_of(campaign, directory / table.name), "calibrate")
-    return _begun(work.plan, work.stages, watch, directory, in_process)
+    request = task_request(_calibration_of(campaign, directory / table.name), "calibrate")
+    return _run(replace(request, folder=directory), resources)
 
 
 def _calibration_of(campaign: CampaignPlan, table: Path) -> CampaignPlan:
@@ -196,12 +193,8 @@ def plan(
             raise InvalidArgumentError(f"{name}={value!r}: should be 1 or more")
     vessel = load_vessel(Path(receiver).expanduser()) if isinstance(receiver, str | Path) else receiver
     given = _given(theta, campaign)
-    found = planned(campaign, given.theta, vessel, iterations, given.draws, given.left_over)
-    deployment = found.deployment
-    assert deployment is not None
-    stages = [*deployment_stages(found, deployment), *prediction_stages(found, deployment, seeds)]
-    _check(found, stages, in_process, as_written=receiver is None)
-    return _begun(found, stages, watch, create_run(found), in_process)
+    request = task_request(campaign, "plan", given=given, receiver=vessel, iterations=iterations, seeds=seeds)
+    return _run(request, _checked(request, watch, in_process))
 
 
 def _given(theta: SimulationParameters | Run | Path | str | None, campaign: CampaignPlan) -> GivenTheta:
@@ -223,65 +216,38 @@ def _given(theta: SimulationParameters | Run | Path | str | None, campaign: Camp
     )
 
 
-def _check(
-    campaign: CampaignPlan, stages: Sequence[StageDefinition], in_process: bool, *, as_written: bool = True
-) -> None:
+def _checked(request: RunRequest, watch: Sequence[Watch], in_process: bool) -> RunResources:
     """Refuse what can't be run, and warn of what is suspicious, before a run folder is made."""
+    campaign, service = request.campaign, RunService()
     if campaign.laboratory.mode == "hardware":
         raise InvalidArgumentError(
             f"laboratory {campaign.laboratory.name} is hardware, which is armed from the command line alone: "
             f"decant run {campaign.source} --arm"
         )
-    found: list[str] = []
-    check_job(campaign, as_written=as_written, warn=lambda problem: found.append(str(problem)))
+    report = service.check(request)
+    report.require()
+    found = list(report.warnings)
     found.append("\n".join(not_simulated(campaign, found.append)))
     for text in filter(None, dict.fromkeys(found)):
         _warn(text)
-    check_laboratory(_laboratory(campaign, in_process), need_bench=any(stage.pours for stage in stages))
+    resources = RunResources(
+        in_process=in_process,
+        subscribers=watch,
+        recorder=lambda plan, run: recorder_of(plan, run, _warn),
+    )
+    service.check_laboratory(request, resources)
+    return resources
 
 
 def _warn(text: str) -> None:
     warnings.warn(text, UserWarning, stacklevel=4)
 
 
-def _laboratory(campaign: CampaignPlan, in_process: bool) -> LaboratorySpec:
-    return replace(campaign.laboratory, in_process=in_process or campaign.laboratory.in_process)
-
-
-def _begun(
-    campaign: CampaignPlan,
-    stages: Sequence[StageDefinition],
-    watch: Sequence[Watch],
-    directory: Path,
-    in_process: bool,
-    *,
-    resume: bool = False,
-) -> Run:
+def _run(request: RunRequest, resources: RunResources) -> Run:
     """Run what was checked, record it, and publish it."""
-    need_bench = any(stage.pours for stage in stages)
-    monitor = recorder_of(campaign, directory, _warn)
-    watchers: list[Watcher] = [_watcher(one) for one in watch]
-    try:
-        work = run_campaign(
-            campaign,
-            open_laboratory(_laboratory(campaign, in_process), need_bench=need_bench),
-            directory,
-            resume=resume,
-            watchers=watchers if monitor is None else [*watchers, monitor],
-            stages=stages,
-        )
-        result = run_coroutine(work)
-    finally:
-        if monitor is not None:
-            monitor.close()
-    return Run(campaign, result, publish(campaign, result, monitor))
-
-
-def _watcher(watch: Watch) -> Watcher:
-    def watcher(event: Event) -> None:
-        watch(event)
-
-    return watcher
+    with closing(RunService().start(request, resources)) as handle:
+        result = run_coroutine(handle.wait())
+    return Run(request.campaign, result, handle.publish())
 
 
 def _rows(table: Any) -> list[dict[str, Any]]:

@@ -80,12 +80,12 @@ def simulate(
         ValueError: `seeds` is below 1, the action is incomplete, or the vessels touch, are too small for the load, or
             cannot be built (each is a `DecantError`).
     """
-    from orchestrator.cli.pour_prediction import scene_to_simulate
+    from orchestrator.runs.stages import named_scenes
     from sim_engine.simulator import PourSimulator
 
     if seeds < 1:
         raise InvalidArgumentError(f"seeds={seeds!r}: should be 1 or more")
-    scene, space = scene_to_simulate(campaign)
+    scene, space = next(iter(named_scenes(campaign).values()))
     if receiver is not None:
         vessel = receiver if isinstance(receiver, VesselSpec) else load_vessel(Path(receiver).expanduser())
         scene = replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)

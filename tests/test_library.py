@@ -161,7 +161,7 @@ def test_a_program_of_a_user_passes_a_strict_type_check_and_misspelt_names_do_no
 def test_every_public_error_is_a_decant_error_and_what_it_was_before() -> None:
     from orchestrator.journal.codec import CodecError
     from orchestrator.journal.journal_file import JournalError
-    from orchestrator.runs.run_tasks import RunTaskError
+    from orchestrator.run_service import RunTaskError
     from sim_engine.errors import InvalidSceneError
     from sim_engine.resources import BackendError
     from sim_engine.settings.plugin_registry import PluginError
@@ -251,7 +251,7 @@ def fake_simulators(monkeypatch: pytest.MonkeyPatch) -> None:
     from actors.laboratory import open_laboratory
     from tests.actors.conftest import make_fake
 
-    monkeypatch.setattr("decant.running.open_laboratory", partial(open_laboratory, make=make_fake()))
+    monkeypatch.setattr("actors.laboratory.open_laboratory", partial(open_laboratory, make=make_fake()))
 
 
 def test_draws_of_theta_that_no_calibration_makes_are_refused_before_a_run_begins(tmp_path: Path) -> None:

@@ -370,3 +370,17 @@ def _interleaved(tables: list[tuple[LineSettings, ...]]) -> tuple[LineSettings, 
     """Merge the tables: the first entries of all, then the second entries, and so on."""
     longest = max(len(table) for table in tables)
     return tuple(dict.fromkeys(table[i] for i in range(longest) for table in tables if i < len(table)))
+
+
+def look_at_balance(spec: BalanceSpec | None, *, tare: bool) -> list[DeviceCheck]:
+    """Who is there, a stable reading, its step; and whether it obeys a tare.
+
+    Args:
+        spec: as in the laboratory's file, its address filled in.
+        tare: also tare it.
+    """
+    if spec is None:
+        return [DeviceCheck("balance", "fail", "the file has none", "add a 'balance' section, or 'placement: manual'")]
+    if spec.device is None:
+        return [DeviceCheck("balance", "ok", "all weights are typed by the operator")]
+    return spec.device.look(tare=tare)

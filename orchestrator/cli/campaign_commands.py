@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, print_json
 from orchestrator.cli.foreground_run import (
-    Finished,
     check_campaign_can_run,
     check_laboratory_answers,
     read_campaign,
@@ -17,7 +16,8 @@ from orchestrator.cli.foreground_run import (
 )
 
 if TYPE_CHECKING:
-    from orchestrator.runs.stages import StageDefinition
+    from orchestrator.journal.run_record import CampaignResult
+    from orchestrator.results.publishing import Published
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
 
@@ -61,29 +61,20 @@ def run(path: Path, options: RunOptions) -> None:
     """The whole campaign."""
     from orchestrator.results.run_summary import summary_json
 
-    plan = read_campaign(path, options.laboratory, options.seed)
-    check_campaign_can_run(plan)
-    finished = _run(plan, "run", path, options)
+    result, published = _run("run", path, options)
     if options.as_json:
-        summary = summary_json(finished.published.summary)
-        print_json({"run": finished.result.directory.name, "report": finished.published.report, **summary})
+        summary = summary_json(published.summary)
+        print_json({"run": result.directory.name, "report": published.report, **summary})
 
 
 def calibrate(path: Path, options: RunOptions) -> None:
     """Only what finds θ*, and how good it is beside its rivals."""
-    from orchestrator.runs.run_tasks import RunTaskError, job
-
-    try:
-        work = job(read_campaign(path, options.laboratory, options.seed), "calibrate")
-    except RunTaskError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
-    check_campaign_can_run(work.plan)
-    finished = _run(work.plan, "calibrate", path, options, list(work.stages))
+    result, published = _run("calibrate", path, options)
     if options.as_json:
-        print_json(calibration_json(finished))
+        print_json(calibration_json(result, published))
 
 
-def calibration_json(finished: Finished) -> dict[str, Any]:
+def calibration_json(result: CampaignResult, published: Published) -> dict[str, Any]:
     """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see
     `CalibrationEvaluation`."""
     from orchestrator.journal.stage_results import result_of
@@ -92,7 +83,7 @@ def calibration_json(finished: Finished) -> dict[str, Any]:
     from orchestrator.strategies.calibration.calibration_base import Calibrated
     from orchestrator.strategies.calibration.calibration_scores import CALIBRATED, Scores
 
-    results = finished.result.results
+    results = result.results
     theta, calibration = calibrated_theta(results).theta, result_of(results, CALIBRATION, Calibrated)
     evaluation = result_of(results, EVALUATION, Scores)
     ours = evaluation.discrepancy[CALIBRATED]
@@ -108,13 +99,13 @@ def calibration_json(finished: Finished) -> dict[str, Any]:
             data |= {f"{split}_discrepancy_{name}": values.get(split) for name, values in rivals.items()}
     return {
         **data,
-        "simulations": finished.result.simulations,
+        "simulations": result.simulations,
         "calibration_simulations": calibration.simulations,
-        "cpu_s": finished.result.cpu_s,
-        "run": str(finished.result.directory),
-        "figures": finished.published.figures,
-        "recording": finished.published.recording,
-        "report": finished.published.report,
+        "cpu_s": result.cpu_s,
+        "run": str(result.directory),
+        "figures": published.figures,
+        "recording": published.recording,
+        "report": published.report,
     }
 
 
@@ -134,43 +125,42 @@ def plan_pour(
     """D1 for one receiver: the action that the calibrated simulator would pour with, and what to expect of it."""
     from orchestrator.cli.prediction_inputs import foretelling
     from orchestrator.journal.stage_results import result_of
+    from orchestrator.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
     from orchestrator.strategies.deployment.deployment_result import Deployed
     from orchestrator.strategies.repeated_simulation import Foreseen
 
     plan = planning_plan(read_campaign(path, laboratory, seed), parameters, receiver, iterations)
-    check_campaign_can_run(plan, as_written=receiver is None)
     assert plan.deployment is not None
     planning = deployment_stages(plan, plan.deployment)
+    request = RunRequest(plan, planning, as_written=receiver is None)
+    check_campaign_can_run(request)
     known = foretelling(plan, parameters, thetas, seeds)
     count = max(seeds, len(known.drawn))
     stages = [*planning, *prediction_stages(plan, plan.deployment, count, known.drawn)]
-    check_laboratory_answers(plan, stages, in_process=in_process, brief=True)
+    resources = RunResources(in_process=in_process, brief=True)
+    check_laboratory_answers(request, resources)
     directory = run_directory(plan, resume=False, run_id=None)
     if parameters is None:
         mention(
             f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})"
         )
-    finished = run_in_front_of_people(
-        plan,
-        directory,
-        resume=False,
-        stages=stages,
-        in_process=in_process,
-        brief=True,
+    run_result, published = run_in_front_of_people(
+        dataclasses.replace(request, stages=stages, folder=directory),
+        resources,
         again=f"Plan anew: decant plan {path}",
         not_resumed="this planning is not resumed; what was simulated",
     )
     answers = []
     for stage in planning:
-        result = result_of(finished.result.results, stage.name, Deployed)
+        result = result_of(run_result.results, stage.name, Deployed)
         recommended = result.recommended
         if recommended is None:
             raise RefusalError(f"{stage.name}: no action could be planned; every simulation failed. See {directory}")
         receiver_name = stage.name.removeprefix(DEPLOYMENT)
-        repeated = result_of(finished.result.results, PREDICTION + receiver_name, Foreseen).over_seeds
+        repeated = result_of(run_result.results, PREDICTION + receiver_name, Foreseen).over_seeds
         spillage = repeated.get("spillage")
-        told = finished.published.summary.receivers[result.scene]
+        told = published.summary.receivers[result.scene]
         answers.append(
             {
                 "receiver": receiver_name,
@@ -186,7 +176,7 @@ def plan_pour(
         )
     theta = plan.parameters.model_dump()
     if as_json:
-        totals = {"simulations": finished.result.simulations, "cpu_s": finished.result.cpu_s, "run": str(directory)}
+        totals = {"simulations": run_result.simulations, "cpu_s": run_result.cpu_s, "run": str(directory)}
         first = answers[0]
         print_json({**first, "theta": theta, **totals, **({"plans": answers} if len(answers) > 1 else {})})
 
@@ -209,51 +199,48 @@ def planning_plan(
     """
     from orchestrator.config.file_loading import load_vessel
     from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.runs.run_tasks import GivenTheta, RunTaskError, planned, read_theta
+    from orchestrator.run_service import RunTaskError, planned, read_theta
 
     with Refused(ConfigError, RunTaskError):
-        given = GivenTheta(plan.parameters) if parameters is None else read_theta(parameters, plan)
-        vessel = None if receiver is None else load_vessel(receiver)
-        return planned(plan, given.theta, vessel, iterations, given.draws, given.left_over)
+        given = None if parameters is None else read_theta(parameters, plan)
+        return planned(plan, given, None if receiver is None else load_vessel(receiver), iterations)
 
 
-def _run(
-    plan: CampaignPlan, verb: str, path: Path, options: RunOptions, stages: list[StageDefinition] | None = None
-) -> Finished:
+def _run(task: Literal["run", "calibrate"], path: Path, options: RunOptions) -> tuple[CampaignResult, Published]:
     from orchestrator.cli.foreground_run import check_somebody_is_there
     from orchestrator.cli.motion_approval import arm_campaign
     from orchestrator.cli.view_command import live_view
-    from orchestrator.runs.stages import stages_of
+    from orchestrator.run_service import RunResources, RunTaskError, task_request
 
+    with Refused(RunTaskError):
+        request = task_request(read_campaign(path, options.laboratory, options.seed), task)
+    plan = request.campaign
+    check_campaign_can_run(request)
     if options.answer is not None and not options.resume:
         raise RefusalError(
             f"--answer {options.answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT
         )
-    chosen = stages_of(plan) if stages is None else stages
-    checksum = arm_campaign(plan, chosen, armed=options.arm, verb=verb)
-    if any(stage.pours for stage in chosen):
+    checksum = arm_campaign(plan, request.stages, armed=options.arm, verb=task)
+    if request.pours:
         check_somebody_is_there(plan.laboratory)
-    check_laboratory_answers(plan, chosen, in_process=options.in_process)
+    resources = RunResources(in_process=options.in_process, approved_checksum=checksum or "")
+    check_laboratory_answers(request, resources)
     live = live_view(plan, live=options.live, at=options.live_at)
     directory = run_directory(plan, resume=options.resume, run_id=options.run_id)
     flag = "" if options.laboratory is None else f" --laboratory {options.laboratory}"
     flag += "" if options.seed is None else f" --seed {options.seed}"
     flag += " --arm" if plan.laboratory.mode == "hardware" else ""
-    again = f"decant {verb} {path} --resume --run {directory.name}{flag}"
-    finished = run_in_front_of_people(
-        plan,
-        directory,
-        resume=options.resume,
-        stages=stages,
-        in_process=options.in_process,
+    again = f"decant {task} {path} --resume --run {directory.name}{flag}"
+    result, published = run_in_front_of_people(
+        dataclasses.replace(request, folder=directory, resume="yes" if options.resume else "no"),
+        resources,
         again=again,
         answer=options.answer,
-        checksum=checksum,
         live=live,
     )
-    if finished.published.theta is not None:
-        mention(f"the parameters to use are in {finished.published.theta}; give them with --parameters")
-    return finished
+    if published.theta is not None:
+        mention(f"the parameters to use are in {published.theta}; give them with --parameters")
+    return result, published
 
 
 def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:

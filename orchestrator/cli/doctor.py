@@ -13,30 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
-from actors.balance.balance_settings import BalanceSpec
+from actors.balance.balance_settings import look_at_balance
 from actors.interfaces import DeviceCheck, LaboratoryError
-from actors.laboratory import check_bench_packages, check_laboratory
+from actors.laboratory import check_bench_packages, check_laboratory, reached
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, say
-from orchestrator.cli.hands_on import reached
 from orchestrator.installed_plugins import broken
 from orchestrator.runs.safety_approval import SafetyRecordError, read_record, record_path, write_record
 
 if TYPE_CHECKING:
     from actors.laboratory_settings import LaboratorySpec
-
-
-def look_at_balance(spec: BalanceSpec | None, *, tare: bool) -> list[DeviceCheck]:
-    """Check the balance: identity, a stable reading, its step, and optionally whether it can be tared.
-
-    Args:
-        spec: settings from the laboratory's file, with the address.
-        tare: also tare it.
-    """
-    if spec is None:
-        return [DeviceCheck("balance", "fail", "the file has none", "add a 'balance' section, or 'placement: manual'")]
-    if spec.device is None:
-        return [DeviceCheck("balance", "ok", "all weights are typed by the operator")]
-    return spec.device.look(tare=tare)
 
 
 _MARKS = {"ok": ("ok", "green"), "warn": ("warn", "yellow"), "fail": ("FAIL", "bold red")}

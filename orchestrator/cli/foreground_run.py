@@ -14,7 +14,7 @@ import signal
 import sys
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,13 +32,13 @@ from orchestrator.cli.console import (
 )
 
 if TYPE_CHECKING:
-    from actors.interfaces import Laboratory, Operator
+    from actors.interfaces import Operator
     from actors.laboratory_settings import LaboratorySpec
     from orchestrator.journal.run_record import CampaignResult
     from orchestrator.live_view.live_server import LiveView
     from orchestrator.live_view.rerun_subscriber import RerunMonitor
     from orchestrator.results.publishing import Published
-    from orchestrator.runs.stages import StageDefinition
+    from orchestrator.run_service import RunHandle, RunRequest, RunResources
     from orchestrator.runs.unknown_pours import AskOperator
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
@@ -56,47 +56,36 @@ def read_campaign(path: Path, laboratory: Path | None = None, seed: int | None =
         return load_campaign(path, laboratory, seed)
 
 
-def check_campaign_can_run(plan: CampaignPlan, *, as_written: bool = True) -> None:
-    """Vessels (those of the campaign's file, or others), loads and motions, before anything starts.
+def check_campaign_can_run(request: RunRequest) -> None:
+    """Vessels, loads and motions of a campaign, before anything starts; its warnings are shown.
 
     Raises:
-        RefusalError: with everything that is wrong, exit code 2.
+        RefusalError: with every problem, exit code 2.
     """
-    from orchestrator.runs.run_tasks import RunTaskError, check_job
+    from orchestrator.run_service import RunService, RunTaskError
 
-    warned: list[str] = []
-    try:
-        with Refused(RunTaskError), WaitingIndicator() as doing:
-            check_job(
-                plan, as_written=as_written, warn=lambda problem: warned.append(f"warning: {problem}"), doing=doing
-            )
-    finally:
-        for text in dict.fromkeys(warned):
-            mention(text)
+    with WaitingIndicator() as doing:
+        report = RunService().check(request, doing=doing)
+    for text in report.warnings:
+        mention(f"warning: {text}")
+    with Refused(RunTaskError):
+        report.require()
 
 
-def check_laboratory_answers(
-    plan: CampaignPlan, stages: Sequence[StageDefinition], *, in_process: bool, brief: bool = False
-) -> None:
-    """What the laboratory needs, here and from other machines, before anything starts.
-
-    Args:
-        plan: with its laboratory.
-        stages: that are to run.
-        in_process: everything in this process: no other machine is needed.
-        brief: see `actors.laboratory.open_laboratory`.
+def check_laboratory_answers(request: RunRequest, resources: RunResources) -> None:
+    """The requirements of the laboratory, on this machine and on others, before anything starts.
 
     Raises:
-        RefusalError: with what is missing, exit code 2.
+        RefusalError: something is missing; exit code 2.
     """
     from actors.interfaces import LaboratoryError
-    from actors.laboratory import check_laboratory
+    from orchestrator.run_service import RunService
 
-    laboratory = replace(plan.laboratory, in_process=in_process or plan.laboratory.in_process)
+    laboratory = resources.settings(request.campaign)
     if laboratory.ray is not None and not laboratory.in_process:
         mention(f"looking at the Ray cluster at {laboratory.ray.address} …")
     with Refused(LaboratoryError):
-        check_laboratory(laboratory, need_bench=any(stage.pours for stage in stages), brief=brief)
+        RunService().check_laboratory(request, resources)
 
 
 def check_output(path: Path | None, option: str, suffix: str) -> None:
@@ -138,89 +127,65 @@ def _why_not_opened(path: Path) -> str | None:
     return None
 
 
-@dataclass(frozen=True)
-class Finished:
-    """A campaign that ran to its end, and what was written about it."""
-
-    result: CampaignResult
-    published: Published
-
-
 def run_in_front_of_people(
-    plan: CampaignPlan,
-    directory: Path,
+    request: RunRequest,
+    resources: RunResources,
     *,
-    resume: bool,
-    stages: Sequence[StageDefinition] | None = None,
-    in_process: bool = False,
-    brief: bool = False,
     again: str,
     not_resumed: str = "",
     answer: str | None = None,
-    checksum: str | None = None,
     live: LiveView | None = None,
-) -> Finished:
+) -> tuple[CampaignResult, Published]:
     """Run a campaign with a live display, a recording, figures and a summary.
 
     Args:
-        directory: of the run.
-        stages: in place of the plan's.
-        in_process: everything in this process, without Ray (slower; for debugging).
-        brief: see `actors.laboratory.open_laboratory`.
-        again: the command that resumes, for the message after an interruption; or that begins anew …
-        not_resumed: … where nothing resumes: what is not, and what of it is kept.
-        answer: what came of a pour that was under way when the run died; else a person at the terminal is asked.
-        checksum: of the safety settings that people have accepted for the controller of hardware.
+        request: with the folder of the run.
+        resources: to run it with; operator, display and recorder are added here.
+        again: the command that resumes the run, or starts another one, for the message after an interruption.
+        not_resumed: for a run that can't be resumed: its name, and the part of it that is kept.
+        answer: outcome of a pour that was under way when the run died; None: a person at the terminal is asked.
         live: view to open while it runs.
+
+    Returns:
+        The result of the run, and the files written about it.
 
     Raises:
         RefusalError: it failed, was interrupted, or needs a person.
     """
     from actors.interfaces import LaboratoryError
-    from actors.laboratory import open_laboratory
     from orchestrator.live_view.live_server import can_record, recorder_of
     from orchestrator.progress.console_progress import ProgressDisplay
     from orchestrator.results.console_view import print_summary
-    from orchestrator.results.publishing import not_simulated, publish
+    from orchestrator.results.publishing import not_simulated
     from orchestrator.run_errors import RunError
-    from orchestrator.runs.events import Watcher
-    from orchestrator.runs.run_engine import run_campaign
-    from orchestrator.runs.stages import stages_of
+    from orchestrator.run_service import RunService
 
-    chosen = tuple(stages_of(plan) if stages is None else stages)
-    pouring = any(stage.pours for stage in chosen)
-    spec = replace(
-        plan.laboratory, in_process=in_process or plan.laboratory.in_process, accepted_checksum=checksum or ""
-    )
-    mention(f"run {directory}  ({spec.mode} bench)" if pouring else f"run {directory}")
-    if not resume:
+    plan, directory = request.campaign, request.folder
+    assert directory is not None
+    mention(f"run {directory}  ({plan.laboratory.mode} bench)" if request.pours else f"run {directory}")
+    if request.resume == "no":
         for line in not_simulated(plan, say):
             mention(line)
-    monitor: RerunMonitor | None = None
+
+    def recorder(plan: CampaignPlan, run: Path) -> RerunMonitor | None:
+        if live is not None and can_record(plan):
+            mention(f"live view: {live.open()}")
+        return recorder_of(plan, run, say, live)
+
+    handle: RunHandle | None = None
     result: CampaignResult | None = None
     try:
         display = ProgressDisplay(plan, quiet=is_quiet())
-        operator = person_at_the_terminal(spec, display.paused) if pouring else None
-        laboratory = open_laboratory(spec, need_bench=pouring, brief=brief, operator=operator)
-        if live is not None and can_record(plan):
-            mention(f"live view: {live.open()}")
-        monitor = recorder_of(plan, directory, say, live)
-        with display:
-            watchers: list[Watcher] = [display, *([monitor] if monitor is not None else [])]
-
-            async def work(laboratory: Laboratory) -> CampaignResult:
-                return await run_campaign(
-                    plan,
-                    laboratory,
-                    directory,
-                    resume=resume,
-                    watchers=watchers,
-                    ask_operator=asked_about_unknown_pours(answer),
-                    stages=chosen,
-                )
-
-            with stdout_for_results():
-                result = asyncio.run(_until_signalled(lambda: work(laboratory), resumable=not not_resumed))
+        resources = replace(
+            resources,
+            operator=person_at_the_terminal(plan.laboratory, display.paused) if request.pours else None,
+            ask_operator=asked_about_unknown_pours(answer),
+            subscribers=[display],
+            recorder=recorder,
+        )
+        handle = RunService().start(request, resources)
+        with display, stdout_for_results():
+            result = asyncio.run(_until_signalled(handle.wait, resumable=not not_resumed))
     except (RunError, LaboratoryError) as error:
         problem = getattr(error, "problem", error) if not_resumed else error
         way_on = _way_on(directory, again, not_resumed)
@@ -242,24 +207,25 @@ def run_in_front_of_people(
         raise RefusalError(f"interrupted{way_on}", INTERRUPTED) from None
     finally:
         if result is None:
-            if monitor is not None:
-                monitor.close()
-            if live is not None:
-                live.close()
+            _close(handle, live)
             if (page := report_of_what_stands(plan, directory)) is not None:
                 mention(f"report of what stands  {page}")
     try:
-        if monitor is not None:
-            monitor.close()
-        if live is not None:
-            live.close()
-        published = publish(plan, result, monitor)
+        _close(handle, live)
+        published = handle.publish()
         print_summary(plan, published.summary)
     except KeyboardInterrupt:
         raise RefusalError(f"interrupted{finished_without_report(directory)}", INTERRUPTED) from None
     if published.report is not None:
         mention(f"report  {published.report}")
-    return Finished(result, published)
+    return result, published
+
+
+def _close(handle: RunHandle | None, live: LiveView | None) -> None:
+    if handle is not None:
+        handle.close()
+    if live is not None:
+        live.close()
 
 
 def _way_on(directory: Path, again: str, not_resumed: str) -> str:
@@ -369,17 +335,13 @@ def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
     from orchestrator.journal.codec import digest
     from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
     from orchestrator.journal.run_record import read_result
-    from orchestrator.results.campaign_figures import draw_figures
-    from orchestrator.results.html_report import REPORT_NAME
-    from orchestrator.results.publishing import FIGURES, summary_of, write_report
+    from orchestrator.results.publishing import report_on
     from orchestrator.runs.fingerprint import fingerprint
 
     with contextlib.suppress(Exception, KeyboardInterrupt), JournalReader(directory / JOURNAL_NAME) as journal:
         if digest(journal.header.fingerprint) != digest(fingerprint(plan)):
             return None  # it was refused, since this is another campaign
-        result = read_result(journal, directory)
-        figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
-        return write_report(directory / REPORT_NAME, plan, summary_of(plan, result, figures), directory)
+        return report_on(plan, read_result(journal, directory), draw=plan.outputs.figures)[0]
     return None
 
 

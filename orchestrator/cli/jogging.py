@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from actors.interfaces import LaboratoryError
+from actors.laboratory import reached
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, say
 from orchestrator.cli.doctor import read_laboratory, without_arm
-from orchestrator.cli.hands_on import accepted_for, connected, reached, stoppable, typed_line
-from orchestrator.cli.motion_approval import confirm, require_flag
+from orchestrator.cli.motion_approval import confirm, connected, require_flag, stoppable, typed_line
+from orchestrator.runs.safety_approval import SafetyRecordError, accepted_checksum
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm
@@ -210,7 +211,8 @@ def jog(path: Path, *, armed: bool) -> None:
     require_flag(spec, armed=armed, again=f"decant jog {path} --arm")
     if not sys.stdin.isatty():
         raise RefusalError("jogging is typed at a terminal, step by step, with nothing piped into it", BAD_INPUT)
-    accepted = accepted_for(path) if spec.mode == "hardware" else None
+    with Refused(SafetyRecordError):
+        accepted = accepted_checksum(path) if spec.mode == "hardware" else None
     if spec.mode == "hardware":
         confirm(spec, ["steps          one at a time, as typed: at most 10 deg at 5 deg/s, or 50 mm at 20 mm/s"])
     else:

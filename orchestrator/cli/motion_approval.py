@@ -1,134 +1,30 @@
-"""Approval of motion on hardware: the operator at the terminal reads what will move and types the laboratory's name.
+"""Approval and control of an arm's motion for one command at the terminal.
 
-`arm_campaign` does this for a campaign, `confirm` for other commands. `Envelope` summarises the planned paths of
-representative actions. Without approval, no command moves hardware; virtual laboratories need none.
+Hardware moves only after the operator has read what will move and has typed the laboratory's name. The arm is
+connected, its safety settings are compared, and Ctrl-C stops it. Virtual laboratories need no approval.
 """
 
 from __future__ import annotations
 
-import math
+import contextlib
 import sys
 import termios
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, TypeVar
 
-import numpy as np
-
-from actors.arm.arm_geometry import JOINT_NAMES
-from actors.arm.arm_interface import PathReport
-from actors.arm.arm_settings import ArmSpec
-from actors.interfaces import InvalidActionError
-from actors.optimizer.questions import Linear
+from actors.arm.arm_interface import NotAcceptedError
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, say
-from orchestrator.config.yaml.yaml_errors import shown_path
-from orchestrator.runs.safety_approval import SafetyRecordError, accepted_checksum
-from orchestrator.strategies.calibration.action_prior import actions_all_over
-from sim_engine.action import Action
-from sim_engine.scene import Scene
-from sim_engine.search_space import Space
+from orchestrator.runs.motion_envelope import campaign_pours, envelope, envelope_lines, pour_count
+from orchestrator.runs.safety_approval import SafetyRecordError, required_checksum
 
 if TYPE_CHECKING:
+    from actors.arm.arm_interface import Arm, ArmFacts
     from actors.laboratory_settings import LaboratorySpec
     from orchestrator.runs.stages import StageDefinition
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
-CORNERS, INTERIOR = 32, 12
-"""Number of corner and interior actions of each space whose paths are planned, in addition to the middle."""
-
-
-@dataclass(frozen=True)
-class Envelope:
-    """Extremes of the paths of several actions.
-
-    Attributes:
-        reports: reports of the executable paths.
-        refused: reasons of the others, one text each.
-    """
-
-    reports: tuple[PathReport, ...]
-    refused: tuple[str, ...] = ()
-
-    @property
-    def worst(self) -> PathReport:
-        """The extremes of all paths in one report.
-
-        Raises:
-            ValueError: no path can be executed.
-        """
-        if not self.reports:
-            raise ValueError("no path can be executed")
-        fastest = max(self.reports, key=lambda r: r.joint_speed)
-        low = np.min([r.low for r in self.reports], axis=0)
-        high = np.max([r.high for r in self.reports], axis=0)
-        return PathReport(
-            joint_speed=fastest.joint_speed,
-            fastest_joint=fastest.fastest_joint,
-            tool_speed=max(r.tool_speed for r in self.reports),
-            tilt=max(r.tilt for r in self.reports),
-            tilt_speed=max(r.tilt_speed for r in self.reports),
-            singularity=min(r.singularity for r in self.reports),
-            clearance=min(r.clearance for r in self.reports),
-            low=(float(low[0]), float(low[1]), float(low[2])),
-            high=(float(high[0]), float(high[1]), float(high[2])),
-            duration=max(r.duration for r in self.reports),
-            deviation=max(r.deviation for r in self.reports),
-        )
-
-
-def envelope(arm: ArmSpec, pours: Iterable[tuple[Scene, Action]]) -> Envelope:
-    """Plan the paths of actions and collect their reports."""
-    reports, refused = [], []
-    for scene, action in pours:
-        try:
-            reports.append(arm.plan(scene, action).report)
-        except (InvalidActionError, ValueError) as error:
-            refused.append(f"{action.display()}: {error}")
-    return Envelope(tuple(reports), tuple(refused))
-
-
-def campaign_pours(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> list[tuple[Scene, Action]]:
-    """Return representative actions of the spaces that the stages search: middle, corners and interior."""
-    calibrating, deploying = _pouring(stages)
-    cases: list[tuple[Scene, Action]] = []
-    if plan.calibration is not None and calibrating:
-        for scene in plan.calibration.poured:
-            cases += _from_all_over(scene, plan.calibration.actions, plan.calibration.constraints)
-    if plan.deployment is not None and deploying:
-        for scene in plan.deployment.scenes:
-            cases += _from_all_over(scene, plan.deployment.actions, plan.deployment.constraints)
-    return cases
-
-
-def _from_all_over(scene: Scene, actions: Space, constraints: Sequence[Linear]) -> list[tuple[Scene, Action]]:
-    found = []
-    for values in actions_all_over(actions, constraints, corners=CORNERS, drawn=INTERIOR):
-        try:
-            found.append((scene, scene.action(values)))
-        except ValueError:
-            continue  # the values do not form a valid action
-    return found
-
-
-def pour_count(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> int:
-    """Return the largest number of pours that the stages may request."""
-    from orchestrator.runs.stages import CONFIRMATION
-
-    calibrating, deploying = _pouring(stages)
-    count = plan.calibration.pour_count if plan.calibration is not None and calibrating else 0
-    if plan.deployment is None:
-        return count
-    confirming = sum(stage.name.startswith(CONFIRMATION) for stage in stages)
-    return count + plan.deployment.pours * deploying + plan.deployment.confirm * confirming
-
-
-def _pouring(stages: Sequence[StageDefinition]) -> tuple[bool, int]:
-    """Return whether the stages include calibration pours, and the number of deployments that pour."""
-    from orchestrator.runs.stages import CONFIRMATION, DEPLOYMENT
-
-    names = [stage.name for stage in stages if stage.pours and not stage.name.startswith(CONFIRMATION)]
-    deploying = sum(name.startswith(DEPLOYMENT) for name in names)
-    return deploying < len(names), deploying
+T = TypeVar("T")
 
 
 def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed: bool, verb: str) -> str | None:
@@ -157,7 +53,8 @@ def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed
         return None
     require_flag(laboratory, armed=armed, again=f"decant {verb} {plan.source.name} --arm")
     assert laboratory.arm is not None
-    checksum = accepted(plan)
+    with Refused(SafetyRecordError):
+        checksum = required_checksum(plan)
     mention(f"planning paths from all over the actions of {plan.name} …")
     found = envelope(laboratory.arm, campaign_pours(plan, stages))
     if not found.reports:
@@ -181,56 +78,6 @@ def require_flag(laboratory: LaboratorySpec, *, armed: bool, again: str) -> None
             f"('decant doctor', 'decant pour --dry-run'); then arm this one run: {again}",
             BAD_INPUT,
         )
-
-
-def accepted(plan: CampaignPlan) -> str:
-    """Return the checksum of the accepted safety settings of the laboratory's hardware.
-
-    Raises:
-        RefusalError: no settings have been accepted (exit code 2).
-    """
-    with Refused(SafetyRecordError):
-        checksum = accepted_checksum(plan.laboratory_source or plan.source)
-    if checksum is None:
-        raise RefusalError(
-            f"laboratory {plan.laboratory.name}: nobody has accepted the controller's safety settings. Run "
-            f"'decant doctor {shown_path(plan.laboratory_source or plan.source)}' first; it says how",
-            BAD_INPUT,
-        )
-    return checksum
-
-
-def envelope_lines(found: Envelope) -> list[str]:
-    """Describe the extremes of the paths for the operator."""
-    lines = report_lines(found.worst)
-    total = len(found.reports) + len(found.refused)
-    lines.append(
-        f"planned        {len(found.reports)} of {total} actions from all over; others stay within their limits"
-    )
-    if found.refused:
-        lines.append(f"refused        {len(found.refused)}; such pours are refused again before anything moves, e.g.")
-        lines.append(f"               {found.refused[0].splitlines()[0]}")
-    return lines
-
-
-def report_lines(report: PathReport) -> list[str]:
-    """Describe one path's report, or the extremes of several, for the operator."""
-    low, high = ([f"{1e3 * v:.0f}" for v in corner] for corner in (report.low, report.high))
-    turned, turning = math.degrees(report.tilt), math.degrees(report.tilt_speed)
-    return [
-        "box            " + ", ".join(f"{n} {a} … {b} mm" for n, a, b in zip("xyz", low, high, strict=True)),
-        f"tool, pourer   up to {1e3 * report.tool_speed:.0f} mm/s",
-        *(
-            [f"joints         up to {math.degrees(report.joint_speed):.0f} deg/s, {JOINT_NAMES[report.fastest_joint]}"]
-            if report.joint_speed > 0.0
-            else []
-        ),
-        f"tilt           up to {turned:.0f} deg, at up to {turning:.0f} deg/s",
-        f"clearance      at least {1e3 * report.clearance:.0f} mm between pourer and receiver"
-        if report.clearance > 0.0
-        else "clearance      pourer and receiver don't touch",
-        f"one pour       up to {report.duration:.1f} s in motion",
-    ]
 
 
 def announce(laboratory: str, arm: str, lines: Sequence[str], lasting: str = "") -> None:
@@ -264,3 +111,69 @@ def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
     if typed.strip() != laboratory.name:
         raise RefusalError(f"not armed: '{typed.strip()}' was typed; nothing has moved", BAD_INPUT)
     say(f"armed, for this run only: {laboratory.name}")
+
+
+@contextlib.contextmanager
+def connected(spec: LaboratorySpec, accepted: str | None) -> Iterator[tuple[Arm, ArmFacts]]:
+    """The arm's driver, connected and locked; it is stopped and let go of in any case.
+
+    Args:
+        spec: of a laboratory that was reached.
+        accepted: checksum of the safety settings that people have accepted; not asked for where nothing is hardware.
+
+    Raises:
+        RefusalError: the arm isn't ready, or its safety settings are others.
+        LaboratoryError: it can't be reached.
+    """
+    assert spec.arm is not None
+    cls, arguments = spec.arm.driver((accepted or "") if spec.mode == "hardware" else None)
+    arm: Arm = cls(*arguments)
+    try:
+        with Refused(NotAcceptedError):
+            facts = arm.connect()
+        if facts.problem:
+            raise RefusalError(f"{spec.arm.title}: {facts.problem}; 'decant doctor' says what to do about it")
+        yield arm, facts
+    finally:
+        arm.close()
+
+
+def stoppable(arm: Arm, motion: Callable[[], T]) -> T:
+    """Do something that moves the arm; Ctrl-C stops it, and the error that the stop causes is raised.
+
+    The motion runs in a thread: an interrupt must reach the arm as an order to stop, not tear the driver apart.
+    """
+    result: list[T] = []
+    failure: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            result.append(motion())
+        except BaseException as error:
+            failure.append(error)
+
+    thread = threading.Thread(target=work, name="motion", daemon=True)
+    thread.start()
+    while thread.is_alive():
+        try:
+            thread.join(0.1)
+        except KeyboardInterrupt:
+            say("\nstopping the arm …")
+            arm.stop()
+    if failure:
+        raise failure[0]
+    return result[0]
+
+
+def typed_line(prompt: str) -> str:
+    """A line from the terminal; keys pressed before it was asked for are thrown away: they meant something else.
+
+    Raises:
+        EOFError: there are no more.
+    """
+    termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
+    print(prompt, end="", file=sys.stderr, flush=True)
+    line = sys.stdin.readline()
+    if not line:
+        raise EOFError
+    return line

@@ -18,15 +18,16 @@ from typing import TYPE_CHECKING, Any
 
 from actors.arm.arm_interface import PathReport, PlannedPour
 from actors.interfaces import LaboratoryError
+from actors.laboratory import reached
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, mention, print_json, say
 from orchestrator.cli.foreground_run import check_output, read_campaign
-from orchestrator.cli.hands_on import connected, reached, stoppable, typed_line
-from orchestrator.cli.motion_approval import accepted, confirm, report_lines, require_flag
+from orchestrator.cli.motion_approval import confirm, connected, require_flag, stoppable, typed_line
 from orchestrator.cli.pour_prediction import scene_to_simulate, wanted_in
+from orchestrator.runs.motion_envelope import report_lines
+from orchestrator.runs.safety_approval import SafetyRecordError, required_checksum
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm, Executed
-    from orchestrator.runs.stages import StageDefinition
     from orchestrator.strategies.campaign_plan import CampaignPlan
     from orchestrator.strategies.single_pour import WeighedPour
     from sim_engine.action import Action
@@ -211,9 +212,6 @@ def _stands_at_home(chosen: Chosen) -> bool:
     Raises:
         RefusalError: it can't be read.
     """
-    from actors.interfaces import LaboratoryError
-    from orchestrator.cli.hands_on import reached
-
     with Refused(LaboratoryError, code=FAILED), reached(chosen.plan.laboratory) as ready:
         assert ready.arm is not None
         check = ready.arm.look().at_home()
@@ -230,6 +228,7 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
         run_in_front_of_people,
     )
     from orchestrator.journal.stage_results import result_of
+    from orchestrator.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import StageDefinition
     from orchestrator.strategies.single_pour import OnePour, OnePoured
 
@@ -239,26 +238,24 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
         outputs=dataclasses.replace(chosen.plan.outputs, figures=False),
     )
     build: Callable[..., OnePour] = lambda results, seed: OnePour(chosen.scene, chosen.action, seed)  # noqa: E731
-    stages: list[StageDefinition] = [StageDefinition(STAGE, build, pours=True)]
-    checksum = None
+    request = RunRequest(plan, [StageDefinition(STAGE, build, pours=True)])
+    checksum = ""
     if plan.laboratory.mode == "hardware":
         assert chosen.path is not None
-        checksum = accepted(chosen.plan)
+        with Refused(SafetyRecordError):
+            checksum = required_checksum(chosen.plan)
         confirm(plan.laboratory, ["pours          1", *report_lines(chosen.path.report)])
     check_somebody_is_there(plan.laboratory)
-    check_laboratory_answers(plan, stages, in_process=in_process)
+    resources = RunResources(in_process=in_process, approved_checksum=checksum)
+    check_laboratory_answers(request, resources)
     directory = run_directory(plan, resume=False, run_id=None)
-    finished = run_in_front_of_people(
-        plan,
-        directory,
-        resume=False,
-        stages=stages,
-        in_process=in_process,
+    finished, _ = run_in_front_of_people(
+        dataclasses.replace(request, folder=directory),
+        resources,
         again=again,
         not_resumed="this pour is not resumed; what was weighed of it",
-        checksum=checksum,
     )
-    result = result_of(finished.result.results, STAGE, OnePoured)
+    result = result_of(finished.results, STAGE, OnePoured)
     if result.weighed is None:
         raise RefusalError(result.failed or "nothing was poured", FAILED)
     if as_json:
@@ -313,7 +310,8 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
     hardware = laboratory.mode == "hardware"
     if hardware and not sys.stdin.isatty():
         raise RefusalError("--empty asks a person before the arm moves: run it in a terminal", BAD_INPUT)
-    checksum = accepted(plan) if hardware else None
+    with Refused(SafetyRecordError):
+        checksum = required_checksum(plan) if hardware else None
     lines = [f"one cycle      with an EMPTY pourer, at {100 * slow:g} % of its speed", *report_lines(path.report)]
     if hardware:
         confirm(laboratory, lines)

@@ -191,13 +191,9 @@ def scene_to_simulate(plan: CampaignPlan, name: str | None = None) -> tuple[Scen
     Raises:
         RefusalError: the campaign has no such scene.
     """
-    scenes: dict[str, tuple[Scene, Space]] = {}
-    if plan.deployment is not None:
-        scenes |= {scene.receiver.name: (scene, plan.deployment.actions) for scene in plan.deployment.scenes}
-    if plan.calibration is not None:
-        scenes |= {scene.name: (scene, plan.calibration.actions) for scene in plan.calibration.poured}
-        if plan.calibration.transfer is not None:
-            scenes["transfer"] = plan.calibration.transfer.scene, plan.calibration.actions
+    from orchestrator.runs.stages import named_scenes
+
+    scenes = named_scenes(plan)
     if name is None:
         return next(iter(scenes.values()))
     if name not in scenes:

@@ -58,6 +58,7 @@ def read_study(path: Path) -> StudyPlan:
 
     from orchestrator.cli.foreground_run import check_campaign_can_run
     from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.run_service import RunRequest
     from orchestrator.study.study_file import load_study
 
     with Refused(ConfigError):
@@ -65,7 +66,7 @@ def read_study(path: Path) -> StudyPlan:
     deployment = None
     if plan.deployments:  # the cells use draws of θ from the calibration cells
         deployment = replace(plan.deployments[0].plan, thetas=(plan.base.parameters,))
-    check_campaign_can_run(replace(plan.base, source=plan.source, deployment=deployment))
+    check_campaign_can_run(RunRequest(replace(plan.base, source=plan.source, deployment=deployment), ()))
     return plan
 
 

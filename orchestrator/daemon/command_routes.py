@@ -15,8 +15,6 @@ from typing import Annotated
 
 from fastapi import APIRouter, HTTPException, Path, Request
 
-from orchestrator.cli.console import RefusalError
-from orchestrator.cli.motion_approval import accepted, campaign_pours, envelope, envelope_lines, pour_count
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.access_control import Admin, Daemon, Operator, Viewer
 from orchestrator.daemon.daemon_store import ENDED, QueueItem
@@ -38,6 +36,8 @@ from orchestrator.daemon.schemas import (
 from orchestrator.daemon.submissions import Submission, SubmissionError, prepare
 from orchestrator.daemon.supervisor import RequestRefusedError, Supervisor
 from orchestrator.run_errors import RunError
+from orchestrator.runs.motion_envelope import campaign_pours, envelope, envelope_lines, pour_count
+from orchestrator.runs.safety_approval import required_checksum
 
 
 class MotionNotEnabledError(RunError):
@@ -56,18 +56,18 @@ def what_moves(daemon: Supervisor, item: QueueItem) -> WhatMovesOut:
         raise MotionNotEnabledError(f"{item.id} is {item.state}")
     try:
         work = job_of(daemon.settings, item, daemon.settings.rig(item.rig))
-        accepted(work.plan)
-        arm = work.plan.laboratory.arm
+        required_checksum(work.campaign)
+        arm = work.campaign.laboratory.arm
         assert arm is not None
-        found = envelope(arm, campaign_pours(work.plan, work.stages))
-    except (ConfigError, RunError, RefusalError, KeyError) as error:
+        found = envelope(arm, campaign_pours(work.campaign, work.stages))
+    except (ConfigError, RunError, KeyError) as error:
         raise MotionNotEnabledError(str(error)) from None
     if not found.reports:
         raise MotionNotEnabledError(
             f"none of {len(found.refused)} actions could be poured by this arm: {found.refused[0]}"
         )
-    lines = [f"pours          up to {pour_count(work.plan, work.stages)}", *envelope_lines(found)]
-    return WhatMovesOut(laboratory=work.plan.laboratory.name, arm=arm.title, lines=lines)
+    lines = [f"pours          up to {pour_count(work.campaign, work.stages)}", *envelope_lines(found)]
+    return WhatMovesOut(laboratory=work.campaign.laboratory.name, arm=arm.title, lines=lines)
 
 
 def arm(daemon: Supervisor, item: QueueItem, moves: WhatMovesOut, typed: str, by: str) -> QueueItem:

@@ -72,7 +72,7 @@ def rigs_out(daemon: Supervisor) -> list[RigOut]:
     found = []
     for name, worker in daemon.lanes.items():
         running = worker.running
-        checkpoint = running.watching.checkpoint if running is not None and running.watching is not None else ""
+        checkpoint = "" if running is None else running.checkpoint
         campaign = None if running is None else running.item.id
         stop = daemon.emergencies.get(name)
         found.append(
@@ -112,7 +112,7 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
 
         def read() -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
             def plan() -> CampaignPlan:
-                return job_of(daemon.settings, item, daemon.settings.rig(item.rig)).plan
+                return job_of(daemon.settings, item, daemon.settings.rig(item.rig)).campaign
 
             return daemon.pours.of(directory, plan), summary_of(directory)
 

@@ -9,16 +9,15 @@ import asyncio
 import contextlib
 import logging
 import time
+from collections.abc import Awaitable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 from actors.bench.bench_factory import needs_person
-from actors.interfaces import Laboratory, LaboratoryError, Stoppable
-from actors.laboratory import open_laboratory
+from actors.interfaces import LaboratoryError
 from actors.simulators.shared_pool import WarmSimulators
 from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.daemon.campaign_progress import CampaignProgress
 from orchestrator.daemon.daemon_settings import DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
@@ -26,32 +25,20 @@ from orchestrator.daemon.remote_operator import Asking, RemoteOperator, RunQuest
 from orchestrator.daemon.run_readout import prune_recordings
 from orchestrator.daemon.submission_bundle import CAMPAIGN, THETA, load_confined
 from orchestrator.journal.disk_reserve import MB, free_space
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-from orchestrator.journal.journal_check import check_journal, has_begun
 from orchestrator.journal.journal_file import JournalError
-from orchestrator.journal.run_record import CampaignResult, read_result
+from orchestrator.journal.run_record import CampaignResult
 from orchestrator.live_view.live_server import LiveView, recorder_of
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
-from orchestrator.results.publishing import not_simulated, publish
+from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState
+from orchestrator.results.publishing import not_simulated
 from orchestrator.run_errors import RunError
-from orchestrator.runs.events import CampaignStateChanged, Watcher
+from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService, read_theta, task_request
+from orchestrator.runs.events import CampaignStateChanged, StageOpened
 from orchestrator.runs.request_executor import PourUnknownError, RequestExecutorError
-from orchestrator.runs.run_engine import run_campaign
-from orchestrator.runs.run_folder import create_run
-from orchestrator.runs.run_tasks import RunTask, Verb, check_job, job, read_theta
 from orchestrator.runs.stages import scenes_of
 from orchestrator.runs.unknown_pours import OperatorNeededError
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
-
-MOVING = ("approach", "tilt", "hold", "return")
-"""Checkpoints of a pour during which the arm moves."""
-
-BETWEEN_CANCELS = 1.0
-"""Longest time that a run has to take note of a pause before it is told to give everything up [s]."""
-
-STOP_DEADLINE = 5.0
-"""Longest time that is waited for an arm to confirm that it was stopped [s]; everything else goes on meanwhile."""
 
 _log = logging.getLogger(__name__)
 
@@ -68,30 +55,41 @@ class Common:
     live: LiveView | None = None
 
 
-def job_of(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunTask:
-    """The work of a submitted campaign, from its snapshot. Takes a moment, and no event loop.
+def job_of(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunRequest:
+    """The run of a submitted campaign, from its snapshot. Takes a moment, and no event loop.
 
     Raises:
-        ConfigError, JobError: it can't be used.
+        ConfigError, RunTaskError, JournalError: it can't be used.
     """
     folder = settings.snapshots / item.id
     plan = load_confined(folder / CAMPAIGN, [folder.resolve()], rig.source)
     given = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
     # A daemon never repeats a pour by itself: whoever is there is asked, whatever the campaign says.
     plan = replace(plan, on_unknown="ask", outputs=replace(plan.outputs, directory=settings.runs))
-    verb: Verb = item.verb  # type: ignore[assignment]  # written by us
-    return job(plan, verb, given)
+    request = task_request(plan, item.verb, given=given)  # type: ignore[arg-type]  # written by us
+    if item.run is None:
+        return request
+    return replace(request, folder=settings.runs / item.run, resume="if begun")
 
 
-def _warnings_of(plan: CampaignPlan) -> list[str]:
-    """All that is suspicious about a campaign, or not simulated. Takes a moment, and no event loop.
+def _prepared(request: RunRequest) -> tuple[RunRequest, list[str]]:
+    """The request with its folder, and what is suspicious about a new run. Takes a moment, and no event loop.
 
     Raises:
-        JobError: it can't run.
+        RunError, OSError: it can't run.
     """
-    found: list[str] = []
-    check_job(plan, warn=lambda problem: found.append(str(problem)))
-    return list(dict.fromkeys([*found, *not_simulated(plan, found.append)]))
+    service, warned = RunService(), list[str]()
+    if request.folder is None:
+        report = service.check(request)
+        report.require()
+        warned += report.warnings
+        warned += not_simulated(request.campaign, warned.append)
+    elif not request.folder.is_dir():
+        raise JournalError(
+            f"{request.folder}: the folder of this run is missing, and pours may have been made in it. Nothing was "
+            "poured now. Restore the folder from a copy, or submit the campaign again"
+        )
+    return service.with_folder(request), list(dict.fromkeys(warned))
 
 
 class Running:
@@ -105,10 +103,9 @@ class Running:
 
     def __init__(self, common: Common, item: QueueItem, rig: Rig) -> None:
         self._common, self.item, self._rig = common, item, rig
-        self.watching: CampaignProgress | None = None
-        self._laboratory: Laboratory | None = None
-        self._task: asyncio.Task[CampaignResult] | None = None
-        self._aborting = self._giving_up = False
+        self._tally: ProgressState | None = None
+        self._stage = StageOpened(stage="", index=0, count=0)
+        self._handle: RunHandle | None = None
         self._asked_to_end = False
 
     async def run(self, checksum: str = "") -> CampaignResult:
@@ -121,100 +118,58 @@ class Running:
             asyncio.CancelledError: it was paused, stopped, aborted.
             RunError, LaboratoryError, ConfigError, OSError: it can't go on.
         """
-        work = await asyncio.to_thread(job_of, self._common.settings, self.item, self._rig)
-        submitted_before = self.item.run is not None
-        directory = await asyncio.to_thread(self._directory, work.plan)
-        if not submitted_before:
-            for text in await asyncio.to_thread(_warnings_of, work.plan):
-                self._log_warning(text)
-        # Before anything is written: a lost journal must not look like a run that was never begun.
-        begun = await asyncio.to_thread(self._begun, directory)
+        found = await asyncio.to_thread(job_of, self._common.settings, self.item, self._rig)
+        request, warned = await asyncio.to_thread(_prepared, found)
+        assert request.folder is not None
+        for text in warned:
+            self._log_warning(text)
         await self._common.warm.open()
-        self.watching = CampaignProgress(work.plan)
-        monitor = self._recording(work.plan, directory)
-        watchers: list[Watcher] = [self._common.feed.watcher(self.item.id), self.watching, self._note_state]
-        if monitor is not None:
-            watchers.append(monitor)
+        if self.item.run != request.folder.name:
+            self.note_run(request.folder)
+        self._tally = ProgressState(request.campaign)
+        self._handle = handle = RunService().start(request, self._resources(request, checksum))
+        if self._asked_to_end:
+            handle.pause()
         try:
-            result = await self._run(work, directory, begun, watchers, checksum)
+            result = await handle.wait()
         finally:
-            if monitor is not None:
-                await asyncio.to_thread(monitor.close)
-        await asyncio.to_thread(publish, work.plan, result, monitor)
+            await asyncio.to_thread(handle.close)
+        await asyncio.to_thread(handle.publish)
         return result
 
-    async def _run(
-        self, work: RunTask, directory: Path, begun: bool, watchers: list[Watcher], checksum: str
-    ) -> CampaignResult:
-        spec = work.plan.laboratory
-        spec = replace(
-            spec, in_process=spec.in_process or self._common.settings.in_process, accepted_checksum=checksum, ray=None
-        )
+    def _resources(self, request: RunRequest, checksum: str) -> RunResources:
         asking, key, rig = self._common.asking, self.item.id, self._rig.name
-        load = next(iter(scenes_of(work.plan).values())).liquid.mass  # a campaign has one liquid
-        operator = RemoteOperator(asking, key, rig, self._announce) if work.pours and needs_person(spec) else None
-        self._laboratory = open_laboratory(
-            spec,
-            need_bench=work.pours,
-            operator=operator,
-            kept=self._common.warm.share(),
+        plan, live = request.campaign, self._common.live
+        load = next(iter(scenes_of(plan).values())).liquid.mass  # a campaign has one liquid
+        asks = request.pours and needs_person(plan.laboratory)
+        assert self._tally is not None
+
+        def recorder(plan: CampaignPlan, run: Path) -> RerunMonitor | None:
+            return recorder_of(plan, run, self._log_warning, live if live is not None and live.alive else None)
+
+        return RunResources(
+            in_process=self._common.settings.in_process,
+            simulators=self._common.warm.share(),
             optimizer=self._common.warm.optimizer(),
+            operator=RemoteOperator(asking, key, rig, self._announce) if asks else None,
+            ask_operator=RunQuestions(asking, self._common.store, key, rig, load, lambda: self._look(plan)),
+            approved_checksum=checksum,
+            subscribers=[self._common.feed.watcher(key), self._tally, self._note_state],
+            recorder=recorder,
         )
-        self._task = asyncio.create_task(
-            run_campaign(
-                work.plan,
-                self._laboratory,
-                directory,
-                resume=begun,
-                watchers=watchers,
-                ask_operator=RunQuestions(asking, self._common.store, key, rig, load, lambda: self._look(work.plan)),
-                stages=work.stages,
-            ),
-            name=f"campaign {key}",
-        )
-        if self._asked_to_end:
-            self._task.cancel()
-        return await self._task
-
-    def _directory(self, plan: CampaignPlan) -> Path:
-        if self.item.run is None:
-            return create_run(plan)
-        directory = self._common.settings.runs / self.item.run
-        if not directory.is_dir():
-            raise JournalError(
-                f"{directory}: the folder of this run is missing, and pours may have been made in it. Nothing was "
-                "poured now. Restore the folder from a copy, or submit the campaign again"
-            )
-        return directory
-
-    def _begun(self, directory: Path) -> bool:
-        """Whether a run was begun in that folder.
-
-        Raises:
-            JournalDamagedError: its journal is lost or damaged.
-        """
-        path = directory / JOURNAL_NAME
-        if has_begun(path):
-            check_journal(path).require()
-            return True
-        return False
 
     def note_run(self, directory: Path) -> None:
         """Write down which folder the run has, before anything happens in it."""
         self.item = replace(self.item, run=directory.name)
         self._common.store.change(self.item.id, run=directory.name)
 
-    def _recording(self, plan: CampaignPlan, directory: Path) -> RerunMonitor | None:
-        if self.item.run != directory.name:
-            self.note_run(directory)
-        live = self._common.live
-        return recorder_of(plan, directory, self._log_warning, live if live is not None and live.alive else None)
-
     def _log_warning(self, text: str) -> None:
         self._common.feed.tell("LogLine", {"level": "warning", "text": text, "stage": ""}, self.item.id)
 
     def _note_state(self, event: Any) -> None:
-        if isinstance(event, CampaignStateChanged):
+        if isinstance(event, StageOpened):
+            self._stage = event
+        elif isinstance(event, CampaignStateChanged):
             # Finished is what has been published: killed before that, it is taken up again for it.
             done = event.after == State.FINISHED
             state, reason = ("running", "being published") if done else (event.after, event.reason)
@@ -231,78 +186,83 @@ class Running:
     # ---- ending it sooner
 
     def pause(self) -> None:
-        """Come to rest at the next safe point: simulations are dropped, a pour that has begun is finished, weighed."""
+        """Come to rest at the next safe point; see `RunHandle.pause`."""
         self._asked_to_end = True
-        if self._task is not None:
-            self._task.cancel()
+        if self._handle is not None:
+            self._handle.pause()
 
     async def abort(self) -> None:
-        """Stop the motion now. What was tilted is brought upright when somebody has agreed to it.
-
-        Where nothing moves, what is under way is given up; so it is when this is called again.
-        """
-        moving = self.watching is not None and self.watching.checkpoint in MOVING
-        if not moving or self._aborting:
-            self.pause()
-            await self.give_up()
-            return
-        self._aborting = True
-        stopping = asyncio.create_task(self.stop_arm())
-        await asyncio.sleep(0)
-        self.pause()
-        await stopping
+        """Stop the motion now, or abandon the pour; see `RunHandle.abort`."""
+        self._asked_to_end = True
+        if self._handle is not None:
+            await self._confirmed(self._handle.abort())
 
     async def emergency(self) -> None:
-        """Stop the motion now and give everything up: nobody is asked, nothing is brought upright."""
-        stopping = asyncio.create_task(self.stop_arm())
-        await asyncio.sleep(0)
-        self.pause()
-        await asyncio.gather(stopping, self.give_up())
+        """Stop the motion now and abandon the pour; see `RunHandle.emergency_stop`."""
+        self._asked_to_end = True
+        if self._handle is not None:
+            await self._confirmed(self._handle.emergency_stop())
 
-    async def stop_arm(self) -> None:
-        """Past everything that waits for it."""
-        laboratory: object = self._laboratory
-        if isinstance(laboratory, Stoppable):
-            try:
-                async with asyncio.timeout(STOP_DEADLINE):
-                    await laboratory.stop_arm()
-            except (LaboratoryError, TimeoutError) as error:
-                text = f"the arm of {self._rig.name} did not confirm that it was stopped ({error}): use its own button"
-                _log.error(text)
-                self._common.feed.tell("LogLine", {"level": "error", "text": text, "stage": ""}, self.item.id)
+    async def _confirmed(self, stop: Awaitable[None]) -> None:
+        """Log it if the arm does not confirm a stop."""
+        try:
+            await stop
+        except (LaboratoryError, TimeoutError) as error:
+            text = f"the arm of {self._rig.name} did not confirm that it was stopped ({error}): use its own button"
+            _log.error(text)
+            self._common.feed.tell("LogLine", {"level": "error", "text": text, "stage": ""}, self.item.id)
 
     async def give_up(self) -> None:
-        """Told to pause already: now give up the pour as well. It is UNKNOWN if it had begun."""
-        if self._giving_up or self._task is None:
-            return
-        self._giving_up = True
-        # Two cancellations at once would count as one.
-        await asyncio.wait({self._task}, timeout=0.05)
-        if self.watching is not None:
-            noted = asyncio.ensure_future(self.watching.winding_down.wait())
-            await asyncio.wait({self._task, noted}, timeout=BETWEEN_CANCELS, return_when=asyncio.FIRST_COMPLETED)
-            noted.cancel()
-        self._task.cancel()
+        """Paused already: now abandon the pour as well; see `RunHandle.abandon_pour`."""
+        if self._handle is not None:
+            await self._handle.abandon_pour()
 
     async def tidy(self) -> None:
-        """After a stop: what came of it so far is published as of a run that was finished."""
+        """After a stop: publish the results so far, as those of a finished run."""
 
         def work() -> None:
-            made = job_of(self._common.settings, self.item, self._rig)
-            assert self.item.run is not None
-            directory = self._common.settings.runs / self.item.run
-            if (directory / JOURNAL_NAME).is_file():
-                with JournalReader(directory / JOURNAL_NAME) as journal:
-                    result = read_result(journal, directory)
-                publish(made.plan, result)
+            RunService().publish_so_far(job_of(self._common.settings, self.item, self._rig))
 
         if self.item.run is not None:
             await asyncio.to_thread(work)
 
     @property
+    def checkpoint(self) -> str:
+        """Of the pour that is under way; '' between pours."""
+        return "" if self._handle is None else self._handle.checkpoint
+
+    def progress(self) -> dict[str, Any] | None:
+        """JSON-ready: stage, counts, the pour in words, and how long it still takes [s] where that is known.
+
+        None before it has begun.
+        """
+        tally = self._tally
+        if tally is None:
+            return None
+        stage = tally.stages.get(self._stage.stage)
+        done = stage.progress if stage is not None else None
+        pour = tally.pour
+        return {
+            "stage": self._stage.stage,
+            "stage_index": self._stage.index,
+            "stage_count": self._stage.count,
+            "simulations": done.simulations if done else 0,
+            "of_simulations": done.of_simulations if done else 0,
+            "pours": done.pours if done else 0,
+            "of_pours": done.of_pours if done else 0,
+            "simulators_busy": tally.busy,
+            "line": tally.counts_line(),
+            "pour": tally.pour_line(),
+            "checkpoint": self.checkpoint,
+            "checkpoint_words": CHECKPOINT_WORDS.get(self.checkpoint, ""),
+            "fraction": pour.progress.fraction if pour is not None and pour.progress is not None else None,
+            "seconds_left": tally.forecast.left(time.time()),
+        }
+
+    @property
     def pouring(self) -> bool:
         """Whether a pour of it is under way."""
-        return self.watching is not None and self.watching.checkpoint != ""
+        return self.checkpoint != ""
 
 
 RETRY = 30.0

@@ -16,10 +16,10 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
+from actors.balance.balance_settings import look_at_balance
 from actors.interfaces import LaboratoryError
+from actors.laboratory import reached
 from actors.laboratory_settings import LaboratorySpec
-from orchestrator.cli.doctor import look_at_balance
-from orchestrator.cli.hands_on import reached
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.journal.codec import CodecError, decode_outcome, decode_request
 from orchestrator.journal.journal import JOURNAL_NAME, Entry, JournalReader, Kind

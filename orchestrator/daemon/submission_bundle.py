@@ -22,7 +22,7 @@ from orchestrator.journal.journal_file import whole_copy
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
 CAMPAIGN, THETA = "campaign.yaml", "theta.yaml"
-"""Names of the campaign's file, and of the file with the θ for planning (`orchestrator.runs.run_tasks.read_theta`)."""
+"""Names of the campaign's file, and of the file with the θ for planning (`orchestrator.run_service.read_theta`)."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}(/[A-Za-z0-9][A-Za-z0-9._-]{0,79}){0,3}")
 _FILES = 100

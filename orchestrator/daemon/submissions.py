@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from actors.interfaces import LaboratoryError
-from actors.laboratory import check_laboratory
 from orchestrator.config.yaml.file_access import resolved
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.daemon_settings import ANY_RIG, DESK, DaemonSettings, Rig
@@ -20,7 +19,7 @@ from orchestrator.daemon.daemon_store import DesiredState, QueueItem
 from orchestrator.daemon.rig_worker import job_of
 from orchestrator.daemon.submission_bundle import Files, SubmissionBundleError, load_confined, pack, unpack
 from orchestrator.run_errors import RunError
-from orchestrator.runs.run_tasks import RunTask, RunTaskError, check_job
+from orchestrator.run_service import RunRequest, RunResources, RunService, RunTaskError
 
 
 class SubmissionError(RunError):
@@ -109,9 +108,10 @@ def _prepared(settings: DaemonSettings, submission: Submission, key: str, by: st
     anywhere = job_of(settings, draft, Rig(ANY_RIG))
     rig = _rig(settings, submission.rig, anywhere)
     work = anywhere if rig.source is None else job_of(settings, draft, rig)
-    check_job(work.plan)
-    check_laboratory(work.plan.laboratory, need_bench=work.pours)
-    mode = "none" if rig.name == DESK else work.plan.laboratory.mode
+    service = RunService()
+    service.check(work).require()
+    service.check_laboratory(work, RunResources())
+    mode = "none" if rig.name == DESK else work.campaign.laboratory.mode
     item = replace(draft, id=f"{plan.name[:40]}-{key}", rig=rig.name, mode=mode)
     folder.rename(settings.snapshots / item.id)
     return item
@@ -135,10 +135,10 @@ def _inside(path: Path, settings: DaemonSettings) -> bool:
     return any(root in path.parents for root in settings.roots)
 
 
-def _rig(settings: DaemonSettings, wanted: str, work: RunTask) -> Rig:
+def _rig(settings: DaemonSettings, wanted: str, work: RunRequest) -> Rig:
     """Return the requested rig, or the one that matches the campaign's laboratory."""
     names = [rig.name for rig in settings.rigs]
-    spec = work.plan.laboratory
+    spec = work.campaign.laboratory
     if wanted:
         if wanted not in (*names, DESK):
             raise SubmissionError(f"there is no rig '{wanted}'; there are {', '.join(names)}")

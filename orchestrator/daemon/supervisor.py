@@ -321,7 +321,7 @@ class Supervisor:
     def progress(self, item: QueueItem) -> dict[str, Any] | None:
         """Return the progress of a running campaign; None for others."""
         running = self._running(item)
-        return None if running is None or running.watching is None else running.watching.progress()
+        return None if running is None else running.progress()
 
     # ---- all of them
 

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from orchestrator.catalogue.run_reading import read_run
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
@@ -41,24 +41,6 @@ KEPT_THETAS = 50
 _log = logging.getLogger(__name__)
 
 
-class Recording(Protocol):
-    """The recording of a run, as far as publishing goes."""
-
-    @property
-    def path(self) -> Path:
-        """Its file."""
-        ...
-
-    @property
-    def dropped(self) -> int:
-        """Events that are missing in it."""
-        ...
-
-    def close(self) -> object:
-        """Write what is left, and end it; may be called twice."""
-        ...
-
-
 @dataclass(frozen=True)
 class Published:
     """What was written about a run.
@@ -76,24 +58,39 @@ class Published:
     report: Path | None = None
 
 
-def publish(plan: CampaignPlan, result: CampaignResult, recording: Recording | None = None) -> Published:
-    """Close a run's recording, and write its figures (if the plan wants any), `theta.json`, `summary.json` and the
-    report. A run that stands still may be published, too: its report says where it stands.
+def publish(
+    plan: CampaignPlan, result: CampaignResult, recording: Path | None = None, dropped_events: int = 0
+) -> Published:
+    """Write a run's figures (if the plan wants any), `theta.json`, `summary.json` and the report.
 
-    Safe to call again: the files are then written anew.
+    A run that has not finished may be published, too: its report says where it stands. Safe to call again: the files
+    are then written again.
 
     Args:
         plan: of the campaign.
-        result: what it came to, as `run_campaign` or `read_result` has it.
-        recording: that watched it.
+        result: of the run, as `run_campaign` or `read_result` returns it.
+        recording: its file, closed; None if there is none.
+        dropped_events: missing in the recording.
 
     Raises:
         OSError: a file can't be written.
     """
-    if recording is not None:
-        recording.close()
-        return _write(plan, result, recording.path, recording.dropped)
-    return _write(plan, result, None, 0)
+    directory = result.directory
+    figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
+    summary = summary_of(plan, result, figures, recording=recording, dropped_events=dropped_events)
+    write_summary(directory, summary)
+    found = theta_of(result.results)
+    theta = None if found is None else directory / THETA_FILE
+    if theta is not None and found is not None:
+        written = theta_file(found, evaluation_of(result.results))
+        theta.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
+    report: Path | None = directory / REPORT_NAME
+    try:
+        write_report(directory / REPORT_NAME, plan, summary, directory)
+    except Exception as error:  # days of pouring don't end in a traceback about a page
+        _log.warning("the report was not written: %s: %s", type(error).__name__, error)
+        report = None
+    return Published(summary, figures, recording, theta, report)
 
 
 def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
@@ -109,33 +106,8 @@ def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
     if result.state is not State.FINISHED or all((result.directory / name).is_file() for name in expected):
         return False
     recording = result.directory / "campaign.rrd"
-    _write(plan, result, recording if recording.is_file() else None, 0)
+    publish(plan, result, recording if recording.is_file() else None)
     return True
-
-
-def _write(plan: CampaignPlan, result: CampaignResult, recording: Path | None, dropped: int) -> Published:
-    directory = result.directory
-    figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
-    summary = summary_of(
-        plan,
-        result,
-        figures,
-        recording=recording,
-        dropped_events=dropped,
-    )
-    write_summary(directory, summary)
-    found = theta_of(result.results)
-    theta = None if found is None else directory / THETA_FILE
-    if theta is not None and found is not None:
-        written = theta_file(found, evaluation_of(result.results))
-        theta.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
-    report: Path | None = directory / REPORT_NAME
-    try:
-        write_report(directory / REPORT_NAME, plan, summary, directory)
-    except Exception as error:  # days of pouring don't end in a traceback about a page
-        _log.warning("the report was not written: %s: %s", type(error).__name__, error)
-        report = None
-    return Published(summary, figures, recording, theta, report)
 
 
 def summary_of(
@@ -160,19 +132,25 @@ def summary_of(
 
 
 def report_on(
-    plan: CampaignPlan, result: CampaignResult, path: Path | None = None, formats: tuple[str, ...] = (".svg",)
+    plan: CampaignPlan,
+    result: CampaignResult,
+    path: Path | None = None,
+    formats: tuple[str, ...] = (".svg",),
+    *,
+    draw: bool = True,
 ) -> tuple[Path, dict[str, Path]]:
     """Draw a run's figures anew, and write the page about it, wherever the run stands.
 
     Args:
         path: of the page; in the run's folder unless given.
         formats: of the figures.
+        draw: whether figures are drawn; the page has none otherwise.
 
     Raises:
         OSError: a file can't be written.
         RunError: the journal can't be read.
     """
-    figures = draw_figures(result.directory / FIGURES, plan, result.results, formats)
+    figures = draw_figures(result.directory / FIGURES, plan, result.results, formats) if draw else {}
     summary = summary_of(plan, result, figures)
     return write_report(path or result.directory / REPORT_NAME, plan, summary, result.directory), figures
 

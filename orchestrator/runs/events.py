@@ -169,7 +169,7 @@ class LogLine(Event):
     asked: bool = False
 
 
-Watcher = Callable[[Event], None]
+Watcher = Callable[[Event], object]
 
 
 class Watchers:

@@ -11,14 +11,16 @@ from dataclasses import asdict, fields
 from pathlib import Path
 
 from actors.arm.arm_settings import SafetyRecord
+from orchestrator.config.yaml.yaml_errors import shown_path
 from orchestrator.run_errors import RunError
+from orchestrator.strategies.campaign_plan import CampaignPlan
 
 SUFFIX = ".safety.json"
 _CHECKSUM = re.compile(r"[0-9A-F]{8}")
 
 
 class SafetyRecordError(RunError):
-    """The record can't be read; the text gives the reason."""
+    """The record can't be read, or there is none; the text gives the reason."""
 
     exit_code = 2
 
@@ -83,6 +85,22 @@ def accepted_checksum(laboratory: Path) -> str | None:
     """
     record = read_record(laboratory)
     return None if record is None else record.checksum.upper()
+
+
+def required_checksum(plan: CampaignPlan) -> str:
+    """Checksum that was accepted for the hardware of a campaign's laboratory.
+
+    Raises:
+        SafetyRecordError: none was accepted, or the record can't be read.
+    """
+    laboratory = plan.laboratory_source or plan.source
+    checksum = accepted_checksum(laboratory)
+    if checksum is None:
+        raise SafetyRecordError(
+            f"laboratory {plan.laboratory.name}: nobody has accepted the controller's safety settings. Run "
+            f"'decant doctor {shown_path(laboratory)}' first; it says how"
+        )
+    return checksum
 
 
 def _accept(laboratory: Path) -> str:

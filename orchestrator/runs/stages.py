@@ -47,6 +47,7 @@ from orchestrator.strategies.repeated_simulation import RepeatedSimulation
 from orchestrator.strategies.strategy import Strategy
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import Scene
+from sim_engine.search_space import Space
 
 POURS, CALIBRATION, EVALUATION = "pours", "calibration", "evaluation"
 DEPLOYMENT, CONFIRMATION, PREDICTION = "deployment:", "confirmation:", "prediction:"
@@ -80,6 +81,18 @@ def stage_seed(seed: int, stage: str) -> int:
     words = np.frombuffer(hashlib.sha256(stage.encode()).digest(), dtype="<u4")
     high, low = np.random.SeedSequence([seed, *(int(w) for w in words)]).generate_state(2, dtype=np.uint32)
     return (int(high) >> 1) << 32 | int(low)
+
+
+def named_scenes(plan: CampaignPlan) -> dict[str, tuple[Scene, Space]]:
+    """Scenes with their searched actions, by the name of the receiver, 'calibration' or 'transfer'; the usual first."""
+    scenes: dict[str, tuple[Scene, Space]] = {}
+    if plan.deployment is not None:
+        scenes |= {scene.receiver.name: (scene, plan.deployment.actions) for scene in plan.deployment.scenes}
+    if plan.calibration is not None:
+        scenes |= {scene.name: (scene, plan.calibration.actions) for scene in plan.calibration.poured}
+        if plan.calibration.transfer is not None:
+            scenes["transfer"] = plan.calibration.transfer.scene, plan.calibration.actions
+    return scenes
 
 
 def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:

@@ -13,42 +13,28 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 
-from actors.interfaces import Laboratory, LaboratoryError
-from actors.laboratory_settings import LaboratorySpec
+from actors.interfaces import LaboratoryError
 from actors.simulators.local_worker import InProcessSimulatorPool
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.journal.journal_check import has_begun
 from orchestrator.run_errors import RunError
-from orchestrator.runs.run_engine import run_campaign
+from orchestrator.run_service import RunRequest, RunResources, RunService
 from orchestrator.runs.stages import CALIBRATION
 from orchestrator.study.study_campaigns import campaign_of
 from orchestrator.study.study_folder import CellResult, code_now, read_result, run_folder, write_result
 from orchestrator.study.study_plan import StudyCell, StudyPlan, cells_of
 
-Make = Callable[[LaboratorySpec, bool], Laboratory]
-"""Makes the laboratory of a cell, with a bench or without."""
 
-
-def in_this_process(simulators: InProcessSimulatorPool) -> Make:
-    """Makes laboratories in threads of this process: cells run side by side, each on a core.
+def run_cell(study: StudyPlan, cell: StudyCell, folder: Path, resources: RunResources) -> CellResult:
+    """Run a cell, or go on with it, and keep what came of it.
 
     Args:
-        simulators: that all of them use, one after the other.
-    """
-    from actors.laboratory import open_laboratory
-
-    def make(spec: LaboratorySpec, need_bench: bool) -> Laboratory:
-        return open_laboratory(replace(spec, in_process=True), need_bench=need_bench, kept=simulators)
-
-    return make
-
-
-def run_cell(study: StudyPlan, cell: StudyCell, folder: Path, make: Make) -> CellResult:
-    """Run a cell, or go on with it, and keep what came of it.
+        study: that it belongs to.
+        cell: to run.
+        folder: of the study.
+        resources: to run it with; all cells of a process share them.
 
     Raises:
         RunError: it can't begin or go on.
@@ -57,9 +43,8 @@ def run_cell(study: StudyPlan, cell: StudyCell, folder: Path, make: Make) -> Cel
     directory = run_folder(folder, cell.id)
     plan, stages = campaign_of(study, cell, lambda other: read_result(folder, other).results, directory)
     directory.mkdir(parents=True, exist_ok=True)
-    laboratory = make(plan.laboratory, any(stage.pours for stage in stages))
-    begun = has_begun(directory / JOURNAL_NAME)
-    result = asyncio.run(run_campaign(plan, laboratory, directory, resume=begun, stages=stages))
+    handle = RunService().start(RunRequest(plan, stages, directory, "if begun"), resources)
+    result = asyncio.run(handle.wait())
     kept = CellResult(
         results=dict(result.results),
         simulations=result.simulations,
@@ -109,12 +94,12 @@ def named_cells() -> Iterator[str]:
         yield name
 
 
-def work(path: Path, make: Make | None = None) -> None:
+def work(path: Path, resources: RunResources | None = None) -> None:
     """Run the cells that stdin names until it ends.
 
     Args:
         path: of the study.
-        make: makes laboratories; by default in this process, around one simulator.
+        resources: to run them with; by default one simulator in this process.
     """
     from orchestrator.study.study_file import load_study
 
@@ -125,11 +110,11 @@ def work(path: Path, make: Make | None = None) -> None:
     study = load_study(path)
     cells = {cell.id: cell for cell in cells_of(study)}
     simulators = InProcessSimulatorPool()
-    make = make or in_this_process(simulators)
+    resources = resources or RunResources(in_process=True, simulators=simulators)
     for name in named_cells():
         problem = None
         try:
-            run_cell(study, cells[name], study.folder, make)
+            run_cell(study, cells[name], study.folder, resources)
         except (RunError, LaboratoryError) as error:
             problem = str(error)
         print(json.dumps([name, problem]), file=answers, flush=True)

@@ -20,8 +20,8 @@ from orchestrator.requests import Failed, Outcome, Pour, Prediction, Request, Si
 from orchestrator.results.console_view import summary_table
 from orchestrator.results.loss_units import loss_unit
 from orchestrator.results.summarise import summarise
+from orchestrator.run_service import planned
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor
-from orchestrator.runs.run_tasks import planned
 from orchestrator.runs.stages import deployment_stages, prediction_stages
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning

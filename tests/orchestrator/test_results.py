@@ -63,26 +63,20 @@ def test_a_stage_that_learnt_something_else_is_named(results: dict[str, Any]) ->
         result_of(results, "pours", Calibrated)
 
 
-def test_publishing_closes_the_recording_and_can_be_done_again(tmp_path: Path, results: dict[str, Any]) -> None:
-    class Recording:
-        path, dropped, closed = tmp_path / "campaign.rrd", 3, False
-
-        def close(self) -> None:
-            self.closed = True
-
+def test_publishing_names_the_recording_and_can_be_done_again(tmp_path: Path, results: dict[str, Any]) -> None:
     from dataclasses import replace
 
-    recording = Recording()
+    recording = tmp_path / "campaign.rrd"
     result = replace(asyncio.run(run_toy(tmp_path / "run")), results=results)
-    published = publish(watched.campaign(), result, recording)
-    assert recording.closed
+    published = publish(watched.campaign(), result, recording, 3)
+    assert published.recording == published.summary.recording == recording
     assert published.summary.dropped_events == 3
     assert published.theta is not None
     assert json.loads(published.theta.read_text())["theta"] == results["calibration"].found.theta.model_dump()
     assert all(path.is_file() for path in published.figures.values())
     summary = (tmp_path / "run" / "summary.json").read_text()
     assert json.loads(summary)["theta"] == results["calibration"].found.theta.model_dump()
-    publish(watched.campaign(), result, recording)
+    publish(watched.campaign(), result, recording, 3)
     assert (tmp_path / "run" / "summary.json").read_text() == summary
 
 

@@ -14,7 +14,6 @@ import pytest
 from actors.optimizer.questions import Suggestion, SuggestProblem
 from actors.optimizer.suggest import propose
 from decant.run_results import open_run
-from orchestrator.cli.motion_approval import pour_count
 from orchestrator.config.file_loading import predicts_with_posterior
 from orchestrator.journal.codec import canonical
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
@@ -25,6 +24,7 @@ from orchestrator.results.publishing import publish
 from orchestrator.results.summarise import summarise
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import Event, RequestFinished
+from orchestrator.runs.motion_envelope import pour_count
 from orchestrator.runs.stages import deployed_theta, scenes_of, stages_of
 from orchestrator.strategies.campaign_plan import (
     CalibrationPlan,

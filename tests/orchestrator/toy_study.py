@@ -16,6 +16,7 @@ import numpy as np
 
 from actors.laboratory_settings import LaboratorySpec
 from actors.optimizer.suggest import propose
+from orchestrator.run_service import RunResources
 from orchestrator.study.cell_process import work
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import opened
@@ -80,6 +81,10 @@ class ToyLaboratory:
         pass
 
 
+TOYS = RunResources(laboratory=ToyLaboratory)  # type: ignore[arg-type]
+"""Runs every cell in a toy laboratory of its own."""
+
+
 def toy_command(study: StudyPlan) -> list[str]:
     """A process for cells with a toy laboratory."""
     return [sys.executable, str(Path(__file__)), str(study.source), "cells"]
@@ -93,7 +98,7 @@ def run_toy_study(study: StudyPlan, **arguments: Any) -> CellStatus:
 
 def main() -> int:
     if len(sys.argv) > 2:
-        work(Path(sys.argv[1]), ToyLaboratory)  # type: ignore[arg-type]
+        work(Path(sys.argv[1]), TOYS)
         return 0
     begun = time.monotonic()
     status = run_toy_study(load_study(Path(sys.argv[1])))

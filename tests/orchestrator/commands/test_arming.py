@@ -12,9 +12,9 @@ from typer.testing import CliRunner, Result
 
 from actors.emulators.ur_controller.controller_process import VirtualController
 from orchestrator.cli.app import app
-from orchestrator.cli.motion_approval import Envelope, accepted, campaign_pours, envelope, pour_count
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.runs.safety_approval import SafetyRecord, record_path, write_record
+from orchestrator.runs.motion_envelope import Envelope, campaign_pours, envelope, pour_count
+from orchestrator.runs.safety_approval import SafetyRecord, record_path, required_checksum, write_record
 from orchestrator.runs.stages import stages_of
 from tests.orchestrator import hardware
 from tests.orchestrator.terminal import Terminal
@@ -88,7 +88,7 @@ def test_the_record_that_counts_is_that_of_the_laboratory_in_use(campaign: Path)
     assert "laboratory other: nobody has accepted" in result.stderr  # for rig.yaml, which the campaign names, somebody
     assert "other.yaml" in result.stderr
     write_record(other, SafetyRecord("0A0B0C0D", "2016300123", "ur10", "3.15.8", "2030-01-31", "a person"))
-    assert accepted(load_campaign(campaign, other)) == "0A0B0C0D"
+    assert required_checksum(load_campaign(campaign, other)) == "0A0B0C0D"
 
 
 @pytest.mark.realtime

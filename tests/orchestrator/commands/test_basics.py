@@ -64,8 +64,8 @@ def begun(monkeypatch: pytest.MonkeyPatch, command: str) -> Any:
 
     plans = []
 
-    def begin(plan: Any, *args: Any, **kwargs: Any) -> NoReturn:
-        plans.append((plan, kwargs["again"]))
+    def begin(request: Any, *args: Any, **kwargs: Any) -> NoReturn:
+        plans.append((request.campaign, kwargs["again"]))
         raise SeenError
 
     monkeypatch.setattr(campaigns, "run_in_front_of_people", begin)

@@ -166,7 +166,7 @@ async def serving(folder: Path, make: Make = HeldLaboratory, **settings: Any) ->
         return laboratory
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orchestrator.daemon.rig_worker.open_laboratory", open_laboratory)
+        patch.setattr("actors.laboratory.open_laboratory", open_laboratory)
         daemon = Supervisor(chosen)
         known = {role: token_of(chosen.tokens, role) or "" for role in Role}
         ended: list[bool] = []

@@ -32,7 +32,7 @@ from orchestrator.study.study_folder import finished_results, read_result
 from orchestrator.study.study_plan import StudyPlan, cells_of
 from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, report, write
 from tests.orchestrator.study_files import read, written
-from tests.orchestrator.toy_study import ToyLaboratory
+from tests.orchestrator.toy_study import TOYS
 from tests.orchestrator.toys import calibration_spill, narrow_cup, narrow_cup_biased, weighed
 
 
@@ -155,7 +155,7 @@ def test_another_mean_than_the_papers_is_none_of_d2_paper(tmp_path: Path) -> Non
 def test_the_papers_methods_run_and_stand_in_figures_and_tables(tmp_path: Path) -> None:
     plan = study(tmp_path)
     for cell in cells_of(plan):
-        run_cell(plan, cell, plan.folder, ToyLaboratory)  # type: ignore[arg-type]
+        run_cell(plan, cell, plan.folder, TOYS)
     alone = read_result(plan.folder, "deployment.small.D3-paper.deployment-narrow.01")
     assert (alone.simulations, alone.pours) == (4, 2), "none beside the pours"
     found = gather(plan, finished_results(plan.folder, cells_of(plan)))

@@ -23,8 +23,9 @@ from actors.simulators.local_worker import InProcessSimulatorPool
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.requests import Failed, Poured, Slots
+from orchestrator.run_service import RunResources
 from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.study.cell_process import in_this_process, run_cell
+from orchestrator.study.cell_process import run_cell
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import (
     RESULT,
@@ -47,7 +48,7 @@ from tests.actors.conftest import make_fake
 from tests.orchestrator import toy_study
 from tests.orchestrator.study_files import ROOT, read, small, without, written
 from tests.orchestrator.toy import logical_record
-from tests.orchestrator.toy_study import PAUSE, ToyLaboratory, run_toy_study
+from tests.orchestrator.toy_study import PAUSE, TOYS, run_toy_study
 from tests.patience import PATIENCE
 
 
@@ -91,7 +92,7 @@ def test_killed_in_the_middle_it_goes_on_and_comes_to_what_an_undisturbed_one_co
     undisturbed, disturbed = small(tmp_path / "one", **changes), small(tmp_path / "two", **changes)
     cells = cells_of(undisturbed)
     for cell in cells:
-        run_cell(undisturbed, cell, undisturbed.folder, ToyLaboratory)  # type: ignore[arg-type]
+        run_cell(undisturbed, cell, undisturbed.folder, TOYS)
     process = toy_process(disturbed, 0.05)
     deadline = time.monotonic() + PATIENCE
     while sum(is_finished(disturbed.folder, cell.id) for cell in cells) < 2:
@@ -200,7 +201,7 @@ def test_a_final_pour_is_the_recommended_action_with_fresh_chance_and_its_code_i
     study = small(tmp_path, **changes, calibration=None)
     cells = cells_of(study)
     assert [cell.kind for cell in cells] == ["deployment", "final", "final"]
-    learnt, *again = (run_cell(study, cell, study.folder, ToyLaboratory) for cell in cells)  # type: ignore[arg-type]
+    learnt, *again = (run_cell(study, cell, study.folder, TOYS) for cell in cells)
     values = learnt.results["deployment:narrow"].recommended.action_si
     finals = [one.results["final"] for one in again]
     action = study.deployments[0].plan.scenes[0].action(values)
@@ -222,7 +223,8 @@ def test_the_cells_of_a_worker_share_a_simulator_and_none_of_them_closes_it(tmp_
     study = small(tmp_path, **changes, calibration=None)
     log = tmp_path / "simulator.log"
     simulators = InProcessSimulatorPool(make=make_fake(log=log))
-    pours = [run_cell(study, c, study.folder, in_this_process(simulators)).pours for c in cells_of(study)]
+    resources = RunResources(in_process=True, simulators=simulators)
+    pours = [run_cell(study, cell, study.folder, resources).pours for cell in cells_of(study)]
     assert len(pours) > 1
     assert all(pours)
     happened = [line.split()[0] for line in log.read_text(encoding="utf-8").splitlines()]
@@ -285,7 +287,7 @@ def test_a_dry_run_tells_by_arm_what_is_left_and_begins_nothing(tmp_path: Path) 
     each = study.pour_count
     assert rows["pours small"] == f"0 of {len(pours)} finished, left: 0 simulations, {each * len(pours)} pours"
     assert f"{len(cells)} cells, {len(cells)} left" in first.stdout
-    run_cell(study, pours[0], study.folder, ToyLaboratory)  # type: ignore[arg-type]
+    run_cell(study, pours[0], study.folder, TOYS)
     then = CliRunner().invoke(app, ["study", str(study.source), "--dry-run"]).stdout
     assert f"pours small {' ' * 22} 1 of {len(pours)} finished" in then
     assert f"{len(cells)} cells, {len(cells) - 1} left" in then

@@ -1,0 +1,149 @@
+"""The envelope of a campaign's motions on hardware: limits of the paths of actions from all over its action spaces.
+
+The command line and the daemon show it before a person enables the motion of one run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from actors.arm.arm_interface import JOINT_NAMES, PathReport
+from actors.arm.arm_settings import ArmSpec
+from actors.interfaces import InvalidActionError
+from actors.optimizer.questions import Linear
+from orchestrator.runs.stages import CONFIRMATION, DEPLOYMENT, StageDefinition
+from orchestrator.strategies.calibration.action_prior import actions_all_over
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.action import Action
+from sim_engine.scene import Scene
+from sim_engine.search_space import Space
+
+CORNERS, INTERIOR = 32, 12
+"""Actions of each space whose paths are planned for the envelope, in addition to its middle."""
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """Limits of the paths of some actions.
+
+    Attributes:
+        reports: of the paths that can be executed.
+        refused: why the others can't, one text each.
+    """
+
+    reports: tuple[PathReport, ...]
+    refused: tuple[str, ...] = ()
+
+    @property
+    def worst(self) -> PathReport:
+        """The extremes of all of them in one.
+
+        Raises:
+            ValueError: no path can be executed.
+        """
+        if not self.reports:
+            raise ValueError("no path can be executed")
+        fastest = max(self.reports, key=lambda r: r.joint_speed)
+        low = np.min([r.low for r in self.reports], axis=0)
+        high = np.max([r.high for r in self.reports], axis=0)
+        return PathReport(
+            joint_speed=fastest.joint_speed,
+            fastest_joint=fastest.fastest_joint,
+            tool_speed=max(r.tool_speed for r in self.reports),
+            tilt=max(r.tilt for r in self.reports),
+            tilt_speed=max(r.tilt_speed for r in self.reports),
+            singularity=min(r.singularity for r in self.reports),
+            clearance=min(r.clearance for r in self.reports),
+            low=(float(low[0]), float(low[1]), float(low[2])),
+            high=(float(high[0]), float(high[1]), float(high[2])),
+            duration=max(r.duration for r in self.reports),
+            deviation=max(r.deviation for r in self.reports),
+        )
+
+
+def envelope(arm: ArmSpec, pours: Iterable[tuple[Scene, Action]]) -> Envelope:
+    """Plan paths, and see what they keep within."""
+    reports, refused = [], []
+    for scene, action in pours:
+        try:
+            reports.append(arm.plan(scene, action).report)
+        except (InvalidActionError, ValueError) as error:
+            refused.append(f"{action.display()}: {error}")
+    return Envelope(tuple(reports), tuple(refused))
+
+
+def campaign_pours(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> list[tuple[Scene, Action]]:
+    """Actions from all over the spaces that the stages' pours are chosen from: middle, corners, and some between."""
+    calibrating, deploying = _pouring(stages)
+    cases: list[tuple[Scene, Action]] = []
+    if plan.calibration is not None and calibrating:
+        for scene in plan.calibration.poured:
+            cases += _from_all_over(scene, plan.calibration.actions, plan.calibration.constraints)
+    if plan.deployment is not None and deploying:
+        for scene in plan.deployment.scenes:
+            cases += _from_all_over(scene, plan.deployment.actions, plan.deployment.constraints)
+    return cases
+
+
+def _from_all_over(scene: Scene, actions: Space, constraints: Sequence[Linear]) -> list[tuple[Scene, Action]]:
+    found = []
+    for values in actions_all_over(actions, constraints, corners=CORNERS, drawn=INTERIOR):
+        try:
+            found.append((scene, scene.action(values)))
+        except ValueError:
+            continue  # no such action
+    return found
+
+
+def pour_count(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> int:
+    """How many pours the stages may ask for."""
+    calibrating, deploying = _pouring(stages)
+    count = plan.calibration.pour_count if plan.calibration is not None and calibrating else 0
+    if plan.deployment is None:
+        return count
+    confirming = sum(stage.name.startswith(CONFIRMATION) for stage in stages)
+    return count + plan.deployment.pours * deploying + plan.deployment.confirm * confirming
+
+
+def _pouring(stages: Sequence[StageDefinition]) -> tuple[bool, int]:
+    """Whether the calibration's pours are among the stages, and how many deployments that pour."""
+    names = [stage.name for stage in stages if stage.pours and not stage.name.startswith(CONFIRMATION)]
+    deploying = sum(name.startswith(DEPLOYMENT) for name in names)
+    return deploying < len(names), deploying
+
+
+def envelope_lines(found: Envelope) -> list[str]:
+    """The limits of the paths as text."""
+    lines = report_lines(found.worst)
+    total = len(found.reports) + len(found.refused)
+    lines.append(
+        f"planned        {len(found.reports)} of {total} actions from all over; others stay within their limits"
+    )
+    if found.refused:
+        lines.append(f"refused        {len(found.refused)}; such pours are refused again before anything moves, e.g.")
+        lines.append(f"               {found.refused[0].splitlines()[0]}")
+    return lines
+
+
+def report_lines(report: PathReport) -> list[str]:
+    """One path's report, or many's extremes, for people."""
+    low, high = ([f"{1e3 * v:.0f}" for v in corner] for corner in (report.low, report.high))
+    turned, turning = math.degrees(report.tilt), math.degrees(report.tilt_speed)
+    return [
+        "box            " + ", ".join(f"{n} {a} … {b} mm" for n, a, b in zip("xyz", low, high, strict=True)),
+        f"tool, pourer   up to {1e3 * report.tool_speed:.0f} mm/s",
+        *(
+            [f"joints         up to {math.degrees(report.joint_speed):.0f} deg/s, {JOINT_NAMES[report.fastest_joint]}"]
+            if report.joint_speed > 0.0
+            else []
+        ),
+        f"tilt           up to {turned:.0f} deg, at up to {turning:.0f} deg/s",
+        f"clearance      at least {1e3 * report.clearance:.0f} mm between pourer and receiver"
+        if report.clearance > 0.0
+        else "clearance      pourer and receiver don't touch",
+        f"one pour       up to {report.duration:.1f} s in motion",
+    ]
