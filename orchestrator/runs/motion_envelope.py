@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from actors.arm.arm_interface import JOINT_NAMES, PathReport
+from actors.arm.arm_geometry import JOINT_NAMES
+from actors.arm.arm_interface import PathReport
 from actors.arm.arm_settings import ArmSpec
 from actors.interfaces import InvalidActionError
 from actors.optimizer.questions import Linear

@@ -11,9 +11,9 @@ from dataclasses import asdict, fields
 from pathlib import Path
 
 from actors.arm.arm_settings import SafetyRecord
-from orchestrator.config.yaml.yaml_errors import shown_path
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.errors import shown_path
 
 SUFFIX = ".safety.json"
 _CHECKSUM = re.compile(r"[0-9A-F]{8}")

@@ -10,8 +10,9 @@ from orchestrator.config.laboratory_file import LaboratoryFile, resolve_laborato
 from orchestrator.config.vessel_file import MESH_SUFFIXES, LiquidFile, VesselFile, resolve_liquid, resolve_vessel
 from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.section_validation import validate
-from orchestrator.config.yaml.yaml_errors import ConfigError, shown_path
+from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
+from sim_engine.errors import shown_path
 from sim_engine.liquids import Liquid
 from sim_engine.settings.model import Section
 from sim_engine.vessel.shapes import VesselSpec

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from sim_engine.errors import DecantError
+from sim_engine.errors import DecantError, shown_path
 
 PROBLEMS_SHOWN = 20
 LINE_SHOWN, TEXT_SHOWN = 200, 1500
@@ -65,14 +65,6 @@ class ConfigError(DecantError):
 
 def _cut(text: str) -> str:
     return text if len(text) <= TEXT_SHOWN else f"{text[: TEXT_SHOWN // 2]} … {text[-TEXT_SHOWN // 4 :]}"
-
-
-def shown_path(path: Path) -> str:
-    """A path for messages: relative to the working directory if it lies below it."""
-    try:
-        return str(path.relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
 
 
 def dotted(loc: Iterable[str | int]) -> str:
