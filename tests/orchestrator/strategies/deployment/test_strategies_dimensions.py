@@ -120,7 +120,7 @@ def make(name: str, dimension: int) -> Any:
             prior_simulations=7,
             per_pour=1,
             noise="varying",
-            model="adaptive",
+            model="residual",
         )
         return KINDS[name](deployment, SCENE, THETA, 5)
     grid = {parameter: 2 if i < 3 else 1 for i, parameter in enumerate(parameters.names)}
