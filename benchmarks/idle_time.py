@@ -28,7 +28,8 @@ from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 ROOT = Path(__file__).parents[1]
 
 WITH = "from orchestrator.cli.app import main; main()"
-WITHOUT = f"from orchestrator.runs.speculation import SpeculativeExecution as S; S.foresee = lambda self, request: None; {WITH}"
+NONE = "SpeculativeExecution.foresee = lambda self, request: None"
+WITHOUT = f"from orchestrator.runs.speculation import SpeculativeExecution; {NONE}; {WITH}"
 
 
 def run_once(campaign: str, program: str) -> dict[str, Any]:

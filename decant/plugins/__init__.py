@@ -1,4 +1,4 @@
-"""What a plug-in is written with: strategies, objectives, balances, arms and sources of vessels. See docs/extending.md.
+"""Names for authors of plug-ins: strategies, objectives, balances, arms and sources of vessels. See docs/extending.md.
 
 ::
 

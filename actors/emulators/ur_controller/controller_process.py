@@ -1,6 +1,6 @@
 """Starting a virtual controller from Python, talking to its fault port, and making sure that it ends.
 
-The virtual controller as what stands in for a UR arm on a virtual bench; see `actors.bench.device_emulators.ArmEmulator`.
+The virtual controller as the emulator of a UR arm on a virtual bench; see `actors.bench.device_emulators.ArmEmulator`.
 """
 
 from __future__ import annotations
