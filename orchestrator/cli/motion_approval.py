@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 from actors.arm.arm_interface import NotAcceptedError
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, say
-from orchestrator.runs.motion_envelope import campaign_pours, envelope, envelope_lines, pour_count
 from orchestrator.runs.safety_approval import SafetyRecordError, required_checksum
 
 if TYPE_CHECKING:
@@ -42,6 +41,8 @@ def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed
     Raises:
         RefusalError: motion is not enabled (exit code 2).
     """
+    from orchestrator.runs.motion_envelope import campaign_pours, envelope, envelope_lines, pour_count
+
     laboratory = plan.laboratory
     if not any(stage.pours for stage in stages):
         return None
