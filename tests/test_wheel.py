@@ -233,7 +233,7 @@ def test_the_wheel_works_in_a_bare_environment(wheel: Path, tmp_path: Path) -> N
     (tmp_path / "campaign.yaml").write_text(wide, encoding="utf-8")
     done = decant("run", "campaign.yaml", "--json")
     assert done.returncode == 0, done.stderr
-    (folder,) = (tmp_path / "runs").iterdir()
+    (folder,) = (tmp_path / "runs").glob("outside-*")
     assert json.loads((folder / "summary.json").read_text(encoding="utf-8"))["pours"] == 2
     assert "decant-example" in json.loads((folder / "versions.json").read_text(encoding="utf-8"))["packages"]
     for name in ("test_examples.py", "test_stand.py"):
