@@ -114,7 +114,7 @@ def without_its_last_entries(run: Path) -> None:
     """As it was before its second pour: valid, with everything after it lost."""
     with closing(sqlite3.connect(run / JOURNAL_NAME)) as connection:
         (second,) = connection.execute(
-            "select max(seq) from event where kind = 'pour.started'",
+            "select seq from event where kind = 'pour.started' order by seq limit 1 offset 1",
         ).fetchone()
         for trigger in ("event_is_never_deleted", "chain_is_never_deleted"):
             connection.execute(f"drop trigger {trigger}")

@@ -34,7 +34,7 @@ from tests.orchestrator.toy import ToyLaboratory, ToySimulators, toy_plan
 def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A state directory of its own; runs are made beside it."""
     monkeypatch.setenv(VARIABLE, str(tmp_path / "state"))
-    monkeypatch.setattr(registry, "_said", False)
+    monkeypatch.setattr(registry, "_reported", False)
     return tmp_path / "state"
 
 
