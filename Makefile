@@ -3,6 +3,7 @@
 #   make demo      sets up and runs the quickstart campaign on the virtual bench
 #   make test      sets up and runs all checks and the quick tests
 #   make slow      the long tests
+#   make physics   every criterion of the solver's full cases
 #   make docs      the documentation as a site, in build/site
 PYTHON ?= python3
 VENV := .venv
@@ -11,7 +12,7 @@ BIN := $(VENV)/bin
 BY_FILE := --dist loadfile --no-loadscope-reorder
 READY := $(VENV)/.ready
 
-.PHONY: install demo test lint unit slow docs coverage oldest lock clean
+.PHONY: install demo test lint unit slow physics docs coverage oldest lock clean
 .DEFAULT_GOAL := demo
 
 $(READY): requirements.lock pyproject.toml
@@ -39,11 +40,15 @@ lint: $(READY)
 	$(BIN)/lint-imports
 
 unit: $(READY)
-	$(BIN)/pytest -m "not slow" -n 3 $(BY_FILE)
+	$(BIN)/pytest -m "not slow and not physics" -n 3 $(BY_FILE)
 
 # What takes long, and every property on four times as many examples. DECANT_TESTS_PART=2/4 runs every fourth file.
 slow: $(READY)
-	DECANT_THOROUGH=1 $(BIN)/pytest -m "slow or hypothesis" -n 2 $(BY_FILE)
+	DECANT_THOROUGH=1 $(BIN)/pytest -m "(slow or hypothesis) and not physics" -n 2 $(BY_FILE)
+
+# Every criterion of the solver's full cases, about half an hour. Near a limit the processor's rounding decides.
+physics: $(READY)
+	$(BIN)/pytest -m physics -n 2 --dist load
 
 docs: $(READY)
 	$(BIN)/sphinx-build -W --keep-going -q -b html -c docs . build/site
@@ -51,14 +56,14 @@ docs: $(READY)
 
 # Which lines the quick tests run, in this process and in those that they start.
 coverage: $(READY)
-	COVERAGE_FILE=build/.coverage $(BIN)/pytest -m "not slow" -n 3 $(BY_FILE) --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
+	COVERAGE_FILE=build/.coverage $(BIN)/pytest -m "not slow and not physics" -n 3 $(BY_FILE) --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
 
 # The tests that start nothing, with the oldest dependencies that pyproject.toml allows (needs uv).
 OLDEST := build/oldest
 oldest:
 	uv venv -q --python 3.11 $(OLDEST)
 	uv pip install -q --python $(OLDEST)/bin/python --resolution lowest-direct --group dev -e .
-	$(OLDEST)/bin/python -m pytest -q -m "not slow and not realtime and not ray" tests/orchestrator tests/sim_engine
+	$(OLDEST)/bin/python -m pytest -q -m "not slow and not physics and not realtime and not ray" tests/orchestrator tests/sim_engine
 
 # After a change of the dependencies in pyproject.toml (needs uv).
 lock:

@@ -79,7 +79,7 @@ def test_the_slow_turn_waits_until_a_sharp_weir_would_have_drained() -> None:
 
 
 @pytest.mark.parametrize(
-    "particles", [500, *(pytest.param(number, marks=pytest.mark.slow) for number in (1_000, 2_000))]
+    "particles", [500, pytest.param(1_000, marks=pytest.mark.slow), pytest.param(2_000, marks=pytest.mark.physics)]
 )
 def test_the_standard_pour_flows_as_that_of_infinitely_fine_particles(simulator: PourSimulator, particles: int) -> None:
     measurements, _ = pours.outflow(simulator, particles, suite.PLAIN, seeds=3)
@@ -294,7 +294,7 @@ TOO_LONG = ("walls",)
 is a test of its own."""
 
 
-@pytest.mark.slow
+@pytest.mark.physics
 @pytest.mark.parametrize("name", [case.name for case in suite.CASES if case.name not in TOO_LONG])
 def test_full_case(simulator: PourSimulator, name: str) -> None:
     result = suite.case(name).run(simulator, suite.CaseEffort(full=True))
