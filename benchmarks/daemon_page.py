@@ -1,6 +1,6 @@
-"""Writes what was measured of the daemon into docs/daemon.md: `python benchmarks/daemon_page.py`.
+"""Writes what was measured of the daemon into docs/evidence/reliability.md: `python benchmarks/daemon_page.py`.
 
-What was measured stands in docs/daemon.json; `daemon_stops`, `soak` and `idle_time` put it there and call this.
+What was measured stands in docs/data/daemon.json; `daemon_stops`, `soak` and `idle_time` put it there and call this.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).parents[1] / "docs"
-FIGURES, PAGE = DOCS / "daemon.json", DOCS / "daemon.md"
+FIGURES, PAGE = DOCS / "data" / "daemon.json", DOCS / "evidence" / "reliability.md"
 MARKED = re.compile(r"(<!-- measured: ([\w-]+) -->\n).*?(<!-- end of what was measured -->)", re.DOTALL)
 
 UNTIL = {

@@ -5,7 +5,7 @@ while its arm tilts: 'pause' and 'stop' are measured until the daemon has taken 
 intention), 'abort' and the emergency stop until the arm has confirmed that it stands. Idle: nothing else. Readers: 200
 of all events. Saturated: the readers, and a busy process for each core. Run from the project's root:
 
-    python benchmarks/daemon_stops.py --times 10    # into docs/daemon.json and docs/daemon.md
+    python benchmarks/daemon_stops.py --times 10    # into docs/data/daemon.json and docs/evidence/reliability.md
 """
 
 from __future__ import annotations

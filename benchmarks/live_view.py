@@ -1,4 +1,4 @@
-"""What watching costs control: `python benchmarks/live_view.py` writes docs/live-view-timing.json and the page's table.
+"""What watching costs control: `python benchmarks/live_view.py` writes docs/data/live-view-timing.json and the page's table.
 
 A control loop of 100 Hz runs in this process and emits what a campaign emits: a pour's progress ten times a second, a
 simulation every half second, every tenth with its particles, and a surrogate every two seconds. Measured is how late
@@ -46,7 +46,7 @@ from sim_engine.outcome import PourOutcome, RecordedFrames
 
 ROOT = Path(__file__).parents[1]
 
-PAGE = ROOT / "docs" / "live-view.md"
+PAGE = ROOT / "docs" / "evidence" / "reliability.md"
 
 BEGIN, END = "<!-- timing of control, by benchmarks/live_view.py -->", "<!-- end of timing -->"
 
@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=40.0, help="measured, per case")
     parser.add_argument("--warm-up", type=float, default=15.0, help="before that [s]")
     parser.add_argument("--only", default="", help="cases whose names begin so; the page is left alone then")
-    parser.add_argument("--to", type=Path, default=ROOT / "docs" / "live-view-timing.json")
+    parser.add_argument("--to", type=Path, default=ROOT / "docs" / "data" / "live-view-timing.json")
     arguments = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # what is open is closed
     plan = load_campaign(ROOT / "configs" / "campaigns" / "quickstart.yaml")

@@ -1,10 +1,10 @@
-"""Measure all that docs/performance.md tells, and write the page.
+"""Measure all figures of docs/evidence/performance.md, and write the page.
 
     python benchmarks/make_page.py                      the page anew, from what was measured before
     python benchmarks/make_page.py --measure            all measurements, then the page
     python benchmarks/make_page.py --measure pour-2000 start-up
 
-Measurements are kept in docs/performance.json, each with its command, machine and moment; those that are not made now
+Measurements are kept in docs/data/performance.json, each with its command, machine and moment; those that are not made now
 stay as they are. `docs/performance-tried.md` is written by hand and becomes a section of the page.
 """
 
@@ -39,7 +39,7 @@ PLAN: dict[str, tuple[str, ...]] = {
 }
 """Measurements by name: script and its arguments."""
 
-PAGE, DATA, TRIED = "performance.md", "performance.json", "performance-tried.md"
+PAGE, DATA = "evidence/performance.md", "data/performance.json"
 
 
 def measure(name: str) -> dict[str, Any]:
@@ -56,12 +56,11 @@ def measure(name: str) -> dict[str, Any]:
     return {"command": " ".join(["python", f"benchmarks/{script}", *arguments, "--json"]), "result": result}
 
 
-def page_text(records: dict[str, Any], tried: str) -> str:
+def page_text(records: dict[str, Any]) -> str:
     """The page.
 
     Args:
         records: measurements by name, as `measure` returns them.
-        tried: the section that is written by hand, or ''.
     """
     pours = pour_records(records)
     scaling = records.get("scaling")
@@ -80,8 +79,6 @@ def page_text(records: dict[str, Any], tried: str) -> str:
         page_many.pool(records.get("pool")),
         page_many.gpu(records.get("gpu")),
     ]
-    if tried.strip():
-        parts.append(re.sub(r"<!--.*?-->\n*", "", tried, flags=re.DOTALL).strip() + "\n")
     return "\n".join(parts)
 
 
@@ -129,9 +126,9 @@ def write(folder: Path) -> Path:
         raise SystemExit(f"{folder / DATA}: there is no such file; make it with --measure") from None
     except ValueError as problem:
         raise SystemExit(f"{folder / DATA}: not JSON: {problem}") from None
-    tried = folder / TRIED
-    text = page_text(records, tried.read_text(encoding="utf-8") if tried.exists() else "")
+    text = page_text(records)
     draw(records, folder / "images")
+    (folder / PAGE).parent.mkdir(parents=True, exist_ok=True)
     (folder / PAGE).write_text(text, encoding="utf-8")
     return folder / PAGE
 
@@ -143,6 +140,7 @@ def keep(folder: Path, name: str, record: dict[str, Any]) -> None:
     records[name] = record
     order = {known: place for place, known in enumerate(PLAN)}
     records = dict(sorted(records.items(), key=lambda item: order.get(item[0], len(order))))
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(records, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 

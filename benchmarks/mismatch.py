@@ -6,7 +6,7 @@
 
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
 the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are kept in FILE, so that an
-interrupted comparison goes on; `--write` makes none, and puts the rows of FILE into the table of docs/optimiser.md.
+interrupted comparison goes on; `--write` makes none, and puts the rows of FILE into the table of docs/evidence/results.md.
 
 Primary questions, written before any of it was run. Seeds below 1000 are for tuning, those from 1000 on for answers:
 1000 to 1019, and 2000, 3000 and 7000 to 7019 for what was changed after the answers of those before were known (5000 to
@@ -54,7 +54,7 @@ NAMES = {
     "adaptive": "D3, `adaptive`",
 }
 GOOD, BAD = 0.01, 0.10
-PAGE = Path(__file__).parents[1] / "docs" / "optimiser.md"
+PAGE = Path(__file__).parents[1] / "docs" / "evidence" / "results.md"
 FEWEST = 20
 """Seeds of a row on the page."""
 
@@ -183,7 +183,7 @@ def main() -> None:
     parser.add_argument("--pours", type=int, default=15)
     parser.add_argument("--simulations", type=int, default=37)
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--write", action="store_true", help="write the table of FILE into docs/optimiser.md")
+    parser.add_argument("--write", action="store_true", help="write the table of FILE into docs/evidence/results.md")
     parser.add_argument("--receivers", action="store_true", help="three receivers one after the other on one bench")
     asked = parser.parse_args()
     if asked.receivers:

@@ -1,4 +1,4 @@
-"""Figures of docs/performance.md, in the look of a campaign's report."""
+"""Figures of docs/evidence/performance.md, in the look of a campaign's report."""
 
 from __future__ import annotations
 

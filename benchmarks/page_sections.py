@@ -1,4 +1,4 @@
-"""The sections of docs/performance.md, each from the JSON of one benchmark."""
+"""The sections of docs/evidence/performance.md, each from the JSON of one benchmark."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def introduction() -> str:
     """What the page is and how it is made anew."""
     return """# Performance
 
-<!-- written by benchmarks/make_page.py from docs/performance.json and docs/performance-tried.md; edit those -->
+<!-- written by benchmarks/make_page.py from docs/data/performance.json -->
 
-What a simulated pour costs, where the time goes, and how that compares with the fastest solver that we know of. All of
-it is measured anew, and this page written, by
+The cost of a simulated pour, where the time goes, and a comparison with SPlisHSPlasH, the fastest open CPU solver that we
+know of. This command measures everything again and writes the page:
 
 <!-- needs: checkout and minutes -->
 ```
@@ -122,7 +122,7 @@ def beside_the_peer(pours: Sequence[Record]) -> str:
 Its physics, measured as ours:
 
 {table(("N", *PHYSICS), physics, "rrrrlrr")}
-![CPU seconds against the number of particles](images/{page_figures.COST})
+![CPU seconds against the number of particles](../images/{page_figures.COST})
 
 {settings(both)}"""
 
@@ -156,7 +156,7 @@ def passes(record: Record | None, limit: Record | None) -> str:
 {about}
 
 {table(("pass", *moments, "calls a step"), rows, "lrrr")}
-![Share of each pass](images/{page_figures.PASSES})
+![Share of each pass](../images/{page_figures.PASSES})
 
 {_limit(r, limit)}{settings([record, limit] if limit else [record])}"""
 

@@ -7,7 +7,7 @@ The shipped campaign as it is; only random θ are not scored, which the deployme
 a process of its own that ends with this one. Every simulated pour of a seed is kept under `--into`, by what was asked
 and the solver that answered, so that the arms of a seed share their calibration and whatever else they both ask for,
 pour for pour the same; finished runs are kept there, too, and an interrupted comparison goes on. `--write` makes no
-runs, and puts the table of those that are there into docs/optimiser.md.
+runs, and puts the table of those that are there into docs/evidence/results.md.
 
 The other arms change the program, for this benchmark only: there are no such settings.
 
@@ -42,7 +42,7 @@ from sim_engine.outcome import PourOutcome, SimulatedPour
 from sim_engine.scene import PourTask
 
 GOOD, BAD = 0.01, 0.10
-PAGE = ROOT / "docs" / "optimiser.md"
+PAGE = ROOT / "docs" / "evidence" / "results.md"
 BEGIN, END = "<!-- measured: quickstart -->\n", "<!-- end of measured -->"
 CAMPAIGN = ROOT / "configs" / "campaigns" / "quickstart.yaml"
 
@@ -222,7 +222,7 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=["shipped"])
     parser.add_argument("--laboratory", type=Path, default=ROOT / "configs" / "laboratories" / "twin.yaml")
     parser.add_argument("--into", type=Path, default=ROOT / "build" / "quickstart")
-    parser.add_argument("--write", action="store_true", help="write the table of what is there into docs/optimiser.md")
+    parser.add_argument("--write", action="store_true", help="write the table of what is there into docs/evidence/results.md")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # this is a process that makes one seed
     asked = parser.parse_args()
     if asked.one is not None:

@@ -1,9 +1,9 @@
-"""The six primary questions of the study of hidden benches (docs/study-questions.md), answered by its finished cells.
+"""The six primary questions of the study of hidden benches (docs/evidence/study-questions.md), answered by its finished cells.
 
     python benchmarks/study_questions.py [runs/study-benches] [--write]
 
 Every number is a bench's: the mean over its repetitions (and receivers) of differences paired by repetition. Their mean
-has a 95 % t interval over the benches. `--write` puts the table into docs/results.md.
+has a 95 % t interval over the benches. `--write` puts the table into docs/evidence/results.md.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from orchestrator.study.report.statistics import Estimate, estimate, tests_of
 from orchestrator.study.study_folder import finished_results
 from orchestrator.study.study_plan import cells_of
 
-PAGE = ROOT / "docs" / "results.md"
+PAGE = ROOT / "docs" / "evidence" / "results.md"
 BEGIN, END = "<!-- measured: hidden benches -->\n", "<!-- end of measured -->"
 STUDY = ROOT / "configs" / "studies" / "benches.yaml"
 NEAR = 0.005
@@ -145,7 +145,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "runs" / "study-benches")
     parser.add_argument("--study", type=Path, default=STUDY)
-    parser.add_argument("--write", action="store_true", help="write the table into docs/results.md")
+    parser.add_argument("--write", action="store_true", help="write the table into docs/evidence/results.md")
     asked = parser.parse_args()
     study = read_study(asked.study)
     found = gather(study, finished_results(asked.folder, cells_of(study)))

@@ -1,6 +1,6 @@
 """How well `decant vessel` does: shipped vessels through each of its doors, with the errors of real tools.
 
-Writes the table of docs/vessels.md. Run from the project's root: python benchmarks/vessel_doors.py
+Writes the table of docs/evidence/results.md. Run from the project's root: python benchmarks/vessel_doors.py
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sim_engine.vessel.shapes import VesselSpec
 from sim_engine.vessel.vessel import Vessel, build_vessel
 from tests.measured import FOCAL, Bench
 
-PAGE = Path("docs/vessels.md")
+PAGE = Path("docs/evidence/results.md")
 PARTICLES = 600
 LOAD = 0.15
 OFFSETS = {

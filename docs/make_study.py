@@ -1,4 +1,4 @@
-"""Brings a study's figures and tables into docs/results.md.
+"""Brings a study's figures and tables into docs/evidence/results.md.
 
     python docs/make_study.py runs/study-benches/report
 
@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 DOCS = Path(__file__).parent
-PAGE, IMAGES = DOCS / "results.md", DOCS / "images" / "study"
+PAGE, IMAGES = DOCS / "evidence" / "results.md", DOCS / "images" / "study"
 MARKED = re.compile(r"(<!-- study: (?P<name>[\w-]+)(?P<wanted>[^>]*) -->\n).*?(<!-- end of study -->)", re.DOTALL)
 FIGURES = ("3b", "5b", "6", "final")
 """Those that the page shows."""

@@ -1,4 +1,4 @@
-"""Runs the kill matrix, and writes docs/reliability.md's tables and docs/kill-matrix.csv.
+"""Runs the kill matrix, and writes docs/evidence/reliability.md's tables and docs/data/kill-matrix.csv.
 
 python -m tests.reliability.page --jobs 2                      # all cases: within an hour on two idle cores
 python -m tests.reliability.page --only controller balance     # of these targets alone
@@ -31,7 +31,7 @@ from tests.reliability.rig import Rig
 from tests.reliability.strikes import can_mount
 
 ROOT = Path(__file__).parents[2]
-PAGE, LIST = ROOT / "docs" / "reliability.md", ROOT / "docs" / "kill-matrix.csv"
+PAGE, LIST = ROOT / "docs" / "evidence" / "reliability.md", ROOT / "docs" / "data" / "kill-matrix.csv"
 RESULTS = ROOT / "build" / "kill-matrix.jsonl"
 BEGIN, END = "<!-- table: {} -->\n", "<!-- end of table -->"
 SEED = 13

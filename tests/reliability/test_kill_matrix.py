@@ -1,4 +1,4 @@
-"""A campaign that is struck anywhere ends as if nothing had happened (docs/reliability.md)."""
+"""A campaign that is struck anywhere ends as if nothing had happened (docs/evidence/reliability.md)."""
 
 from __future__ import annotations
 
