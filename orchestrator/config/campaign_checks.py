@@ -22,9 +22,8 @@ import numpy as np
 from actors.arm.arm_settings import ArmSpec
 from actors.bench.pour_feasibility import vessel as built
 from actors.interfaces import InvalidActionError, UnreachablePlaceError
-from orchestrator.config.action_ranges import EXAMPLES
 from orchestrator.config.campaign_file import CampaignFile
-from orchestrator.config.parameter_ranges import ParameterRangeSection, ParametersBase
+from orchestrator.config.search_ranges import EXAMPLES, ParameterRangeSection, ParametersBase
 from orchestrator.config.yaml.file_access import why_not_writable
 from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.config.yaml.yaml_source import Document, Loc, Place, Report

@@ -12,10 +12,8 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import Field, create_model
 
-from orchestrator.config.action_ranges import Actions as ActionsModel
-from orchestrator.config.action_ranges import Motion as MotionModel
 from orchestrator.config.laboratory_file import LaboratoryFile
-from orchestrator.config.parameter_ranges import Parameters as ParametersModel
+from orchestrator.config.search_ranges import Actions, Motion, Parameters
 from orchestrator.config.vessel_file import LiquidFile, VesselFile
 from orchestrator.strategies.campaign_plan import CalibrationSettings, DeploymentSettings, Design, StrategySettings
 from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES, calibrations, deployments
@@ -37,11 +35,6 @@ from sim_engine.settings.model import (
     tagged,
 )
 from sim_engine.settings.quantity import Quantity
-
-# Created at import from the declarations in sim_engine; a type checker sees them as Any.
-Actions: Any = ActionsModel
-Motion: Any = MotionModel
-Parameters: Any = ParametersModel
 
 
 class TransferSection(Section):
