@@ -34,6 +34,7 @@ from orchestrator.config.yaml.section_validation import sections_in
 from orchestrator.daemon import daemon_settings as daemon
 from orchestrator.daemon.notifications import NotifySection
 from orchestrator.states import State
+from orchestrator.strategies.campaign_plan import OutputSettings
 from orchestrator.strategies.deployment import disturbances as pose
 from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.disturbances import RiskSettings
@@ -48,6 +49,7 @@ from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES
 from orchestrator.study import study_file as study
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquids import KNOWN, ROOM, SimulationParameters
+from sim_engine.outcome import Loss
 from sim_engine.settings.model import Choice, Section
 from sim_engine.settings.quantity import Quantity
 from sim_engine.validation import sensitivity
@@ -69,9 +71,9 @@ SECTIONS: dict[str, type[Section]] = {
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
     "data": campaign.DataSection,
-    "loss": campaign.LossSection,
+    "loss": Loss,
     "objective": Objective,
-    "outputs": campaign.OutputsSection,
+    "outputs": OutputSettings,
     "liquid": vessel.LiquidFile,
     "vessel": vessel.VesselFile,
     "profile": vessel.ProfileSection,
@@ -116,7 +118,7 @@ OF_SECTIONS = {
     "PoseErrorSection": "[pose error](#bench)",
     "PoseNoiseSection": "standard deviations of the [pose error](#bench)",
     "TransferSection": "[transfer](#pours)",
-    "LossSection": "[loss](#losses)",
+    "Loss": "[loss](#losses)",
     "Objective": "[objective](#objectives)",
     **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
     "RiskSettings": "[risk](#risk-and-the-safe-window)",

@@ -430,7 +430,7 @@ def check_campaign(
         document = None  # a plan without a file
     checker = _Checker(plan.source, plan.laboratory.arm, document, warn, doing)
     at: Loc
-    if (problem := why_not_writable(plan.outputs.directory)) is not None:
+    if (problem := why_not_writable(plan.outputs.folder)) is not None:
         checker.add((("outputs", "directory"),), problem)
     if plan.calibration is not None:
         calibration, section = plan.calibration, ("calibration",)

@@ -15,9 +15,15 @@ from pydantic import Field, create_model
 from orchestrator.config.laboratory_file import LaboratoryFile
 from orchestrator.config.search_ranges import Actions, Motion, Parameters
 from orchestrator.config.vessel_file import LiquidFile, VesselFile
-from orchestrator.strategies.campaign_plan import CalibrationSettings, DeploymentSettings, Design, StrategySettings
+from orchestrator.strategies.campaign_plan import (
+    CalibrationSettings,
+    DeploymentSettings,
+    Design,
+    OutputSettings,
+    StrategySettings,
+)
 from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES, calibrations, deployments
-from sim_engine.outcome import LossName
+from sim_engine.outcome import Loss
 from sim_engine.settings.model import (
     MADE,
     FilePath,
@@ -140,16 +146,6 @@ class DataSection(Section):
     """Columns that have another name in the CSV: {Decant's name: name in the file}."""
 
 
-class LossSection(Section):
-    """Loss that deployment minimises."""
-
-    name: LossName = "spilled_and_retained"
-    """(spilled + w·retained) / loaded; or the paper's: normalised, grams, particles."""
-
-    retained_weight: Annotated[float, Quantity("1", "1.0", 0.0, 100.0)] | None = None
-    """Weight w of the retained liquid; 1 unless given."""
-
-
 AnyObjective: Any = tagged(OBJECTIVES.all)
 
 
@@ -171,7 +167,7 @@ class DeploymentSection(Section):
     actions: Actions | None = None
     """Searched dimensions; the campaign's `actions` unless given."""
 
-    loss: LossSection | None = None
+    loss: Loss | None = None
     """Loss that is minimised."""
 
     objectives: list[AnyObjective] | None = None
@@ -236,25 +232,6 @@ class SimulatorSection(Section):
     """Parameters θ: a value fixes one, a range makes calibration search it; the others have their defaults."""
 
 
-class OutputsSection(Section):
-    """Outputs in addition to the journal."""
-
-    directory: FilePath | None = None
-    """Folder of the runs; 'runs' in the working directory unless given."""
-
-    rrd: Switch = True
-    """Write a recording for the viewer."""
-
-    figures: Switch = True
-    """Write figures at the end."""
-
-    record_rate: Annotated[float, Quantity("1/s", "10 1/s", 0.0, 10.0)] = 10.0
-    """Frames of particles per simulated second."""
-
-    recorded_simulations: SimulationCount = 6
-    """Number of simulations that are recorded with their particles."""
-
-
 class CampaignFile(Section):
     """A campaign: calibrate the simulator, deploy with the calibrated parameters, or both."""
 
@@ -307,5 +284,5 @@ class CampaignFile(Section):
     """Logical slots for parallel simulations, independent of the machine: the same seed gives the same requests on any
     machine."""
 
-    outputs: OutputsSection = OutputsSection()
+    outputs: OutputSettings = OutputSettings()
     """Outputs in addition to the journal."""

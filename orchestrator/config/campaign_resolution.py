@@ -9,8 +9,6 @@ Sections are validated before (`orchestrator.config.yaml.section_validation`); v
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from actors.laboratory_settings import LaboratorySpec
 from actors.optimizer.questions import Linear
 from orchestrator.config.campaign_checks import check_ranges
@@ -19,9 +17,8 @@ from orchestrator.config.campaign_file import (
     CampaignFile,
     DeploymentSection,
     LearningSection,
-    LossSection,
 )
-from orchestrator.config.run_snapshot import campaign_record
+from orchestrator.config.run_snapshot import as_file
 from orchestrator.config.scene_builder import SceneBuilder
 from orchestrator.config.search_ranges import ParametersBase
 from orchestrator.config.weighed_pours import read_table, records_of_run, resolve_data, resolve_records
@@ -34,7 +31,6 @@ from orchestrator.strategies.campaign_plan import (
     CampaignPlan,
     DeploymentPlan,
     NormalPrior,
-    OutputPlan,
     Premises,
 )
 from orchestrator.strategies.deployment.objectives import STOPS, Objectives
@@ -99,8 +95,8 @@ def resolve_deployment(
     elif section.confirm and laboratory is not None and not laboratory.pours:
         text = f"laboratory '{laboratory.name}' has no bench to pour on; name one with a bench, or remove it"
         report.add(place.at("confirm"), text)
-    loss = section.loss or LossSection()
-    if loss.retained_weight is not None and loss.name != "spilled_and_retained":
+    loss = section.loss or Loss()
+    if "retained_weight" in loss.model_fields_set and loss.name != "spilled_and_retained":
         report.add(
             place.at("loss", "retained_weight"), f"belongs to spilled_and_retained, not to {loss.name}", key=True
         )
@@ -132,7 +128,7 @@ def resolve_deployment(
         settings=settings,
         scenes=complete,
         actions=actions,
-        loss=Loss(loss.name, 1.0 if loss.retained_weight is None else loss.retained_weight),
+        loss=loss,
         data=data,
         objectives=resolve_objectives(section, place, complete[0], actions, report),
         constraints=constraints,
@@ -140,7 +136,7 @@ def resolve_deployment(
     )
 
 
-def _check_that_pouring_pays(loss: LossSection, actions: Space, place: Place, builder: SceneBuilder) -> None:
+def _check_that_pouring_pays(loss: Loss, actions: Space, place: Place, builder: SceneBuilder) -> None:
     """If a pour can stop before any liquid leaves, stopping early must not be the optimum."""
     stops = [name for name in STOPS if name in actions.names]
     if not stops or (loss.name == "spilled_and_retained" and loss.retained_weight != 0.0):
@@ -349,7 +345,8 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         )
     if report.problems or laboratory is None or file.name is None:
         return None
-    directory = _directory(file.outputs.directory, root)
+    directory = file.outputs.folder if file.outputs.directory is None else root.directory / file.outputs.directory
+    outputs = file.outputs.model_copy(update={"directory": str(resolved(directory))})
     in_force = default if parameters is None else default | parameters.in_force()
     return CampaignPlan(
         name=file.name,
@@ -359,22 +356,12 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         parameters=SimulationParameters.from_values(in_force),
         calibration=calibration,
         deployment=deployment,
-        outputs=OutputPlan(
-            directory=directory,
-            rrd=file.outputs.rrd,
-            figures=file.outputs.figures,
-            record_rate=file.outputs.record_rate,
-            recorded_simulations=file.outputs.recorded_simulations,
-        ),
+        outputs=outputs,
         parallel_simulations=file.parallel_simulations,
         on_unknown=file.on_unknown,
-        resolved=campaign_record(file, root, references, directory),
+        resolved=as_file(file.model_copy(update={"outputs": outputs}), root, references),
         laboratory_source=(resolved(root.directory / file.laboratory) if isinstance(file.laboratory, str) else None),
     )
-
-
-def _directory(text: str | None, root: Place) -> Path:
-    return resolved(Path("runs") if text is None else root.directory / text)
 
 
 def _is_virtual(laboratory: LaboratorySpec) -> bool:

@@ -1,6 +1,6 @@
 """The self-contained record of a campaign that a run stores as `resolved.json`: the file with all values filled in.
 
-`as_file` writes any section in the format of its file; `campaign_record` writes a campaign's file. `record_of` writes a
+`as_file` writes any section in the format of its file; `record_of` writes a
 plan derived from another campaign, for example the cell of a study, as the base record with its changes. Loading a
 record gives the plan again.
 """
@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from pydantic import Tag
 
-from orchestrator.config.campaign_file import CalibrationSection, CampaignFile, LearningSection
+from orchestrator.config.campaign_file import CalibrationSection, LearningSection
 from orchestrator.config.laboratory_file import HiddenLiquid
 from orchestrator.config.search_ranges import Parameters
 from orchestrator.config.yaml.file_access import resolved
@@ -40,12 +40,11 @@ def record_of(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
         plan: plan of a study's cell, or for planning alone.
     """
     record = {key: value for key, value in base.items() if key not in ("calibration", "deployment")}
-    outputs = {**asdict(plan.outputs), "record_rate": f"{plan.outputs.record_rate!r} 1/s"}
     record |= {
         "name": plan.name,
         "seed": plan.seed,
         "on_unknown": plan.on_unknown,
-        "outputs": {**outputs, "directory": str(plan.outputs.directory)},
+        "outputs": written(plan.outputs),
         "laboratory": _laboratory(base["laboratory"], plan),
         "simulator": {"parameters": _parameters(plan)},
     }
@@ -128,20 +127,6 @@ def _common(base: Mapping[str, Any], section: type[Section]) -> dict[str, Any]:
 def written(section: Section) -> dict[str, Any]:
     """A section without a file, in the format of a file."""
     return as_file(section, Place(Document(Path.cwd() / "written")), References(Report()))
-
-
-def campaign_record(file: CampaignFile, root: Place, references: References, directory: Path) -> dict[str, Any]:
-    """The campaign in the format of campaign files, JSON-ready: loading it gives the same plan.
-
-    Args:
-        file: the file's content, without problems.
-        root: place of the file's root.
-        references: the references that read its other files.
-        directory: parent folder of its runs.
-    """
-    record = as_file(file, root, references)
-    record["outputs"]["directory"] = str(directory)
-    return record
 
 
 T = TypeVar("T")
