@@ -18,7 +18,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_engine.settings.model import Section
+from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
 
 
@@ -197,7 +197,7 @@ def normalised_spillage(fractions: Fractions) -> float | None:
     return fractions.spilled / fractions.poured
 
 
-class Loss(Section):
+class Loss(Settings):
     """Loss that deployment minimises."""
 
     recorded_as_given: ClassVar[bool] = True

@@ -23,7 +23,7 @@ from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
-from sim_engine.settings.model import IN_FILE, FieldMark, Section
+from sim_engine.settings.model import IN_FILE, FieldMark, Settings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.vessel.shapes import MeshShape, ProfileShape, VesselSpec
 
@@ -113,18 +113,18 @@ def vessel_record(vessel: VesselSpec) -> dict[str, Any]:
         case MeshShape():
             unit = {} if shape.unit is None else {"unit": shape.unit}
             return {"name": vessel.name, "mesh": str(shape.path), "up": shape.up, **unit}
-        case Section():
+        case Settings():
             return {"name": vessel.name, shape.kind: written(shape)}
         case _:
             raise TypeError(f"a vessel of the kind {shape.kind!r} can't be written down")
 
 
-def _common(base: Mapping[str, Any], section: type[Section]) -> dict[str, Any]:
+def _common(base: Mapping[str, Any], section: type[Settings]) -> dict[str, Any]:
     """The keys of a section that are common to all strategies."""
     return {key: value for key, value in base.items() if key in section.written_keys()}
 
 
-def written(section: Section) -> dict[str, Any]:
+def written(section: Settings) -> dict[str, Any]:
     """A section without a file, in the format of a file."""
     return as_file(section, Place(Document(Path.cwd() / "written")), References(Report()))
 
@@ -132,7 +132,7 @@ def written(section: Section) -> dict[str, Any]:
 T = TypeVar("T")
 
 
-def as_file(section: Section, place: Place, references: References, *, whole: bool = True) -> dict[str, Any]:
+def as_file(section: Settings, place: Place, references: References, *, whole: bool = True) -> dict[str, Any]:
     """A section in the format of a file, JSON-ready: loading it gives an equal section.
 
     Defaults are written (unless the section is recorded as given), numbers keep all digits, paths are absolute, and
@@ -153,7 +153,7 @@ class _Writer:
     references: References
     whole: bool
 
-    def section(self, section: Section, place: Place) -> dict[str, Any]:
+    def section(self, section: Settings, place: Place) -> dict[str, Any]:
         table: dict[str, Any] = {}
         for key, name in section.written_keys().items():
             value, info = getattr(section, name), type(section).model_fields[name]
@@ -165,7 +165,7 @@ class _Writer:
         return table
 
     def _value(self, value: Any, annotation: Any, metadata: tuple[Any, ...], place: Place) -> Any:
-        if isinstance(value, Section):
+        if isinstance(value, Settings):
             return as_file(value, place, self.references, whole=self.whole)
         if isinstance(value, str):
             return self._text(value, annotation, metadata, place)
@@ -199,11 +199,11 @@ def _parts(annotation: Any) -> list[tuple[Any, tuple[Any, ...]]]:
     return [(annotation, ())]
 
 
-def _behind_a_path(annotation: Any) -> type[Section] | None:
+def _behind_a_path(annotation: Any) -> type[Settings] | None:
     """The section that may be in its own file, referenced by a path."""
     for part, metadata in _parts(annotation):
         if any(isinstance(m, Tag) and m.tag == "inline" for m in metadata):
-            return typing.cast("type[Section]", part)
+            return typing.cast("type[Settings]", part)
     return None
 
 

@@ -21,7 +21,7 @@ from sim_engine.action import ACTION_DIMENSIONS, Dimension
 from sim_engine.liquids import ParameterInfo, SimulationParameters
 from sim_engine.scene import Pivot
 from sim_engine.search_space import Axis, Scale, Space
-from sim_engine.settings.model import MADE, Section, Text
+from sim_engine.settings.model import MADE, Settings, Text
 from sim_engine.settings.quantity import Quantity
 
 EXAMPLES = {
@@ -43,7 +43,7 @@ EXAMPLES = {
 """A valid value of every action dimension and simulation parameter, for messages and schemas."""
 
 
-class RangeSection(Section):
+class RangeSection(Settings):
     """Bounds of a searched quantity: `[lowest, highest]`, or with a scale `{range: [...], scale: log}`."""
 
     required: ClassVar[dict[str, str]] = {"range": "[lowest, highest]"}
@@ -88,7 +88,7 @@ class RangeSection(Section):
 
 
 def _section(
-    name: str, base: type[Section], types: Mapping[str, Any], meanings: Mapping[str, str] | None = None
+    name: str, base: type[Settings], types: Mapping[str, Any], meanings: Mapping[str, str] | None = None
 ) -> Any:
     """A section with optional keys of these types; keys that `base` declares keep their descriptions."""
     described = {key: info.description for key, info in base.model_fields.items()} | dict(meanings or {})
@@ -122,7 +122,7 @@ def dimension_quantity(dimension: Dimension, *, words: bool = False) -> Quantity
     )
 
 
-class PriorSection(Section):
+class PriorSection(Settings):
     """Prior of a searched dimension: a normal distribution, truncated at the ends of the range."""
 
     mean: Any = None
@@ -156,7 +156,7 @@ def _action_range(dimension: Dimension) -> Any:
     return _section(f"{title}Range", ActionRangeSection, {"range": _range(quantity), "prior": prior})
 
 
-class PivotPoint(Section):
+class PivotPoint(Settings):
     """A horizontal line in the frame of the upright pourer."""
 
     required: ClassVar[dict[str, str]] = {"x": "0 mm", "z": "50 mm"}
@@ -172,7 +172,7 @@ def _pivot_form(value: Any) -> str:
     return "word" if isinstance(value, str) else "point"
 
 
-class MotionBase(Section):
+class MotionBase(Settings):
     """Values of the motion that are not searched."""
 
     pivot: (
@@ -204,7 +204,7 @@ class MotionBase(Section):
         return Pivot("point", self.pivot.x, self.pivot.z)
 
 
-class ActionsBase(Section):
+class ActionsBase(Settings):
     """Searched dimensions of the motion, each with its range; any subset."""
 
     constraints: list[Text] | None = None
@@ -298,7 +298,7 @@ def _parameter_form(value: Any) -> str:
     return "searched" if isinstance(value, (list, Mapping)) else "fixed"
 
 
-class ParametersBase(Section):
+class ParametersBase(Settings):
     """Parameters: a value fixes one; a range, or a measured value with a tolerance, makes calibration search it."""
 
     def fixed(self) -> dict[str, float]:
