@@ -48,11 +48,12 @@ from orchestrator.strategies.deployment.safe_window import WindowSettings
 from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES
 from orchestrator.study import study_file as study
 from sim_engine.action import ACTION_DIMENSIONS
-from sim_engine.liquids import KNOWN, ROOM, SimulationParameters
+from sim_engine.liquids import KNOWN, ROOM, LiquidSettings, SimulationParameters
 from sim_engine.outcome import Loss
 from sim_engine.settings.model import Choice, Settings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.validation import sensitivity
+from sim_engine.vessel.shapes import ProfileShape
 
 FOLDER = Path(__file__).parent
 MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
@@ -74,9 +75,9 @@ SECTIONS: dict[str, type[Settings]] = {
     "loss": Loss,
     "objective": Objective,
     "outputs": OutputSettings,
-    "liquid": vessel.LiquidFile,
+    "liquid": LiquidSettings,
     "vessel": vessel.VesselFile,
-    "profile": vessel.ProfileSection,
+    "profile": ProfileShape,
     "laboratory": laboratory.LaboratoryFile,
     "ray": cluster.RaySection,
     "arm": arm_sections.UrArmSection,
@@ -128,13 +129,13 @@ OF_SECTIONS = {
     "RiskLimitSettings": "[risk_limit](#ignorance-limits-and-the-end)",
     "StopSettings": "[stop](#ignorance-limits-and-the-end)",
     "DataSection": "[data](#existing-data)",
-    "ProfileSection": "[profile](#vessels)",
+    "ProfileShape": "[profile](#vessels)",
     "Motion": "[motion](#motion-and-actions)",
     "Actions": "[actions](#motion-and-actions)",
     "Parameters": "[parameters](#simulator)",
     "VesselFile": "[vessel](#vessels) or the path of its file",
     "LaboratoryFile": "[laboratory](#laboratories) or the path of its file",
-    "LiquidFile": "[liquid](#liquid) or the path of its file",
+    "LiquidSettings": "[liquid](#liquid) or the path of its file",
     "LevelSection": "[level](#studies)",
     **{
         model.__name__: f"`{{{', '.join(model.written_keys())}}}`, [each](#studies) a mapping"

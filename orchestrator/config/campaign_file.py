@@ -14,7 +14,7 @@ from pydantic import Field, create_model
 
 from orchestrator.config.laboratory_file import LaboratoryFile
 from orchestrator.config.search_ranges import Actions, Motion, Parameters
-from orchestrator.config.vessel_file import LiquidFile, VesselFile
+from orchestrator.config.vessel_file import VesselFile
 from orchestrator.strategies.campaign_plan import (
     CalibrationSettings,
     DeploymentSettings,
@@ -23,6 +23,7 @@ from orchestrator.strategies.campaign_plan import (
     StrategySettings,
 )
 from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES, calibrations, deployments
+from sim_engine.liquids import LiquidSettings
 from sim_engine.outcome import Loss
 from sim_engine.settings.model import (
     MADE,
@@ -250,7 +251,7 @@ class CampaignFile(Settings):
     laboratory: PathOr[LaboratoryFile] | None = None
     """Laboratory in which it runs."""
 
-    liquid: PathOr[LiquidFile] | None = None
+    liquid: PathOr[LiquidSettings] | None = None
     """Liquid that is poured."""
 
     pourer: PathOr[VesselFile] | None = None

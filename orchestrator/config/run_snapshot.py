@@ -25,7 +25,7 @@ from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan,
 from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
 from sim_engine.settings.model import IN_FILE, FieldMark, Settings
 from sim_engine.settings.quantity import Quantity
-from sim_engine.vessel.shapes import MeshShape, ProfileShape, VesselSpec
+from sim_engine.vessel.shapes import MeshShape, VesselSpec
 
 
 def record_of(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
@@ -103,20 +103,11 @@ def vessel_record(vessel: VesselSpec) -> dict[str, Any]:
     """A vessel in the format of its file."""
     shape = vessel.shape
     match shape:
-        case ProfileShape():
-            inner, thickness = [list(point) for point in shape.inner], {"wall": shape.wall, "floor": shape.floor}
-            lengths = {**thickness, **({"height_deviation": shape.height_deviation} if shape.height_deviation else {})}
-            profile = {"unit": "m", "inner": inner, **{key: f"{value!r} m" for key, value in lengths.items()}}
-            if shape.radius_deviations:
-                profile["radius_deviations"] = [list(row) for row in shape.radius_deviations]
-            return {"name": vessel.name, "profile": profile}
         case MeshShape():
             unit = {} if shape.unit is None else {"unit": shape.unit}
             return {"name": vessel.name, "mesh": str(shape.path), "up": shape.up, **unit}
-        case Settings():
-            return {"name": vessel.name, shape.kind: written(shape)}
         case _:
-            raise TypeError(f"a vessel of the kind {shape.kind!r} can't be written down")
+            return {"name": vessel.name, shape.kind: written(shape)}
 
 
 def _common(base: Mapping[str, Any], section: type[Settings]) -> dict[str, Any]:

@@ -399,7 +399,7 @@ def _record_set(
 def _check_lip_radius(pours: PoursSection, place: Place, builder: SceneBuilder, pourer: VesselSpec | None) -> None:
     if pours.lip_radius is None or pourer is None or not isinstance(pourer.shape, ProfileShape):
         return
-    rim = pourer.shape.inner[-1][0]
+    rim = pourer.shape.outline().inner[-1][0]
     if abs(rim - pours.lip_radius) > LIP_RADIUS_TOLERANCE:
         builder.report.add(
             place.at("lip_radius"),
