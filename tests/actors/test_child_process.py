@@ -26,7 +26,7 @@ from actors.runtime.child_process import (
     run,
     run_async,
 )
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[2]
 PRODUCT = ("decant", "orchestrator", "actors", "sim_engine")
@@ -328,10 +328,10 @@ def test_tests_and_scripts_give_every_child_an_environment() -> None:
 
 
 def test_rays_private_api_is_used_in_one_function_only() -> None:
-    found = set()
-    for path, tree in trees(*PRODUCT, about=r"\bray\._"):
-        for function in ast.walk(tree):
-            if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
-                if re.search(r"\bray\._\w", ast.unparse(function)):
-                    found.add((str(path.relative_to(ROOT)), function.name))
+    found = {
+        (str(path.relative_to(ROOT)), node.name)
+        for path, tree in trees(*PRODUCT, about=r"\bray\._")
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and re.search(r"\bray\._", ast.unparse(node))
+    }
     assert found == {("actors/runtime/ray_runtime.py", "_ray_internals")}

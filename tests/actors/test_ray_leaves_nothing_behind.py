@@ -19,7 +19,7 @@ from actors.interfaces import LaboratoryError
 from actors.laboratory_settings import LaboratorySpec
 from actors.runtime import ray_runtime
 from actors.runtime.child_process import child_environment
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 pytestmark = pytest.mark.ray
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.patience import PATIENCE
 from tests.reliability import strikes
+from tests.support.waiting import PATIENCE
 
 pytestmark = pytest.mark.ray
 
@@ -27,7 +27,7 @@ from actors.laboratory import WarmSimulators
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
 from sim_engine.scene import PourTask
-from tests.actors.conftest import make_scene
+from tests.support.fake_simulator import make_scene
 from sim_engine.action import Action
 from tests.reliability.formula import Formula
 

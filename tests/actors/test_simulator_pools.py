@@ -21,7 +21,7 @@ from actors.runtime.remote_object import RayDevice
 from actors.simulators import pool as pools
 from actors.simulators.local_worker import process_pool, thread_pool
 from actors.simulators.ray_worker import ray_pool
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 
 async def until(what, timeout=PATIENCE):

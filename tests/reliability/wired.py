@@ -12,17 +12,17 @@ from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from actors.bench import virtual_operator
+from actors.bench import bench_operators
 from actors.bench.bench_operators import VirtualOperator
 from actors.interfaces import OperatorQuestion, OperatorSpec
 from actors.laboratory import InProcessLaboratory
 from orchestrator.journal.journal import Kind
-from tests.actors.bench.conftest import wired_spec
 from tests.end_to_end.test_wired_campaign import write_wired
 from tests.reliability import strikes
 from tests.reliability.case import CUT, KILLED, STOPPED, Case, Point, every, first_of_kind
 from tests.reliability.formula import Formula
 from tests.reliability.rig import Life, Rig
+from tests.support.wired_bench import wired_spec
 
 PACE = 30.0
 
@@ -63,7 +63,7 @@ class WiredRig(Rig):
             hurried=True,
             operator=OperatorSpec(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
         )
-        virtual_operator.SCATTER = 0.0  # each refilling is one of chance, and after a restart there is one more
+        bench_operators.SCATTER = 0.0  # each refilling is one of chance, and after a restart there is one more
         async with InProcessLaboratory(spec, Formula, need_bench=True) as opened:
             attend(opened, life)
             assert opened.opened is not None
