@@ -263,6 +263,7 @@ def test_other_code_than_that_of_finished_cells_is_named_once_and_is_no_error(tm
     text = warning({"a": same, "b": older, "c": same}) or ""
     assert "1 finished by other code (strategies: changed since)" in text
     assert "\n" not in text
+    assert sources(tmp_path / "nothing") not in code_now().values(), "a folder of the code has moved"
     (tmp_path / "a.py").write_text("x = 1", encoding="utf-8")
     before = sources(tmp_path)
     (tmp_path / "a.py").write_text("x = 2", encoding="utf-8")
