@@ -20,7 +20,7 @@ from actors.arm.arm_geometry import ArmLimits, Joints, Mount, Pose, RobotCell, V
 from actors.interfaces import DeviceCheck
 from sim_engine.action import Action
 from sim_engine.scene import Scene
-from sim_engine.settings.model import FREE
+from sim_engine.settings.model import NOT_IN_FINGERPRINT
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import ArmFigure, PlannedPour
@@ -95,7 +95,7 @@ class ArmSpec(ABC):
     Attributes:
         kind: as registered in `decant.arms`, and as written in files.
         stand_in: 'module:callable' that makes, from these settings, the emulator of the arm on a virtual bench. See
-            `actors.bench.device_emulators.ArmEmulator`; '' for a driver that only simulates.
+            `actors.bench.virtual_bench.ArmEmulator`; '' for a driver that only simulates.
         time_scale: bench seconds per second of the clock; 1 for hardware, 0 to skip all waits.
         announcement: from the operator's consent to the first movement [s].
         untilt_speed: angular velocity at which a stopped, tilted pourer is brought upright [rad/s].
@@ -206,7 +206,7 @@ class UrArmSpec(ArmSpec):
     limits: ArmLimits
     cell: RobotCell
     home: Joints
-    address: Annotated[str, FREE] = ""
+    address: Annotated[str, NOT_IN_FINGERPRINT] = ""
     mount: Mount = field(default_factory=Mount)
     tool: Pose = field(default_factory=Pose)
     payload: float = 0.0

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingStatus, Reply
     from actors.balance.serial_balance import SerialBalance
     from actors.balance.simulated_balance import Load
-    from actors.bench.device_emulators import ArmEmulator, History
     from actors.bench.pour_feasibility import plan_pour
+    from actors.bench.virtual_bench import ArmEmulator, History
     from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
     from actors.optimizer.questions import Data, Suggestion, SuggestProblem
     from orchestrator.config.arm_file import ArmSettings, CellSection
@@ -80,18 +80,16 @@ if TYPE_CHECKING:
     from sim_engine.scene import PoseError, Scene
     from sim_engine.search_space import Axis, Space
     from sim_engine.settings.model import (
-        FREE,
+        NOT_IN_FINGERPRINT,
         Choice,
         Count,
         Name,
         Number,
         PositiveCount,
         Problems,
+        Settings,
         Switch,
         Text,
-    )
-    from sim_engine.settings.model import (
-        Section as Settings,
     )
     from sim_engine.settings.quantity import Quantity
     from sim_engine.vessel.distance_grid import SignedDistanceGrid
@@ -100,8 +98,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ACTION_DIMENSIONS",
-    "FREE",
     "MAP_RESOLUTION",
+    "NOT_IN_FINGERPRINT",
     "THETA_MAP_RESOLUTION",
     "Acknowledgement",
     "Action",
@@ -217,7 +215,7 @@ __all__ = [
 _SOURCES = {
     # Settings
     "sim_engine.settings.model": (
-        "FREE",
+        "NOT_IN_FINGERPRINT",
         "Choice",
         "Count",
         "Name",
@@ -294,7 +292,7 @@ _SOURCES = {
     ),
     "actors.arm.arm_settings": ("ArmDiagnostics", "ArmSpec"),
     "actors.arm.planned_pour": ("ExecutedMotion", "MotionPath"),
-    "actors.bench.device_emulators": ("ArmEmulator", "History"),
+    "actors.bench.virtual_bench": ("ArmEmulator", "History"),
     "actors.bench.pour_feasibility": ("plan_pour",),
     "orchestrator.config.arm_file": ("ArmSettings", "CellSection"),
     "orchestrator.config.yaml.yaml_source": ("Place", "Report"),
@@ -308,16 +306,13 @@ _SOURCES = {
 
 _SOURCE_OF = {name: module for module, names in _SOURCES.items() for name in names}
 
-_RENAMED = {"Settings": "Section"}
-"""Public name → the name in its module, if they differ."""
-
 if not TYPE_CHECKING:  # otherwise a type checker would accept misspelt names as Any
 
     def __getattr__(name: str) -> Any:
         """Import a name on first use (PEP 562)."""
         if name not in _SOURCE_OF:
             raise AttributeError(f"module 'decant.plugins' has no attribute '{name}'; it has {', '.join(__all__)}")
-        return getattr(import_module(_SOURCE_OF[name]), _RENAMED.get(name, name))
+        return getattr(import_module(_SOURCE_OF[name]), name)
 
 
 def __dir__() -> list[str]:

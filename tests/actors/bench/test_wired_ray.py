@@ -13,8 +13,7 @@ import pytest
 
 from actors.interfaces import Notice, UnknownPourError
 from actors.laboratory import RayLaboratory
-
-from .conftest import ACTION, SCENE, Trickle, reach, wired_spec
+from tests.support.wired_bench import ACTION, SCENE, Trickle, reach, wired_spec
 
 pytestmark = [pytest.mark.ray]
 
@@ -49,7 +48,7 @@ def test_a_stop_and_the_death_of_the_driver_are_told_and_the_bench_pours_on(labo
         notices: list[Notice] = []
         async with laboratory as opened:
             opened.listen(notices.append)
-            site, operator = opened.opened.stand_ins, opened.opened.operator
+            site, operator = opened.opened.emulators, opened.opened.operator
 
             first, _ = await stopped(opened, slow, lambda: site.fault("protective_stop"))
             asked = next(question for question in operator.heard if question.about == "recover")

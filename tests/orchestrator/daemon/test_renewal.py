@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from actors.simulators.shared_pool import WarmSimulators
+from actors.laboratory import WarmSimulators
 from orchestrator.daemon import restart as renewal
 from orchestrator.daemon import supervisor
 from orchestrator.daemon.restart import MOST, RENEWED, DaemonRestart, RayWatch
-from tests.orchestrator.daemon.served import held, run, serving
+from tests.support.toy_daemon import held, run, serving
 
 
 def test_a_pour_is_finished_before_and_its_campaign_goes_on_after(
