@@ -1,4 +1,4 @@
-"""Makes docs/library.ipynb of docs/library.md: the same text and examples, executed, with their pictures.
+"""Makes docs/library.ipynb of docs/tutorials/notebook.md: the same text and examples, executed, with their pictures.
 
     python docs/make_notebook.py
 
@@ -16,7 +16,7 @@ import nbformat
 from nbclient import NotebookClient
 
 DOCS = Path(__file__).resolve().parent
-PAGE, NOTEBOOK = DOCS / "library.md", DOCS / "library.ipynb"
+PAGE, NOTEBOOK = DOCS / "tutorials" / "notebook.md", DOCS / "library.ipynb"
 
 CELL = re.compile(r"^\S*/ipykernel_\d+/\d+\.py:\d+: ", flags=re.MULTILINE)
 """Where a warning was issued: a file of the kernel, which has another name each time."""

@@ -6,7 +6,10 @@ page is not current. Run from the project's root: python docs/make_tables.py
 
 from __future__ import annotations
 
+import inspect
 import itertools
+import json
+import os
 import re
 import types
 import typing
@@ -22,6 +25,7 @@ from orchestrator.catalogue.catalogue_index import TABLES as CATALOGUE
 from orchestrator.cli.solver_report import kept_records
 from orchestrator.config import arm_file as arm_sections
 from orchestrator.config import arm_file as cell
+from orchestrator.config import balance_file
 from orchestrator.config import campaign_file as campaign
 from orchestrator.config import laboratory_file as cluster
 from orchestrator.config import laboratory_file as laboratory
@@ -67,8 +71,8 @@ SECTIONS: dict[str, type[Settings]] = {
     "deployment": campaign.DeploymentSection,
     "risk": RiskSettings,
     "window": WindowSettings,
-    "prices": PricesSettings,
-    "ignorance": DiscrepancyPolicySettings,
+    "costs": PricesSettings,
+    "discrepancy_policy": DiscrepancyPolicySettings,
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
     "data": campaign.DataSection,
@@ -85,7 +89,8 @@ SECTIONS: dict[str, type[Settings]] = {
     "cell": cell.CellSection,
     "operator": operator.OperatorSection,
     "bench": laboratory.BenchSection,
-    "balance": laboratory.BalanceSection,
+    "balance": balance_file.SerialSection,
+    "balance-display": laboratory.BalanceSection,
     "pose-error": pose.PoseErrorSection,
     "study": study.StudyFile,
     "level": study.LevelSection,
@@ -101,10 +106,10 @@ SECTIONS: dict[str, type[Settings]] = {
 
 OF_SECTIONS = {
     **{model.__name__: f"[{name}](#{name})" for name, model in SECTIONS.items()},
-    "BalanceSection": "[balance](#bench)",
-    **dict.fromkeys((arm.__name__ for arm in ARMS.all.values()), "[arm](#arm-and-cell)"),
-    "CellSection": "[cell](#arm-and-cell)",
-    "LimitsSection": "[limits](#arm-and-cell)",
+    "BalanceSection": "[display](#display)",
+    **dict.fromkeys((arm.__name__ for arm in ARMS.all.values()), "[arm](#arm)"),
+    "CellSection": "[cell](#cell)",
+    "LimitsSection": "[limits](#limits)",
     "BoxSection": "`{low: {x, y, z}, high: {x, y, z}}`, lengths",
     "PlaneSection": "`{normal: [x, y, z], offset: length}`",
     "PointSection": "`{x, y, z}`, lengths",
@@ -112,61 +117,63 @@ OF_SECTIONS = {
     "PoseSection": "`{x, y, z, rx, ry, rz}`, lengths and a rotation vector in rad",
     "MountSection": "`{tilt, turn}`, angles",
     "JointsSection": "`{base, shoulder, elbow, wrist1, wrist2, wrist3}`, angles",
-    "SerialSection": "[balance](balances.md#settings)",
-    "NumbersSection": "[balance](balances.md#settings)",
+    "SerialSection": "[balance](#balance)",
+    "NumbersSection": "[balance](#balance)",
     "OperatorSection": "[operator](#operator)",
     "HiddenLiquid": "[parameters](#simulator), one value each",
-    "PoseErrorSection": "[pose error](#bench)",
-    "PoseNoiseSection": "standard deviations of the [pose error](#bench)",
-    "TransferSection": "[transfer](#pours)",
-    "Loss": "[loss](#losses)",
+    "PoseErrorSection": "[pose error](#pose-error)",
+    "PoseNoiseSection": "standard deviations of the [pose error](#pose-error)",
+    "TransferSection": "[transfer](#transfer)",
+    "Loss": "[loss](#loss)",
     "Objective": "[objective](#objectives)",
     **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
-    "RiskSettings": "[risk](#risk-and-the-safe-window)",
-    "WindowSettings": "[window](#risk-and-the-safe-window)",
-    "PricesSettings": "[prices](#prices)",
-    "DiscrepancyPolicySettings": "[ignorance](#ignorance-limits-and-the-end)",
-    "RiskLimitSettings": "[risk_limit](#ignorance-limits-and-the-end)",
-    "StopSettings": "[stop](#ignorance-limits-and-the-end)",
-    "DataSection": "[data](#existing-data)",
-    "ProfileShape": "[profile](#vessels)",
+    "RiskSettings": "[risk](#risk)",
+    "WindowSettings": "[window](#window)",
+    "PricesSettings": "[costs](#costs)",
+    "DiscrepancyPolicySettings": "[discrepancy policy](#discrepancy-policy)",
+    "RiskLimitSettings": "[risk limit](#risk-limit)",
+    "StopSettings": "[stop](#stop)",
+    "DataSection": "[data](#data)",
+    "ProfileShape": "[profile](#profile)",
     "Motion": "[motion](#motion-and-actions)",
     "Actions": "[actions](#motion-and-actions)",
     "Parameters": "[parameters](#simulator)",
-    "VesselFile": "[vessel](#vessels) or the path of its file",
-    "LaboratoryFile": "[laboratory](#laboratories) or the path of its file",
+    "VesselFile": "[vessel](#vessel) or the path of its file",
+    "LaboratoryFile": "[laboratory](#laboratory) or the path of its file",
     "LiquidSettings": "[liquid](#liquid) or the path of its file",
-    "LevelSection": "[level](#studies)",
+    "LevelSection": "[level](#level)",
     **{
-        model.__name__: f"`{{{', '.join(model.written_keys())}}}`, [each](#studies) a mapping"
+        model.__name__: f"`{{{', '.join(model.written_keys())}}}`, each a mapping"
         for model in (study.CalibrationsSection, study.DeploymentsSection)
     },
-    **{f"{name}ArmSection": "[mapping](#studies)" for name in STRATEGIES.names},
+    **{f"{name}ArmSection": "mapping" for name in STRATEGIES.names},
     **{model.__name__: "[calibration](#calibration)" for model in campaign.CALIBRATIONS.values()},
     **{model.__name__: "[deployment](#deployment)" for model in campaign.DEPLOYMENTS.values()},
 }
 
 
-GUIDE = ("user-guide.md", "laboratories.md", "studies.md")
-"""Pages that explain the keys of files; a table on one of them may speak of what another one explains."""
+REFERENCE = tuple(sorted((FOLDER / "reference").glob("*.md")))
+"""Pages that explain the keys of files; a table on one of them may link to what another one explains."""
 
 
-def render(text: str, page: str) -> str:
+def render(text: str, page: Path) -> str:
     """The page with its tables as the code has them now.
 
     Args:
         text: of the page.
-        page: its file's name; links to what other pages explain lead there.
+        page: its file; links to what other pages explain lead there.
 
     Raises:
         KeyError: a marker names a table that does not exist.
     """
-    homes = {anchor: name for name in reversed(GUIDE) for anchor in _anchors((FOLDER / name).read_text("utf-8"))}
+    homes = {anchor: home for home in reversed(REFERENCE) for anchor in _anchors(home.read_text("utf-8"))}
     own = _anchors(text)
 
     def linked(match: re.Match[str]) -> str:
-        home = homes.get(match[1], page)
-        return match[0] if match[1] in own or home == page else f"({home}#{match[1]})"
+        home = homes.get(match[1])
+        if match[1] in own or home is None or home == page:
+            return match[0]
+        return f"({os.path.relpath(home, page.parent)}#{match[1]})"
 
     def table(match: re.Match[str]) -> str:
         return f"{match[1]}{re.sub(r'[(]#([a-z-]+)[)]', linked, TABLES[match[2]]())}{match[3]}"
@@ -180,8 +187,9 @@ def _anchors(text: str) -> set[str]:
 
 
 def pages() -> list[Path]:
-    """All pages that hold tables."""
-    return [page for page in sorted(FOLDER.glob("*.md")) if MARKED.search(page.read_text(encoding="utf-8"))]
+    """All pages that hold tables. Those of the kill matrix are written by `tests.reliability.page`."""
+    found = (page for page in sorted(FOLDER.rglob("*.md")) if page.parent.name != "notes")
+    return [page for page in found if any(name in TABLES for _, name, _ in MARKED.findall(page.read_text("utf-8")))]
 
 
 def actions() -> str:
@@ -327,6 +335,101 @@ def liquids() -> str:
 SHOWN_SHARES = (20.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0)
 
 
+def measured(name: str) -> str:
+    """A table of docs/data/results.json, with how it was measured."""
+    found = json.loads((FOLDER / "data" / "results.json").read_text(encoding="utf-8"))[name]
+    how = (
+        f"<sub>`{found['command']}`; {found['settings']}. {found['machine']}; {found['date']}, "
+        f"version {found['version']}.</sub>"
+    )
+    return f"{_table(found['head'], found['rows'])}\n{how}\n"
+
+
+def command_line() -> str:
+    """Every command with its arguments, options and examples."""
+    import typer.main
+
+    from orchestrator.cli.app import app
+
+    parts: list[str] = []
+
+    def add(command: Any, words: tuple[str, ...]) -> None:
+        if isinstance(getattr(command, "commands", None), dict):
+            if len(words) > 1:
+                parts.append(f"## `{' '.join(words)} …`\n\n{_prose(command.help)}\n")
+            for name, below in command.commands.items():
+                if not below.hidden:
+                    add(below, (*words, name))
+            return
+        parameters = [option for option in command.params if not getattr(option, "hidden", False)]
+        usage = " ".join([*words, *(_usage(one) for one in parameters if one.param_type_name == "argument")])
+        parts.append(f"{'##' if len(words) == 2 else '###'} `{usage}`\n\n{_prose(command.help)}\n")
+        rows = [
+            (f"`{', '.join((*one.opts, *one.secondary_opts))}`", _prose(one.help))
+            for one in parameters
+            if one.param_type_name == "option" and one.name != "help"
+        ]
+        if rows:
+            parts.append(_table(("option", "meaning"), rows))
+
+    add(typer.main.get_command(app), ("decant",))
+    return "\n".join(parts)
+
+
+def _usage(argument: Any) -> str:
+    name = str(argument.metavar or argument.name.upper())
+    name = f"{name}…" if argument.nargs == -1 else name
+    return name if argument.required else f"[{name}]"
+
+
+def _prose(text: str | None) -> str:
+    return _one_line((text or "").partition("\f")[0]).replace("<", "&lt;")
+
+
+def rest() -> str:
+    """The operations of the API, from docs/openapi.json."""
+    document = json.loads((FOLDER / "openapi.json").read_text(encoding="utf-8"))
+    rows = [
+        (f"`{method.upper()} {path}`", _one_line(operation.get("description") or operation["summary"]))
+        for path, operations in document["paths"].items()
+        for method, operation in operations.items()
+    ]
+    return _table(("request", "meaning"), rows)
+
+
+def events() -> str:
+    """The events of a run with their fields."""
+    from orchestrator.runs import events as module
+
+    parts = []
+    for name, kind in vars(module).items():
+        if isinstance(kind, type) and issubclass(kind, module.Event) and kind.__module__ == module.__name__:
+            text, _, fields = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
+            own = [
+                field
+                for field in typing.get_type_hints(kind)
+                if kind is module.Event or field not in typing.get_type_hints(module.Event)
+            ]
+            described = dict(re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", fields, re.MULTILINE))
+            rows = [(f"`{field}`", _one_line(described.get(field, ""))) for field in own]
+            parts.append(f"## {name}\n\n{_one_line(text)}\n")
+            if rows:
+                parts.append(_table(("field", "meaning"), rows))
+    return "\n".join(parts)
+
+
+def plugin_names() -> str:
+    """The public names for plug-ins, each with the first sentence of its description."""
+    from decant import plugins
+
+    rows = []
+    for name in plugins.__all__:
+        text = inspect.getdoc(getattr(plugins, name)) if not isinstance(getattr(plugins, name), (int, dict)) else ""
+        first = _one_line(text or "").partition(". ")[0].rstrip(".")
+        rows.append((f"`{name}`", first if isinstance(getattr(plugins, name), type) else ""))
+    return _table(("name", "meaning"), rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "catalogue-runs": partial(catalogued, "run"),
     "catalogue-pours": partial(catalogued, "pour"),
@@ -343,6 +446,14 @@ TABLES: dict[str, Callable[[], str]] = {
     "objectives": partial(variants, OBJECTIVES.all, Objective),
     "compared-calibration": partial(variants, _arms(study.CalibrationsSection), Settings),
     "compared-deployment": partial(variants, _arms(study.DeploymentsSection), Settings),
+    **{
+        f"result-{name}": partial(measured, name)
+        for name in ("recorded", "recorded-run", "bands", "risk", "optimizers")
+    },
+    "command-line": command_line,
+    "rest": rest,
+    "events": events,
+    "plugin-names": plugin_names,
 }
 
 
@@ -421,7 +532,7 @@ def main() -> None:
     """Bring all pages up to date."""
     for page in pages():
         old = page.read_text(encoding="utf-8")
-        new = render(old, page.name)
+        new = render(old, page)
         if new != old:
             page.write_text(new, encoding="utf-8")
             print(f"{page}: updated")

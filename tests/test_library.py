@@ -17,7 +17,7 @@ from orchestrator.requests import Simulate
 from tests.support.hypothesis_examples import THOROUGH
 
 ROOT = Path(__file__).parents[1]
-PAGE, NOTEBOOK = ROOT / "docs" / "library.md", ROOT / "docs" / "library.ipynb"
+PAGE, NOTEBOOK = ROOT / "docs" / "tutorials" / "notebook.md", ROOT / "docs" / "library.ipynb"
 MOST_LINES = 10
 HEAVY = ("taichi", "ray", "rerun", "matplotlib")
 

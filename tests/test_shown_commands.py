@@ -72,7 +72,7 @@ def test_a_block_is_executed_or_says_what_it_needs(block: Block) -> None:
 
 
 def test_the_campaign_that_is_told_is_the_shipped_one() -> None:
-    told = (ROOT / "docs" / "from-yaml-to-report.md").read_text(encoding="utf-8")
+    told = (ROOT / "docs" / "tutorials" / "first-pour.md").read_text(encoding="utf-8")
     shipped = [line.partition(" #")[0].rstrip() for line in QUICKSTART.read_text(encoding="utf-8").splitlines()]
     lines = [line for block in re.findall(r"```yaml\n(.*?)```", told, re.DOTALL) for line in block.splitlines()]
     assert len(lines) > 12

@@ -22,7 +22,8 @@ from decant.plugins import testing
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "tests" / "plugins" / "decant_example"
-PAGE = ROOT / "docs" / "extending.md"
+PAGES = sorted((ROOT / "docs" / "extend").glob("*.md"))
+REFERENCE = ROOT / "docs" / "reference" / "plugins.md"
 PUBLIC = {"decant", "decant.plugins", "decant.plugins.testing"}
 OWN = {"decant", "orchestrator", "actors", "sim_engine"}
 HEAVY = ["ray", "taichi", "rerun", "sqlite3"]
@@ -68,7 +69,8 @@ def test_the_example_imports_only_public_names(path: Path) -> None:
 
 
 def test_the_page_for_authors_of_plug_ins_imports_only_public_names() -> None:
-    blocks = re.findall(r"^( *)```python\n(.*?)^ *```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+    blocks = re.findall(r"^( *)```python\n(.*?)^ *```", text, re.MULTILINE | re.DOTALL)
     used = {name for _, block in blocks for name in imported(textwrap.dedent(block))}
     assert "decant.plugins.testing:BalanceContract" in used
     for name in used:
@@ -78,7 +80,7 @@ def test_the_page_for_authors_of_plug_ins_imports_only_public_names() -> None:
 
 
 def test_the_page_for_authors_of_plug_ins_lists_every_public_name() -> None:
-    page = PAGE.read_text(encoding="utf-8")
+    page = "".join(path.read_text(encoding="utf-8") for path in [REFERENCE, *PAGES])
     assert [name for module in (plugins, testing) for name in module.__all__ if f"`{name}`" not in page] == []
 
 

@@ -91,7 +91,7 @@ def test_schema_refuses_what_an_editor_should_underline() -> None:
 
 def test_first_pours_of_a_real_arm_fit_the_limits_of_its_first_day(tmp_path: Path) -> None:
     text = (CONFIGS / "laboratories" / "ur10-kern.yaml").read_text(encoding="utf-8")
-    page = (CONFIGS.parent / "docs" / "commissioning.md").read_text(encoding="utf-8")
+    page = (CONFIGS.parent / "docs" / "laboratory" / "commissioning.md").read_text(encoding="utf-8")
     for usual, first_day in (("tool_speed: 800 mm/s", "tool_speed: 250 mm/s"), ("130 deg/s", "45 deg/s")):
         assert usual in text
         assert first_day in page
