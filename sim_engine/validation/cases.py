@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from sim_engine.liquids import SimulationParameters
@@ -21,7 +21,7 @@ from sim_engine.validation import (
     wall_tightness,
     whole_pours,
 )
-from sim_engine.validation.case_result import CaseResult, Figure, Measurement, Series, at_least
+from sim_engine.validation.case_result import CaseResult, Figure, Measurement, at_least, collected
 
 PLAIN = SimulationParameters(cohesion=0.0, viscosity=1.0, friction=0.0)
 """θ of the cases, as their references assume. Water's own viscosity has no effect in a cup, a liquid has no dry
@@ -88,21 +88,9 @@ def describe(parameters: SimulationParameters) -> str:
     return ", ".join(shown)
 
 
-def _collected(
-    results: Iterable[tuple[Sequence[Measurement], Sequence[Series]]],
-) -> tuple[list[Measurement], list[Series]]:
-    """Measurements and curves of several runs; a curve that all of them have is drawn only once."""
-    found: list[Measurement] = []
-    curves: list[Series] = []
-    for measurements, series in results:
-        found += measurements
-        curves += [curve for curve in series if curve not in curves]
-    return found, curves
-
-
 def _at_rest(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     runs = [hydrostatic_cases.at_rest(n, PLAIN) for n in ((2_000, 5_000) if effort.full else (2_000,))]
-    found, curves = _collected((measurements, figure.series) for measurements, figure in runs)
+    found, curves = collected((measurements, figure.series) for measurements, figure in runs)
     return found, replace(runs[-1][1], series=tuple(curves))
 
 
@@ -119,7 +107,7 @@ def _retention(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measu
     else:
         runs = [(hydrostatic_cases.straight_cup(), 500, hydrostatic_cases.ANGLES[:1])]
     seeds = SEEDS if effort.full else 1
-    found, curves = _collected(
+    found, curves = collected(
         hydrostatic_cases.slow_tilt(vessel, LOAD, n, PLAIN, angles, seeds) for vessel, n, angles in runs
     )
     return found, hydrostatic_cases.retention_figure(curves)
@@ -127,7 +115,7 @@ def _retention(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measu
 
 def _outflow(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     numbers = (500, 1_000, 2_000, 5_000) if effort.full else (500, 1_000)
-    found, curves = _collected(whole_pours.outflow(simulator, n, PLAIN, seeds=3 if n <= 2_000 else 1) for n in numbers)
+    found, curves = collected(whole_pours.outflow(simulator, n, PLAIN, seeds=3 if n <= 2_000 else 1) for n in numbers)
     return found, whole_pours.outflow_figure(curves)
 
 
@@ -146,13 +134,13 @@ def _column(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurem
 
 def _sloshing(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     numbers = (2_000, 5_000, 10_000) if effort.full else (2_000,)
-    found, curves = _collected(sloshing.sloshing(n, PLAIN) for n in numbers)
+    found, curves = collected(sloshing.sloshing(n, PLAIN) for n in numbers)
     return found, sloshing.sloshing_figure(curves)
 
 
 def _torricelli(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     runs = {n: torricelli.torricelli(n, PLAIN) for n in ((6_000, 12_000) if effort.full else (6_000,))}
-    found, curves = _collected(run[:2] for run in runs.values())
+    found, curves = collected(run[:2] for run in runs.values())
     if len(runs) > 1:
         found.append(torricelli.steadiness({n: discharge for n, (_, _, discharge) in runs.items()}))
     return found, torricelli.torricelli_figure(curves)
@@ -160,7 +148,7 @@ def _torricelli(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Meas
 
 def _dam_break(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     across = 16 if effort.full else 12
-    found, curves = _collected(dam_break.dam_break(width, across, PLAIN) for width in dam_break.MEASURED)
+    found, curves = collected(dam_break.dam_break(width, across, PLAIN) for width in dam_break.MEASURED)
     return found, dam_break.dam_figure(curves)
 
 
@@ -168,7 +156,7 @@ def _cohesion(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measur
     free = PLAIN.model_copy(update={"viscosity": 0.0})
     sphere = capillarity.cube_to_sphere(2_000, free)
     runs = {n: capillarity.oscillation(n, free) for n in ((2_000, 10_000) if effort.full else (2_000,))}
-    found, curves = _collected([(sphere, []), *(run[:2] for run in runs.values())])
+    found, curves = collected([(sphere, []), *(run[:2] for run in runs.values())])
     if len(runs) > 1:
         found.append(capillarity.same_tension({n: tension for n, (_, _, tension) in runs.items()}))
     return found, capillarity.droplet_figure(curves)
