@@ -159,7 +159,7 @@ class Answers:
         from actors.optimizer.suggest import propose
 
         if isinstance(request, Suggest):
-            return Suggested(propose(request.problem))
+            return Suggested(propose(request.query))
         assert isinstance(request, Simulate)
         task = PourTask(self._scenes[request.scene], request.action, request.parameters, request.seed)
         try:

@@ -38,7 +38,18 @@ if TYPE_CHECKING:
     from actors.bench.device_emulators import ArmEmulator, History
     from actors.bench.pour_feasibility import plan_pour
     from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
-    from actors.optimizer.questions import Data, Suggestion, SuggestProblem
+    from actors.optimizer.questions import (
+        CalibrationQuery,
+        Data,
+        MinimumQuery,
+        PourQuery,
+        RegressionQuery,
+        RiskQuery,
+        SimulationQuery,
+        SpaceFillingQuery,
+        Suggestion,
+        SuggestionQuery,
+    )
     from orchestrator.config.arm_file import ArmSettings, CellSection
     from orchestrator.config.balance_file import BalanceDeviceSection
     from orchestrator.config.yaml.yaml_source import Place, Report
@@ -126,6 +137,7 @@ __all__ = [
     "BalanceEmulator",
     "Calibration",
     "CalibrationPlan",
+    "CalibrationQuery",
     "CalibrationSettings",
     "CellSection",
     "Choice",
@@ -153,6 +165,7 @@ __all__ = [
     "Load",
     "Loss",
     "MeasuredPour",
+    "MinimumQuery",
     "MotionPath",
     "Name",
     "Number",
@@ -169,6 +182,7 @@ __all__ = [
     "Pour",
     "PourMeasurement",
     "PourOutcome",
+    "PourQuery",
     "Poured",
     "Problems",
     "ProfileShape",
@@ -176,10 +190,12 @@ __all__ = [
     "Quantity",
     "Reading",
     "ReadingStatus",
+    "RegressionQuery",
     "Reply",
     "Report",
     "Request",
     "ResultPart",
+    "RiskQuery",
     "Scene",
     "SearchSettings",
     "SeedStream",
@@ -191,14 +207,16 @@ __all__ = [
     "Simulate",
     "Simulated",
     "SimulationParameters",
+    "SimulationQuery",
     "Slots",
     "Space",
+    "SpaceFillingQuery",
     "StageResult",
     "Strategy",
     "Suggest",
-    "SuggestProblem",
     "Suggested",
     "Suggestion",
+    "SuggestionQuery",
     "Switch",
     "Text",
     "Trial",
@@ -237,7 +255,18 @@ _SOURCES = {
     "sim_engine.scene": ("PoseError", "Scene"),
     "sim_engine.search_space": ("Axis", "Space"),
     # Strategies
-    "actors.optimizer.questions": ("Data", "SuggestProblem", "Suggestion"),
+    "actors.optimizer.questions": (
+        "CalibrationQuery",
+        "Data",
+        "MinimumQuery",
+        "PourQuery",
+        "RegressionQuery",
+        "RiskQuery",
+        "SimulationQuery",
+        "SpaceFillingQuery",
+        "Suggestion",
+        "SuggestionQuery",
+    ),
     "orchestrator.requests": (
         "Answered",
         "Ask",

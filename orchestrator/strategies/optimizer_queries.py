@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.questions import Suggestion, SuggestionQuery
 from orchestrator.requests import Failed, Outcome, Suggest, Suggested
 from orchestrator.run_errors import LearningError
 from orchestrator.strategies.trials import SeedStream
@@ -20,9 +20,9 @@ class OptimizerQueries:
         self._unissued: list[Suggest] = []
         self._then: dict[Suggest, Callable[[Suggestion], None]] = {}
 
-    def put(self, problem: SuggestProblem, purpose: str, then: Callable[[Suggestion], None]) -> None:
+    def put(self, query: SuggestionQuery, purpose: str, then: Callable[[Suggestion], None]) -> None:
         """Queue a query and draw its seed."""
-        request = Suggest(replace(problem, seed=self._seeds.next()), purpose)
+        request = Suggest(replace(query, seed=self._seeds.next()), purpose)
         self._unissued.append(request)
         self._then[request] = then
 
@@ -45,7 +45,7 @@ class OptimizerQueries:
         """
         then = self._then.pop(request, None)
         if then is None:
-            raise ValueError(f"this question was not asked, or has been answered already (purpose {request.purpose!r})")
+            raise ValueError(f"this query was not made, or has been answered already (purpose {request.purpose!r})")
         if not isinstance(outcome, Suggested):
             reason = outcome.reason if isinstance(outcome, Failed) else f"unexpected outcome {type(outcome).__name__}"
             raise LearningError(f"the optimiser has no answer to {request.purpose!r}: {reason}")

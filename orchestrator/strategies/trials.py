@@ -26,7 +26,7 @@ class Trial:
         point: point in the unit cube of the searched space.
         requests: simulations whose costs are averaged.
         costs: cost of each answered request, by index; None if the request yielded no cost.
-        context: further coordinates of the observation; see `SuggestProblem.context`.
+        context: further coordinates of the observation; see `CalibrationQuery`.
         refused: whether some request was refused because its action is impossible. It has no cost and is not counted as
             lost.
     """

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.progress.progress_state import ProgressState
@@ -45,8 +45,8 @@ ACTION = SCENE.action({"angular_velocity": 1.0, "x_offset": 0.1})
 class Learning:
     """The real optimiser, in this process."""
 
-    async def suggest(self, problem: SuggestProblem) -> Suggestion:
-        return propose(problem)
+    async def suggest(self, query: SuggestionQuery) -> Suggestion:
+        return propose(query)
 
 
 def learning_laboratory() -> ToyLaboratory:

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from actors.optimizer.questions import (
+    CalibrationQuery,
     Data,
     DesignQuestion,
     Linear,
     Point,
     PosteriorQuestion,
     Suggestion,
-    SuggestProblem,
 )
 from orchestrator.requests import Decision, Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest
 from orchestrator.strategies.calibration.action_prior import actions_of_prior
@@ -155,17 +155,17 @@ class ActivePours(DesignedPours):
             DRAWS,
             unit_prior(self._plan),
         )
-        problem = SuggestProblem(
+        query = CalibrationQuery(
             self._plan.parameters,
             Data(data.points, tuple(-cost for cost in data.costs)),  # difference to zero, because no pour belongs to it
             count=0,
-            context=(self._targets[0].point,),
+            contexts=(self._targets[0].point,),
             posterior=weighed,
             design=DesignQuestion(
                 tuple(place.point for place in self._candidates), tuple(place.point for place in self._targets)
             ),
         )
-        self._questions.put(problem, "design", self._choose)
+        self._questions.put(query, "design", self._choose)
 
     def _choose(self, suggestion: Suggestion) -> None:
         best = max(range(len(self._candidates)), key=lambda i: suggestion.gains[i])

@@ -1,10 +1,10 @@
 """Offsets between a bench and the simulator, and the selection of simulations for a query.
 
-- `play_of` returns the assumed deviation of each searched dimension, which depends on its unit.
+- `offset_priors` returns the assumed deviation of each searched dimension, which depends on its unit.
 - `displacement` converts nuisances of a bench to an offset of the action.
 - `thinned` subsamples observations if there are too many for a fast answer.
 
-The types `Play` and `BenchOffset` belong to the optimiser's queries (`actors.optimizer.questions`).
+The types `OffsetPrior` and `BenchOffset` belong to the optimiser's queries (`actors.optimizer.questions`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from actors.optimizer.questions import BenchOffset, Data, Play, Point
+from actors.optimizer.questions import BenchOffset, Data, OffsetPrior, Point
 from sim_engine.action import ACTION_DIMENSIONS, DEG
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
@@ -32,9 +32,9 @@ UNKNOWN = 0.1
 """Standard deviation of a dimension with any other unit, as a fraction of the searched range."""
 
 
-def play_of(actions: Space) -> tuple[Play, ...]:
+def offset_priors(actions: Space) -> tuple[OffsetPrior, ...]:
     """Assumed deviation of each searched dimension."""
-    return tuple(_play(axis) for axis in actions.axes)
+    return tuple(_offset_prior(axis) for axis in actions.axes)
 
 
 def displacement(believed: SimulationParameters, bench: SimulationParameters, actions: Space) -> BenchOffset:
@@ -67,21 +67,21 @@ def displacement(believed: SimulationParameters, bench: SimulationParameters, ac
     return BenchOffset(tuple(scales), tuple(shifts))
 
 
-def _play(axis: Axis) -> Play:
+def _offset_prior(axis: Axis) -> OffsetPrior:
     dimension = ACTION_DIMENSIONS.get(axis.name)
     unit = "" if dimension is None else dimension.unit
     if axis.scale == "log":  # a factor is a shift on a logarithmic axis
-        return Play(shift=CLOCK / math.log(axis.upper / axis.lower) if unit not in ("m", "rad", "") else UNKNOWN)
+        return OffsetPrior(shift=CLOCK / math.log(axis.upper / axis.lower) if unit not in ("m", "rad", "") else UNKNOWN)
     width = axis.upper - axis.lower
     match unit:
         case "m":
-            return Play(shift=LENGTH / width)
+            return OffsetPrior(shift=LENGTH / width)
         case "rad":
-            return Play(shift=ANGLE / width)
+            return OffsetPrior(shift=ANGLE / width)
         case "":
-            return Play(shift=UNKNOWN)
+            return OffsetPrior(shift=UNKNOWN)
         case _:
-            return Play(factor=CLOCK, origin=axis.lower / width)
+            return OffsetPrior(factor=CLOCK, origin=axis.lower / width)
 
 
 def thinned(data: Data, around: Sequence[Point], most: int) -> Data:

@@ -12,18 +12,20 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from actors.optimizer.questions import (
-    AcquisitionName,
     Data,
     Limit,
+    MinimumQuery,
     ModelDiscrepancy,
     Point,
+    PourQuery,
     SearchEffort,
+    SimulationQuery,
     Suggestion,
-    SuggestProblem,
+    SuggestionQuery,
 )
 from orchestrator.requests import Answered, Ask, Decision, Outcome, Pour, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.campaign_plan import DeploymentPlan, Premises
-from orchestrator.strategies.deployment.bench_offset import play_of, thinned
+from orchestrator.strategies.deployment.bench_offset import offset_priors, thinned
 from orchestrator.strategies.deployment.costing import Prices, PricesSettings
 from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
 from orchestrator.strategies.deployment.deployment_result import Deployed
@@ -210,7 +212,7 @@ class Hybrid(Deployment[D3Settings]):
         elif self._pours_left:
             self._next_pour()
         else:
-            self._questions.put(self._hybrid(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
+            self._questions.put(self._pour_query(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
 
     def _next_prior(self) -> None:
         def simulate(suggestion: Suggestion) -> None:
@@ -218,17 +220,17 @@ class Hybrid(Deployment[D3Settings]):
 
         if len(self._trials) == 0:
             count = min(max(self._settings.initial, 1), self._settings.prior_simulations)
-            self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
+            self._questions.put(self._space_filling(count=count), "start", simulate)
         elif self._trials.ready:
             self._compromise.weigh(exploring=True)
             # in the paper κ is constant, and no simulation only fills space
             known, pending, plain = self._simulated(), self._trials.pending(), not self._settings.adaptive
-            problem = self._problem(known, everything=False, pending=pending, plain=plain)
-            self._questions.put(problem, "prior", simulate)
+            query = self._query(MinimumQuery, known, everything=False, pending=pending, plain=plain)
+            self._questions.put(query, "prior", simulate)
 
     def _next_pour(self) -> None:
         """The next pour, and with it the simulations that run beside it."""
-        problem = self._hybrid(
+        query = self._pour_query(
             count=1 + self._settings.simulations_beside,
             acquisition=self._acquisition,
             map_resolution=MAP_RESOLUTION,
@@ -238,14 +240,14 @@ class Hybrid(Deployment[D3Settings]):
             self._pour_first(suggestion)
             self._simulate(suggestion, "refine", first=1)
 
-        self._questions.put(problem, "pour", lambda suggestion: self._judged(suggestion, pour))
+        self._questions.put(query, "pour", lambda suggestion: self._judged(suggestion, pour))
 
     def _judged(self, suggestion: Suggestion, pour: Callable[[Suggestion], None]) -> None:
         """Say what the latest pour has told of the simulator; then the next one is made, or it is not."""
-        if self._trust is None or suggestion.mismatch is None:
+        if self._trust is None or suggestion.discrepancy is None:
             pour(suggestion)
             return
-        self._trust.hear(suggestion.mismatch, self._pours)
+        self._trust.hear(suggestion.discrepancy, self._pours)
         verdict = self._trust.judge(suggestion, self._pours, self._plan.pours - self._counted)
         self._said()
         if verdict.ask is not None:
@@ -275,8 +277,8 @@ class Hybrid(Deployment[D3Settings]):
         self._ended = why
 
     def _concluded(self, suggestion: Suggestion) -> None:
-        if self._trust is not None and suggestion.mismatch is not None:
-            self._trust.hear(suggestion.mismatch, self._pours)
+        if self._trust is not None and suggestion.discrepancy is not None:
+            self._trust.hear(suggestion.discrepancy, self._pours)
             self._said()
         self._conclude(suggestion)
 
@@ -285,45 +287,41 @@ class Hybrid(Deployment[D3Settings]):
         return super()._pours_left and self._ended is None
 
     @property
-    def _acquisition(self) -> AcquisitionName:
+    def _acquisition(self) -> str:
         """What chooses the next pour."""
         if self._settings.adaptive and not self._compromise.exploring:
             return "least_loss"
         return "lcb" if self._pours or self._former else "posterior_minimum"
 
-    def _hybrid(self, **changes: Any) -> SuggestProblem:
-        self._compromise.weigh(exploring=changes.get("count") != 0)
-        return self._informed(self._real(), self._simulated(everything=True), **changes)
+    def _pour_query(self, **parts: Any) -> PourQuery:
+        """A query for the next pour; with a count of 0, about the real cost only."""
+        self._compromise.weigh(exploring=parts.get("count") != 0)
+        return self._informed(self._real(), self._simulated(everything=True), **parts)
 
-    def _informed(self, poured: Data, simulated: Data, **changes: Any) -> SuggestProblem:
-        """A question about the real cost, with what the simulations say of it."""
-        if not self._settings.adaptive:
-            changes["mean"] = "simulated"
-        elif changes.get("acquisition") == "knowledge":  # what one more simulation is worth beside a pour
-            changes["mean"] = "scaled"
-        else:
-            changes |= {"mean": "adaptive", "mismatch": self._mismatch}
-        return self._problem(poured, simulated=simulated, **changes)
+    def _informed(self, poured: Data, simulated: Data, **parts: Any) -> PourQuery:
+        return self._query(PourQuery, poured, simulated=simulated, discrepancy=self._discrepancy, **parts)
 
     @property
-    def _mismatch(self) -> ModelDiscrepancy:
-        """How the simulator may be wrong."""
+    def _discrepancy(self) -> ModelDiscrepancy | None:
+        """The ways in which the simulator may be wrong; None with the paper's model."""
+        if not self._settings.adaptive:
+            return None
         left = max(self._plan.pours - self._counted - 1, 0)
         limit = self._rules.limit
         if limit is not None and not any(p.cost is not None and p.cost <= limit.loss for p in self._pours):
             limit = None  # nothing good is in hand that could be poured again
         return ModelDiscrepancy(
-            play_of(self._plan.actions),
+            offset_priors(self._plan.actions),
             self._plan.bench,
             worst=self._costing.worst,
-            left=left,
+            pours_left=left,
             limit=limit,
             # a first pour for what it tells may end in a corner, and a limit keeps those that follow there
-            looks_ahead=self._rules.limit is None or limit is not None,
+            lookahead=self._rules.limit is None or limit is not None,
         )
 
-    def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
-        return self._informed(poured, simulated)
+    def _front_query(self, simulated: Data, poured: Data) -> PourQuery:
+        return self._informed(poured, simulated, count=0)
 
     @property
     def _warned(self) -> bool:
@@ -426,7 +424,7 @@ class FreeHybrid(Hybrid):
     def _wind_up(self) -> None:
         self._trials.withdraw()
         if self._trials.idle and not self._out:
-            self._put(self._hybrid(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
+            self._put(self._pour_query(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
 
     def _look_ahead(self) -> None:
         """Choose simulations before there is a slot for them."""
@@ -441,8 +439,7 @@ class FreeHybrid(Hybrid):
         settings, trials = self._settings, self._trials
         if len(trials) == 0 and settings.prior_simulations > 0:
             count = min(max(settings.initial, trials.width), settings.prior_simulations)
-            question = self._problem(Data(), acquisition="sobol", count=count)
-            self._put(question, "start", lambda suggestion: self._simulate(suggestion, "prior"))
+            self._put(self._space_filling(count=count), "start", lambda suggestion: self._simulate(suggestion, "prior"))
         elif len(trials) >= settings.prior_simulations:
             self._decide_to_pour("all prior simulations are asked for")
         elif trials.answered >= min(2, len(trials)) and trials.waiting < trials.width:
@@ -497,25 +494,37 @@ class FreeHybrid(Hybrid):
             self._pour_first(suggestion)
             self._rested_at, self._map_due = None, True
 
-        acquisition = self._acquisition
-        self._ask_quickly("pour", lambda answer: self._judged(answer, pour), count=1, acquisition=acquisition)
+        query = self._pour_query(count=1, acquisition=self._acquisition)
+        self._ask_quickly(query, "pour", lambda answer: self._judged(answer, pour))
 
     # -- questions -------------------------------------------------------------------------------------------------
 
-    def _ask_knowledge(self, count: int, purpose: str, then: Callable[[Suggestion], None], **changes: object) -> None:
-        trials = self._trials
-        pouring = tuple(pour.point for pour in self._pours[-1:] if pour.status == "pouring")
-        changes |= {"count": count, "pending": trials.pending(everything=True), "pouring": pouring}
-        self._ask_quickly(purpose, then, acquisition="knowledge", **changes)
+    def _ask_knowledge(
+        self, count: int, purpose: str, then: Callable[[Suggestion], None], map_resolution: int = 0
+    ) -> None:
+        self._compromise.weigh(exploring=True)
+        query = self._query(
+            SimulationQuery,
+            self._real(),
+            simulated=self._simulated(everything=True),
+            count=count,
+            pending=self._trials.pending(everything=True),
+            pouring=tuple(pour.point for pour in self._pours[-1:] if pour.status == "pouring"),
+            coupling="scaled" if self._settings.adaptive else "residual",
+            map_resolution=map_resolution,
+        )
+        self._ask_quickly(query, purpose, then)
 
-    def _ask_quickly(self, purpose: str, then: Callable[[Suggestion], None], **changes: object) -> None:
-        """Put a question that starts from the last fit."""
-        problem = self._hybrid(**changes)
-        key = (problem.mean, len(problem.simulated) >= 2)
-        effort = SearchEffort()
-        if len(problem.data) + len(problem.simulated) > FRESH_FITS and not self._compromise.wanted:
+    def _ask_quickly(
+        self, query: PourQuery | SimulationQuery, purpose: str, then: Callable[[Suggestion], None]
+    ) -> None:
+        """Put a query whose fit starts from the last one of the same model."""
+        adaptive = isinstance(query, PourQuery) and query.discrepancy is not None
+        model = query.coupling if isinstance(query, SimulationQuery) else "adaptive" if adaptive else "residual"
+        key, effort = (model, len(query.simulated) >= 2), SearchEffort()
+        if len(query.data) + len(query.simulated) > FRESH_FITS and not self._compromise.wanted:
             # noise that varies with the cost is fitted afresh: what it depends on is found in two steps
-            effort = SearchEffort(self._fitted.get(key, ()) if problem.noise == "constant" else (), STEPS)
+            effort = SearchEffort(self._fitted.get(key, ()) if query.noise == "constant" else (), STEPS)
 
         def answered(suggestion: Suggestion) -> None:
             if suggestion.fitted:
@@ -523,15 +532,15 @@ class FreeHybrid(Hybrid):
             self._around = suggestion.best_point or self._around
             then(suggestion)
 
-        self._put(replace(problem, effort=effort), purpose, answered)
+        self._put(replace(query, effort=effort), purpose, answered)
 
-    def _put(self, problem: SuggestProblem, purpose: str, then: Callable[[Suggestion], None]) -> None:
+    def _put(self, query: SuggestionQuery, purpose: str, then: Callable[[Suggestion], None]) -> None:
         def answered(suggestion: Suggestion) -> None:
             self._out.discard(purpose)
             then(suggestion)
 
         self._out.add(purpose)
-        self._questions.put(problem, purpose, answered)
+        self._questions.put(query, purpose, answered)
 
     def _simulated(self, *, everything: bool = False) -> Data:
         """All that are in: beside a pour there is no order to keep."""

@@ -9,7 +9,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Generic, TypeVar, cast
 
-from actors.optimizer.questions import Data, Point, Suggestion, SuggestProblem
+from actors.optimizer.questions import (
+    Data,
+    Point,
+    PourQuery,
+    RegressionQuery,
+    SpaceFillingQuery,
+    Suggestion,
+    SurrogateQuery,
+)
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Prediction, Request, Simulate, Slots, Suggest
 from orchestrator.strategies.calibration.calibration_base import Kappa
 from orchestrator.strategies.campaign_plan import DeploymentPlan, DeploymentSettings
@@ -49,6 +57,9 @@ MAP_RESOLUTION = 25
 
 S = TypeVar("S", bound=DeploymentSettings)
 """Settings of a deployment."""
+
+Q = TypeVar("Q", bound=SurrogateQuery)
+"""Type of a query."""
 
 
 class Deployment(ABC, Generic[S]):
@@ -244,12 +255,12 @@ class Deployment(ABC, Generic[S]):
             return
         simulated = self._compromise.of(self._trials.counting(everything=True))
         self._compromise.look_for_front(
-            simulated, self._poured, self._plan.actions, self._front_problem, self._questions, self._finish
+            simulated, self._poured, self._plan.actions, self._front_query, self._questions, self._finish
         )
 
-    def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
+    def _front_query(self, simulated: Data, poured: Data) -> RegressionQuery | PourQuery:
         """How one objective is regressed: of the simulations, unless a strategy pours."""
-        return self._problem(simulated)
+        return self._query(RegressionQuery, simulated)
 
     def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
         text = f"{what}  {described(values)}"
@@ -261,26 +272,32 @@ class Deployment(ABC, Generic[S]):
             found = expecting(text, Prediction(suggestion.means[index], suggestion.deviations[index]))
         self.decisions.append(found)
 
-    def _problem(self, data: Data, *, everything: bool = True, **changes: Any) -> SuggestProblem:
-        """A question about the loss.
+    def _query(self, kind: type[Q], data: Data, *, everything: bool = True, **parts: Any) -> Q:
+        """A query about the loss.
 
         Args:
+            kind: its type.
+            data: observations of the loss.
             everything: use all refusals of simulations; else those that the next choice may know.
-            changes: fields of the problem.
+            parts: further fields of the query.
         """
-        trials = self._trials.counting(everything=everything)
         if isinstance(self._settings, SearchSettings):
-            changes = {"kappa": self._settings.kappa} | changes
-        return SuggestProblem(
-            self._plan.actions,
-            data,
-            constraints=self._plan.constraints,
-            infeasible=tuple(trial.point for trial in trials if trial.refused),
-            refused=tuple(p.point for p in self._pours if p.status == "refused"),
-            failed=tuple(p.point for p in self._pours if p.mishap and p.cost is not None) if self._warned else (),
-            noise=self._settings.noise,
-            **changes,
-        )
+            parts["kappa"] = self._settings.kappa
+        return kind(self._plan.actions, data, noise=self._settings.noise, **self._limits(everything), **parts)
+
+    def _space_filling(self, **parts: Any) -> SpaceFillingQuery:
+        """A query for points that fill the space of actions."""
+        return SpaceFillingQuery(self._plan.actions, **self._limits(everything=True), **parts)
+
+    def _limits(self, everything: bool) -> dict[str, Any]:
+        """Constraints, refusals and failures, as fields of a query."""
+        trials = self._trials.counting(everything=everything)
+        return {
+            "constraints": self._plan.constraints,
+            "infeasible": tuple(trial.point for trial in trials if trial.refused),
+            "refused": tuple(p.point for p in self._pours if p.status == "refused"),
+            "failed": tuple(p.point for p in self._pours if p.mishap and p.cost is not None) if self._warned else (),
+        }
 
     # -- results ---------------------------------------------------------------------------------------------------
 

@@ -175,9 +175,9 @@ class Trust:
         self._latest = found
         if self._after and self._after[-1].pour == number:
             return
-        self._after.append(Belief(pour=number, ignorance=found.ignorance, gain=found.gain))
+        self._after.append(Belief(pour=number, ignorance=found.uninformative, gain=found.gain))
         if number:
-            values = {"ignorance": found.ignorance} | ({} if found.gain is None else {"gain": found.gain})
+            values = {"ignorance": found.uninformative} | ({} if found.gain is None else {"gain": found.gain})
             self.decisions.append(Decision(f"after pour {number} {self.text}", values, urgent=True))
 
     @property
@@ -185,7 +185,7 @@ class Trust:
         """'the simulator is borne out: 2 % that it says nothing of this bench; …'."""
         if self._latest is None:
             return ""
-        share = self._latest.ignorance
+        share = self._latest.uninformative
         word = next((word for limit, word in WORDS if share < limit), "is wrong here")
         text = f"the simulator {word}: {_percent(share)} that it says nothing of this bench"
         if share >= WORDS[-2][0]:
@@ -215,7 +215,7 @@ class Trust:
             pours: those made.
             left: pours that the budget still has.
         """
-        found, rules = suggestion.mismatch, self._rules
+        found, rules = suggestion.discrepancy, self._rules
         if found is None:
             return Verdict()
         weighed = [pour.cost for pour in pours if pour.status == "weighed" and pour.cost is not None]
@@ -226,7 +226,7 @@ class Trust:
             if rules.gain_below is not None and found.gain is not None and found.gain < rules.gain_below:
                 why = f"no further pour is worth it: one more is expected to save {self._share(found.gain)}"
                 return self._saved(left, f"{why}, the best action to lose {self._share(best)}")
-        if found.ignorance >= rules.ignorance.limit and self._followed is None and weighed:
+        if found.uninformative >= rules.ignorance.limit and self._followed is None and weighed:
             return self._by(rules.ignorance.policy, self.text, "the simulator counts for as little as that")
         limit = rules.limit
         if limit is None or not any(cost <= limit.loss for cost in weighed) or not found.exceedances:

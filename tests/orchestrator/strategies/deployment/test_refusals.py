@@ -41,7 +41,7 @@ def touching(action: Action, theta: SimulationParameters, rng: np.random.Generat
 
 
 def questions(played: StrategyHarness) -> list[Any]:
-    return [request.problem for request in played.asked if isinstance(request, Suggest)]
+    return [request.query for request in played.asked if isinstance(request, Suggest)]
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
