@@ -50,6 +50,7 @@ from orchestrator.runs.stages import (
     scenes_of,
     stage_seed,
 )
+from orchestrator.strategies.calibration.action_prior import Contexts
 from orchestrator.strategies.calibration.calibration_scores import (
     DRAWS,
     Evaluation,
@@ -57,7 +58,6 @@ from orchestrator.strategies.calibration.calibration_scores import (
     mean_predictor_discrepancy,
     regression_discrepancy,
 )
-from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, MeasuredPour, RecordedPour
 from orchestrator.strategies.strategy import Strategy
 from sim_engine.errors import InvalidSceneError

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from actors.optimizer import acquisition
-from actors.optimizer.experimental_design import WeighedDesign, expected_reductions
 from actors.optimizer.feasible_region import Feasibility, Region
 from actors.optimizer.knowledge_gradient import found, most_instructive, proposals
 from actors.optimizer.questions import (
@@ -42,7 +41,13 @@ from actors.optimizer.questions import (
 )
 from actors.optimizer.risk_measures import RiskProcess
 from actors.optimizer.surrogate_models import Model, QueryArrays, array, fit, tuples
-from actors.optimizer.theta_posterior import DISCREPANCY_PRIOR, drawn_beforehand, sample_posterior
+from actors.optimizer.theta_posterior import (
+    DISCREPANCY_PRIOR,
+    WeighedDesign,
+    drawn_beforehand,
+    expected_reductions,
+    sample_posterior,
+)
 from sim_engine.prediction_band import LEVEL
 
 Array = NDArray[np.float64]

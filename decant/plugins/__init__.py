@@ -80,10 +80,9 @@ if TYPE_CHECKING:
     )
     from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
     from orchestrator.strategies.deployment.objectives import Objective, Objectives
-    from orchestrator.strategies.optimizer_queries import OptimizerQueries
     from orchestrator.strategies.stage_result import ResultPart, StageResult
     from orchestrator.strategies.strategy import Progress, Strategy
-    from orchestrator.strategies.trials import SeedStream, Trial, Trials
+    from orchestrator.strategies.trials import OptimizerQueries, SeedStream, Trial, Trials
     from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
     from sim_engine.liquids import Liquid, SimulationParameters
     from sim_engine.outcome import Fractions, Loss, PourMeasurement, PourOutcome
@@ -291,10 +290,9 @@ _SOURCES = {
         "MeasuredPour",
     ),
     "orchestrator.strategies.deployment.deployment_base": ("MAP_RESOLUTION", "Deployment", "SearchSettings"),
-    "orchestrator.strategies.optimizer_queries": ("OptimizerQueries",),
     "orchestrator.strategies.stage_result": ("ResultPart", "StageResult"),
     "orchestrator.strategies.strategy": ("Progress", "Strategy"),
-    "orchestrator.strategies.trials": ("SeedStream", "Trial", "Trials"),
+    "orchestrator.strategies.trials": ("OptimizerQueries", "SeedStream", "Trial", "Trials"),
     # Objectives
     "orchestrator.strategies.deployment.objectives": ("Objective", "Objectives"),
     # Balances

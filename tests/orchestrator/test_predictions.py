@@ -26,7 +26,7 @@ from orchestrator.runs.stages import deployment_stages, prediction_stages
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.repeated_simulation import RepeatedSimulation
+from orchestrator.strategies.single_action import RepeatedSimulation
 from orchestrator.strategies.strategy import Progress, Strategy
 from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
 from sim_engine.outcome import Loss

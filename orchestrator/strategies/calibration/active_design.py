@@ -1,7 +1,7 @@
 """Active design of calibration pours: each pour is chosen by its expected information about deployment.
 
 `ActivePours` is the strategy; `joint_contexts` builds the space of its surrogate. The variance reduction is calculated
-in `actors.optimizer.experimental_design`.
+in `actors.optimizer.theta_posterior`.
 """
 
 from __future__ import annotations
@@ -19,14 +19,12 @@ from actors.optimizer.questions import (
     Suggestion,
 )
 from orchestrator.requests import Decision, Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest
-from orchestrator.strategies.calibration.action_prior import actions_of_prior
+from orchestrator.strategies.calibration.action_prior import Contexts, actions_of_prior
 from orchestrator.strategies.calibration.posterior_summary import unit_prior
-from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.calibration.pour_design import DesignedPours, DesignPoured, SimulatedPoint, Stratum
 from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan, NormalPrior
-from orchestrator.strategies.optimizer_queries import OptimizerQueries
 from orchestrator.strategies.strategy import Progress, is_sound
-from orchestrator.strategies.trials import Trial, Trials
+from orchestrator.strategies.trials import OptimizerQueries, Trial, Trials
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import normalised_spillage
@@ -70,7 +68,7 @@ class ActivePours(DesignedPours):
 
     A candidate whose pour fails is removed. A failed pour yields no data, and the design loses one point.
 
-    Source: as `actors.optimizer.experimental_design`; Kennedy & O'Hagan 2001 for the model.
+    Source: as `actors.optimizer.theta_posterior`; Kennedy & O'Hagan 2001 for the model.
     Limitations: the surrogate is not improved between pours; the order of magnitude of a pour's scatter is assumed.
     """
 

@@ -22,6 +22,7 @@ from actors.optimizer.questions import (
 )
 from orchestrator.requests import Decision, Simulate
 from orchestrator.run_errors import LearningError
+from orchestrator.strategies.calibration.action_prior import Contexts
 from orchestrator.strategies.calibration.calibration_base import (
     THETA_MAP_RESOLUTION,
     Calibration,
@@ -37,7 +38,6 @@ from orchestrator.strategies.calibration.posterior_summary import (
     posterior_found,
     unit_prior,
 )
-from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
 from orchestrator.strategies.strategy import Strategy
 from orchestrator.strategies.trials import Trial

@@ -183,14 +183,14 @@ class OneShotPlanning(Deployment[D1Settings]):
 
     def _search(self, *, everything: bool = False, **parts: Any) -> MinimumQuery | RiskQuery:
         """A query for the next action to simulate."""
-        self._compromise.weigh(exploring=not everything)
+        self._scalarization.weigh(exploring=not everything)
         pending = self._trials.pending(everything=everything)
         data = self._simulated(everything=everything)
         return self._query(MinimumQuery, data, everything=everything, pending=pending, **parts)
 
     def _regression(self, **parts: Any) -> RegressionQuery | RiskQuery:
         """A query about all simulations, without a proposal."""
-        self._compromise.weigh(exploring=False)
+        self._scalarization.weigh(exploring=False)
         return self._query(RegressionQuery, self._simulated(everything=True), **parts)
 
     def _recommend(self, suggestion: Suggestion) -> None:
@@ -288,7 +288,7 @@ class OneShotPlanning(Deployment[D1Settings]):
         return Progress(answered, self._settings.rounds * repeats + checks, self._counted, pours)
 
     def _spillage(self, point: Point) -> SampleStatistics | None:
-        """Statistics over seeds that took part in the selection; `orchestrator.strategies.repeated_simulation` uses new
+        """Statistics over seeds that took part in the selection; `orchestrator.strategies.single_action` uses new
         ones."""
         tried = [trial for trial in self._searched if trial.point == point]
         return SampleStatistics.of(

@@ -40,7 +40,7 @@ class RealOnly(Deployment[D2Settings]):
     def _next(self, free_simulations: int) -> None:
         if self._pouring is not None:
             return
-        self._compromise.weigh(exploring=self._pours_left)
+        self._scalarization.weigh(exploring=self._pours_left)
         if self._pours_left:
             made = [p for p in self._pours if p.status != "refused"]
             known = [*(point for point, _ in self._former), *(p.point for p in made)]

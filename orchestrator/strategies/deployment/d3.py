@@ -25,7 +25,6 @@ from actors.optimizer.questions import (
 )
 from orchestrator.requests import Answered, Ask, Decision, Outcome, Pour, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.campaign_plan import DeploymentPlan, Premises
-from orchestrator.strategies.deployment.bench_offset import offset_priors, thinned
 from orchestrator.strategies.deployment.costing import Prices, PricesSettings
 from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
 from orchestrator.strategies.deployment.deployment_result import Deployed
@@ -36,8 +35,10 @@ from orchestrator.strategies.deployment.model_monitoring import (
     Rules,
     StopSettings,
     Trust,
+    offset_priors,
+    thinned,
 )
-from orchestrator.strategies.deployment.real_pours import Foretold, PourTrial
+from orchestrator.strategies.deployment.real_pours import PourTrial, PredictionCheck
 from orchestrator.strategies.strategy import Progress, Strategy
 from sim_engine.action import described
 from sim_engine.liquids import SimulationParameters
@@ -221,7 +222,7 @@ class Hybrid(Deployment[D3Settings]):
             count = min(max(self._settings.initial, 1), self._settings.prior_simulations)
             self._questions.put(self._space_filling(count=count), "start", simulate)
         elif self._trials.ready:
-            self._compromise.weigh(exploring=True)
+            self._scalarization.weigh(exploring=True)
             # in the paper κ is constant, and no simulation only fills space
             known, pending, plain = self._simulated(), self._trials.pending(), not self._settings.adaptive
             query = self._query(MinimumQuery, known, everything=False, pending=pending, plain=plain)
@@ -288,13 +289,13 @@ class Hybrid(Deployment[D3Settings]):
     @property
     def _acquisition(self) -> str:
         """What chooses the next pour."""
-        if self._settings.adaptive and not self._compromise.exploring:
+        if self._settings.adaptive and not self._scalarization.exploring:
             return "least_loss"
         return "lcb" if self._pours or self._former else "posterior_minimum"
 
     def _pour_query(self, **parts: Any) -> PourQuery:
         """A query for the next pour; with a count of 0, about the real cost only."""
-        self._compromise.weigh(exploring=parts.get("count") != 0)
+        self._scalarization.weigh(exploring=parts.get("count") != 0)
         return self._informed(self._real(), self._simulated(everything=True), **parts)
 
     def _informed(self, poured: Data, simulated: Data, **parts: Any) -> PourQuery:
@@ -328,7 +329,7 @@ class Hybrid(Deployment[D3Settings]):
 
     # -- results ---------------------------------------------------------------------------------------------------
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> Foretold | Believed:
+    def _trusted(self, weighed: Sequence[PourTrial]) -> PredictionCheck | Believed:
         return super()._trusted(weighed) if self._trust is None else self._trust.result()
 
     def result(self) -> Deployed:
@@ -444,7 +445,7 @@ class FreeHybrid(Hybrid):
         elif trials.answered >= min(2, len(trials)) and trials.waiting < trials.width:
 
             def weighed(suggestion: Suggestion) -> None:
-                if suggestion.values and suggestion.pour_value is not None and not self._compromise.exploring:
+                if suggestion.values and suggestion.pour_value is not None and not self._scalarization.exploring:
                     one, pour = suggestion.values[0], suggestion.pour_value
                     if self._prices.prefers_pour(one, pour, trials.width):
                         self._decide_to_pour(self._comparison(one, pour), one, pour)
@@ -468,7 +469,7 @@ class FreeHybrid(Hybrid):
                 self._latest_map = suggestion
             one, pour = (suggestion.values or (0.0,))[0], suggestion.pour_value or 0.0
             exhausted = bool(suggestion.values) and self._prices.is_idle(one, self._trials.width)
-            if exhausted and not self._compromise.exploring:
+            if exhausted and not self._scalarization.exploring:
                 self._rest(f"what is left to learn, only pours tell: {self._comparison(one, pour)}", one, pour)
             elif self._trials.lost_in_a_row >= LOST_IN_A_ROW:
                 self._rest(f"the last {LOST_IN_A_ROW} simulations came to nothing", one, pour)
@@ -501,7 +502,7 @@ class FreeHybrid(Hybrid):
     def _ask_knowledge(
         self, count: int, purpose: str, then: Callable[[Suggestion], None], map_resolution: int = 0
     ) -> None:
-        self._compromise.weigh(exploring=True)
+        self._scalarization.weigh(exploring=True)
         query = self._query(
             SimulationQuery,
             self._real(),
@@ -521,7 +522,7 @@ class FreeHybrid(Hybrid):
         adaptive = isinstance(query, PourQuery) and query.discrepancy is not None
         model = query.coupling if isinstance(query, SimulationQuery) else "adaptive" if adaptive else "residual"
         key, effort = (model, len(query.simulated) >= 2), SearchEffort()
-        if len(query.data) + len(query.simulated) > FRESH_FITS and not self._compromise.wanted:
+        if len(query.data) + len(query.simulated) > FRESH_FITS and not self._scalarization.wanted:
             # noise that varies with the cost is fitted afresh: what it depends on is found in two steps
             effort = SearchEffort(self._fitted.get(key, ()) if query.noise == "constant" else (), STEPS)
 

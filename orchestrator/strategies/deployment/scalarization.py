@@ -19,9 +19,8 @@ from orchestrator.requests import Simulate
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import ParetoAction
 from orchestrator.strategies.deployment.objectives import Vector
-from orchestrator.strategies.optimizer_queries import OptimizerQueries
 from orchestrator.strategies.stage_result import displayed_action
-from orchestrator.strategies.trials import Trial
+from orchestrator.strategies.trials import OptimizerQueries, Trial
 from sim_engine.search_space import Space
 
 AUGMENTATION = 0.05

@@ -7,6 +7,7 @@ import pytest
 from orchestrator.requests import Failed, Simulate, Simulated, Suggest, Suggested
 from orchestrator.run_errors import LearningError
 from orchestrator.runs.stages import POURS, measured_pours
+from orchestrator.strategies.calibration.action_prior import Contexts
 from orchestrator.strategies.calibration.calibration_scores import (
     JUSTIFIED,
     NOT_JUSTIFIED,
@@ -20,7 +21,6 @@ from orchestrator.strategies.calibration.calibration_scores import (
     regression_discrepancy,
 )
 from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.calibration.pour_design import DesignedPours, choose_holdout, stratified
 from orchestrator.strategies.campaign_plan import MeasuredPour
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness, outcome_of, replay

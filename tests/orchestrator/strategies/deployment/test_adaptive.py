@@ -14,7 +14,6 @@ from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Suggest
 from orchestrator.runs.stages import DEPLOYMENT, with_bench
 from orchestrator.runs.unknown_pours import OperatorNeededError
-from orchestrator.strategies.deployment.bench_offset import displacement, offset_priors
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_monitoring import (
@@ -22,6 +21,8 @@ from orchestrator.strategies.deployment.model_monitoring import (
     DiscrepancyPolicySettings,
     RiskLimitSettings,
     StopSettings,
+    displacement,
+    offset_priors,
 )
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
@@ -165,8 +166,8 @@ def test_with_a_limit_pours_are_made_for_what_they_tell_once_one_has_kept_it(lim
     play = StrategyHarness(narrow_cup).run(adaptive(pours=3, risk_limit=limit))
     asked = [one.query.discrepancy for one in play.asked if isinstance(one, Suggest) and one.purpose == "pour"]
     problems = [one for one in asked if one is not None]
-    assert [one.looks_ahead for one in problems] == [limit is None or one.limit is not None for one in problems]
-    assert (problems[0].looks_ahead, problems[-1].looks_ahead) == (limit is None, True)
+    assert [one.lookahead for one in problems] == [limit is None or one.limit is not None for one in problems]
+    assert (problems[0].lookahead, problems[-1].lookahead) == (limit is None, True)
 
 
 @pytest.mark.parametrize("otherwise", ["stop", "go on"])

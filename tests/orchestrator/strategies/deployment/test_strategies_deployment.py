@@ -4,6 +4,7 @@ import math
 import numpy as np
 import pytest
 
+from actors.optimizer.questions import Data
 from orchestrator.journal.stage_results import encode_result
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Suggest
 from orchestrator.strategies.deployment.costing import Costing
@@ -143,7 +144,8 @@ def test_failed_simulations_and_pours_never_poison_a_fit():
 
     for name in STRATEGIES:
         played = StrategyHarness(flaky).run(make(name, 2, pours=6))
-        costs = [c for r in played.asked if isinstance(r, Suggest) for c in r.query.data.costs]
+        queries = [r.query for r in played.asked if isinstance(r, Suggest)]
+        costs = [c for query in queries for c in getattr(query, "data", Data()).costs]
         assert all(math.isfinite(c) and c <= 1.0 for c in costs)
 
 

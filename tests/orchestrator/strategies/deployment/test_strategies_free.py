@@ -17,10 +17,9 @@ from actors.optimizer.questions import Data
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
 from orchestrator.results.pool_occupancy import RESTS, Occupancy, occupancies
-from orchestrator.strategies.deployment.bench_offset import thinned
 from orchestrator.strategies.deployment.costing import Prices, PricesSettings
 from orchestrator.strategies.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
-from orchestrator.strategies.deployment.model_monitoring import DiscrepancyPolicySettings
+from orchestrator.strategies.deployment.model_monitoring import DiscrepancyPolicySettings, thinned
 from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
 from tests.orchestrator.test_stages import campaign, laboratory
 from tests.support.killed_runs import die_at, finished_times
