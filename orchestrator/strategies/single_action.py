@@ -27,8 +27,9 @@ from orchestrator.requests import (
 )
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Recommended
+from orchestrator.strategies.deployment.real_pours import PourTrial
 from orchestrator.strategies.stage_result import ResultPart, StageResult
-from orchestrator.strategies.strategy import Progress, is_sound
+from orchestrator.strategies.strategy import Progress
 from orchestrator.strategies.trials import SeedStream
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
@@ -383,27 +384,20 @@ class Confirmation:
         if pour is None or request != pour:
             raise ValueError(f"this pour was not asked for: {request}")
         self._pouring = None
-        failed, loss, spillage, delivered = "", None, None, None
-        match outcome:
-            case Poured(measurement) if is_sound(measurement.fractions):
-                loss = self._costing.total(self._costing.poured(measurement, pour.action))
-                spillage, delivered = normalised_spillage(measurement.fractions), measurement.delivered
-            case Poured():
-                failed = "weighing: the balance gave no numbers"
-            case Failed(kind, reason):
-                failed = f"{kind}: {reason}"
-                if kind == "invalid_action":
-                    self._count = len(self._pours) + 1  # it would be refused again
-            case _:
-                raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
+        assert self._recommended is not None
+        trial = PourTrial(pour.number, (), dict(self._recommended.action_si), pour.predicted, 0.0)
+        trial.take(outcome, self._costing.scene, self._costing, penalised=False)
+        if trial.status == "refused":
+            self._count = len(self._pours) + 1  # it would be refused again
+        row = trial.row((), self._costing.scene.liquid)
         self._pours.append(
             ConfirmingPour(
-                number=pour.number,
-                failed=failed,
-                loss=loss,
-                spillage=spillage,
-                delivered_g=None if delivered is None else 1e3 * delivered,
-                delivered_ml=None if delivered is None else self._costing.scene.liquid.millilitres(delivered),
+                number=row.number,
+                failed=f"invalid_action: {row.reason}" if row.status == "refused" else row.reason,
+                loss=row.loss,
+                spillage=row.spillage,
+                delivered_g=row.delivered_g,
+                delivered_ml=row.delivered_ml,
             )
         )
 

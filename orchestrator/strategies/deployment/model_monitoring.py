@@ -2,7 +2,7 @@
 
 - `Trust` records the optimiser's conclusions after every pour and decides whether the next pour is made.
 - `offset_priors` and `displacement` describe how a bench may deviate from its simulator.
-- `thinned` selects the observations that a query carries.
+- `subsampled` selects the observations that a query carries.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ STOP: Final = "stop"
 OPTIONS = (GO_ON, STOP)
 
 DOUBT = 0.3
-"""From this ignorance on a simulator is in doubt."""
+"""Probability of an uninformative simulator from which it is in doubt."""
 
 WORDS = ((0.05, "is borne out"), (DOUBT, "is borne out so far"), (0.7, "is in doubt"), (0.95, "is probably wrong here"))
-"""The words for a simulator whose ignorance is below each of these; above all of them it is wrong here."""
+"""Description of the simulator below each probability of being uninformative; above all, it is wrong here."""
 
 
 class DiscrepancyPolicySettings(Settings):
@@ -70,58 +70,58 @@ class StopSettings(Settings):
 
 
 class Belief(ResultPart):
-    """What was known of the simulator after a pour."""
+    """Conclusions about the simulator after a pour."""
 
     pour: int
-    """Its number; 0: before the first one."""
+    """Number of the pour; 0: before the first one."""
 
     ignorance: float
-    """Probability that the simulator says nothing of this bench."""
+    """Probability that the simulator contains no information about this bench."""
 
     gain: float | None
-    """What one more pour was expected to save, in the loss' own unit."""
+    """Expected saving of one more pour, in the unit of the loss."""
 
 
 class Displaced(ResultPart):
-    """By how much a dimension of what the simulator does differs from what is commanded."""
+    """Difference between the simulated and the commanded value of a dimension."""
 
     mean: float
-    """In the middle of the searched range [SI]."""
+    """Mean in the middle of the searched range [SI]."""
 
     deviation: float
-    """How well it is known [SI]."""
+    """Standard deviation [SI]."""
 
 
 class Believed(ResultPart):
-    """How far the simulator is to be trusted, pour by pour."""
+    """Conclusions about the simulator, pour by pour."""
 
     after: tuple[Belief, ...]
-    """Each pour that told something."""
+    """State after each pour that changed it."""
 
     displaced: dict[str, Displaced]
-    """By dimension."""
+    """Differences by dimension."""
 
     factor: float
-    """Real over simulated loss."""
+    """Ratio of real to simulated loss."""
 
     limit: float
-    """Ignorance from which the policy follows."""
+    """Probability of an uninformative simulator from which the policy applies."""
 
     policy: str
-    """What follows."""
+    """The policy."""
 
     followed: str | None
-    """What did; None below the limit."""
+    """The applied policy; None below the limit."""
 
     alarm: bool
-    """Ignorance is at or above the limit."""
+    """Whether the probability is at or above the limit."""
 
     text: str
-    """The last state in a sentence."""
+    """The last state as a sentence."""
 
 
 class BenchFound(ResultPart):
-    """Draws of how the bench differs from the simulator, for the next receiver."""
+    """Draws of the deviation of the bench from the simulator, for the next receiver."""
 
     axes: tuple[str, ...]
     """Searched dimensions, in order."""
@@ -133,18 +133,18 @@ class BenchFound(ResultPart):
     """The shift of each draw in each dimension, on the unit interval."""
 
     def displacements(self) -> tuple[BenchOffset, ...]:
-        """As questions carry them."""
+        """The draws as bench offsets of a query."""
         return tuple(BenchOffset(*pair) for pair in zip(self.scales, self.shifts, strict=True))
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What follows from an answer before its pour is made.
+    """Consequence of an answer before its pour is made.
 
     Attributes:
-        ask: a question to a person; None: nothing to ask.
-        end: why no pour follows; empty: one does.
-        limit: whether it is about the limit of a pour's loss.
+        ask: question to the operator; None: no question.
+        end: reason why no pour follows; empty if one does.
+        limit: whether it concerns the limit of a pour's loss.
     """
 
     ask: Ask | None = None
@@ -154,7 +154,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Rules:
-    """What a user has set; losses are in the loss' own unit."""
+    """Rules from the settings; losses in their own unit."""
 
     ignorance: DiscrepancyPolicySettings
     limit: Limit | None
@@ -164,7 +164,7 @@ class Rules:
 
 
 class Trust:
-    """Keeps what every answer says about the simulator, and judges whether the pour that it proposes is made."""
+    """Records the conclusions about the simulator, and decides whether a proposed pour is made."""
 
     def __init__(self, rules: Rules, actions: Space, worst: float) -> None:
         self._rules, self._actions, self._worst = rules, actions, worst
@@ -176,8 +176,8 @@ class Trust:
 
     # -- what is logged --------------------------------------------------------------------------------------------
 
-    def hear(self, found: DiscrepancyFound, pours: Sequence[PourTrial]) -> None:
-        """Take in an answer, and say in words what the latest pour changed."""
+    def record(self, found: DiscrepancyFound, pours: Sequence[PourTrial]) -> None:
+        """Record the conclusions of an answer, and log those of the latest pour."""
         known = [pour for pour in pours if pour.cost is not None]
         number = known[-1].number if known else 0
         self._latest = found
@@ -190,7 +190,7 @@ class Trust:
 
     @property
     def text(self) -> str:
-        """'the simulator is borne out: 2 % that it says nothing of this bench; …'."""
+        """The latest conclusions: 'the simulator is borne out: 2 % that it says nothing of this bench; …'."""
         if self._latest is None:
             return ""
         share = self._latest.uninformative
@@ -213,15 +213,15 @@ class Trust:
         pairs = zip(self._actions.axes, self._latest.shifts, self._latest.deviations, strict=True)
         return [_in_si(axis, shift, deviation) for axis, shift, deviation in pairs]
 
-    # -- what follows ----------------------------------------------------------------------------------------------
+    # -- decisions ----------------------------------------------------------------------------------------------
 
     def judge(self, suggestion: Suggestion, pours: Sequence[PourTrial], left: int) -> Verdict:
-        """Whether the proposed pour is made.
+        """Decide whether the proposed pour is made.
 
         Args:
-            suggestion: the answer with it.
-            pours: those made.
-            left: pours that the budget still has.
+            suggestion: the answer that proposes it.
+            pours: pours made so far.
+            left: number of pours left in the budget.
         """
         found, rules = suggestion.discrepancy, self._rules
         if found is None:
@@ -252,7 +252,7 @@ class Trust:
         return self._by(rules.otherwise, why, "the least risky action is poured", limit=True)
 
     def answer(self, answer: str, *, limit: bool) -> str:
-        """What a person decided; why nothing follows, or nothing."""
+        """Record the operator's answer; return the reason to end, or an empty text."""
         if limit:
             self._accepted = answer == GO_ON
         else:
@@ -283,8 +283,8 @@ class Trust:
     # -- results ---------------------------------------------------------------------------------------------------
 
     def result(self) -> Believed:
-        """All that was logged."""
-        ignorance = self._after[-1].ignorance if self._after else 0.0
+        """All conclusions so far."""
+        share = self._after[-1].ignorance if self._after else 0.0
         displaced = {} if self._latest is None else dict(zip(self._actions.names, self._shifts(), strict=True))
         return Believed(
             after=tuple(self._after),
@@ -293,12 +293,12 @@ class Trust:
             limit=self._rules.ignorance.limit,
             policy=self._rules.ignorance.policy,
             followed=self._followed,
-            alarm=ignorance >= self._rules.ignorance.limit,
+            alarm=share >= self._rules.ignorance.limit,
             text=self.text,
         )
 
     def bench(self) -> BenchFound | None:
-        """For the next receiver."""
+        """Deviation of the bench for the next receiver; None if no query requested it."""
         if self._latest is None or not self._latest.drawn:
             return None
         drawn = self._latest.drawn
@@ -310,7 +310,7 @@ class Trust:
 
 
 def _in_si(axis: Axis, shift: float, deviation: float) -> Displaced:
-    """A shift on the unit interval in the axis' own unit, taken in the middle of its range."""
+    """A shift on the unit interval in the unit of the axis, at the middle of its range."""
     if axis.scale == "log":
         middle, width = axis.decode(0.5), math.log(axis.upper / axis.lower)
         return Displaced(mean=middle * math.expm1(shift * width), deviation=middle * deviation * width)
@@ -399,7 +399,7 @@ def _offset_prior(axis: Axis) -> OffsetPrior:
             return OffsetPrior(factor=CLOCK, origin=axis.lower / width)
 
 
-def thinned(data: Data, around: Sequence[Point], most: int) -> Data:
+def subsampled(data: Data, around: Sequence[Point], most: int) -> Data:
     """Select at most `most` observations: half of them nearest to `around`, the others spread over the rest.
 
     The selection depends on the points and never on the costs. Leaving out high costs would bias the remaining
