@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 from actors.bench.bench_factory import needs_person
 from actors.interfaces import LaboratoryError
-from actors.simulators.shared_pool import WarmSimulators
+from actors.laboratory import WarmSimulators
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.daemon_settings import DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, DesiredState, QueueItem, Store
@@ -65,7 +65,7 @@ def job_of(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunRequest:
     plan = load_confined(folder / CAMPAIGN, [folder.resolve()], rig.source)
     given = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
     # A daemon never repeats a pour by itself: whoever is there is asked, whatever the campaign says.
-    plan = replace(plan, on_unknown="ask", outputs=replace(plan.outputs, directory=settings.runs))
+    plan = replace(plan, on_unknown="ask", outputs=plan.outputs.model_copy(update={"directory": str(settings.runs)}))
     request = task_request(plan, item.verb, given=given)  # type: ignore[arg-type]  # written by us
     if item.run is None:
         return request
