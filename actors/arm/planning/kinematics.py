@@ -1,6 +1,6 @@
 """Kinematics of whole paths, transformations between the frames of a pour, and rotations; all in numpy.
 
-- `forward`, `inverse` and `posture` are the closed forms of `actors.emulators.ur_controller.robot_kinematics` on arrays.
+- `forward`, `inverse` and `posture` are the closed forms of `ur_controller.robot_kinematics` on arrays.
 - `flange_poses` converts poses of the pourer to poses of the flange, `pourer_transforms` converts joints to poses of
   the pourer. The frames are described in `actors.arm.arm_interface`.
 - Rotations are matrices, vectors and quaternions (w first), of one or many. scipy has rotations too, but it takes a

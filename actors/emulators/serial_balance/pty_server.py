@@ -3,8 +3,8 @@
 `PtyEnd` is the balance's end of the terminal. It sends characters at the line's speed, garbles them for a client with
 another speed, and can be unplugged. `Replay` is an `EmulatedBalance` that gives each query the recorded reply.
 
-The process ends when its standard input ends or its parent ends, whichever comes first. A killed test therefore leaves no
-process behind.
+The process ends when its standard input ends or its parent ends, whichever comes first. A killed test therefore leaves
+no process behind.
 """
 
 from __future__ import annotations
@@ -264,6 +264,7 @@ def make_character(settings: dict[str, Any]) -> EmulatedBalance:
     """
     if "recording" in settings:
         from actors.balance.line_recording import LineRecording
+
         return Replay(LineRecording.load(Path(settings["recording"])), settings["speed"])
     return Emulation(
         settings["dialect"],

@@ -267,7 +267,7 @@ class Hybrid(Deployment[D3Settings]):
         else:
             pour(suggestion)
 
-    def _said(self) -> None:
+    def _take_decisions(self) -> None:
         assert self._trust is not None
         self.decisions += self._trust.decisions
         self._trust.decisions.clear()
