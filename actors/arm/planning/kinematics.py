@@ -171,9 +171,6 @@ def link_points(q: FloatArray, m: RobotModel) -> FloatArray:
     )
 
 
-FloatArray = NDArray[np.float64]
-
-
 def about(axis: str, angle: float) -> FloatArray:
     """Matrix (3, 3) of a rotation by `angle` [rad] about 'x', 'y' or 'z'."""
     k = "xyz".index(axis)

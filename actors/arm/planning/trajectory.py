@@ -266,8 +266,6 @@ class SampledPath:
         return f"{t:.2f} s into the {self.name}"
 
 
-FloatArray = NDArray[np.float64]
-
 TOOL_ACCELERATION = 0.5
 """Acceleration of a pourer that is carried [m/s²]. Its liquid leans by 3 deg, and twice as far while it swings."""
 
