@@ -18,7 +18,7 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from orchestrator.catalogue.catalogue_index import TABLES as CATALOGUE
+from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.cli.solver_report import kept_records
 from orchestrator.config import arm_file as arm_sections
 from orchestrator.config import arm_file as cell
