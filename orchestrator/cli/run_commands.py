@@ -7,6 +7,7 @@ command is called, so that `--help` starts fast.
 from __future__ import annotations
 
 import contextlib
+import functools
 import inspect
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -104,20 +105,20 @@ def _command(
     names = {f"asked_{option}": option for option in options}
 
     def register(command: Callable[..., None]) -> Callable[..., None]:
-        own = inspect.signature(command, eval_str=True).parameters.values()
-
+        @functools.wraps(command)
         def call_it(**given: Any) -> None:
             if names:
                 given["conditions"] = {option: given.pop(key) for key, option in names.items()}
             call(command, **given)
 
-        parameters = [
-            *(inspect.Parameter(key, KEYWORD, default=None, annotation=options[o]) for key, o in names.items()),
-            *(one.replace(kind=KEYWORD) for one in own if one.name != "conditions"),
-        ]
-        call_it.__name__, call_it.__doc__ = command.__name__, command.__doc__
-        call_it.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        call_it.__annotations__ = {one.name: one.annotation for one in parameters}
+        if names:
+            own = inspect.signature(command, eval_str=True).parameters.values()
+            parameters = [
+                *(inspect.Parameter(key, KEYWORD, default=None, annotation=options[o]) for key, o in names.items()),
+                *(one.replace(kind=KEYWORD) for one in own if one.name != "conditions"),
+            ]
+            call_it.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+            call_it.__annotations__ = {one.name: one.annotation for one in parameters}
         runs.command(name, epilog=examples(*lines))(call_it)
         return command
 
