@@ -153,7 +153,7 @@ def _duration(seconds: float) -> str:
 
 
 def _report(plan: StudyPlan, folder: Path) -> Path:
-    from orchestrator.study.report.study_page import write_report
+    from orchestrator.study.study_page import write_report
 
     page = write_report(plan, folder)
     mention(f"figures, tables and a page: {page}")

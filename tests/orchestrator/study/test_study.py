@@ -25,7 +25,6 @@ from orchestrator.config.file_loading import load_campaign
 from orchestrator.requests import Failed, Poured, Slots
 from orchestrator.run_service import RunResources
 from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.study.cell_process import run_cell
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import (
     RESULT,
@@ -41,6 +40,7 @@ from orchestrator.study.study_folder import (
     warning,
 )
 from orchestrator.study.study_plan import StudyPlan, cells_of, study_fingerprint
+from orchestrator.study.study_runner import run_cell
 from orchestrator.study.study_strategies import FinalPour
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement

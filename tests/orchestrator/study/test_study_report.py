@@ -19,16 +19,13 @@ from orchestrator.strategies.calibration.calibration_scores import ScoredPair, S
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.real_pours import Foretold, PourRow
 from orchestrator.strategies.stage_result import DisplayedMap
-from orchestrator.study.report.calibration_figures import draw_calibrations
-from orchestrator.study.report.cell_results import at_pour, gather, running_least
-from orchestrator.study.report.deployment_figures import draw_deployments, draw_finals, means
-from orchestrator.study.report.figure_panels import Drawn, look
-from orchestrator.study.report.statistics import Estimate, effect, estimate
-from orchestrator.study.report.study_page import write_report
-from orchestrator.study.report.study_tables import pours_needed, tables
+from orchestrator.study.calibration_figures import Drawn, draw_calibrations, look
+from orchestrator.study.deployment_figures import draw_deployments, means
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import CellResult, code_now, run_folder, told, write_result
+from orchestrator.study.study_page import pours_needed, tables, write_report
 from orchestrator.study.study_plan import StudyCell, StudyPlan, cells_of
+from orchestrator.study.study_statistics import Estimate, at_pour, effect, estimate, gather, running_least
 from orchestrator.study.study_strategies import FinalPoured
 from sim_engine.liquids import SimulationParameters
 from tests.orchestrator.reported import strays
@@ -232,7 +229,7 @@ def test_small_losses_can_be_told_apart_and_none_is_drawn_at_the_floor(study: St
 
 def all_drawn(study: StudyPlan) -> list[Drawn]:
     found = gather(study, {cell.id: made_up(cell) for cell in cells_of(study)})
-    return [*draw_calibrations(study, found), *draw_deployments(study, found), *draw_finals(study, found)]
+    return [*draw_calibrations(study, found), *draw_deployments(study, found)]
 
 
 @pytest.mark.slow
