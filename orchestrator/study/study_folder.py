@@ -181,7 +181,7 @@ def code_now() -> dict[str, str]:
     here = versions()
     return {
         "decant": here.decant,
-        "optimiser": sources(_ROOT / "actors" / "optimizer" / "core"),
+        "optimiser": sources(_ROOT / "actors" / "optimizer"),
         "strategies": sources(_ROOT / "orchestrator" / "strategies"),
         "solver": here.simulator,
     }
