@@ -15,7 +15,7 @@ from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from sim_engine.settings.model import Settings
-from tests.orchestrator.good_files import written_out
+from tests.support.campaign_files import written_out
 
 
 class Laboratory(Settings):

@@ -44,12 +44,12 @@ from orchestrator.study.study_runner import run_cell
 from orchestrator.study.study_strategies import FinalPour
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement
-from tests.actors.conftest import make_fake
-from tests.orchestrator import toy_study
-from tests.orchestrator.study_files import ROOT, read, small, without, written
-from tests.orchestrator.toy import logical_record
-from tests.orchestrator.toy_study import PAUSE, TOYS, run_toy_study
-from tests.patience import PATIENCE
+from tests.support import toy_study
+from tests.support.fake_simulator import make_fake
+from tests.support.study_files import ROOT, read, small, without, written
+from tests.support.toy_campaign import logical_record
+from tests.support.toy_study import PAUSE, TOYS, run_toy_study
+from tests.support.waiting import PATIENCE
 
 
 def comparable(study: StudyPlan) -> dict[str, Any]:
@@ -267,6 +267,7 @@ def test_other_code_than_that_of_finished_cells_is_named_once_and_is_no_error(tm
     before = sources(tmp_path)
     (tmp_path / "a.py").write_text("x = 2", encoding="utf-8")
     assert sources(tmp_path) != before
+    assert sources(tmp_path / "nothing") not in code_now().values()  # the folders that count exist
 
 
 def test_two_commands_can_not_run_one_study(tmp_path: Path) -> None:
