@@ -56,6 +56,7 @@ _PAIRED = (
     "gives such a difference (sign changes of the repetitions' differences); '—' below five repetitions. Many rows "
     "are tested: one in twenty is below 0.05 by chance."
 )
+_EFFECT_COLUMNS = ("compared", "of", "mismatch", "receiver", "repetitions", "difference", "better in", "probability")
 _NEEDED = (
     "The loss that both D2 and D3 reach: the larger of their mean least losses after the last pour. Pours until the "
     "mean of the least loss so far is there, with 95 % intervals: percentile bootstraps over the repetitions, too "
@@ -97,8 +98,7 @@ def tables(study: StudyPlan, found: Gathered) -> list[StudyTable]:
     if found.calibrated:
         made.append(_calibrations(study, found))
     if rows := [*_calibration_effects(study, found), *_deployment_effects(study, found)]:
-        header = ("compared", "of", "mismatch", "receiver", "repetitions", "difference", "better in", "probability")
-        made.append(StudyTable("table-effects", "Who gains how much", _PAIRED, header, rows))
+        made.append(StudyTable("table-effects", "Who gains how much", _PAIRED, _EFFECT_COLUMNS, rows))
     if found.finals:
         made.append(_finals(found, Losses(study, found, final=True)))
     if found.losses:
