@@ -113,7 +113,7 @@ class Catalogue:
                     path.with_name(path.name + suffix).unlink(missing_ok=True)
                 self._connection = _opened(str(path))
         except (OSError, sqlite3.OperationalError) as error:
-            self.warning = f"{path}: can't be written ({error}); the runs are read anew each time"
+            self.warning = f"{path}: can't be written ({error}); the runs are read again each time"
             self._connection = _opened(":memory:")
 
     def __enter__(self) -> Self:
@@ -260,7 +260,7 @@ _ANNOTATIONS = {"tags": "tag", "notes": "note"}
 """Columns of runs that are tables of their own."""
 
 _SOURCES = {"run": "runs", "pour": "pour"}
-"""What the rows of `TABLES` are read from. The view `runs` adds tags, notes and the present state to the table."""
+"""Sources of the rows of `TABLES`. The view `runs` adds tags, notes and the present state to the table."""
 
 _BELONGS = "path text references run on delete cascade"
 

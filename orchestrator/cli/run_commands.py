@@ -284,9 +284,9 @@ def compare(
     heads = [Path(path).name for path in found["runs"]]
     heads = heads if len(set(heads)) == len(heads) else found["runs"]
     asked = [_compared(place, heads, values) for place, values in found["settings"].items()]
-    came = found["outcomes"]
-    keys = dict.fromkeys(key for one in came for key in one)
-    ended = [_compared(key, heads, [one.get(key) for one in came]) for key in keys]
+    outcomes = found["outcomes"]
+    keys = dict.fromkeys(key for one in outcomes for key in one)
+    ended = [_compared(key, heads, [one.get(key) for one in outcomes]) for key in keys]
     print_table(asked or [_compared("(the same settings)", heads, [""] * len(heads))], title="asked for")
     print_table(ended, title="came to")
 

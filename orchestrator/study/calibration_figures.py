@@ -1,7 +1,8 @@
 """Figures of a study's calibrations, and what all figures of a study share.
 
 - `draw_calibrations`: 3b test discrepancy, 3c discrepancy against simulations, 4 discrepancy over θ.
-- `Drawn` is a figure with its caption and numbers; `look` is the style of an arm; `level_panels` and `legend` arrange.
+- `Drawn` is a figure with its caption and numbers; `series_style` is the style of an arm; `level_panels` and `legend`
+  make panels and a legend.
 """
 
 from __future__ import annotations
@@ -133,7 +134,7 @@ def strategy_of(arm: str) -> str:
     return arm.split("-", maxsplit=1)[0]
 
 
-def look(arm: str, arms: Sequence[str]) -> SeriesStyle:
+def series_style(arm: str, arms: Sequence[str]) -> SeriesStyle:
     """Style of an arm in a figure with other arms.
 
     Args:
@@ -283,7 +284,7 @@ def _against_simulations(known: Mapping[str, Found]) -> Drawn:
                 clip_on=False,
             )
         else:
-            axes.plot(spent, means, look(name, list(known)).line, color=colour(name), label=name)
+            axes.plot(spent, means, series_style(name, list(known)).line, color=colour(name), label=name)
             axes.errorbar(
                 spent[-1:], means[-1:], yerr=error(points[-1][1]), fmt="o", color=colour(name), capsize=4, clip_on=False
             )

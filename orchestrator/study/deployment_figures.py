@@ -23,7 +23,7 @@ from orchestrator.study.calibration_figures import (
     level_panels,
     level_words,
     log_axis,
-    look,
+    series_style,
 )
 from orchestrator.study.study_plan import StudyPlan
 from orchestrator.study.study_statistics import Estimate, Gathered, Key, at_pour, estimate, mean
@@ -121,7 +121,7 @@ def means(
     for i in range(len(groups)):
         for j, arm in enumerate(arms):
             one = of(i, arm)
-            _mean(axes, i + (j + 0.5) * width - 0.4, one, look(arm, arms), least, arm)
+            _mean(axes, i + (j + 0.5) * width - 0.4, one, series_style(arm, arms), least, arm)
             rows.append((i, arm, [one.count, one.mean, one.low, one.high]))
         if i:
             axes.axvline(i - 0.5, color=style.PALE, linewidth=0.8, zorder=0)
@@ -270,7 +270,7 @@ def _best_so_far(found: Gathered, losses: Losses) -> Drawn:
                     continue
                 points = [losses.mean(at_pour(curves, pour)) for pour in numbers]
                 rows += [[level, receiver, arm, n, e.count, e.mean, e.low, e.high] for n, e in zip(numbers, points)]  # noqa: B905
-                shown = look(arm, arms)
+                shown = series_style(arm, arms)
                 middle = [max(one.mean, least) for one in points]
                 axes.plot(numbers, middle, shown.line, color=shown.colour, label=arm, linewidth=1.7)
                 for pour in losses.checkpoints():
@@ -313,7 +313,7 @@ def _against_time(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
                 if arm.startswith("D1"):
                     planned += list(zip(times, shown))  # noqa: B905
                 else:
-                    style_of = look(arm, arms)
+                    style_of = series_style(arm, arms)
                     axes.plot(times, shown, style_of.line, marker=".", color=style_of.colour, label=arm, markersize=4)
             if planned:
                 planned.sort()
@@ -326,9 +326,9 @@ def _against_time(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
     return Drawn(
         "figure-7",
         "7",
-        "What pays off at which prices",
+        "What pays off at which costs",
         f"Least loss so far, mean over repetitions and receivers ({level_words(level)}), against the time that it "
-        "would have taken at hypothesised prices. D3's simulations beside a pour cost time only where they take longer "
+        "would have taken at hypothesised costs. D3's simulations during a pour cost time only if they take longer "
         "than the pour. Calibration is not counted: D1 and D3 share it. "
         f"Less than {least:g} {unit.unit} is drawn there.",
         figure,

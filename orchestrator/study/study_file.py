@@ -96,6 +96,7 @@ def _arm(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
     strategy = settings.model_fields["strategy"].default
     model = create_model(f"{strategy}ArmSettings", __base__=ArmSettings, __doc__=ArmSettings.__doc__, **fields)
     model.variant = strategy
+    model.retired = {old: new for old, new in settings.retired.items() if new.partition(":")[0] in fields}
     return model
 
 
@@ -421,9 +422,9 @@ def _searched(file: StudyFile, base: CampaignPlan, root: Place, report: Report) 
 
 
 HARDWARE = (
-    "laboratory '{}' is hardware. An arm moves only for one run, after '--arm' and with a person beside it; the cells "
-    "of a study run one after the other in processes of their own, where nobody is asked. Pour there with 'decant "
-    "run', and name a virtual laboratory here"
+    "laboratory '{}' is hardware. An arm moves only for one run, after '--arm' and with a person next to it; the cells "
+    "of a study run in processes of their own, which ask no operator. Pour there with 'decant run', and name a "
+    "virtual laboratory here"
 )
 
 BUDGETS = (
@@ -447,7 +448,7 @@ def _bench(laboratory: LaboratorySpec, at: Place, report: Report) -> VirtualBenc
     elif laboratory.arm is not None and laboratory.operator.answers != "virtual":
         report.add(
             at,
-            f"laboratory '{laboratory.name}' asks a person, and nobody is asked in a study; set 'operator: {{answers: "
+            f"laboratory '{laboratory.name}' asks an operator, and a study asks none; set 'operator: {{answers: "
             "virtual}' in it",
         )
     elif laboratory.bench is None:

@@ -26,7 +26,7 @@ from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED
 from orchestrator.study.calibration_figures import Drawn, draw_calibrations, is_ours, level_words, write_csv
 from orchestrator.study.deployment_figures import CAPTION, Losses, draw_deployments
-from orchestrator.study.study_folder import finished_results, told, write_whole
+from orchestrator.study.study_folder import code_summary, finished_results, write_whole
 from orchestrator.study.study_plan import Level, StudyPlan, cells_of
 from orchestrator.study.study_statistics import (
     ALL,
@@ -133,7 +133,7 @@ def _calibrations(study: StudyPlan, found: Gathered) -> StudyTable:
         "Discrepancy of the calibrated simulators",
         f"Mean |measured − simulated| of the normalised spillage, mean over repetitions [95 % t interval], at "
         f"{study.compared} mismatch. Uncalibrated: searched parameters at their defaults. Repetitions weigh the same "
-        f"{study.pour_count} actions anew, and keep {study.holdout} of them for testing: test pours recur between "
+        f"{study.pour_count} actions again, and keep {study.holdout} of them for testing: test pours recur between "
         "repetitions. C1's share one simulated grid, too: its interval has the chance of pours, and none of the grid's "
         "simulations.",
         ("strategy", "simulations", "repetitions", "training pours [%]", "test pours [%]", "θ*, mean ± deviation"),
@@ -294,7 +294,7 @@ def _sentence(compared: str, of: str, level: str, receiver: str, difference: Est
     if math.isnan(difference.low):
         return f"{where}: there are too few repetitions for an interval ({size})."
     if difference.low <= 0.0 <= difference.high:
-        return f"{where}: nothing tells {first} from {second} ({size})."
+        return f"{where}: the data do not separate {first} from {second} ({size})."
     return f"{where}: {first} is {'better' if difference.high < 0.0 else 'worse'} than {second} ({size})."
 
 
@@ -339,7 +339,7 @@ def write_report(study: StudyPlan, folder: Path) -> Path:
     for table in shown:
         write_csv(report / f"{table.name}.csv", *table.flat())
     path = report / PAGE
-    write_whole(path, _page(study, found, told(results), drawn, shown, report))
+    write_whole(path, _page(study, found, code_summary(results), drawn, shown, report))
     return path
 
 
@@ -362,7 +362,7 @@ def _page(
         ],
         resampled=_RESAMPLED,
         settings=[*_settings(study), code],
-        footer="Every number of every figure and table lies beside this page as CSV, the figures as PNG and SVG.",
+        footer="Every number of every figure and table is in a CSV file next to this page, the figures as PNG and SVG.",
     )
 
 

@@ -162,15 +162,15 @@ def _differences(data: CellResult, split: str, *, random: bool) -> list[float]:
     ]
 
 
-def _add(noted: Found, number: int, data: CellResult, *, random: bool = False) -> None:
-    noted.numbers.append(number)
-    noted.test.append(_differences(data, "test", random=random))
-    noted.train.append([] if random else _differences(data, "train", random=False))
+def _add(arm: Found, number: int, data: CellResult, *, random: bool = False) -> None:
+    arm.numbers.append(number)
+    arm.test.append(_differences(data, "test", random=random))
+    arm.train.append([] if random else _differences(data, "train", random=False))
     result = None if random or CALIBRATION not in data.results else result_of(data.results, CALIBRATION, Calibrated)
-    noted.simulations.append(0 if result is None else result.simulations)
+    arm.simulations.append(0 if result is None else result.simulations)
     if result is not None:
-        noted.results.append(result)
-        noted.expected.append(data.expected)
+        arm.results.append(result)
+        arm.expected.append(data.expected)
 
 
 def _losses(data: CellResult) -> list[float]:

@@ -181,7 +181,7 @@ def test_a_state_directory_that_cannot_be_written_is_said_once_and_stops_no_run(
     (line,) = [record.getMessage() for record in caplog.records if "catalogue" in record.getMessage()]
     assert f"decant runs add {first}" in line
     result = invoke("runs")
-    assert (result.exit_code, "the runs are read anew each time" in result.stderr) == (0, True)
+    assert (result.exit_code, "the runs are read again each time" in result.stderr) == (0, True)
     assert invoke(f"runs add {first}").exit_code == 2
 
 
