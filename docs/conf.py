@@ -7,6 +7,7 @@ be read.
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib.metadata import version as version_of
 from pathlib import Path
@@ -24,7 +25,7 @@ version = release = version_of("decant")
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 root_doc = "docs/index"
 include_patterns = ["*.md", "docs/**.md", "configs/**.md"]
-exclude_patterns = ["build", "runs", ".venv", "**/.pytest_cache"]
+exclude_patterns = ["build", "runs", ".venv", "**/.pytest_cache", "docs/notes"]
 nitpicky = False  # annotations name types of many packages; our own links are checked by MyST
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
@@ -40,7 +41,9 @@ napoleon_use_ivar = True
 add_module_names = False
 
 html_theme = "furo"
-html_title = "Decant"
+html_title = f"Decant {version}"
+if repository := os.environ.get("DECANT_REPOSITORY"):  # its address, for the link to edit a page
+    html_theme_options = {"source_repository": repository, "source_branch": "main", "source_directory": ""}
 html_show_sphinx = False
 html_extra_path = ["site"]
 
