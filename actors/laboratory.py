@@ -9,12 +9,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
-from actors.balance.balance_settings import SerialBalanceSpec
-from actors.bench.bench_factory import MakeDevice, OpenBench, needs_person, open_bench
+from actors.balance.balance_settings import SerialBalanceSettings
+from actors.bench.bench_factory import MakeDevice, OpenBench, open_bench
 from actors.bench.device_emulators import BenchEmulators
 from actors.interfaces import (
     Bench,
@@ -26,7 +25,7 @@ from actors.interfaces import (
     Optimizer,
     SimulatorPool,
 )
-from actors.laboratory_settings import LaboratorySpec, simulator_count
+from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
 from actors.runtime.ray_runtime import watch_ray
 from actors.runtime.remote_object import Device, LocalDevice, RayDevice
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
     from actors.runtime.ray_cluster import JoinedCluster
 
 
-def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = False) -> None:
+def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool = False) -> None:
     """Check that everything a laboratory needs on this machine and others is available. Leaves nothing running.
 
     Args:
@@ -69,16 +68,16 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = Fa
         check_cluster(spec.ray, need_bench=need_bench)
 
 
-def check_bench_packages(spec: LaboratorySpec) -> None:
+def check_bench_packages(spec: LaboratorySettings) -> None:
     """Check that the packages are installed that control, or emulate, the arm and the balance of a laboratory.
 
     Raises:
         LaboratoryError: some are not; the text names them and their extra.
     """
-    if spec.arm is None or (spec.arm.stand_in == "" and spec.arm.missing() is None and spec.balance is None):
+    if spec.arm is None or (spec.arm.emulator == "" and spec.arm.missing() is None and spec.balance is None):
         return
-    needed = ["psutil"] if spec.mode == "virtual" and spec.arm.stand_in else []
-    if spec.balance is not None and isinstance(spec.balance.device, SerialBalanceSpec):
+    needed = ["psutil"] if spec.mode == "virtual" and spec.arm.emulator else []
+    if spec.balance is not None and isinstance(spec.balance, SerialBalanceSettings) and not spec.balance.typed:
         needed.append("serial")
     missing = [module for module in needed if not installed(module)]
     if missing:
@@ -90,7 +89,7 @@ def check_bench_packages(spec: LaboratorySpec) -> None:
 
 
 @contextlib.contextmanager
-def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
+def reached(spec: LaboratorySettings) -> Iterator[LaboratorySettings]:
     """A laboratory with its addresses: on hardware its own, else those of what is started for as long as this.
 
     Raises:
@@ -101,24 +100,21 @@ def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
         yield spec
         return
     assert spec.arm is not None
-    stand_ins = BenchEmulators(spec.arm, None if spec.balance is None else spec.balance.device)
+    stand_ins = BenchEmulators(spec.arm, spec.balance)
     try:
         where = stand_ins.found()
         stand_ins.install()
-        balance = spec.balance
-        if balance is not None:
-            balance = replace(balance, device=where.balance)
-        yield replace(spec, arm=where.arm, balance=balance)
+        yield spec.with_values(arm=where.arm, balance=where.balance)
     finally:
         stand_ins.close()
 
 
-def _without_ray(spec: LaboratorySpec, *, need_bench: bool, brief: bool) -> bool:
+def _without_ray(spec: LaboratorySettings, *, need_bench: bool, brief: bool) -> bool:
     return spec.in_process or (brief and spec.ray is None and not need_bench)
 
 
 def open_laboratory(
-    spec: LaboratorySpec,
+    spec: LaboratorySettings,
     *,
     need_bench: bool,
     brief: bool = False,
@@ -141,19 +137,17 @@ def open_laboratory(
         optimizer: an optimiser to use instead of its own; it is stateless.
 
     Raises:
-        LaboratoryError: a bench is needed and there is none, or it has no operator, or the mode is unknown.
+        LaboratoryError: a bench is needed and there is none, or it has no operator.
     """
-    if spec.mode not in ("virtual", "hardware"):
-        raise LaboratoryError(f"laboratory {spec.name}: mode '{spec.mode}' is not known; 'virtual' and 'hardware' are")
     if need_bench and not spec.pours:
         raise LaboratoryError(f"laboratory {spec.name} has no bench, but the campaign pours: add a 'bench' to it")
-    if need_bench and operator is None and needs_person(spec):
+    if need_bench and operator is None and spec.needs_person:
         raise LaboratoryError(
             f"laboratory {spec.name} needs a person beside it who answers questions; run the campaign in a terminal"
         )
     kind: Callable[..., InProcessLaboratory | RayLaboratory]
     if _without_ray(spec, need_bench=need_bench, brief=brief):
-        kind = partial(InProcessLaboratory, processes=0 if spec.in_process else simulator_count(spec))
+        kind = partial(InProcessLaboratory, processes=0 if spec.in_process else spec.simulator_count)
     else:
         kind = RayLaboratory
         if spec.ray is not None:
@@ -182,7 +176,7 @@ class _OpenLaboratory:
 
     def __init__(
         self,
-        spec: LaboratorySpec,
+        spec: LaboratorySettings,
         make: Callable[[], Simulator] = pour_simulator,
         *,
         need_bench: bool = False,
@@ -367,7 +361,7 @@ class RayLaboratory(_OpenLaboratory):
             self._report(Notice("warning", text))
 
         if self._cluster is None:
-            return RaySimulatorPool(simulator_count(self._spec), make=self._make, tell=tell)
+            return RaySimulatorPool(self._spec.simulator_count, make=self._make, tell=tell)
         pool = RaySimulatorPool(
             self._spec.simulators or self._cluster.cpus,
             make=self._make,

@@ -27,7 +27,7 @@ from orchestrator.config import laboratory_file as cluster
 from orchestrator.config import laboratory_file as laboratory
 from orchestrator.config import laboratory_file as operator
 from orchestrator.config import vessel_file as vessel
-from orchestrator.config.arm_file import ARMS
+from actors.arm.arm_settings import ARMS
 from orchestrator.config.scene_builder import DEFAULTS, NEEDED
 from orchestrator.config.weighed_pours import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.yaml.section_validation import sections_in
@@ -75,15 +75,15 @@ SECTIONS: dict[str, type[Settings]] = {
     "liquid": vessel.LiquidFile,
     "vessel": vessel.VesselFile,
     "profile": vessel.ProfileSection,
-    "laboratory": laboratory.LaboratoryFile,
+    "laboratory": laboratory.LaboratorySettings,
     "ray": cluster.RaySection,
     "arm": arm_sections.UrArmSection,
     "limits": arm_sections.LimitsSection,
-    "cell": cell.CellSection,
+    "cell": cell.RobotCell,
     "operator": operator.OperatorSection,
     "bench": laboratory.BenchSection,
     "balance": laboratory.BalanceSection,
-    "pose-error": pose.PoseErrorSection,
+    "pose-error": pose.PoseErrorSettings,
     "study": study.StudyFile,
     "level": study.LevelSection,
     "compared-calibrations": study.CalibrationsSection,
@@ -100,7 +100,7 @@ OF_SECTIONS = {
     **{model.__name__: f"[{name}](#{name})" for name, model in SECTIONS.items()},
     "BalanceSection": "[balance](#bench)",
     **dict.fromkeys((arm.__name__ for arm in ARMS.all.values()), "[arm](#arm-and-cell)"),
-    "CellSection": "[cell](#arm-and-cell)",
+    "RobotCell": "[cell](#arm-and-cell)",
     "LimitsSection": "[limits](#arm-and-cell)",
     "BoxSection": "`{low: {x, y, z}, high: {x, y, z}}`, lengths",
     "PlaneSection": "`{normal: [x, y, z], offset: length}`",
@@ -113,8 +113,8 @@ OF_SECTIONS = {
     "NumbersSection": "[balance](balances.md#settings)",
     "OperatorSection": "[operator](#operator)",
     "HiddenLiquid": "[parameters](#simulator), one value each",
-    "PoseErrorSection": "[pose error](#bench)",
-    "PoseNoiseSection": "standard deviations of the [pose error](#bench)",
+    "PoseErrorSettings": "[pose error](#bench)",
+    "PoseNoise": "standard deviations of the [pose error](#bench)",
     "TransferSection": "[transfer](#pours)",
     "LossSection": "[loss](#losses)",
     "Objective": "[objective](#objectives)",
@@ -131,7 +131,7 @@ OF_SECTIONS = {
     "Actions": "[actions](#motion-and-actions)",
     "Parameters": "[parameters](#simulator)",
     "VesselFile": "[vessel](#vessels) or the path of its file",
-    "LaboratoryFile": "[laboratory](#laboratories) or the path of its file",
+    "LaboratorySettings": "[laboratory](#laboratories) or the path of its file",
     "LiquidFile": "[liquid](#liquid) or the path of its file",
     "LevelSection": "[level](#studies)",
     **{

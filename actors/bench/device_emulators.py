@@ -11,10 +11,10 @@ import importlib
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
-from actors.arm.arm_settings import ArmSpec
+from actors.arm.arm_settings import ArmSettings
 from actors.balance.balance_device import DeviceBalance
-from actors.balance.balance_settings import BalanceDevice, BalanceEmulator
-from actors.balance.simulated_balance import Load
+from actors.balance.balance_settings import BalanceEmulator, BalanceSettings
+from actors.balance.scale_model import Load
 from actors.interfaces import LaboratoryError
 from actors.runtime.remote_object import Device
 
@@ -25,12 +25,12 @@ class Found:
 
     Attributes:
         arm: the arm's settings with the address of its emulator.
-        balance: the balance's settings with the address of its emulator; None if weights are typed.
+        balance: the balance's settings with the address of its emulator; None without a balance.
         follows: whether `history` is available.
     """
 
-    arm: ArmSpec
-    balance: BalanceDevice | None
+    arm: ArmSettings
+    balance: BalanceSettings | None
     follows: bool
 
 
@@ -50,10 +50,10 @@ class History:
 
 
 class ArmEmulator(Protocol):
-    """The emulator that an arm's driver connects to; created from an `ArmSpec`, which names it in `stand_in`."""
+    """The emulator that an arm's driver connects to; created from an `ArmSettings`, which names it in `emulator`."""
 
     @property
-    def arm(self) -> ArmSpec:
+    def arm(self) -> ArmSettings:
         """The settings, with the emulator's address."""
         ...
 
@@ -74,11 +74,11 @@ class ArmEmulator(Protocol):
         ...
 
 
-def emulator_of(arm: ArmSpec) -> ArmEmulator | None:
+def emulator_of(arm: ArmSettings) -> ArmEmulator | None:
     """Start the emulator of an arm; None if the arm's driver is a simulation itself."""
-    if not arm.stand_in:
+    if not arm.emulator:
         return None
-    module, _, name = arm.stand_in.partition(":")
+    module, _, name = arm.emulator.partition(":")
     return cast(ArmEmulator, getattr(importlib.import_module(module), name)(arm))
 
 
@@ -87,16 +87,16 @@ class BenchEmulators:
 
     Args:
         arm: settings of the arm.
-        balance: settings of the balance; None if weights are typed.
+        balance: settings of the balance; None without one.
     """
 
-    def __init__(self, arm: ArmSpec, balance: BalanceDevice | None) -> None:
+    def __init__(self, arm: ArmSettings, balance: BalanceSettings | None) -> None:
         self._spec = arm
         self._arm = emulator_of(arm)
         self._weighs = balance
         self._balance: BalanceEmulator | None = None
         try:
-            self._balance = None if balance is None else balance.stand_in()
+            self._balance = None if balance is None or balance.typed else balance.start_emulator()
         except BaseException:
             self.close()
             raise
@@ -104,7 +104,7 @@ class BenchEmulators:
     def found(self) -> Found:
         """Return the addresses of the emulators."""
         arm = self._spec if self._arm is None else self._arm.arm
-        return Found(arm, self._weighs if self._balance is None else self._balance.device, self._arm is not None)
+        return Found(arm, self._weighs if self._balance is None else self._balance.balance, self._arm is not None)
 
     def install(self) -> None:
         """See `ArmEmulator.install`."""

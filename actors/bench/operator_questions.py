@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from actors.interfaces import LaboratoryError, Notice, Operator, OperatorQuestion, OperatorSpec
+from actors.interfaces import LaboratoryError, Notice, Operator, OperatorQuestion, OperatorSettings
 
 
 class NoAnswerError(LaboratoryError):
@@ -48,7 +48,7 @@ class OperatorQuestions:
     """
 
     def __init__(
-        self, operator: Operator, spec: OperatorSpec, tell: Callable[[Notice], None], time_scale: float = 1.0
+        self, operator: Operator, spec: OperatorSettings, tell: Callable[[Notice], None], time_scale: float = 1.0
     ) -> None:
         self._operator, self._notify = operator, tell
         self._on_screen = spec.answers == "person"

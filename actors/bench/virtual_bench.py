@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.arm_interface import Executed, PlannedPour
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.bench.device_emulators import DeviceEmulators, History
 from actors.bench.ground_truth import draw_pose_error, hidden_pour, spill_of, stream
 from actors.bench.virtual_operator import Hands
 from actors.interfaces import LaboratoryError, SimulatorPool
-from actors.laboratory_settings import VirtualBenchSpec
+from actors.laboratory_settings import BenchSettings
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import RecordedFrames
@@ -203,7 +203,7 @@ class VirtualBench(GroundTruth):
 
     def __init__(
         self,
-        spec: VirtualBenchSpec,
+        spec: BenchSettings,
         time_scale: float,
         stand_ins: DeviceEmulators,
         hands: Hands,
@@ -277,8 +277,8 @@ class FollowedBench(VirtualBench):
 
     def __init__(
         self,
-        spec: VirtualBenchSpec,
-        arm: UrArmSpec,
+        spec: BenchSettings,
+        arm: UrArmSettings,
         stand_ins: DeviceEmulators,
         hands: Hands,
         simulators: SimulatorPool,

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import RaySpec
+from actors.laboratory_settings import RaySettings
 from actors.runtime.child_process import python_module, run
 from actors.runtime.cluster_nodes import Versions, versions
 
@@ -60,7 +60,7 @@ class NodeFacts:
     problem: str = ""
 
 
-def check_cluster(spec: RaySpec, *, need_bench: bool) -> list[NodeFacts]:
+def check_cluster(spec: RaySettings, *, need_bench: bool) -> list[NodeFacts]:
     """Check that a laboratory can be opened on a cluster. The check leaves nothing on the cluster.
 
     Args:
@@ -116,7 +116,7 @@ def _read_cluster(address: str) -> dict[str, Any]:
     return {"error": f"it can't be joined: {last}"}
 
 
-def _check_nodes(spec: RaySpec, nodes: list[NodeFacts]) -> None:
+def _check_nodes(spec: RaySettings, nodes: list[NodeFacts]) -> None:
     where = f"Ray cluster at {spec.address}"
     if not any(node.cpus for node in nodes):
         raise LaboratoryError(f"{where}: none of its {len(nodes)} node(s) has a core to simulate on (--num-cpus)")
@@ -132,7 +132,7 @@ def _check_nodes(spec: RaySpec, nodes: list[NodeFacts]) -> None:
             )
 
 
-def _check_bench(spec: RaySpec, nodes: list[NodeFacts], available: dict[str, float]) -> None:
+def _check_bench(spec: RaySettings, nodes: list[NodeFacts], available: dict[str, float]) -> None:
     where, name = f"Ray cluster at {spec.address}", spec.bench_resource
     if not any(node.total.get(name, 0.0) >= 1.0 for node in nodes):
         hosts = ", ".join(node.host for node in nodes)

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import LaboratorySpec, simulator_count
+from actors.laboratory_settings import LaboratorySettings
 from actors.runtime.child_process import ChildProcess, python_module
 from actors.runtime.ray_cleanup import MARK, end_cluster
 
@@ -140,7 +140,7 @@ def close_private(private: PrivateRay) -> None:
     private.warden.close(15.0)
 
 
-def start_private(private: PrivateRay, spec: LaboratorySpec) -> None:
+def start_private(private: PrivateRay, spec: LaboratorySettings) -> None:
     """Start Ray's processes and connect to them; its settings must be in the environment. Linux ends them with this
     thread.
 
@@ -154,9 +154,9 @@ def start_private(private: PrivateRay, spec: LaboratorySpec) -> None:
             with _bare_ray(), _marked(private.folder):
                 ray.init(
                     address="local",
-                    num_cpus=simulator_count(spec),
+                    num_cpus=spec.simulator_count,
                     num_gpus=0,
-                    object_store_memory=max(spec.object_store_mb, 80) * 1024 * 1024,
+                    object_store_memory=round(max(spec.object_store, 80.0)) * 1024 * 1024,
                     include_dashboard=False,
                     logging_level=logging.ERROR,
                     log_to_driver=False,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from actors.interfaces import LaboratoryError, Notice
-from actors.laboratory_settings import RaySpec
+from actors.laboratory_settings import RaySettings
 from actors.runtime.cluster_nodes import Node, PinnedNode, living_nodes, this_node
 
 LOOK_INTERVAL = 2.0
@@ -38,7 +38,7 @@ class JoinedCluster:
         grown: called with the number of cores when it increases.
     """
 
-    spec: RaySpec
+    spec: RaySettings
     tell: Callable[[Notice], None]
     bench_lost: Callable[[str], None]
     here_lost: Callable[[str], None]

@@ -22,7 +22,7 @@ from pathlib import Path
 from types import FrameType
 
 from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.runtime.cluster_exit_message import dismiss, speaker
 from actors.runtime.private_ray import (
     PrivateRay,
@@ -62,7 +62,7 @@ _cluster: _Cluster | None = None
 _guard = threading.RLock()
 
 
-def start_ray(spec: LaboratorySpec) -> None:
+def start_ray(spec: LaboratorySettings) -> None:
     """Start Ray for a laboratory, join its cluster, or use the Ray that this process has already started.
 
     Blocks for some seconds. From a running event loop, call it in a thread (`asyncio.to_thread`), and then
@@ -173,7 +173,7 @@ def _close_cluster(cluster: _Cluster) -> None:
         close_private(cluster.private)
 
 
-def _start_keeper(cluster: _Cluster, spec: LaboratorySpec) -> None:
+def _start_keeper(cluster: _Cluster, spec: LaboratorySettings) -> None:
     """Start Ray in a thread that lives as long as Ray does.
 
     Linux ends Ray's processes when the *thread* that started them ends. If a thread of an executor started Ray, or a
@@ -190,7 +190,7 @@ def _start_keeper(cluster: _Cluster, spec: LaboratorySpec) -> None:
         raise cluster.failure
 
 
-def _keep(cluster: _Cluster, spec: LaboratorySpec) -> None:
+def _keep(cluster: _Cluster, spec: LaboratorySettings) -> None:
     settings = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"} if cluster.private is None else cluster.private.settings()
     with ray_settings(**settings):
         messenger = None

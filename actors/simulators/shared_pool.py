@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from actors.interfaces import LaboratoryError, Optimizer, SimulatorPool
 from actors.laboratory import ClosablePool
-from actors.laboratory_settings import LaboratorySpec, simulator_count
+from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
 from actors.runtime.ray_runtime import watch_ray
 from actors.runtime.remote_object import Device, LocalDevice, RayDevice
@@ -131,7 +131,7 @@ class WarmSimulators:
         make: Callable[[], Simulator] = pour_simulator,
         tell: Callable[[str], None] = lambda text: None,
     ) -> None:
-        self._spec = LaboratorySpec("warm", simulators=simulators, in_process=in_process)
+        self._spec = LaboratorySettings(name="warm", simulators=simulators, in_process=in_process)
         self._make, self._report = make, tell
         self._pool: ClosablePool | None = None
         self._fair: FairPool | None = None
@@ -185,7 +185,7 @@ class WarmSimulators:
                 await asyncio.to_thread(stop_ray)
             raise
         keep_signals()
-        return RaySimulatorPool(simulator_count(self._spec), make=self._make, tell=self._report)
+        return RaySimulatorPool(self._spec.simulator_count, make=self._make, tell=self._report)
 
     def share(self) -> Share:
         """Return a share for one laboratory, for as long as the laboratory is open.

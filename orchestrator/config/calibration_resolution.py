@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Linear
 from orchestrator.config.campaign_file import CalibrationSection, DataSection
 from orchestrator.config.scene_builder import SceneBuilder
@@ -34,7 +34,7 @@ def resolve_data(
     place: Place,
     scenes: tuple[Scene, ...],
     actions: Space,
-    laboratory: LaboratorySpec | None,
+    laboratory: LaboratorySettings | None,
     report: Report,
 ) -> ExistingPours | None:
     """Existing pours of the deployment by scene; None after a problem, which is added to the report."""
@@ -110,7 +110,7 @@ def _of_file(
 
 
 def _of_run(
-    run: str, place: Place, scenes: tuple[Scene, ...], laboratory: LaboratorySpec | None, report: Report
+    run: str, place: Place, scenes: tuple[Scene, ...], laboratory: LaboratorySettings | None, report: Report
 ) -> tuple[Path, dict[str, tuple[RecordedPour, ...]] | None]:
     previous = former_run(run, place, report)
     if previous is None:
@@ -150,7 +150,7 @@ def records_of_run(
     place: Place,
     scenes: tuple[Scene, ...],
     actions: Space,
-    laboratory: LaboratorySpec | None,
+    laboratory: LaboratorySettings | None,
     report: Report,
 ) -> RecordSet | None:
     """Calibration pours from a previous run, in any of its scenes; None after a problem."""
@@ -192,7 +192,7 @@ def resolve_calibration(
     fixed: dict[str, float],
     searched: dict[str, Axis],
     place: Place,
-    laboratory: LaboratorySpec | None,
+    laboratory: LaboratorySettings | None,
     known: tuple[NormalPrior, ...] = (),
 ) -> CalibrationPlan | None:
     """The plan of a calibration. Problems are added to the report; the plan may then be None.

@@ -12,9 +12,9 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import Field, create_model
 
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.action_ranges import Actions as ActionsModel
 from orchestrator.config.action_ranges import Motion as MotionModel
-from orchestrator.config.laboratory_file import LaboratoryFile
 from orchestrator.config.parameter_ranges import Parameters as ParametersModel
 from orchestrator.config.vessel_file import LiquidFile, VesselFile
 from orchestrator.strategies.campaign_plan import CalibrationSettings, DeploymentSettings, Design, StrategySettings
@@ -277,7 +277,7 @@ class CampaignFile(Settings):
     seed: Seed = 0
     """Seed of every random choice: same campaign, seed and outcomes → same requests."""
 
-    laboratory: PathOr[LaboratoryFile] | None = None
+    laboratory: PathOr[LaboratorySettings] | None = None
     """Laboratory in which it runs."""
 
     liquid: PathOr[LiquidFile] | None = None

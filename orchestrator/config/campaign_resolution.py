@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.calibration_resolution import resolve_calibration, resolve_data
 from orchestrator.config.campaign_checks import check_ranges
 from orchestrator.config.campaign_file import CampaignFile, DeploymentSection, LearningSection, LossSection
@@ -62,7 +62,7 @@ def resolve_objectives(
 
 
 def resolve_deployment(
-    section: DeploymentSection, builder: SceneBuilder, place: Place, laboratory: LaboratorySpec | None
+    section: DeploymentSection, builder: SceneBuilder, place: Place, laboratory: LaboratorySettings | None
 ) -> DeploymentPlan | None:
     """The plan of a deployment. Problems are added to the report; the plan may then be None."""
     report, settings = builder.report, section.settings
@@ -146,7 +146,7 @@ def _check_that_pouring_pays(loss: LossSection, actions: Space, place: Place, bu
 def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> CampaignPlan | None:
     """The plan of a campaign. Problems are added to the report; the plan may then be None."""
     references = References(report)
-    laboratory: LaboratorySpec | None = references.laboratory(file.laboratory, root.at("laboratory"))
+    laboratory: LaboratorySettings | None = references.laboratory(file.laboratory, root.at("laboratory"))
     liquid = references.liquid(file.liquid, root.at("liquid"))
     builder = SceneBuilder(file, root, references, liquid)
     for role in ("pourer", "receiver"):  # checked even if the sections override it
@@ -211,5 +211,5 @@ def _directory(text: str | None, root: Place) -> Path:
     return resolved(Path("runs") if text is None else root.directory / text)
 
 
-def _is_virtual(laboratory: LaboratorySpec) -> bool:
+def _is_virtual(laboratory: LaboratorySettings) -> bool:
     return laboratory.mode == "virtual" and laboratory.bench is not None

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Discriminator, Field, Tag, create_model
 
-from orchestrator.config.action_ranges import EXAMPLES, RangeSection, described, range_model
+from orchestrator.config.action_ranges import RangeSection, described, range_model
 from orchestrator.strategies.campaign_plan import NormalPrior
 from sim_engine.liquids import ParameterInfo, SimulationParameters
 from sim_engine.search_space import Axis
@@ -20,8 +20,7 @@ SEARCHED_TOLERANCES = 3.0
 
 def parameter_quantity(name: str) -> Quantity:
     """Annotation of a simulation parameter."""
-    info = SimulationParameters.info()[name]
-    return Quantity(info.unit, EXAMPLES[name], info.lower, info.upper, whole=info.integer)
+    return SimulationParameters.info()[name].quantity
 
 
 class ParameterRangeSection(RangeSection):

@@ -11,14 +11,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from actors.laboratory_settings import HiddenLiquid
 from orchestrator.config.campaign_file import CalibrationSection, CampaignFile, LearningSection
-from orchestrator.config.laboratory_file import HiddenLiquid
 from orchestrator.config.parameter_ranges import Parameters
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from orchestrator.config.yaml.yaml_writer import as_file
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
-from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
 from sim_engine.settings.model import Settings
 from sim_engine.vessel.shapes import MeshShape, ProfileShape, VesselSpec
 
@@ -56,9 +55,9 @@ def _laboratory(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
     if bench is None:
         return dict(base)
     changed = {
-        "liquid": written(HiddenLiquid(**bench.liquid.of_the_solver())),
-        "pose_error": written(PoseErrorSection(**asdict(bench.pose_error))),
-        "pose_noise": written(PoseNoiseSection(**asdict(bench.pose_noise))),
+        "liquid": written(HiddenLiquid(**bench.theta.of_the_solver())),
+        "pose_error": written(bench.pose_error),
+        "pose_noise": written(bench.pose_noise),
         "time_scale": bench.time_scale,
     }
     return {**base, "bench": {**base["bench"], **changed}}

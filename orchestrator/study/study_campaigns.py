@@ -70,7 +70,7 @@ def _planned(
         base,
         name=cell.id,
         seed=cell.seed,
-        laboratory=replace(base.laboratory, bench=bench),
+        laboratory=base.laboratory.with_values(bench=bench),
         outputs=OutputPlan(directory, rrd=False, figures=False, record_rate=0.0, recorded_simulations=0),
         on_unknown="repeat",
     )

@@ -17,8 +17,8 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, create_model
 
+from actors.laboratory_settings import HiddenLiquid, LaboratorySettings
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.laboratory_file import HiddenLiquid, LaboratoryFile
 from orchestrator.config.parameter_ranges import Parameters, ParametersBase
 from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.references import References
@@ -32,11 +32,11 @@ from orchestrator.strategies.campaign_plan import CampaignPlan, StrategySettings
 from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
-from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
 from orchestrator.strategies.strategy_registry import calibrations, deployments
 from orchestrator.study.study_plan import ALL, StudyPlan
 from orchestrator.study.study_resolution import bench_of, calibration_arms, deployment_arms, levels_of, written_levels
 from sim_engine.liquids import SimulationParameters
+from sim_engine.scene import PoseErrorSettings, PoseNoise
 from sim_engine.search_space import Space
 from sim_engine.settings.model import (
     MADE,
@@ -186,10 +186,10 @@ class LevelSection(Settings):
     liquid: HiddenLiquid | None = None
     """Hidden θ of the 'real' liquid; calibration never reads it."""
 
-    pose_error: PoseErrorSection = PoseErrorSection()
+    pose_error: PoseErrorSettings = PoseErrorSettings()
     """Systematic error of grip and placement."""
 
-    pose_noise: PoseNoiseSection = PoseNoiseSection()
+    pose_noise: PoseNoise = PoseNoise()
     """Scatter of the pose error, drawn for each pour."""
 
 
@@ -210,7 +210,7 @@ class StudyFile(Settings):
     campaign: FilePath | None = None
     """File of the base campaign: vessels, motions, action spaces, ranges of θ, calibration pours, loss."""
 
-    laboratory: PathOr[LaboratoryFile] | None = None
+    laboratory: PathOr[LaboratorySettings] | None = None
     """Laboratory that replaces the campaign's: a virtual one with a bench, simulated directly or over wires."""
 
     parameters: Parameters | None = None  # type: ignore[valid-type]
@@ -355,7 +355,7 @@ def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
         report.problems.extend(error.problems)
         return None
     if laboratory is not None:
-        found = references.section(file.laboratory, root.at("laboratory"), LaboratoryFile)
+        found = references.section(file.laboratory, root.at("laboratory"), LaboratorySettings)
         record = {} if found is None else as_file(*found, references)
         base = replace(base, laboratory=laboratory, resolved={**base.resolved, "laboratory": record})
     return base if file.parameters is None else _with_parameters(base, file.parameters, root.at("parameters"), report)

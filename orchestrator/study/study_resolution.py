@@ -13,13 +13,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
+from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from orchestrator.config.yaml.section_validation import PlacedProblems
 from orchestrator.config.yaml.yaml_source import Place, Report
 from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan, Premises
 from orchestrator.strategies.strategy_registry import calibrations, deployments
 from orchestrator.study.study_plan import ALL, CalibrationArm, DeploymentArm, Level
-from sim_engine.scene import PoseError
 
 if TYPE_CHECKING:
     from sim_engine.settings.model import Settings
@@ -44,7 +43,7 @@ AS_IN_THE_PAPER: dict[str, dict[str, Any]] = {
 """Settings in which the paper's forms differ from the defaults."""
 
 
-def bench_of(laboratory: LaboratorySpec, at: Place, report: Report) -> VirtualBenchSpec | None:
+def bench_of(laboratory: LaboratorySettings, at: Place, report: Report) -> BenchSettings | None:
     """The bench of a study. Without a usable one, the reason is added to the report and the result is None."""
     if laboratory.mode != "virtual":
         report.add(at, HARDWARE.format(laboratory.name))
@@ -63,7 +62,7 @@ def bench_of(laboratory: LaboratorySpec, at: Place, report: Report) -> VirtualBe
     else:
         # Simulated readings need no waiting; an arm over wires needs its real time.
         wired = laboratory.arm is not None
-        return replace(laboratory.bench, time_scale=laboratory.bench.time_scale if wired else 0.0)
+        return laboratory.bench if wired else laboratory.bench.with_values(time_scale=0.0)
     return None
 
 
@@ -81,19 +80,14 @@ def written_levels(sections: Sequence[Settings] | None, root: Place, report: Rep
     return found if sections is not None else None
 
 
-def levels_of(written: Sequence[Any] | None, laboratory: str, bench: VirtualBenchSpec) -> tuple[Level, ...]:
+def levels_of(written: Sequence[Any] | None, laboratory: str, bench: BenchSettings) -> tuple[Level, ...]:
     """The benches of all levels: as given, or the laboratory's own under its name."""
     if written is None:
         return (Level(laboratory, bench),)
     return tuple(
         Level(
             level.name,
-            replace(
-                bench,
-                liquid=level.liquid.parameters(),
-                pose_error=PoseError(**level.pose_error.model_dump()),
-                pose_noise=PoseError(**level.pose_noise.model_dump()),
-            ),
+            bench.with_values(liquid=level.liquid, pose_error=level.pose_error, pose_noise=level.pose_noise),
         )
         for level in written
     )

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
+from actors.laboratory_settings import LaboratorySettings, BenchSettings
 from sim_engine.action import DEG, Action
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.liquids import Liquid, SimulationParameters
@@ -125,8 +125,8 @@ def task(action: Action) -> Callable[..., PourTask]:
 
 
 @pytest.fixture
-def bench_spec() -> VirtualBenchSpec:
-    return VirtualBenchSpec(
+def bench_spec() -> BenchSettings:
+    return BenchSettings(
         liquid=SimulationParameters(particles=3_000, cohesion=0.03),
         pose_error=PoseError(x=0.002, tilt=0.01, speed_factor=1.02),
         pose_noise=PoseError(x=5e-4, tilt=2e-3, speed_factor=0.01),
@@ -139,7 +139,7 @@ def ray_running() -> Iterator[None]:
     """Ray, started once; laboratories of tests join it."""
     from actors.runtime.ray_runtime import start_ray, stop_ray
 
-    start_ray(LaboratorySpec("tests", simulators=4))
+    start_ray(LaboratorySettings("tests", simulators=4))
     import ray
 
     # Workers can't import test modules by name.

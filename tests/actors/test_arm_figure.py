@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from orchestrator.config.file_loading import load_laboratory
 
 FILE = Path(__file__).parents[2] / "configs" / "laboratories" / "virtual.yaml"
 
 
-def _arm() -> UrArmSpec:
+def _arm() -> UrArmSettings:
     spec = load_laboratory(FILE).arm
-    assert isinstance(spec, UrArmSpec)
+    assert isinstance(spec, UrArmSettings)
     return spec
 
 

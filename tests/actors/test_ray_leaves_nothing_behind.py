@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.runtime import private_ray as ray_private
 from actors.runtime import ray_runtime
 from actors.runtime.child_process import ChildProcess, child_environment
@@ -28,7 +28,7 @@ PROGRAM = """
 import asyncio, json, os, signal, sys, time
 import psutil
 from actors.runtime.ray_runtime import keep_signals, ray_folder, start_ray, stop_ray
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 
 class Spinner:
     def pid(self): return os.getpid()
@@ -44,7 +44,7 @@ async def main(how, patience):
     caught = asyncio.Event()
     if how == "own handler":
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, caught.set)
-    await asyncio.to_thread(start_ray, LaboratorySpec("test", simulators=1))
+    await asyncio.to_thread(start_ray, LaboratorySettings("test", simulators=1))
     keep_signals()
     import ray
     actor = ray.remote(Spinner).remote()
@@ -175,7 +175,7 @@ def test_a_ray_of_somebody_else_in_this_process_is_neither_taken_over_nor_ended(
 
     monkeypatch.setattr(ray_runtime, "_cluster", None)
     with pytest.raises(LaboratoryError, match="Ray of its own"):
-        ray_runtime.start_ray(LaboratorySpec("late"))
+        ray_runtime.start_ray(LaboratorySettings("late"))
     assert ray.is_initialized()
 
 

@@ -21,7 +21,7 @@ PROGRAM = """
 import asyncio, json, sys
 from actors.laboratory import open_laboratory
 from actors.optimizer.questions import Data, SuggestProblem
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.simulators.shared_pool import WarmSimulators
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
@@ -52,7 +52,7 @@ async def questions(simulators, optimizer):
 
 async def of_its_own():
     heard = []
-    async with open_laboratory(LaboratorySpec("desk", simulators=1), need_bench=False, make=Formula) as laboratory:
+    async with open_laboratory(LaboratorySettings("desk", simulators=1), need_bench=False, make=Formula) as laboratory:
         laboratory.listen(heard.append)
         await questions(laboratory.simulators, laboratory.optimizer)
     print(json.dumps(" ".join(notice.text for notice in heard)))

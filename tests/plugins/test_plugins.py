@@ -226,11 +226,11 @@ def test_the_doctor_asks_a_balance_and_an_arm_from_outside(site: Path, broken: P
 
 
 DIALECT = """
-from decant.plugins import SerialBalance, SerialBalanceSpec
+from decant.plugins import SerialBalance, SerialBalanceSettings
 from decant.plugins.testing import VirtualSerialBalance
 
 far = VirtualSerialBalance.start("plain", baud=0, time_scale=20.0)
-balance = SerialBalance(SerialBalanceSpec(far.port, time_scale=20.0))
+balance = SerialBalance(SerialBalanceSettings(far.port, time_scale=20.0))
 print(balance.connect())
 balance.tare()
 far.put(0.2)
@@ -267,12 +267,12 @@ def test_the_tables_of_the_pages_know_what_is_installed(site: Path) -> None:
 
 UNFINISHED = """
 from typing import Literal
-from decant.plugins import ArmSettings, BalanceDeviceSection, DesignSettings, Objective, Shape
+from decant.plugins import ArmSettings, BalanceSettings, DesignSettings, Objective, Shape
 
 class Arm(ArmSettings):
     kind: Literal["arm"] = "arm"
 
-class Balance(BalanceDeviceSection):
+class Balance(BalanceSettings):
     kind: Literal["balance"] = "balance"
 
 class Design(DesignSettings):

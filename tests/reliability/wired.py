@@ -14,7 +14,7 @@ from typing import Any
 
 from actors.bench import virtual_operator
 from actors.bench.virtual_operator import VirtualOperator
-from actors.interfaces import OperatorQuestion, OperatorSpec
+from actors.interfaces import OperatorQuestion, OperatorSettings
 from actors.laboratory import InProcessLaboratory
 from orchestrator.journal.journal import Kind
 from tests.actors.bench.conftest import wired_spec
@@ -61,7 +61,7 @@ class WiredRig(Rig):
         spec = wired_spec(
             pace=PACE,
             hurried=True,
-            operator=OperatorSpec(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
+            operator=OperatorSettings(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
         )
         virtual_operator.SCATTER = 0.0  # each refilling is one of chance, and after a restart there is one more
         async with InProcessLaboratory(spec, Formula, need_bench=True) as opened:

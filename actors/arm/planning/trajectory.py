@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.frames import Transforms, cell_transforms, flange_poses, flange_transforms, quaternions
 from actors.arm.planning.kinematics import MODELS, RobotModel, link_points, singularities
@@ -148,19 +148,19 @@ class SampledPath:
     name: str
     times: FloatArray
     joints: FloatArray
-    spec: UrArmSpec
+    spec: UrArmSettings
     phases: Phases = ()
     unreached: Transforms | None = None
 
     @classmethod
-    def of(cls, name: str, path: JointPath, spec: UrArmSpec, phases: Phases = ()) -> SampledPath:
+    def of(cls, name: str, path: JointPath, spec: UrArmSettings, phases: Phases = ()) -> SampledPath:
         """A path with midpoints between its waypoints: joints are linear in between, poses nearly so."""
         times = np.sort(np.concatenate([path.times, 0.5 * (path.times[1:] + path.times[:-1])]))
         return cls(name, times, path.at(times), spec, phases)
 
     @classmethod
     def beyond(
-        cls, name: str, times: FloatArray, poses: FloatArray, spec: UrArmSpec, phases: Phases = ()
+        cls, name: str, times: FloatArray, poses: FloatArray, spec: UrArmSettings, phases: Phases = ()
     ) -> SampledPath:
         """Poses of the pourer in the world (N, 7), some of which cannot be reached."""
         return cls(name, times, np.zeros((len(times), 6)), spec, phases, flange_poses(poses, spec))

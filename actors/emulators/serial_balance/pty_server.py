@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from actors.balance.simulated_balance import ScaleSettings
+from actors.balance.scale_model import ScaleSettings
 from actors.emulators.serial_balance.emulated_balance import EmulatedBalance, Emulation
 from actors.emulators.serial_balance.pty_end import PtyEnd
 

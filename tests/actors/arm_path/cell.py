@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planning.transfer_motion import follow
 from orchestrator.config.file_loading import load_vessel
 from sim_engine.action import DEG, Action
@@ -28,7 +28,7 @@ CONFIGS = Path(__file__).parents[3] / "configs"
 LIMITS = ArmLimits(
     box_low=(0.25, -0.6, 0.0), box_high=(1.0, 0.4, 0.9), joint_speed=170 * DEG, tilt_speed=155 * DEG, clearance=3e-3
 )
-SPEC = UrArmSpec(
+SPEC = UrArmSettings(
     model="ur10e",
     limits=LIMITS,
     cell=RobotCell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
@@ -59,17 +59,17 @@ def motion(action: Action = ACTION, receiver: str = "tumbler", pivot: Pivot | No
     return plan_motion(scene, action, vessel("beaker"), vessel(receiver))
 
 
-def limited(**changes: Any) -> UrArmSpec:
+def limited(**changes: Any) -> UrArmSettings:
     """The cell with other limits."""
     return replace(SPEC, limits=replace(LIMITS, **changes))
 
 
-def placed(**changes: Any) -> UrArmSpec:
+def placed(**changes: Any) -> UrArmSettings:
     """The cell with other things in it."""
     return replace(SPEC, cell=replace(SPEC.cell, **changes))
 
 
-def waiting_at(x: float, y: float, z: float) -> UrArmSpec:
+def waiting_at(x: float, y: float, z: float) -> UrArmSettings:
     """The cell with a home that has the pourer upright at a place of the world, in the same posture."""
     pose = np.array([[x, y, z, 1.0, 0.0, 0.0, 0.0]])
     q = follow(pose, np.array(SPEC.home), SPEC)[0]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from actors.arm.arm_geometry import Mount, RobotCell
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planning.frames import cell_transforms, flange_poses, pourer_motion, pourer_transforms
 from actors.arm.planning.kinematics import MODELS, inverse, singularities
 from actors.arm.planning.path_checks import check_limits
@@ -22,7 +22,7 @@ MOUNTS = {"wall": Mount(tilt=90 * DEG), "ceiling": Mount(tilt=180 * DEG, turn=30
 RECEIVERS = {"wall": (0.2, 0.75, 0.3), "ceiling": (0.2, 0.75, -0.8), "tilt": (0.75, 0.1, 0.1)}
 
 
-def mounted(name: str) -> UrArmSpec:
+def mounted(name: str) -> UrArmSettings:
     """A cell for that mount, with a home that has the pourer upright beside the receiver."""
     limits = replace(SPEC.limits, box_low=(-1.5, -1.5, -1.5), box_high=(1.5, 1.5, 1.5))
     for direction in np.arange(0.0, 360.0, 15.0) * DEG:

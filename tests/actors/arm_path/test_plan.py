@@ -12,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from actors.arm.arm_geometry import Plane
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath, PourPath
 from actors.arm.planning.frames import cell_transforms, pourer_motion, pourer_transforms
 from actors.arm.planning.kinematics import MODELS, forward
@@ -47,7 +47,7 @@ actions = st.builds(
 )  # fmt: skip
 
 
-def planned(action=ACTION, spec: UrArmSpec = SPEC, receiver: str = "tumbler", pivot: Pivot | None = None) -> PourPath:
+def planned(action=ACTION, spec: UrArmSettings = SPEC, receiver: str = "tumbler", pivot: Pivot | None = None) -> PourPath:
     return plan_path(motion(action, receiver, pivot), spec, vessel("beaker"), vessel(receiver))
 
 
@@ -173,7 +173,7 @@ def test_a_pour_that_ends_tilted_is_brought_upright_where_it_is_and_carried_home
     turning = tilts > 1e-6
     assert np.abs(lip[turning] - lip[0]).max() < 3e-4
     rates = np.abs(np.diff(tilts)) / np.diff(path.retreat.times)
-    assert rates.max() == pytest.approx(SPEC.untilt_speed, rel=1e-3)
+    assert rates.max() == pytest.approx(SPEC.upright_speed, rel=1e-3)
     np.testing.assert_allclose(path.retreat.joints[-1], SPEC.home, atol=1e-6)
 
 

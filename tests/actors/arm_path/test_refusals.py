@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from actors.arm.arm_geometry import Plane, Pose
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.path_checks import recheck
 from actors.arm.planning.pour_planner import plan_path
@@ -19,7 +19,7 @@ from sim_engine.scene import Pivot
 from .cell import ACTION, LIMITS, SPEC, limited, motion, placed, vessel, waiting_at
 
 
-def refusal(spec: UrArmSpec = SPEC, action: Action = ACTION, pivot: Pivot | None = None) -> str:
+def refusal(spec: UrArmSettings = SPEC, action: Action = ACTION, pivot: Pivot | None = None) -> str:
     with pytest.raises(InvalidActionError) as caught:
         plan_path(motion(action, pivot=pivot), spec, vessel("beaker"), vessel("tumbler"))
     return str(caught.value)
@@ -28,7 +28,7 @@ def refusal(spec: UrArmSpec = SPEC, action: Action = ACTION, pivot: Pivot | None
 WIDE = {"box_low": (-2.0, -2.0, -1.0), "box_high": (2.0, 2.0, 2.0)}
 
 
-def open_cell(**cell: object) -> UrArmSpec:
+def open_cell(**cell: object) -> UrArmSettings:
     """No box in the way."""
     return replace(placed(**cell), limits=replace(LIMITS, **WIDE))
 
@@ -200,7 +200,7 @@ def test_what_can_be_said_of_a_pour_out_of_reach_is_said_too():
 PATH = plan_path(motion(), SPEC, vessel("beaker"), vessel("tumbler")).pour
 
 
-def rechecked(path: JointPath = PATH, spec: UrArmSpec = SPEC) -> str:
+def rechecked(path: JointPath = PATH, spec: UrArmSettings = SPEC) -> str:
     with pytest.raises(InvalidActionError) as caught:
         recheck(path, spec)
     return str(caught.value)

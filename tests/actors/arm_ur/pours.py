@@ -10,7 +10,7 @@ import numpy as np
 
 from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
 from actors.arm.arm_interface import PathReport
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath, PourPath
 
 HOME = tuple(math.radians(v) for v in (0.0, -90.0, 90.0, -90.0, -90.0, 0.0))
@@ -30,9 +30,9 @@ REPORT = PathReport(
 )
 
 
-def settings(address: str = "", **changes: Any) -> UrArmSpec:
+def settings(address: str = "", **changes: Any) -> UrArmSettings:
     """An arm with a tool and a payload."""
-    spec = UrArmSpec(
+    spec = UrArmSettings(
         model="ur10e",
         limits=ArmLimits((-1.5, -1.5, -0.5), (1.5, 1.5, 2.0)),
         cell=RobotCell((0.8, 0.0, 0.0)),
@@ -42,7 +42,7 @@ def settings(address: str = "", **changes: Any) -> UrArmSpec:
         grip=Pose(rx=math.pi),  # the flange looks down, the pourer up
         payload=1.2,
         payload_centre=(0.0, 0.0, 0.08),
-        announcement=1.0,
+        warning_time=1.0,
     )
     return replace(spec, **changes)
 

@@ -11,7 +11,7 @@ import pytest
 
 from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
 from actors.arm.arm_interface import ArmStoppedError
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planning.frames import pourer_motion
 from actors.arm.planning.pour_planner import plan_path
 from actors.arm.ur.motion_segments import leans
@@ -26,7 +26,7 @@ from sim_engine.vessel.vessel import Vessel, build_vessel
 
 from .conftest import Call, Rig, next_address
 
-SPEC = UrArmSpec(
+SPEC = UrArmSettings(
     model="ur10e",
     limits=ArmLimits((0.2, -0.7, 0.0), (1.1, 0.5, 1.0), joint_speed=170 * DEG, tilt_speed=155 * DEG, clearance=3e-3),
     cell=RobotCell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
@@ -34,7 +34,7 @@ SPEC = UrArmSpec(
     tool=Pose(z=0.17),
     grip=Pose(y=-0.06, rx=-90 * DEG),
     payload=0.9,
-    announcement=0.0,
+    warning_time=0.0,
     time_scale=5.0,
 )
 ACTION = Action(

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from actors.balance.balance_settings import SerialBalanceSpec, SettlingRule
+from actors.balance.balance_settings import SerialBalanceSettings, SettlingRule
 from actors.balance.dialect_registry import dialects
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.simulated_balance import ScaleSettings
+from actors.balance.scale_model import ScaleSettings
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.serial_balance.emulated_balance import BalanceFaults
 
@@ -25,9 +25,9 @@ SOON = {"settling": SettlingRule(deadline=4.0)}
 """Gives up early, where giving up is what is tested."""
 
 
-def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSpec:
+def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSettings:
     """Settings that leave nothing to be found out."""
-    spec = SerialBalanceSpec(
+    spec = SerialBalanceSettings(
         virtual.port,
         dialect=dialect,
         baud=9600,

@@ -10,7 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.balance.simulated_balance import BalanceSettings, Load, VirtualBalance
+from actors.balance.scale_model import Load
+from actors.balance.simulated_balance import BalanceSettings, VirtualBalance
 from actors.interfaces import LaboratoryError
 
 SHEET = BalanceSettings(resolution=1e-4, noise=2e-4, drift=0.0, settling_time=1.5, time_scale=0.0)

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.balance.balance_settings import SerialBalanceSpec
+from actors.balance.balance_settings import SerialBalanceSettings
 from actors.balance.weighing_plan import Placement
 from actors.bench.bench_factory import PouringBench
 from actors.bench.device_emulators import DeviceEmulators
 from actors.bench.virtual_bench import FollowedBench, VirtualBench
 from actors.bench.virtual_operator import BenchContents, VirtualOperator
-from actors.interfaces import Notice, OperatorQuestion, OperatorSpec
+from actors.interfaces import Notice, OperatorQuestion, OperatorSettings
 from actors.laboratory import InProcessLaboratory
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.file_loading import load_laboratory
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid
@@ -167,23 +167,23 @@ class Stage:
 def wired_spec(
     placement: Placement = Placement.TRAY,
     pace: float = PACE,
-    operator: OperatorSpec | None = None,
+    operator: OperatorSettings | None = None,
     *,
     hurried: bool = False,
-) -> LaboratorySpec:
+) -> LaboratorySettings:
     """The shipped virtual laboratory with an exact balance; `hurried` saves time where that changes nothing."""
     spec = load_laboratory(LABORATORIES / "virtual.yaml")
     assert spec.arm is not None
     assert spec.balance is not None
     device = spec.balance.device
-    assert isinstance(device, SerialBalanceSpec)
+    assert isinstance(device, SerialBalanceSettings)
     assert device.virtual is not None
     assert spec.bench is not None
     rule = replace(device.settling, deadline=10.0)
     arm = replace(spec.arm, time_scale=pace)
     if hurried:
         rule = replace(rule, readings=2, span=0.2)
-        arm = replace(arm, announcement=1.0, untilt_speed=60 * DEG, approach_speed=90 * DEG)
+        arm = replace(arm, warning_time=1.0, upright_speed=60 * DEG, approach_speed=90 * DEG)
     virtual = replace(device.virtual, noise=0.0, drift=0.0, settling_time=0.5)
     device = replace(device, time_scale=pace, answer_time=0.3, reconnect_time=1.0, settling=rule, virtual=virtual)
     manual = placement is Placement.MANUAL
@@ -197,7 +197,7 @@ def wired_spec(
             device=None if manual else device,
         ),
         bench=replace(spec.bench, time_scale=pace),
-        operator=operator or OperatorSpec(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
+        operator=operator or OperatorSettings(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
     )
 
 
@@ -212,7 +212,7 @@ def open_stage() -> OpenStage:
 
 @contextlib.asynccontextmanager
 async def opened_stage(
-    spec: LaboratorySpec | None = None,
+    spec: LaboratorySettings | None = None,
     *,
     answers: Mapping[str, Sequence[str]] | None = None,
     late: Mapping[str, float] | None = None,

@@ -13,7 +13,7 @@ from actors.balance.weighing_plan import Placement, weighings
 from actors.bench.operator_questions import NoAnswerError, OperatorQuestions
 from actors.bench.virtual_bench import LONGEST_REST, executed_pour
 from actors.bench.virtual_operator import POURER, RECEIVER, TRAY, BenchContents, Hands, PlayedOperator
-from actors.interfaces import Notice, OperatorQuestion, OperatorSpec
+from actors.interfaces import Notice, OperatorQuestion, OperatorSettings
 
 STEP = 0.008
 
@@ -97,7 +97,7 @@ class Person:
 
 def ask(after: float, **spec: float) -> tuple[object, OperatorQuestions, list[Notice]]:
     notices: list[Notice] = []
-    questions = OperatorQuestions(Person(after), OperatorSpec(**spec), notices.append)
+    questions = OperatorQuestions(Person(after), OperatorSettings(**spec), notices.append)
 
     async def play() -> object:
         try:

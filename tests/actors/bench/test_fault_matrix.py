@@ -21,7 +21,7 @@ import pytest
 
 from actors.arm.planning.frames import pourer_motion
 from actors.bench.virtual_operator import VirtualOperator
-from actors.interfaces import LaboratoryError, NotPouredError, OperatorSpec, UnknownPourError
+from actors.interfaces import LaboratoryError, NotPouredError, OperatorSettings, UnknownPourError
 from sim_engine.action import DEG
 from sim_engine.outcome import PourMeasurement
 from tests.patience import PATIENCE
@@ -290,7 +290,7 @@ def test_an_operator_who_does_not_want_the_stopped_arm_to_move(open_stage, how, 
             phase,
             ARM["protective stop"],
             mend=set(),
-            spec={"operator": OperatorSpec(answers="virtual", time=2.0, reminder=15.0, deadline=45.0)},
+            spec={"operator": OperatorSettings(answers="virtual", time=2.0, reminder=15.0, deadline=45.0)},
             **(
                 {"answers": {"recover": ["no"]}, "late": {"recover": 2.0}}
                 if how == "no"
@@ -316,7 +316,7 @@ def test_an_operator_who_leaves_the_balance_as_it_is(open_stage, how):
     """No weight that was taken is lost, and the spill still lies where it can be weighed."""
     fault = replace(BALANCE["unplugged"], mend=None)
     scripted = {"answers": {"balance": ["no"]}} if how == "no" else {"late": {"balance": math.inf}}
-    spec = {"operator": OperatorSpec(answers="virtual", time=2.0, reminder=15.0, deadline=45.0)}
+    spec = {"operator": OperatorSettings(answers="virtual", time=2.0, reminder=15.0, deadline=45.0)}
     tale = asyncio.run(tell_tale(open_stage, "weigh", fault, mend=set(), spec=spec, **scripted))
     assert isinstance(tale.outcome, UnknownPourError)
     assert "pourer_full" in str(tale.outcome)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from actors.arm.simulated_arm import NumbersSpec
+from actors.arm.simulated_arm import SimulatedArmSettings
 from actors.bench.virtual_bench import slipped
 from actors.interfaces import UnknownPourError
 from sim_engine.action import DEG
@@ -20,7 +20,7 @@ PACE = 10.0
 
 
 def without_a_robot():
-    return replace(wired_spec(pace=PACE, hurried=True), arm=NumbersSpec(PACE, announcement=1.0))
+    return replace(wired_spec(pace=PACE, hurried=True), arm=SimulatedArmSettings(PACE, warning_time=1.0))
 
 
 @pytest.mark.realtime

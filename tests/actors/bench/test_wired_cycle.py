@@ -13,7 +13,7 @@ from actors.arm.planned_pour import unpack
 from actors.arm.planning.frames import pourer_motion
 from actors.balance.weighing_plan import Placement
 from actors.bench.device_emulators import History
-from actors.interfaces import InvalidActionError, NotPouredError, OperatorSpec, PourProgress
+from actors.interfaces import InvalidActionError, NotPouredError, OperatorSettings, PourProgress
 from sim_engine.outcome import PourMeasurement
 
 from .conftest import ACTION, SCENE, Stage, opened_stage, reach, wired_spec
@@ -82,12 +82,12 @@ def test_the_arm_moves_only_after_consent_and_the_announced_delay_and_is_home_wh
     times, joints = np.array(poured.history.times), np.array(poured.history.joints)
     spec = wired_spec().arm
     moved = np.flatnonzero(np.max(np.abs(joints - joints[0]), axis=1) > 1e-3)
-    assert times[moved[0]] - poured.stage.answered_at["start"] >= 0.9 * spec.announcement
+    assert times[moved[0]] - poured.stage.answered_at["start"] >= 0.9 * spec.warning_time
     np.testing.assert_allclose(joints[-1], spec.home, atol=1e-3)
     assert poured.heard == ["tray_wiped", "pourer_empty", "pourer_full", "set_up", "start", "pourer_after"]
     text, seconds = poured.stage.operator.announced[0]
     assert "moves in 3 s" in text
-    assert seconds == pytest.approx(spec.announcement / spec.time_scale)  # of the clock
+    assert seconds == pytest.approx(spec.warning_time / spec.time_scale)  # of the clock
 
 
 @pytest.mark.realtime
@@ -157,7 +157,7 @@ def test_no_consent_no_movement(open_stage):
 
 @pytest.mark.realtime
 def test_nobody_there_is_reminded_then_given_up_and_nothing_moves(open_stage):
-    patience = OperatorSpec(answers="virtual", time=2.0, reminder=4.0, deadline=12.0)
+    patience = OperatorSettings(answers="virtual", time=2.0, reminder=4.0, deadline=12.0)
 
     async def play():
         async with open_stage(wired_spec(operator=patience), late={"start": math.inf}) as stage:

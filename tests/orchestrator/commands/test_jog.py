@@ -11,7 +11,7 @@ import pytest
 
 from actors.arm.arm_geometry import Pose
 from actors.arm.arm_interface import ArmPose
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import LaboratoryError
 from orchestrator.cli.jogging import JogError, Jogging, JogStep, parse_step, steps_home
@@ -50,7 +50,7 @@ class Arm:
 class Session:
     def __init__(self, *typed: str) -> None:
         spec = load_laboratory(LABORATORY).arm
-        assert isinstance(spec, UrArmSpec)
+        assert isinstance(spec, UrArmSettings)
         self.home = spec.home
         self.arm, self.screen, self._typed = Arm(spec.home), "", list(typed)
         self.jogging = Jogging(self.arm, self._read, self._tell)  # type: ignore[arg-type]

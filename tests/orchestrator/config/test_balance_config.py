@@ -7,8 +7,8 @@ from textwrap import dedent
 
 import pytest
 
-from actors.balance.balance_settings import BalanceSpec, SerialBalanceSpec, SettlingRule
-from actors.balance.simulated_balance import ScaleSettings
+from actors.balance.balance_settings import BalanceSettings, SerialBalanceSettings, SettlingRule
+from actors.balance.scale_model import ScaleSettings
 from actors.balance.weighing_plan import Placement
 from orchestrator.config.balance_file import SerialSection, SettlingSection, VirtualScaleSection, resolve_balance
 from orchestrator.config.yaml.section_validation import validate
@@ -17,7 +17,7 @@ from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from tests.orchestrator.good_files import written_out
 
 
-def load(text: str, mode: str = "hardware") -> BalanceSpec:
+def load(text: str, mode: str = "hardware") -> BalanceSettings:
     report = Report()
     place = Place(Document.parse(dedent(text), Path("lab.yaml").resolve()))
     section = validate(SerialSection, place, report)
@@ -53,7 +53,7 @@ def test_every_key_reaches_the_balance():
     assert spec.pourer_elsewhere
     assert spec.load_tolerance == pytest.approx(2e-3)
     serial = spec.device
-    assert isinstance(serial, SerialBalanceSpec)
+    assert isinstance(serial, SerialBalanceSettings)
     assert (serial.port, serial.dialect, serial.baud, serial.format) == (
         "/dev/serial/by-id/usb-KERN", "kern-swt", 4800, "7E1")  # fmt: skip
     assert serial.handshake == "software"
@@ -65,16 +65,16 @@ def test_every_key_reaches_the_balance():
 
 def test_a_port_is_enough_and_the_rest_is_found_out():
     serial = load(SIMPLE).device
-    assert isinstance(serial, SerialBalanceSpec)
+    assert isinstance(serial, SerialBalanceSettings)
     assert (serial.dialect, serial.baud, serial.format) == ("auto", None, None)
 
 
 def test_a_virtual_balance_has_a_data_sheet():
     device = load(VIRTUAL, mode="virtual").device
-    assert isinstance(device, SerialBalanceSpec)
+    assert isinstance(device, SerialBalanceSettings)
     assert device.virtual == ScaleSettings(1e-5, 3.0, 2e-5, 1e-6, 2.0)
     other = load(VIRTUAL + "dialect: sbi\n", mode="virtual").device
-    assert isinstance(other, SerialBalanceSpec)
+    assert isinstance(other, SerialBalanceSettings)
     assert other.dialect == "sbi"
 
 

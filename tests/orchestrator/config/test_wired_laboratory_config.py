@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from actors.balance.balance_settings import NumbersBalanceSpec
+from actors.balance.balance_settings import SimulatedBalanceSettings
 from actors.balance.weighing_plan import Placement
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.campaign_checks import check_campaign
 from orchestrator.config.file_loading import load_campaign, load_laboratory
-from orchestrator.config.laboratory_file import LaboratoryFile
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.strategies.campaign_plan import CampaignPlan
@@ -26,7 +26,7 @@ HARDWARE = (CONFIGS / "laboratories" / "ur10-kern.yaml").read_text(encoding="utf
 TWIN = (CONFIGS / "laboratories" / "twin.yaml").read_text(encoding="utf-8")
 
 
-def load(folder: Path, text: str) -> LaboratorySpec:
+def load(folder: Path, text: str) -> LaboratorySettings:
     path = folder / "lab.yaml"
     path.write_text(text, encoding="utf-8")
     return load_laboratory(path)
@@ -78,7 +78,7 @@ def test_hardware_differs_from_virtual_in_addresses_and_limits_only(tmp_path):
 @pytest.mark.parametrize("text", [VIRTUAL, HARDWARE, TWIN], ids=["virtual", "ur10-kern", "twin"])
 def test_a_laboratory_as_written_out_loads_to_the_same(tmp_path, text):
     spec = load(tmp_path, text)
-    assert load(tmp_path, written_out(LaboratoryFile, text)) == spec
+    assert load(tmp_path, written_out(LaboratorySettings, text)) == spec
 
 
 BENCH = "bench:\n  liquid: {particles: 4000}\n  time_scale: 30\n"
@@ -210,9 +210,9 @@ def test_a_receiver_turned_away_from_home_is_refused_soon_and_in_words_of_the_be
 
 def test_a_balance_of_numbers_may_stand_beside_an_arm(tmp_path):
     start = VIRTUAL.index("balance:")
-    text = VIRTUAL[:start] + "balance: {kind: numbers, resolution: 0.2 g}\n" + VIRTUAL[VIRTUAL.index("operator:") :]
+    text = VIRTUAL[:start] + "balance: {kind: simulated, resolution: 0.2 g}\n" + VIRTUAL[VIRTUAL.index("operator:") :]
     spec = load(tmp_path, text).balance
     assert spec is not None
-    assert isinstance(spec.device, NumbersBalanceSpec)
+    assert isinstance(spec.device, SimulatedBalanceSettings)
     assert spec.device.told
     assert (spec.device.sheet.resolution, spec.device.time_scale) == (pytest.approx(2e-4), 30.0)

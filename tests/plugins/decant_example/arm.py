@@ -26,10 +26,10 @@ from decant.plugins import (
     ArmPose,
     ArmRefusedError,
     ArmSettings,
-    ArmSpec,
+    ArmSettings,
     ArmState,
     ArmStoppedError,
-    CellSection,
+    RobotCell,
     ExecutedMotion,
     InvalidActionError,
     MotionPath,
@@ -46,7 +46,7 @@ HOME_HEIGHT = 0.05
 
 
 @dataclass(frozen=True)
-class StandSpec(ArmSpec):
+class StandSpec(ArmSettings):
     """A stand with a motor.
 
     Attributes:
@@ -55,16 +55,16 @@ class StandSpec(ArmSpec):
 
     fastest: float = math.radians(90.0)
     time_scale: float = 1.0
-    announcement: float = 0.5
+    warning_time: float = 0.5
 
     kind: ClassVar[str] = "stand"
 
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `ArmSpec.driver`; a stand has no safety settings that could be accepted."""
+        """See `ArmSettings.driver`; a stand has no safety settings that could be accepted."""
         return Stand, (self,)
 
     def plan(self, scene: Scene, action: Action) -> MotionPath:
-        """See `ArmSpec.plan`: the motor makes any motion that isn't too fast for it."""
+        """See `ArmSettings.plan`: the motor makes any motion that isn't too fast for it."""
         path = MotionPath(plan_pour(scene, action), approach_time=1.0, retreat_time=1.0)
         if path.report.tilt_speed > self.fastest * 1.001:
             asked, most = math.degrees(path.report.tilt_speed), math.degrees(self.fastest)
@@ -83,7 +83,7 @@ class StandSection(ArmSettings):
     fastest: Annotated[float, Quantity("rad/s", "90 deg/s", 0.0, 10.0, positive=True)] = StandSpec.fastest
     """That its motor turns."""
 
-    def resolve(self, cell: CellSection | None, place: Place, report: Report, *, mode: str) -> StandSpec | None:
+    def resolve(self, cell: RobotCell | None, place: Place, report: Report, *, mode: str) -> StandSpec | None:
         """See `ArmSettings.resolve`."""
         if mode == "hardware":
             report.add(place.at("arm"), "this example has no motor; write 'mode: virtual'")
@@ -259,7 +259,7 @@ class Stand:
     def _upright(self, name: str) -> None:
         self._consent()
         _, tilt, height = self._read()
-        duration = abs(tilt) / self._spec.untilt_speed
+        duration = abs(tilt) / self._spec.upright_speed
         self._way(name, duration, _ramp(tilt, 0.0, duration), lambda t: height)
 
     def _way(

@@ -14,14 +14,14 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from decant.plugins import BalanceDevice, BalanceDeviceSection, LaboratoryError, Load, Quantity, Weight
+from decant.plugins import BalanceSettings, BalanceSettings, LaboratoryError, Load, Quantity, Weight
 
 PATIENCE = 20.0
 """How long it may take to come to rest [s of bench time]."""
 
 
 @dataclass(frozen=True)
-class SpringSpec(BalanceDevice):
+class SpringSpec(BalanceSettings):
     """Settings as values.
 
     Attributes:
@@ -38,11 +38,11 @@ class SpringSpec(BalanceDevice):
     told: ClassVar[bool] = True
 
     def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `BalanceDevice.driver`."""
+        """See `BalanceSettings.driver`."""
         return SpringBalance, (self, name)
 
 
-class SpringSection(BalanceDeviceSection):
+class SpringSection(BalanceSettings):
     """A balance with a spring."""
 
     kind: Literal["spring"] = "spring"
@@ -55,7 +55,7 @@ class SpringSection(BalanceDeviceSection):
     """How long it swings after a change."""
 
     def device(self) -> SpringSpec:
-        """See `BalanceDeviceSection.device`."""
+        """See `BalanceSettings.device`."""
         return SpringSpec(self.step, self.swing)
 
 
