@@ -14,7 +14,6 @@ from pydantic import create_model
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.campaign_file import CampaignFile
 from orchestrator.config.campaign_resolution import resolve_campaign
-from orchestrator.config.parameter_ranges import parameter_quantity
 from orchestrator.config.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.config.yaml.file_access import resolved
 from orchestrator.config.yaml.references import References
@@ -124,9 +123,8 @@ class _ThetaBase(Settings):
 
 def _theta_model() -> type[_ThetaBase]:
     fields: Any = {}
-    for name in SimulationParameters.info():
-        q = parameter_quantity(name)
-        loose = _LooseQuantity(q.unit, q.example, q.lower, q.upper, whole=q.whole)
+    for name, info in SimulationParameters.info().items():
+        loose = _LooseQuantity(info.unit, info.example, info.lower, info.upper, whole=info.integer)
         fields[name] = (Annotated[float, loose] | None, None)
     model: type[_ThetaBase] = create_model("Theta", __base__=_ThetaBase, __cls_kwargs__=MADE, **fields)
     return model

@@ -14,7 +14,7 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.arm.simulated_arm import SimulatedArmSettings, SimulatedArm
+from actors.arm.simulated_arm import SimulatedArm, SimulatedArmSettings
 from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
 from actors.runtime.cluster_nodes import versions
 from actors.runtime.remote_object import RayDevice
@@ -22,7 +22,7 @@ from actors.simulators import process_worker as processes
 from actors.simulators.local_worker import InProcessSimulatorPool
 from actors.simulators.pool import RaySimulatorPool
 from actors.simulators.process_worker import ProcessSimulatorPool
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 
 async def until(what, timeout=PATIENCE):

@@ -15,11 +15,11 @@ import pytest
 from actors.bench.ground_truth import draw_pose_error, spill_of
 from actors.interfaces import InvalidActionError, NotPouredError, PourFailedError, UnknownPourError
 from actors.laboratory import open_laboratory
-from actors.laboratory_settings import LaboratorySettings, BenchSettings
+from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from sim_engine.action import DEG
 from sim_engine.outcome import PourOutcome
 from sim_engine.scene import PoseError
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ import pytest
 
 from actors.balance.balance_interface import BalanceError, NoConnectionError, Weight
 from actors.balance.balance_settings import SettlingRule
-from actors.balance.serial_balance import SerialBalance
 from actors.balance.scale_model import Load
+from actors.balance.serial_balance import SerialBalance
 from actors.balance.simulated_balance import BalanceSettings, VirtualBalance
 from actors.contract_tests import balance_contract as contract
 from actors.contract_tests.balance_contract import BalanceBench, BalanceContract

@@ -14,13 +14,13 @@ import pytest
 import serial
 
 from actors.balance.readings import ReadingStatus
-from actors.balance.serial_balance import SerialBalance
 from actors.balance.scale_model import EmulatedScale, Load, ScaleSettings
+from actors.balance.serial_balance import SerialBalance
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.serial_balance.emulated_balance import Emulation
 from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import child_environment
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 from .conftest import spec_for
 

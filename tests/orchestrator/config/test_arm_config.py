@@ -7,15 +7,15 @@ from pathlib import Path
 from textwrap import dedent
 
 import pytest
+from orchestrator.config.arm_file import RobotCell, UrArmSection, resolve_arm
 
 from actors.arm.arm_geometry import Plane, Pose
 from actors.arm.arm_settings import UrArmSettings
-from orchestrator.config.arm_file import RobotCell, UrArmSection, resolve_arm
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from sim_engine.settings.model import Settings
-from tests.orchestrator.good_files import written_out
+from tests.support.campaign_files import written_out
 
 
 class Laboratory(Settings):

@@ -6,15 +6,15 @@ from pathlib import Path
 from textwrap import dedent
 
 import pytest
+from orchestrator.config.balance_file import SerialSection, SettlingSection, VirtualScaleSection, resolve_balance
 
 from actors.balance.balance_settings import BalanceSettings, SerialBalanceSettings, SettlingRule
 from actors.balance.scale_model import ScaleSettings
 from actors.balance.weighing_plan import Placement
-from orchestrator.config.balance_file import SerialSection, SettlingSection, VirtualScaleSection, resolve_balance
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
-from tests.orchestrator.good_files import written_out
+from tests.support.campaign_files import written_out
 
 
 def load(text: str, mode: str = "hardware") -> BalanceSettings:

@@ -29,8 +29,8 @@ from orchestrator.study.study_file import load_study
 from orchestrator.study.study_plan import cells_of
 from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
-from tests.depth import examples
-from tests.orchestrator import plans
+from tests.support import plans
+from tests.support.hypothesis_examples import examples
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 SHIPPED = sorted((CONFIGS / "campaigns").glob("*.yaml"))

@@ -89,7 +89,7 @@ def test_rules_between_keys_only_see_keys_that_are_valid_themselves() -> None:
 
 def test_renamed_keys_and_values_name_their_successors() -> None:
     assert sorted(read("name: one\npace: 30 deg/s\ndrive: clockwork\nhorse: bay\n")[1]) == [
-        "2:1: pace: is called 'speed' now; rename it",
+        "2:1: pace: is called 'speed' now; rename it, or use 'decant migrate'",
         "3:8: drive: 'clockwork' is called 'spring' now; write that",
         "4:1: horse: was retired; remove it: carts go by themselves",
     ]

@@ -14,11 +14,10 @@ from actors.balance.weighing_plan import Placement
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.campaign_checks import check_campaign
 from orchestrator.config.file_loading import load_campaign, load_laboratory
-from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from tests.orchestrator.good_files import written_out
+from tests.support.campaign_files import written_out
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 VIRTUAL = (CONFIGS / "laboratories" / "virtual.yaml").read_text(encoding="utf-8")

@@ -26,10 +26,8 @@ from decant.plugins import (
     ArmPose,
     ArmRefusedError,
     ArmSettings,
-    ArmSettings,
     ArmState,
     ArmStoppedError,
-    RobotCell,
     ExecutedMotion,
     InvalidActionError,
     MotionPath,
@@ -37,6 +35,7 @@ from decant.plugins import (
     Pose,
     Quantity,
     Report,
+    RobotCell,
     Scene,
     plan_pour,
 )

@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from decant.plugins import BalanceSettings, BalanceSettings, LaboratoryError, Load, Quantity, Weight
+from decant.plugins import BalanceSettings, LaboratoryError, Load, Quantity, Weight
 
 PATIENCE = 20.0
 """How long it may take to come to rest [s of bench time]."""
