@@ -52,7 +52,7 @@ def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool 
     """
     if spec.arm is not None and need_bench and (missing := spec.arm.missing()) is not None:
         raise LaboratoryError(
-            f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a bench of numbers "
+            f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a simulated bench "
             "(--laboratory configs/laboratories/twin.yaml)"
         )
     if need_bench:

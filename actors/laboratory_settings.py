@@ -89,7 +89,10 @@ class HiddenLiquidBase(Settings):
 def _hidden_liquid() -> type[HiddenLiquidBase]:
     """The settings with one key per parameter of the solver; the nuisances of a bench are its `pose_error`."""
     fields: Any = {
-        name: (Annotated[float, info.quantity], Field(default=info.default, description=info.meaning or None))
+        name: (
+            Annotated[float, info.quantity, AfterValidator(round)] if info.integer else Annotated[float, info.quantity],
+            Field(default=info.default, description=info.meaning or None),
+        )
         for name, info in SimulationParameters.info().items()
         if not info.nuisance
     }

@@ -14,13 +14,12 @@ import contextlib
 import statistics
 import threading
 import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from machine import describe, say, show
 
-from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
+from actors.arm.arm_geometry import ArmLimits, Box, Centre, JointAngles, Point, Pose, RobotCell
 from actors.arm.arm_interface import ArmStoppedError
 from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import PourPath
@@ -44,13 +43,18 @@ RECEIVER = build_vessel(cylinder("receiver", inner_radius=0.045, inner_height=0.
 
 SPEC = UrArmSettings(
     model="ur10e",
-    limits=ArmLimits((0.2, -0.7, 0.0), (1.1, 0.5, 1.0), joint_speed=170 * DEG, tilt_speed=155 * DEG, clearance=3e-3),
-    cell=RobotCell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
-    home=(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
+    limits=ArmLimits(
+        box=Box(low=Point.of(0.2, -0.7, 0.0), high=Point.of(1.1, 0.5, 1.0)),
+        joint_speed=170 * DEG,
+        tilt_speed=155 * DEG,
+        clearance=3e-3,
+    ),
+    cell=RobotCell(receiver=Point.of(0.75, 0.0, 0.06), direction=90 * DEG),
+    home=JointAngles.of(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
     tool=Pose(z=0.17),
     grip=Pose(y=-0.06, rx=-90 * DEG),
     payload=0.9,
-    payload_centre=(0.0, 0.0, 0.08),
+    payload_centre=Centre.of(0.0, 0.0, 0.08),
     upright_speed=60 * DEG,
     warning_time=0.0,
 )
@@ -143,8 +147,8 @@ def stops(arm: UrArm, controller: VirtualController, spec: UrArmSettings, speed:
 
 def measure(model: str, speeds: list[float], stop_speeds: list[float], count: int) -> dict[str, Any]:
     """Everything about one model."""
-    with VirtualController.start(ADDRESS, model, 1.0, CYCLES[model], joints=SPEC.home) as controller:
-        spec = replace(SPEC, model=model, address=ADDRESS)  # type: ignore[arg-type]
+    with VirtualController.start(ADDRESS, model, 1.0, CYCLES[model], joints=SPEC.home.angles) as controller:
+        spec = SPEC.with_values(model=model, address=ADDRESS)  # type: ignore[arg-type]
         arm = UrArm(spec)
         try:
             arm.connect()

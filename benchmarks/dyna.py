@@ -160,7 +160,7 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
             name="dyna",
             seed=seed,
             source=Path(folder) / "dyna.yaml",
-            laboratory=LaboratorySettings("numbers"),
+            laboratory=LaboratorySettings(name="numbers"),
             parameters=SimulationParameters(particles=500),
             calibration=None,
             deployment=arm,

@@ -21,10 +21,9 @@ Frames:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
-from pydantic import field_validator, model_validator
+from pydantic import field_validator
 
 from sim_engine.settings.model import Example, Number, Problems, Settings
 from sim_engine.settings.quantity import Quantity
@@ -45,12 +44,12 @@ Speed = Annotated[float, Quantity("rad/s", "40 deg/s", 0.0, math.radians(360.0),
 
 
 class Named(Settings):
-    """Numbers with names. A program may also give them as a tuple, in the order of the keys."""
+    """Numbers with names."""
 
-    @model_validator(mode="before")
     @classmethod
-    def _from_tuple(cls, value: Any) -> Any:
-        return dict(zip(cls.model_fields, value, strict=True)) if isinstance(value, tuple) else value
+    def of(cls, *values: float) -> Self:
+        """From all numbers in the order of the keys, without the bounds that settings have."""
+        return cls.model_construct(None, **dict(zip(cls.model_fields, values, strict=True)))
 
 
 class Point(Named):
@@ -89,7 +88,7 @@ class Centre(Named):
         return (self.x, self.y, self.z)
 
 
-class Pose(Settings):
+class Pose(Named):
     """Pose of a frame in another, as on the teach pendant: position and rotation vector."""
 
     x: Length = 0.0
@@ -109,11 +108,6 @@ class Pose(Settings):
 
     rz: Turn = 0.0
     """The z of the rotation vector."""
-
-    @classmethod
-    def measured(cls, values: Sequence[float]) -> Self:
-        """A pose as a controller reports it, x y z [m] rx ry rz [rad], without the bounds of settings."""
-        return cls().with_values(**dict(zip(cls.model_fields, values, strict=True)))
 
     @property
     def as_list(self) -> list[float]:

@@ -133,7 +133,7 @@ class SimulatedArm:
 
     def where(self) -> ArmPose:
         """See `Arm.where`."""
-        return ArmPose(Pose.measured(self._place))
+        return ArmPose(Pose.of(*self._place))
 
     def recover(self) -> str:
         """See `Arm.recover`."""

@@ -139,7 +139,7 @@ class VirtualBalance:
 
     def connect(self) -> str:
         """See `BalanceDriver.connect`."""
-        return f"{self._name}: a balance of numbers, step {1e3 * self._settings.resolution:g} g"
+        return f"{self._name}: a simulated balance, step {1e3 * self._settings.resolution:g} g"
 
     def keep_reference(self) -> None:
         """Do nothing: the connection cannot be lost."""

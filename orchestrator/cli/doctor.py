@@ -92,7 +92,7 @@ def without_arm(path: Path, spec: LaboratorySettings, asked: str) -> RefusalErro
     Args:
         asked: the command's purpose, as part of the message.
     """
-    has = "its bench is made of numbers" if spec.bench is not None else "it has no bench"
+    has = "its bench is simulated" if spec.bench is not None else "it has no bench"
     return RefusalError(
         f"{path}: laboratory {spec.name} has no 'arm', {has}: {asked}. Name a laboratory that has one, for example "
         "laboratories/virtual.yaml",

@@ -42,7 +42,7 @@ class Chosen:
 
     Attributes:
         plan: the campaign that it is taken from.
-        path: of the arm; None on a bench of numbers.
+        path: of the arm; None on a simulated bench.
     """
 
     plan: CampaignPlan
@@ -91,7 +91,7 @@ def pour(
     bench = chosen.plan.laboratory
     if chosen.path is None and (dry_run or empty or png is not None):
         raise RefusalError(
-            f"laboratory {bench.name} has no arm whose path could be planned; its bench is made of numbers",
+            f"laboratory {bench.name} has no arm whose path could be planned; its bench is simulated",
             BAD_INPUT,
         )
     if png is not None:

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 
 from pydantic import Tag
 
-from actors.laboratory_settings import HiddenLiquid
 from orchestrator.config.campaign_file import CalibrationSection, LearningSection
 from orchestrator.config.search_ranges import Parameters
 from orchestrator.config.yaml.file_access import resolved

@@ -153,7 +153,7 @@ def found_at(spec: LaboratorySettings) -> dict[str, str]:
         Findings by device; a device that can't be read has an entry with the reason.
     """
     if spec.arm is None:
-        return {"bench": "made of numbers: it has no arm and no balance that could be read"}
+        return {"bench": "simulated: it has no arm and no balance that could be read"}
     found: dict[str, str] = {}
     try:
         with reached(spec) as ready:

@@ -30,7 +30,7 @@ def motion(path):
 
 
 def released(scale=0.0):
-    arm = SimulatedArm(SimulatedArmSettings(scale))
+    arm = SimulatedArm(SimulatedArmSettings(time_scale=scale))
     arm.release()
     return arm
 
@@ -89,7 +89,7 @@ def make_arm(request):
 @pytest.mark.realtime
 def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, path, motion):
     async def play():
-        arm = make_arm(SimulatedArmSettings(0.2))
+        arm = make_arm(SimulatedArmSettings(time_scale=0.2))
         await arm.release()
         pouring = asyncio.create_task(arm.execute(path, lambda state: None))
         while not (await arm.state()).moving or (await arm.state()).time < 0.1:
@@ -121,7 +121,7 @@ def test_progress_follows_the_tilt_through_the_phases(make_arm, path, motion):
     seen = []
 
     async def play():
-        arm = make_arm(SimulatedArmSettings(2.0))
+        arm = make_arm(SimulatedArmSettings(time_scale=2.0))
         await arm.release()
         await arm.execute(path, seen.append)
         await arm.device.close()
@@ -147,9 +147,9 @@ class UnreachableSpec(SimulatedArmSettings):
 
 @pytest.mark.realtime
 def test_any_arm_can_be_looked_at_and_one_that_does_not_answer_says_so():
-    (there,) = SimulatedArmSettings().look().checks(None, accept="", virtual=True)
-    assert (there.state, there.found) == ("ok", "numbers")
-    (lost,) = UnreachableSpec().look().checks(None, accept="", virtual=True)
+    (there,) = SimulatedArmSettings().diagnostics().checks(None, accept="", virtual=True)
+    assert (there.state, there.found) == ("ok", "simulated")
+    (lost,) = UnreachableSpec().diagnostics().checks(None, accept="", virtual=True)
     assert (lost.state, lost.found) == ("fail", "nobody answers at 192.168.0.10")
 
 
@@ -167,6 +167,6 @@ def test_safety_settings_that_nobody_has_accepted_fail_on_hardware():
 class TestArmOfNumbers(ArmContract):
     @pytest.fixture
     def bench(self, path):
-        arm = SimulatedArm(SimulatedArmSettings(2.0))
+        arm = SimulatedArm(SimulatedArmSettings(time_scale=2.0))
         yield ArmBench(arm, path, 2.0, jog=("z", 0.005, 0.02), disturb=lambda: arm.grip(Grip(speed_factor=0.7)))
         arm.close()

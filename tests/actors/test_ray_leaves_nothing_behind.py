@@ -44,7 +44,7 @@ async def main(how, patience):
     caught = asyncio.Event()
     if how == "own handler":
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, caught.set)
-    await asyncio.to_thread(start_ray, LaboratorySettings("test", simulators=1))
+    await asyncio.to_thread(start_ray, LaboratorySettings(name="test", simulators=1))
     keep_signals()
     import ray
     actor = ray.remote(Spinner).remote()
@@ -175,7 +175,7 @@ def test_a_ray_of_somebody_else_in_this_process_is_neither_taken_over_nor_ended(
 
     monkeypatch.setattr(ray_runtime, "_cluster", None)
     with pytest.raises(LaboratoryError, match="Ray of its own"):
-        ray_runtime.start_ray(LaboratorySettings("late"))
+        ray_runtime.start_ray(LaboratorySettings(name="late"))
     assert ray.is_initialized()
 
 

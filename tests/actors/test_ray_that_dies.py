@@ -52,7 +52,8 @@ async def questions(simulators, optimizer):
 
 async def of_its_own():
     heard = []
-    async with open_laboratory(LaboratorySettings("desk", simulators=1), need_bench=False, make=Formula) as laboratory:
+    desk = LaboratorySettings(name="desk", simulators=1)
+    async with open_laboratory(desk, need_bench=False, make=Formula) as laboratory:
         laboratory.listen(heard.append)
         await questions(laboratory.simulators, laboratory.optimizer)
     print(json.dumps(" ".join(notice.text for notice in heard)))

@@ -200,7 +200,7 @@ def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, task):
 @pytest.mark.ray
 def test_simulators_step_back_behind_an_arm_s_driver_which_does_not(ray_running, fake, task):
     async def play():
-        arm = RayDevice("arm", SimulatedArm, SimulatedArmSettings(0.0))
+        arm = RayDevice("arm", SimulatedArm, SimulatedArmSettings(time_scale=0.0))
         pool = RaySimulatorPool(2, make=fake())
         try:
             await pool.simulate(task())

@@ -28,7 +28,7 @@ def open_bench(fake, bench_spec):
 
     def open_it(*, ray: bool = False, make=None, simulators: int = 1, **changes):
         spec = LaboratorySettings(
-            "virtual", simulators=simulators, bench=replace(bench_spec, **changes), in_process=not ray
+            "virtual", simulators=simulators, bench=bench_spec.with_values(**changes), in_process=not ray
         )
         return open_laboratory(spec, need_bench=True, make=make or fake())
 

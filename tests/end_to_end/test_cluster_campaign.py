@@ -190,7 +190,7 @@ from actors.runtime.cluster_check import check_cluster
 from actors.interfaces import LaboratoryError
 from actors.laboratory_settings import RaySettings
 try:
-    check_cluster(RaySettings(sys.argv[1]), need_bench=False)
+    check_cluster(RaySettings(address=sys.argv[1]), need_bench=False)
 except LaboratoryError as error:
     print(error)
 """
@@ -235,7 +235,8 @@ scene = Scene("mug", cylinder("beaker", inner_radius=0.035, inner_height=0.1), m
 action = Action(angular_velocity=90 * DEG, x_offset=0.13, height=0.05, max_angle=110 * DEG, hold_time=0.2)
 
 async def main():
-    async with open_laboratory(LaboratorySettings("far", ray=RaySettings(address)), need_bench=False) as laboratory:
+    far = LaboratorySettings(name="far", ray=RaySettings(address=address))
+    async with open_laboratory(far, need_bench=False) as laboratory:
         theta = SimulationParameters(particles=300)
         tasks = [PourTask(scene, action, theta, seed) for seed in range(4)]
         for result in await asyncio.gather(*map(laboratory.simulators.simulate, tasks)):

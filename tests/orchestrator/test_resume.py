@@ -212,7 +212,7 @@ def test_other_settings_can_not_continue_a_run_but_the_machine_may_be_another(tm
     plan = toy_plan(directory, on_unknown="repeat")
     with pytest.raises(JournalError, match="seed: 7 became 8"):
         run(directory, resume=True, plan=replace(plan, seed=8))
-    larger = replace(plan, laboratory=LaboratorySettings("toy", simulators=64), source=tmp_path / "moved.yaml")
+    larger = replace(plan, laboratory=LaboratorySettings(name="toy", simulators=64), source=tmp_path / "moved.yaml")
     assert run(directory, resume=True, plan=larger).state == "finished"
 
 

@@ -77,7 +77,7 @@ def test_a_pour_repeated_on_the_virtual_bench_is_the_same_pour(unknown: Callable
 
 def test_matter_is_not_repeated_on_a_real_bench(tmp_path: Path) -> None:
     """Neither by the plan nor by the operator."""
-    hardware = {"laboratory": LaboratorySettings("toy", mode="hardware")}
+    hardware = {"laboratory": LaboratorySettings(name="toy", mode="hardware")}
 
     def laboratory() -> ToyLaboratory:
         return ToyLaboratory(bench=toy_campaign.ToyBench(lambda: 60.0, mode="hardware"))

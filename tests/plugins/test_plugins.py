@@ -230,7 +230,7 @@ from decant.plugins import SerialBalance, SerialBalanceSettings
 from decant.plugins.testing import VirtualSerialBalance
 
 far = VirtualSerialBalance.start("plain", baud=0, time_scale=20.0)
-balance = SerialBalance(SerialBalanceSettings(far.port, time_scale=20.0))
+balance = SerialBalance(SerialBalanceSettings(port=far.port, time_scale=20.0))
 print(balance.connect())
 balance.tare()
 far.put(0.2)
@@ -299,8 +299,8 @@ def test_a_class_that_leaves_out_what_its_kind_has_to_say_is_refused_with_its_pa
     broken = {one["name"]: one for one in json.loads(command(tmp_path)("plugins", "--json").stdout)["broken"]}
     assert {one["package"] for one in broken.values()} == {"unfinished 0.1"}
     assert {name: one["reason"].partition(" lacks ")[2] for name, one in broken.items()} == {
-        "arm": "'resolve'",
-        "balance": "'device'",
+        "arm": "'driver', 'plan'",
+        "balance": "'driver'",
         "design": "'build', 'thetas', 'with_thetas'",
         "wish": "'cost'",
         "bowl": "'outline' or 'build'",

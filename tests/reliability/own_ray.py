@@ -37,7 +37,7 @@ class RayRig(Rig):
     @contextlib.asynccontextmanager
     async def laboratory(self, life: Life) -> AsyncIterator[Any]:
         os.environ[WORK] = "0.02"
-        async with RayLaboratory(LaboratorySettings("matrix", simulators=1), Formula) as opened:
+        async with RayLaboratory(LaboratorySettings(name="matrix", simulators=1), Formula) as opened:
             pool: Any = opened.simulators
             await pool.pids()
             yield ToyLaboratory(pool, LoggingBench(life), opened.optimizer)  # type: ignore[arg-type]

@@ -36,7 +36,7 @@ class PooledRig(Rig):
         from actors.runtime.ray_runtime import start_ray
 
         os.environ[WORK] = "0.02"
-        start_ray(LaboratorySettings("matrix", simulators=SIMULATORS))
+        start_ray(LaboratorySettings(name="matrix", simulators=SIMULATORS))
         self._loop = asyncio.new_event_loop()
         self._pool: Any = None
         self._device: Any = None

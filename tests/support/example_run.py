@@ -88,7 +88,7 @@ def campaign(*, pours: int = 3) -> CampaignPlan:
         "narrow-cup",
         7,
         Path("narrow-cup.yaml"),
-        LaboratorySettings("virtual", simulators=2),
+        LaboratorySettings(name="virtual", simulators=2),
         SimulationParameters(),
         calibration,
         deployment,

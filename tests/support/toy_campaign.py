@@ -65,7 +65,7 @@ def toy_plan(directory: Path, **changes: Any) -> CampaignPlan:
         "name": "toy",
         "seed": 7,
         "source": directory / "toy.yaml",
-        "laboratory": LaboratorySettings("toy"),
+        "laboratory": LaboratorySettings(name="toy"),
         "parameters": THETA,
         "calibration": None,
         "deployment": deployment,

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -174,28 +174,22 @@ def wired_spec(
     spec = load_laboratory(LABORATORIES / "virtual.yaml")
     assert spec.arm is not None
     assert spec.balance is not None
-    device = spec.balance.device
+    device = spec.balance
     assert isinstance(device, SerialBalanceSettings)
     assert device.virtual is not None
     assert spec.bench is not None
-    rule = replace(device.settling, deadline=10.0)
-    arm = replace(spec.arm, time_scale=pace)
+    rule = device.settling.with_values(deadline=10.0)
+    arm = spec.arm.with_values(time_scale=pace)
     if hurried:
-        rule = replace(rule, readings=2, span=0.2)
-        arm = replace(arm, warning_time=1.0, upright_speed=60 * DEG, approach_speed=90 * DEG)
-    virtual = replace(device.virtual, noise=0.0, drift=0.0, settling_time=0.5)
-    device = replace(device, time_scale=pace, answer_time=0.3, reconnect_time=1.0, settling=rule, virtual=virtual)
-    manual = placement is Placement.MANUAL
-    return replace(
-        spec,
+        rule = rule.with_values(readings=2, span=0.2)
+        arm = arm.with_values(warning_time=1.0, upright_speed=60 * DEG, approach_speed=90 * DEG)
+    virtual = device.virtual.with_values(noise=0.0, drift=0.0, settling_time=0.5)
+    quick = {"time_scale": pace, "answer_time": 0.3, "reconnect_time": 1.0}
+    return spec.with_values(
         in_process=True,
         arm=arm,
-        balance=replace(
-            spec.balance,
-            placement=placement,
-            device=None if manual else device,
-        ),
-        bench=replace(spec.bench, time_scale=pace),
+        balance=device.with_values(placement=placement.value, settling=rule, virtual=virtual, **quick),
+        bench=spec.bench.with_values(time_scale=pace),
         operator=operator or OperatorSettings(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
     )
 

@@ -33,7 +33,7 @@ HOME_TOLERANCE = math.radians(1.0)
 
 def tool_check(spec: UrArmSettings, state: RobotState) -> DeviceCheck:
     """Compare the controller's TCP with the file's."""
-    there = Pose.measured(state.tool)
+    there = Pose.of(*state.tool)
     away, turned = distance(spec.tool, there), turn(spec.tool, there)
     if away <= TOOL_TOLERANCE and turned <= TURN_TOLERANCE:
         return DeviceCheck("tool", "ok", f"TCP {_point(there)}")

@@ -114,7 +114,7 @@ class UrArm:
         tool = cell_transforms(self._spec).tool
         x, y, z = map(float, position[0] + rotation[0] @ tool.position)
         rx, ry, rz = map(float, Rotation.from_matrix(rotation[0] @ tool.rotation).as_rotvec())
-        return ArmPose(Pose.measured((x, y, z, rx, ry, rz)), joints, self._spec.home.angles)
+        return ArmPose(Pose.of(x, y, z, rx, ry, rz), joints, self._spec.home.angles)
 
     def release(self) -> None:
         """See `Arm.release`."""

@@ -83,7 +83,7 @@ def facts_of(worker_facts: Facts) -> UrFacts:
         safety_mode=SAFETY_MODES.get(r.safety_mode, str(r.safety_mode)),
         remote=worker_facts.remote,
         checksum=worker_facts.checksum,
-        tool=Pose.measured(worker_facts.tool),
+        tool=Pose.of(*worker_facts.tool),
         payload=r.payload,
         payload_centre=(x, y, z),
         joints=(a, b, c, d, e, f),

@@ -163,7 +163,7 @@ def test_a_step_of_the_tool_is_straight_and_keeps_its_orientation() -> None:
 
 def test_a_step_into_the_table_is_refused_and_one_out_of_it_is_not() -> None:
     spec = settings()
-    high = replace(spec, cell=replace(spec.cell, table=2.0))  # the arm is below it already
+    high = spec.with_values(cell=spec.cell.with_values(table=2.0))  # the arm is below it already
     jog_path(high, HOME, "z", 0.02, 0.05)  # type: ignore[arg-type]
     with pytest.raises(ArmRefusedError, match="below the table"):
         jog_path(high, HOME, "z", -0.02, 0.05)  # type: ignore[arg-type]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import pytest
@@ -28,7 +28,7 @@ SOON = {"settling": SettlingRule(deadline=4.0)}
 def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSettings:
     """Settings that leave nothing to be found out."""
     spec = SerialBalanceSettings(
-        virtual.port,
+        port=virtual.port,
         dialect=dialect,
         baud=9600,
         format="8N1",
@@ -37,7 +37,7 @@ def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSetting
         reconnect_time=2.0,
         time_scale=PACE,
     )
-    return replace(spec, **changes)
+    return spec.with_values(**changes)
 
 
 @pytest.fixture(scope="module")

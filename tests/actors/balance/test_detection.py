@@ -29,7 +29,7 @@ def unknown(virtual: Callable[[str], VirtualSerialBalance]) -> Iterator[Callable
 
     def of(far: VirtualSerialBalance | str, **settings) -> tuple[VirtualSerialBalance, SerialBalance]:
         far = virtual(far) if isinstance(far, str) else far
-        spec = SerialBalanceSettings(far.port, time_scale=PACE, settling=SettlingRule(deadline=10.0), **settings)
+        spec = SerialBalanceSettings(port=far.port, time_scale=PACE, settling=SettlingRule(deadline=10.0), **settings)
         opened.append(SerialBalance(spec, "kern-1"))
         return far, opened[-1]
 
@@ -157,12 +157,12 @@ def test_a_setting_that_the_port_refuses_is_left_out_and_named(unknown, monkeypa
 
 
 def test_settings_narrow_the_search():
-    every = SerialBalanceSettings("p").candidates()
+    every = SerialBalanceSettings(port="p").candidates()
     assert every[0] == LineSettings(9600)
     assert LineSettings(1200, 7, "O") in every
-    assert SerialBalanceSettings("p", dialect="kcp", baud=4800, format="8N1").candidates() == (LineSettings(4800),)
-    assert {c.baud for c in SerialBalanceSettings("p", baud=2400).candidates()} == {2400}
-    assert {c.format for c in SerialBalanceSettings("p", format="7E1").candidates()} == {"7E1"}
+    assert SerialBalanceSettings(port="p", dialect="kcp", baud=4800, format="8N1").candidates() == (LineSettings(4800),)
+    assert {c.baud for c in SerialBalanceSettings(port="p", baud=2400).candidates()} == {2400}
+    assert {c.format for c in SerialBalanceSettings(port="p", format="7E1").candidates()} == {"7E1"}
 
 
 @pytest.mark.parametrize("text", ["9N1", "8X1", "8N", "8N3", ""])

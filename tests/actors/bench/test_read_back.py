@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ PACE = 10.0
 
 
 def without_a_robot():
-    return replace(wired_spec(pace=PACE, hurried=True), arm=SimulatedArmSettings(PACE, warning_time=1.0))
+    return wired_spec(pace=PACE, hurried=True).with_values(arm=SimulatedArmSettings(time_scale=PACE, warning_time=1.0))
 
 
 @pytest.mark.realtime

@@ -119,7 +119,7 @@ def test_virtual_laboratory_is_started_looked_at_and_called_virtual() -> None:
 def test_a_bench_of_numbers_and_a_bad_file_are_refused_with_exit_code_2(tmp_path: Path) -> None:
     numbers = doctor(Path("configs/laboratories/twin.yaml"))
     assert numbers.exit_code == 2
-    assert "laboratory twin has no 'arm', its bench is made of numbers: looked at are an arm" in " ".join(
+    assert "laboratory twin has no 'arm', its bench is simulated: looked at are an arm" in " ".join(
         numbers.stderr.split()
     )
     assert doctor(tmp_path / "nowhere.yaml").exit_code == 2

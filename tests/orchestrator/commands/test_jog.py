@@ -52,8 +52,8 @@ class Session:
     def __init__(self, *typed: str) -> None:
         spec = load_laboratory(LABORATORY).arm
         assert isinstance(spec, UrArmSettings)
-        self.home = spec.home
-        self.arm, self.screen, self._typed = Arm(spec.home), "", list(typed)
+        self.home = spec.home.angles
+        self.arm, self.screen, self._typed = Arm(spec.home.angles), "", list(typed)
         self.jogging = Jogging(self.arm, self._read, self._tell)  # type: ignore[arg-type]
 
     def _read(self, prompt: str) -> str:

@@ -28,7 +28,7 @@ def refusal(folder: Path, arm: str) -> str:
 
 
 def test_ours_come_in_by_the_door(tmp_path):
-    assert {"numbers", "ur"} <= set(ARMS.names)
+    assert {"simulated", "ur"} <= set(ARMS.names)
     assert ARMS.package("ur").startswith("decant ")
     arm = load_laboratory(written(tmp_path, "arm: {kind: simulated}\n")).arm
     assert arm == SimulatedArmSettings(time_scale=30.0)
@@ -42,10 +42,12 @@ def test_an_arm_without_a_kind_is_a_ur_robot(tmp_path):
 
 
 def test_what_is_wrong_with_a_kind_is_told_with_its_place(tmp_path):
-    assert "7:13: arm.kind: 'simulatd' is not known here; did you mean 'numbers'?" in refusal(
+    assert "7:13: arm.kind: 'simulatd' is not known here; did you mean 'simulated'?" in refusal(
         tmp_path, "arm: {kind: simulatd}\n"
     )
-    assert "7:22: arm.model: belongs to ur, not to numbers" in refusal(tmp_path, "arm: {kind: simulated, model: ur10}\n")
-    assert "an arm of numbers stands nowhere" in refusal(
+    assert "7:24: arm.model: belongs to ur, not to simulated" in refusal(
+        tmp_path, "arm: {kind: simulated, model: ur10}\n"
+    )
+    assert "a simulated arm stands nowhere" in refusal(
         tmp_path, "arm: {kind: simulated}\ncell: {receiver: {x: 700 mm, y: 0 mm, z: 0 mm}, direction: 0 deg}\n"
     )
