@@ -22,7 +22,7 @@ from actors import laboratory_settings as laboratory
 from actors.arm.arm_geometry import ArmLimits, RobotCell
 from actors.arm.arm_settings import ARMS, UrArmSettings
 from actors.interfaces import OperatorSettings
-from orchestrator.catalogue.catalogue_index import TABLES as CATALOGUE
+from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.cli.solver_report import kept_records
 from orchestrator.config import campaign_file as campaign
 from orchestrator.config import vessel_file as vessel
@@ -86,9 +86,9 @@ SECTIONS: dict[str, type[Settings]] = {
     "balance": laboratory.BenchBalance,
     "pose-error": PoseErrorSettings,
     "study": study.StudyFile,
-    "level": study.LevelSection,
-    "compared-calibrations": study.CalibrationsSection,
-    "compared-deployments": study.DeploymentsSection,
+    "level": study.LevelSettings,
+    "compared-calibrations": study.CalibrationsSettings,
+    "compared-deployments": study.DeploymentsSettings,
     "daemon": daemon.DaemonFile,
     "listen": daemon.ListenSection,
     "tls": daemon.TlsSection,
@@ -101,8 +101,6 @@ OF_SECTIONS = {
     **{model.__name__: f"[{name}](#{name})" for name, model in SECTIONS.items()},
     "BenchBalance": "[balance](#bench)",
     **dict.fromkeys((arm.__name__ for arm in ARMS.all.values()), "[arm](#arm-and-cell)"),
-    "ArmSettings": "[arm](#arm-and-cell)",
-    "BalanceSettings": "[balance](balances.md#settings)",
     "RobotCell": "[cell](#arm-and-cell)",
     "ArmLimits": "[limits](#arm-and-cell)",
     "Box": "`{low: {x, y, z}, high: {x, y, z}}`, lengths",
@@ -136,12 +134,12 @@ OF_SECTIONS = {
     "VesselFile": "[vessel](#vessels) or the path of its file",
     "LaboratorySettings": "[laboratory](#laboratories) or the path of its file",
     "LiquidSettings": "[liquid](#liquid) or the path of its file",
-    "LevelSection": "[level](#studies)",
+    "LevelSettings": "[level](#studies)",
     **{
         model.__name__: f"`{{{', '.join(model.written_keys())}}}`, [each](#studies) a mapping"
-        for model in (study.CalibrationsSection, study.DeploymentsSection)
+        for model in (study.CalibrationsSettings, study.DeploymentsSettings)
     },
-    **{f"{name}ArmSection": "[mapping](#studies)" for name in STRATEGIES.names},
+    **{f"{name}ArmSettings": "[mapping](#studies)" for name in STRATEGIES.names},
     **{model.__name__: "[calibration](#calibration)" for model in campaign.CALIBRATIONS.values()},
     **{model.__name__: "[deployment](#deployment)" for model in campaign.DEPLOYMENTS.values()},
 }
@@ -341,8 +339,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "calibration-strategies": partial(variants, campaign.CALIBRATIONS, campaign.CalibrationSection),
     "deployment-strategies": partial(variants, campaign.DEPLOYMENTS, campaign.DeploymentSection),
     "objectives": partial(variants, OBJECTIVES.all, Objective),
-    "compared-calibration": partial(variants, _arms(study.CalibrationsSection), Settings),
-    "compared-deployment": partial(variants, _arms(study.DeploymentsSection), Settings),
+    "compared-calibration": partial(variants, _arms(study.CalibrationsSettings), Settings),
+    "compared-deployment": partial(variants, _arms(study.DeploymentsSettings), Settings),
 }
 
 

@@ -103,7 +103,7 @@ class ArmSettings(Settings):
 
     emulator: ClassVar[str] = ""
     """'module:callable' that makes, from these settings, the emulator of the arm on a virtual bench. See
-    `actors.bench.device_emulators.ArmEmulator`; '' for a driver that only simulates."""
+    `actors.bench.virtual_bench.ArmEmulator`; '' for a driver that only simulates."""
 
     kind: str = ""
     """Kind of the arm."""

@@ -17,9 +17,8 @@ from actors.arm.simulated_arm import Grip
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.scale_model import Load
 from actors.balance.simulated_balance import SimulatedBalanceSettings
-from actors.bench.ground_truth import Spill, TouchingError, draw_pose_error, hidden_spill, stream
-from actors.bench.operator_questions import OperatorQuestions
-from actors.bench.virtual_bench import GroundTruth, PourAsk
+from actors.bench.bench_operators import OperatorQuestions
+from actors.bench.ground_truth import GroundTruth, PourAsk, Spill, TouchingError, draw_pose_error, hidden_spill, stream
 from actors.interfaces import LaboratoryError, OperatorQuestion, OperatorSettings, PourFailedError, SimulatorPool
 from actors.laboratory_settings import BenchSettings
 

@@ -35,10 +35,21 @@ if TYPE_CHECKING:
     from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingStatus, Reply
     from actors.balance.scale_model import Load
     from actors.balance.serial_balance import SerialBalance
-    from actors.bench.device_emulators import ArmEmulator, History
     from actors.bench.pour_feasibility import plan_pour
+    from actors.bench.virtual_bench import ArmEmulator, History
     from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
-    from actors.optimizer.questions import Data, Suggestion, SuggestProblem
+    from actors.optimizer.questions import (
+        CalibrationQuery,
+        Data,
+        MinimumQuery,
+        PourQuery,
+        RegressionQuery,
+        RiskQuery,
+        SimulationQuery,
+        SpaceFillingQuery,
+        Suggestion,
+        SuggestionQuery,
+    )
     from orchestrator.requests import (
         Answered,
         Ask,
@@ -66,10 +77,9 @@ if TYPE_CHECKING:
     )
     from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
     from orchestrator.strategies.deployment.objectives import Objective, Objectives
-    from orchestrator.strategies.optimizer_queries import OptimizerQueries
     from orchestrator.strategies.stage_result import ResultPart, StageResult
     from orchestrator.strategies.strategy import Progress, Strategy
-    from orchestrator.strategies.trials import SeedStream, Trial, Trials
+    from orchestrator.strategies.trials import OptimizerQueries, SeedStream, Trial, Trials
     from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
     from sim_engine.liquids import Liquid, SimulationParameters
     from sim_engine.outcome import Fractions, Loss, PourMeasurement, PourOutcome
@@ -122,6 +132,7 @@ __all__ = [
     "BalanceSettings",
     "Calibration",
     "CalibrationPlan",
+    "CalibrationQuery",
     "CalibrationSettings",
     "Choice",
     "Count",
@@ -149,6 +160,7 @@ __all__ = [
     "Load",
     "Loss",
     "MeasuredPour",
+    "MinimumQuery",
     "MotionPath",
     "Name",
     "Number",
@@ -164,6 +176,7 @@ __all__ = [
     "Pour",
     "PourMeasurement",
     "PourOutcome",
+    "PourQuery",
     "Poured",
     "Problems",
     "ProfileShape",
@@ -171,9 +184,11 @@ __all__ = [
     "Quantity",
     "Reading",
     "ReadingStatus",
+    "RegressionQuery",
     "Reply",
     "Request",
     "ResultPart",
+    "RiskQuery",
     "RobotCell",
     "Scene",
     "SearchSettings",
@@ -186,14 +201,16 @@ __all__ = [
     "Simulate",
     "Simulated",
     "SimulationParameters",
+    "SimulationQuery",
     "Slots",
     "Space",
+    "SpaceFillingQuery",
     "StageResult",
     "Strategy",
     "Suggest",
-    "SuggestProblem",
     "Suggested",
     "Suggestion",
+    "SuggestionQuery",
     "Switch",
     "Text",
     "Trial",
@@ -213,7 +230,6 @@ _SOURCES = {
     # Settings
     "sim_engine.settings.model": (
         "NOT_IN_FINGERPRINT",
-        "SET_BY_PROGRAM",
         "SET_BY_PROGRAM",
         "Choice",
         "Count",
@@ -235,7 +251,18 @@ _SOURCES = {
     "sim_engine.scene": ("PoseError", "Scene"),
     "sim_engine.search_space": ("Axis", "Space"),
     # Strategies
-    "actors.optimizer.questions": ("Data", "SuggestProblem", "Suggestion"),
+    "actors.optimizer.questions": (
+        "CalibrationQuery",
+        "Data",
+        "MinimumQuery",
+        "PourQuery",
+        "RegressionQuery",
+        "RiskQuery",
+        "SimulationQuery",
+        "SpaceFillingQuery",
+        "Suggestion",
+        "SuggestionQuery",
+    ),
     "orchestrator.requests": (
         "Answered",
         "Ask",
@@ -262,10 +289,9 @@ _SOURCES = {
         "MeasuredPour",
     ),
     "orchestrator.strategies.deployment.deployment_base": ("MAP_RESOLUTION", "Deployment", "SearchSettings"),
-    "orchestrator.strategies.optimizer_queries": ("OptimizerQueries",),
     "orchestrator.strategies.stage_result": ("ResultPart", "StageResult"),
     "orchestrator.strategies.strategy": ("Progress", "Strategy"),
-    "orchestrator.strategies.trials": ("SeedStream", "Trial", "Trials"),
+    "orchestrator.strategies.trials": ("OptimizerQueries", "SeedStream", "Trial", "Trials"),
     # Objectives
     "orchestrator.strategies.deployment.objectives": ("Objective", "Objectives"),
     # Balances
@@ -291,7 +317,7 @@ _SOURCES = {
     ),
     "actors.arm.arm_settings": ("ArmDiagnostics", "ArmSettings"),
     "actors.arm.planned_pour": ("ExecutedMotion", "MotionPath"),
-    "actors.bench.device_emulators": ("ArmEmulator", "History"),
+    "actors.bench.virtual_bench": ("ArmEmulator", "History"),
     "actors.bench.pour_feasibility": ("plan_pour",),
     # Sources of vessels
     "sim_engine.resources": ("load_arrays", "store_arrays"),

@@ -11,7 +11,7 @@ import time
 from typing import Any
 
 from actors.arm.arm_settings import UrArmSettings
-from actors.bench.device_emulators import History
+from actors.bench.virtual_bench import History
 from actors.emulators.ur_controller.controller_process import VirtualController, VirtualControllerError
 from actors.interfaces import LaboratoryError
 
