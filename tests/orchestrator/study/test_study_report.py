@@ -17,7 +17,7 @@ from orchestrator.results.figure_style import new_figure
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta, TriedOnPours
 from orchestrator.strategies.calibration.calibration_scores import ScoredPair, Scores
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.deployment.real_pours import Foretold, PourRow
+from orchestrator.strategies.deployment.real_pours import PourRow, PredictionCheck
 from orchestrator.strategies.stage_result import DisplayedMap
 from orchestrator.study.calibration_figures import Drawn, draw_calibrations, series_style
 from orchestrator.study.deployment_figures import draw_deployments, means
@@ -138,7 +138,7 @@ def poured(arm: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
         former_pours=0,
         refused_pours=1,
         failed_pours=0,
-        trust=Foretold(z_scores=(), alarm=False),
+        trust=PredictionCheck(z_scores=(), alarm=False),
     )
 
 
