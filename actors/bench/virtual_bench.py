@@ -446,7 +446,7 @@ class FollowedBench(VirtualBench):
 
     def _motion(self, executed: Executed | None, grip_tilt: float) -> SampledMotion | None:
         """The true motion of the pourer from the pour's first pose on; None if the pourer never left it."""
-        from actors.arm.planning.frames import pourer_motion
+        from actors.arm.planning.kinematics import pourer_motion
 
         if self._gap:
             raise LaboratoryError(
