@@ -172,7 +172,7 @@ class BalanceDevice(ABC):
         """Upper limit of a call's duration [s of the clock]; deadlines around the driver should be a little longer."""
         return 120.0
 
-    def stand_in(self) -> BalanceEmulator | None:
+    def start_emulator(self) -> BalanceEmulator | None:
         """Start the emulator on a virtual bench; None if the device needs none."""
         return None
 
@@ -296,8 +296,8 @@ class SerialBalanceSpec(BalanceDevice):
         """See `BalanceDevice.driver`."""
         return resolve_name("actors.balance.serial_balance:SerialBalance"), (self, name)
 
-    def stand_in(self) -> BalanceEmulator | None:
-        """See `BalanceDevice.stand_in`."""
+    def start_emulator(self) -> BalanceEmulator | None:
+        """See `BalanceDevice.start_emulator`."""
         if self.virtual is None:
             return None
         emulator: BalanceEmulator = resolve_name(SERIAL_EMULATOR)(self, self.virtual)
