@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from actors.balance.balance_interface import BalanceError, NotStableError, OutOf
 from actors.balance.balance_settings import SettlingRule
 from actors.balance.serial_balance import SerialBalance
 from actors.runtime.remote_object import LocalDevice, RayDevice
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, wait_for
 
 from .conftest import spec_for
 
@@ -56,11 +55,12 @@ def test_the_stream_goes_on_while_a_weight_is_waited_for_and_does_not_change_it(
 
 @pytest.mark.realtime
 def test_the_last_reading_is_shown_at_once_while_another_call_has_the_line(driver):
-    _, balance = driver("kcp")
+    far, balance = driver("kcp")
     shown = balance.weigh().shown
+    asked = far.state()["questions"]
     listening = threading.Thread(target=balance.listen, args=(3.0,))
     listening.start()
-    time.sleep(0.2)
+    wait_for(lambda: far.state()["questions"] > asked, "question")
     assert balance.read().shown == shown
     assert listening.is_alive(), "it was read while the other call had the line"
     listening.join()

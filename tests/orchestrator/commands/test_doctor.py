@@ -7,7 +7,6 @@ import os
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from functools import partial
 from math import degrees, radians
@@ -271,6 +270,7 @@ sys.modules[missing] = None
 start = VirtualController.start.__func__
 VirtualController.start = classmethod(lambda cls, *a, **k: (started.append(1), start(cls, *a, **k))[1])
 from orchestrator.cli.app import main
+from tests.support.waiting import wait_for
 try:
     main()
 finally:
@@ -371,13 +371,15 @@ def test_a_robot_that_hangs_where_the_file_has_it_stand_is_told(
     """What the tool feels tells where up is."""
     with socket.create_connection((controller.address, 30003), timeout=5.0) as connection:
         connection.sendall(f"def hang():\n set_gravity([{up}])\nend\n".encode())
-        time.sleep(0.3)
+        wait_for(lambda: "program hang started" in str(controller.fault("state")["messages"]), "start of the program")
     try:
         found = checked(laboratory)["mount"]
     finally:
         with socket.create_connection((controller.address, 30003), timeout=5.0) as connection:
             connection.sendall(b"def stand():\n set_gravity([0, 0, 9.82])\nend\n")
-            time.sleep(0.3)
+            wait_for(
+                lambda: "program stand started" in str(controller.fault("state")["messages"]), "start of the program"
+            )
     assert found["state"] == state, found
     if state == "fail":
         assert "tilt 90 deg, turn 0 deg would agree" in found["found"]

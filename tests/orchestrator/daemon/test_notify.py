@@ -176,8 +176,6 @@ def test_a_dead_receiver_slows_nothing_and_is_counted(
         dead = socket.create_server(("127.0.0.1", 0))
         url = f"json://127.0.0.1:{dead.getsockname()[1]}/?rto=9999&cto=9999"
         notifier = Notifier([url, web.url], about=["question"])
-            [f"json://127.0.0.1:{dead.getsockname()[1]}/?rto=9999&cto=9999", web.url], about=["question"]
-        )
         begun(notifier)
         for _ in range(QUEUE + 20):  # would never come to an end if a note waited for the receiver
             notifier.note("QuestionAsked", QUESTION, "narrow-1a2b")
