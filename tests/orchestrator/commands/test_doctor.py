@@ -29,6 +29,7 @@ from orchestrator.config.file_loading import load_laboratory
 from orchestrator.runs.safety_approval import SafetyRecordError, accepted_checksum, read_record, record_path
 from tests.support import hardware_laboratory
 from tests.support.loopback import free_address
+from tests.support.waiting import wait_for
 
 JOINTS = [radians(q) for q in hardware_laboratory.HOME]
 
@@ -270,7 +271,6 @@ sys.modules[missing] = None
 start = VirtualController.start.__func__
 VirtualController.start = classmethod(lambda cls, *a, **k: (started.append(1), start(cls, *a, **k))[1])
 from orchestrator.cli.app import main
-from tests.support.waiting import wait_for
 try:
     main()
 finally:
@@ -371,7 +371,7 @@ def test_a_robot_that_hangs_where_the_file_has_it_stand_is_told(
     """What the tool feels tells where up is."""
     with socket.create_connection((controller.address, 30003), timeout=5.0) as connection:
         connection.sendall(f"def hang():\n set_gravity([{up}])\nend\n".encode())
-        wait_for(lambda: "program hang started" in str(controller.fault("state")["messages"]), "start of the program")
+        wait_for(lambda: "program hang started" in str(controller.fault("state")["messages"]), "the program's start")
     try:
         found = checked(laboratory)["mount"]
     finally:
