@@ -13,7 +13,7 @@ from actors.balance.balance_interface import BalanceError, NotStableError, OutOf
 from actors.balance.balance_settings import SettlingRule
 from actors.balance.serial_balance import SerialBalance
 from actors.runtime.remote_object import LocalDevice, RayDevice
-from tests.support.waiting import PATIENCE, wait_for
+from tests.support.waiting import PATIENCE
 
 from .conftest import spec_for
 
@@ -54,13 +54,14 @@ def test_the_stream_goes_on_while_a_weight_is_waited_for_and_does_not_change_it(
 
 
 @pytest.mark.realtime
-def test_the_last_reading_is_shown_at_once_while_another_call_has_the_line(driver):
-    far, balance = driver("kcp")
+def test_the_last_reading_is_shown_at_once_while_another_call_has_the_line(driver, monkeypatch):
+    _, balance = driver("kcp")
     shown = balance.weigh().shown
-    asked = far.state()["questions"]
+    begun, listen = threading.Event(), balance._conversation.listen
+    monkeypatch.setattr(balance._conversation, "listen", lambda seconds: (begun.set(), listen(seconds)))
     listening = threading.Thread(target=balance.listen, args=(3.0,))
     listening.start()
-    wait_for(lambda: far.state()["questions"] > asked, "question")
+    assert begun.wait(PATIENCE)
     assert balance.read().shown == shown
     assert listening.is_alive(), "it was read while the other call had the line"
     listening.join()
