@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orchestrator.config.file_loading import recorded_campaign
+from orchestrator.journal.codec import Results
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.journal.run_record import CampaignResult, RequestOutcome, Row, answers, pour_row, read_result
-from orchestrator.journal.stage_results import Results
 from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated
 from orchestrator.results.loss_units import loss_of_pour
 from orchestrator.results.publishing import Published, report_on

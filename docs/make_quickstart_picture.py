@@ -15,8 +15,8 @@ import numpy as np
 from PIL import Image
 
 from actors.runtime.child_process import child_environment
+from orchestrator.journal.codec import decode_results
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-from orchestrator.journal.stage_results import decode_results
 from orchestrator.results import figure_style as style
 from orchestrator.results.stage_views import deployments_of
 from orchestrator.strategies.deployment.deployment_result import Deployed

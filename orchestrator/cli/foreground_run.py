@@ -347,7 +347,7 @@ def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
 
 def file_trouble(error: OSError, directory: Path) -> str:
     """What went wrong with a file of a run: which one, and how much room there should be where the disk is full."""
-    from orchestrator.journal.disk_reserve import MB, TO_BEGIN, free_space
+    from orchestrator.journal.journal_file import MB, TO_BEGIN, free_space
 
     where = error.filename or directory
     text = f"{where}: {error.strerror}"

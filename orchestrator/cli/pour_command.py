@@ -227,7 +227,7 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
         check_somebody_is_there,
         run_in_front_of_people,
     )
-    from orchestrator.journal.stage_results import result_of
+    from orchestrator.journal.codec import result_of
     from orchestrator.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import StageDefinition
     from orchestrator.strategies.single_pour import OnePour, OnePoured

@@ -6,10 +6,9 @@ Each `Entry` is one row: sequence number, stage, time, kind, JSON body. `Journal
 - Entries written together (`append_all`) are all present or all absent, whenever the process dies.
 - Pours are flushed to the disk before the arm moves and before their outcome is used (synchronous=FULL). All other
   entries survive the death of the process; a power cut can lose the most recent ones.
-- At a pour, the write-ahead log is copied into the file, and the entry is repeated in a ledger
-  (`orchestrator.journal.pour_ledger`). A lost or changed journal is thus detected
-  (`orchestrator.journal.journal_check`).
-- A full disk does not prevent the records of a pour (`orchestrator.journal.disk_reserve`).
+- At a pour, the write-ahead log is copied into the file, and the entry is repeated in a ledger. A lost or changed
+  journal is thus detected (`orchestrator.journal.journal_check`).
+- A full disk does not prevent the records of a pour (`orchestrator.journal.journal_file`).
 """
 
 from __future__ import annotations
@@ -28,13 +27,23 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 from orchestrator.journal.codec import canonical, digest, first_difference
-from orchestrator.journal.disk_reserve import MB, Reserve, free_space
-from orchestrator.journal.journal_check import check_journal, has_begun, traces_of_a_run
+from orchestrator.journal.journal_check import (
+    BEGUN,
+    LEDGER_NAME,
+    LedgerLine,
+    PourLedger,
+    check_journal,
+    has_begun,
+    read_ledger,
+    traces_of_a_run,
+)
 from orchestrator.journal.journal_file import (
+    MB,
     WITHOUT_CHAIN,
     EventRow,
     Header,
     JournalError,
+    Reserve,
     add_chain,
     chain_of,
     chained,
@@ -42,11 +51,11 @@ from orchestrator.journal.journal_file import (
     checkpoint,
     connect,
     connect_writer,
+    free_space,
     has_tables,
     lay_out,
     take_lock,
 )
-from orchestrator.journal.pour_ledger import BEGUN, LEDGER_NAME, LedgerLine, PourLedger, read_ledger
 from orchestrator.journal.upgrade import upgraded_fingerprint
 from orchestrator.states import State
 
@@ -169,7 +178,7 @@ class JournalReader:
     def stage_results(self) -> dict[str, dict[str, Any]]:
         """Results of the closed stages by name, in the order in which the stages were closed.
 
-        See `orchestrator.journal.stage_results`.
+        See `orchestrator.journal.codec`.
         """
         return {entry.stage: entry.body["result"] for entry in self.entries(kinds=[Kind.STAGE_CLOSED])}
 

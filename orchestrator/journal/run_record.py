@@ -14,9 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from orchestrator.journal.codec import decode_outcome, decode_request
+from orchestrator.journal.codec import Results, decode_outcome, decode_request, decode_results
 from orchestrator.journal.journal import Entry, JournalReader, Kind
-from orchestrator.journal.stage_results import Results, decode_results
 from orchestrator.requests import Ask, Failed, Outcome, Pour, Poured, Request
 from orchestrator.states import RESTING, State
 from orchestrator.strategies.stage_result import displayed_action

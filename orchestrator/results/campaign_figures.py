@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orchestrator.journal.stage_results import Results
+from orchestrator.journal.codec import Results
 from orchestrator.results import figure_style as style
 from orchestrator.results.figure_style import safe_name
 from orchestrator.results.loss_units import deployment_unit

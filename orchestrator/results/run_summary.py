@@ -15,7 +15,7 @@ from typing import Annotated, Any, cast
 from pydantic import Field, SerializeAsAny, create_model
 from pydantic.json_schema import GenerateJsonSchema
 
-from orchestrator.journal.stage_results import kinds
+from orchestrator.journal.codec import kinds
 from orchestrator.strategies.calibration.calibration_scores import CalibrationGain
 from orchestrator.strategies.calibration.posterior_summary import PosteriorSummary
 from orchestrator.strategies.deployment.confirmation import Confirmed

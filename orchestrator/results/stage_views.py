@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from orchestrator.journal.stage_results import Results
+from orchestrator.journal.codec import Results
 from orchestrator.requests import Prediction
 from orchestrator.results.loss_units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit, largest_loss
 from orchestrator.results.spillage_figures import DiscrepancyGroup, PourSeries

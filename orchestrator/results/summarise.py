@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.journal.stage_results import Results
+from orchestrator.journal.codec import Results
 from orchestrator.results import figure_style as style
 from orchestrator.results.run_summary import NotSimulated, ReceiverSummary, RunSummary, Totals
 from orchestrator.results.stage_views import (

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from orchestrator.journal.stage_results import Results
+from orchestrator.journal.codec import Results
 from orchestrator.results import figure_style as style
 from orchestrator.results.stage_views import deployments_of, recommended_theta_of
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan

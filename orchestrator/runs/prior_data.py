@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from orchestrator.journal.codec import decode_outcome, decode_request
+from orchestrator.journal.codec import Results, decode_outcome, decode_request, decode_results
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.journal.stage_results import Results, decode_results
 from orchestrator.requests import Pour, Poured
 from orchestrator.runs.fingerprint import scene_by_content
 from orchestrator.strategies.calibration.pour_design import DesignPoured

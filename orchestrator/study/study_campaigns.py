@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from orchestrator.config.run_snapshot import record_of
+from orchestrator.journal.codec import Results, result_of
 from orchestrator.journal.journal import JOURNAL_NAME
-from orchestrator.journal.stage_results import Results, result_of
 from orchestrator.runs.stages import (
     CALIBRATION,
     EVALUATION,

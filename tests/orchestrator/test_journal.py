@@ -18,9 +18,8 @@ import pytest
 from actors.runtime.child_process import child_environment
 from orchestrator.daemon.daemon_store import Store, StoreError
 from orchestrator.journal.journal import JOURNAL_NAME, Draft, Journal, JournalReader, Kind
-from orchestrator.journal.journal_check import JournalDamagedError, check_journal
+from orchestrator.journal.journal_check import BEGUN, LEDGER_NAME, JournalDamagedError, check_journal, read_ledger
 from orchestrator.journal.journal_file import FORMAT, Header, JournalError, JournalLockedError
-from orchestrator.journal.pour_ledger import BEGUN, LEDGER_NAME, read_ledger
 from orchestrator.states import State
 from orchestrator.study.study_folder import StudyError, opened
 from tests.orchestrator.study_files import small

@@ -9,7 +9,7 @@ from typing import Any
 import jsonschema
 import pytest
 
-from orchestrator.journal.stage_results import decode_results
+from orchestrator.journal.codec import decode_results
 from orchestrator.results.console_view import print_summary, summary_table
 from orchestrator.results.figure_style import display_value, display_values
 from orchestrator.results.run_summary import NotSimulated, PoolUse, RunSummary, Totals, summary_schema, write_summary

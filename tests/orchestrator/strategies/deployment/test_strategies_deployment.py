@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from orchestrator.journal.stage_results import encode_result
+from orchestrator.journal.codec import encode_result
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Suggest
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning

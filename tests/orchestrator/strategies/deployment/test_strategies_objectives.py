@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from orchestrator.journal.stage_results import decode_result, encode_result
+from orchestrator.journal.codec import decode_result, encode_result
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
 from orchestrator.results.console_view import summary_table
 from orchestrator.results.summarise import summarise
