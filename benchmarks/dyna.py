@@ -38,7 +38,7 @@ from actors.interfaces import ProgressCallback
 from actors.laboratory_settings import LaboratorySpec
 from actors.optimizer.questions import Suggestion, SuggestProblem
 from actors.optimizer.suggest import propose
-from orchestrator.results.pool_occupancy import RESTS, Occupancy
+from orchestrator.journal.run_record import POOL_RESTS, Occupancy
 from orchestrator.runs.events import DecisionMade, Event
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan, OutputPlan
@@ -109,7 +109,7 @@ class Bench:
 
     def watch(self, event: Event) -> None:
         """The strategy says when the pool may rest."""
-        if isinstance(event, DecisionMade) and RESTS in event.decision.values:
+        if isinstance(event, DecisionMade) and POOL_RESTS in event.decision.values:
             self.occupancy.rests(self._clock.time())
 
     async def simulate(self, task: PourTask) -> SimulatedPour:

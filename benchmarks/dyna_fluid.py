@@ -27,7 +27,7 @@ from skipping_clock import run
 
 from actors.bench.ground_truth import hidden_spill
 from actors.interfaces import InvalidActionError, ProgressCallback
-from orchestrator.results.pool_occupancy import Occupancy
+from orchestrator.journal.run_record import Occupancy
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.strategies.campaign_plan import DeploymentPlan, OutputPlan
 from orchestrator.strategies.deployment.costing import PricesSettings

@@ -117,7 +117,7 @@ class Run:
 
     def figures(self) -> dict[str, Figure]:
         """All figures that its results allow, by name."""
-        from orchestrator.results.campaign_figures import figures_of
+        from orchestrator.results.run_figures import figures_of
 
         return figures_of(self.campaign, self.results)
 

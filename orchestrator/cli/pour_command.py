@@ -156,7 +156,7 @@ def report_json(report: PathReport) -> dict[str, Any]:
 def _draw(chosen: Chosen, png: Path) -> None:
     from actors.arm.arm_settings import UrArmSpec
     from actors.arm.planned_pour import PourPath
-    from orchestrator.results.arm_path_figures import path_png
+    from orchestrator.results.pour_figures import path_png
     from sim_engine.vessel.vessel import build_vessel
 
     arm = chosen.plan.laboratory.arm

@@ -250,11 +250,11 @@ def predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     dimensions = [name for name in table.dimensions if name in table.varying()] or list(table.dimensions)
     found = scores(rows)
     if options.csv is not None:
-        from orchestrator.results.prediction_figures import write_scored
+        from orchestrator.results.prediction_scores import write_scored
 
         mention(f"table: {write_scored(options.csv, rows, dimensions)}")
     if options.png is not None:
-        from orchestrator.results.prediction_figures import draw_scored
+        from orchestrator.results.prediction_scores import draw_scored
 
         title = f"{scene.pourer.name} into {scene.receiver.name}, {len(rows)} weighed pours"
         mention(f"picture: {draw_scored(options.png, rows, title=title, note=said)}")

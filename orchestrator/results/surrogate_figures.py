@@ -2,7 +2,7 @@
 
 - `draw_surrogate` and `draw_trials`: the discrepancy over θ, or the predicted loss over actions.
 - `draw_window`: the safe window in the loss map, and the loss along each dimension.
-- `posterior_lines` and `draw_posterior`: the posterior of θ as text and as a corner plot.
+- `draw_posterior`: the posterior of θ as a corner plot.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from orchestrator.results import figure_style as style
 from orchestrator.results.loss_units import LossUnit, at_least_nothing
-from orchestrator.strategies.calibration.posterior_summary import PosteriorFound, PosteriorSummary
+from orchestrator.strategies.calibration.posterior_summary import PosteriorFound
 from orchestrator.strategies.deployment.deployment_result import Deployed, RiskFound
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from sim_engine.search_space import Axis, Space
@@ -408,36 +408,6 @@ def _profile(axes: Axes, name: str, window: WindowFound, best: float, unit: Loss
 
 
 BINS = 18
-
-
-def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
-    """Which parameters the pours determine and which they do not, one sentence per line.
-
-    Args:
-        posterior: posterior of a calibration's result.
-        space: searched θ.
-    """
-    known, unknown = [], []
-    for axis in space.axes:
-        words, searched = axis.name.replace("_", " "), _interval(axis.name, axis.lower, axis.upper)
-        if axis.name in posterior.open:
-            unknown.append(f"{words} ({searched})")
-        else:
-            known.append(f"{words} {_interval(axis.name, *posterior.region[axis.name])} (searched {searched})")
-    lines = []
-    if known:
-        lines.append(f"{100 * posterior.level:.0f} % of the θ that fit the pours have {', '.join(known)}")
-    if unknown:
-        lines.append(
-            f"the pours don't determine {', '.join(unknown)}: nearly all of what was searched fits them as well as θ*"
-        )
-    return [*lines, *posterior.directions]
-
-
-def _interval(name: str, low: float, high: float) -> str:
-    """'0.31 … 0.74 N/m'."""
-    first = style.display_value(name, low).removesuffix(style.display_unit(name)).rstrip()
-    return f"{first} … {style.display_value(name, high)}"
 
 
 def draw_posterior(path: Path, posterior: PosteriorFound, space: Space, theta: Mapping[str, float]) -> Path:

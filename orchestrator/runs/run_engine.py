@@ -340,6 +340,6 @@ class _Run:
         self._watchers.emit(CampaignClosed(state=str(self._state), results=results))
 
     def _close(self) -> CampaignResult:
-        result = read_result(self._journal, self._directory, seconds=time.monotonic() - self._begin)
+        result = read_result(self._directory, seconds=time.monotonic() - self._begin)
         self._watchers.emit(CampaignClosed(state=str(result.state), results=result.results))
         return result

@@ -13,9 +13,9 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from orchestrator.results import html_page as page
-from orchestrator.results.html_report import minutes
+from orchestrator.results import html_report as page
 from orchestrator.results.loss_units import deployment_unit
+from orchestrator.results.wording import ResultTable, TableRow, minutes
 from orchestrator.study.report.calibration_figures import draw_calibrations
 from orchestrator.study.report.cell_results import Gathered, gather
 from orchestrator.study.report.deployment_figures import draw_deployments, draw_finals
@@ -194,8 +194,8 @@ def _level(level: Level) -> str:
     )
 
 
-def _table(one: StudyTable) -> page.HtmlTable:
+def _table(one: StudyTable) -> ResultTable:
     cells = [[v.text() if isinstance(v, Estimate) else str(v) for v in row] for row in one.rows]
     columns = range(len(one.header))
     numbers = frozenset(i for i in columns if any(isinstance(row[i], int | float | Estimate) for row in one.rows))
-    return page.HtmlTable(one.title, one.header, [page.Row(row) for row in cells], numbers)
+    return ResultTable(one.title, one.header, [TableRow(row) for row in cells], numbers)

@@ -14,11 +14,11 @@ from matplotlib.text import Text
 
 from orchestrator.results import spillage_figures as figures_module
 from orchestrator.results import surrogate_figures as maps_module
-from orchestrator.results.campaign_figures import draw_figures
+from orchestrator.results.run_figures import draw_figures
 from orchestrator.results.console_view import summary_table
 from orchestrator.results.figure_style import display_value, display_values, log_ticks
 from orchestrator.results.loss_units import loss_unit
-from orchestrator.results.spillage_figures import DiscrepancyGroup, PourSeries, draw_discrepancy, draw_spillage
+from orchestrator.results.run_figures import DiscrepancyGroup, PourSeries, draw_discrepancy, draw_spillage
 from orchestrator.results.stage_views import (
     calibration_picture,
     deployment_picture,

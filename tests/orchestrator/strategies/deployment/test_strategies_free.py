@@ -16,7 +16,7 @@ import pytest
 from actors.optimizer.questions import Data
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
-from orchestrator.results.pool_occupancy import RESTS, Occupancy, occupancies
+from orchestrator.journal.run_record import POOL_RESTS, Occupancy, read_record
 from orchestrator.strategies.deployment.bench_offset import thinned
 from orchestrator.strategies.deployment.costing import Prices, PricesSettings
 from orchestrator.strategies.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
@@ -85,8 +85,8 @@ def test_the_pool_rests_when_simulations_promise_nothing_and_goes_on_when_someth
     many, few = played(tireless)[0], played(lazy)[0]
     assert len(many.simulations) > 45
     assert len(few.simulations) < 25
-    assert not any(RESTS in decision.values for decision in tireless.decisions)
-    rests = [decision for decision in lazy.decisions if RESTS in decision.values]
+    assert not any(POOL_RESTS in decision.values for decision in tireless.decisions)
+    rests = [decision for decision in lazy.decisions if POOL_RESTS in decision.values]
     assert rests
     assert "only pours tell: a simulation promises" in rests[0].text
     assert len(few.pours) == len(many.pours) == 2
@@ -112,7 +112,7 @@ def test_a_simulator_that_fails_for_ever_is_let_alone() -> None:
     play, _ = played(strategy, broken, narrow_cup, beside=200)
     assert len(play.pours) == 2
     assert len(play.simulations) < 80
-    assert any("came to nothing" in d.text for d in strategy.decisions if RESTS in d.values)
+    assert any("came to nothing" in d.text for d in strategy.decisions if POOL_RESTS in d.values)
 
 
 def test_a_person_who_is_asked_about_the_simulator_is_answered_before_the_next_pour() -> None:

@@ -1,19 +1,238 @@
-"""Figures of spillage against pours, and of the discrepancy between the calibrated simulator and weighed pours."""
+"""The figures of a run: what is drawn of its results, and the figures of losses and discrepancies.
+
+- `draw_figures` writes all figures into a folder; `figures_of` returns them for notebooks.
+- `draw_spillage` and `draw_discrepancy` draw losses against pours, and θ* beside its rivals.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from orchestrator.journal.codec import Results
+from orchestrator.requests import Prediction
 from orchestrator.results import figure_style as style
+from orchestrator.results.figure_style import safe_name
+from orchestrator.results.loss_units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit, largest_loss
+from orchestrator.results.stage_views import (
+    SPLITS,
+    calibrated_label,
+    calibration_of,
+    deployments_of,
+    evaluation_of,
+    receiver_name,
+    theta_of,
+)
+from orchestrator.results.surrogate_figures import (
+    SurrogatePicture,
+    draw_posterior,
+    draw_surrogate,
+    draw_trials,
+    draw_window,
+)
+from orchestrator.strategies.calibration.calibration_base import Calibrated
+from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED, Scores
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.deployment.deployment_result import Deployed
+from orchestrator.strategies.stage_result import DisplayedMap
 from sim_engine.prediction_band import LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_log = logging.getLogger(__name__)
+
+
+def draw_figures(
+    directory: Path, plan: CampaignPlan, results: Results, formats: tuple[str, ...] = (".svg",)
+) -> dict[str, Path]:
+    """Draw all figures that the results allow.
+
+    These are the discrepancy map and its trials, the test discrepancy, spillage against pours, loss maps, safe windows,
+    and the comparison of the first pours with simulations. With more than two searched axes, a map shows the two most
+    important ones, and the trials against every axis are a separate figure.
+
+    A figure that can't be drawn is reported and left out, so that it does not end a long run with an error.
+
+    Args:
+        directory: folder of the PNGs.
+        plan: plan of the campaign.
+        results: results of the stages.
+        formats: suffixes of additional files next to each PNG.
+
+    Returns:
+        Name of each figure → its PNG.
+    """
+    drawn: dict[str, Path] = {}
+    with style.also_as(*formats):
+        for name, job in _jobs(directory, plan, results).items():
+            try:
+                drawn[name] = job()
+            except Exception as error:
+                _log.warning("figure '%s' was not drawn: %s: %s", name, type(error).__name__, error)
+    return drawn
+
+
+def figures_of(plan: CampaignPlan, results: Results) -> dict[str, Figure]:
+    """The same figures for notebooks, not written to files. An error in a figure is raised."""
+    found = {}
+    for name, job in _jobs(Path(), plan, results).items():
+        with style.unsaved() as figures:
+            job()
+        found[name] = figures[0]
+    return found
+
+
+def _jobs(directory: Path, plan: CampaignPlan, results: Results) -> dict[str, Callable[[], Path]]:
+    """The functions that draw the figures, by name."""
+    jobs: dict[str, Callable[[], Path]] = {}
+    calibration, evaluation, theta = calibration_of(results), evaluation_of(results), theta_of(results)
+    if calibration is not None and (picture := calibration_picture(plan, calibration)) is not None:
+        jobs["discrepancy map"] = lambda p=picture: draw_surrogate(directory / "discrepancy-map.png", p)  # type: ignore[misc]
+        if picture.held and picture.points:
+            jobs["discrepancy trials"] = lambda p=picture: draw_trials(directory / "discrepancy-trials.png", p)  # type: ignore[misc]
+    if theta is not None and plan.calibration is not None and (posterior := theta.posterior) is not None:
+        space, best = plan.calibration.parameters, theta.theta.model_dump()
+        jobs["posterior"] = lambda: draw_posterior(directory / "posterior.png", posterior, space, best)
+    if evaluation is not None and (groups := discrepancy_groups(evaluation)):
+        jobs["test discrepancy"] = lambda: draw_discrepancy(
+            directory / "test-discrepancy.png", groups, title=f"How far the simulator is from the balance: {plan.name}"
+        )
+    if plan.deployment is not None:
+        unit = deployment_unit(plan.deployment)
+        if series := pour_series(plan, results, unit):
+            jobs["spillage against pours"] = lambda: draw_spillage(
+                directory / "spillage.png", series, cost=unit.label, title=f"What every pour came to: {plan.name}"
+            )
+        for scene, result in deployments_of(results).items():
+            if (picture := deployment_picture(plan, result)) is not None:
+                name = receiver_name(plan, scene)
+                jobs[f"loss map {name}"] = lambda p=picture, n=name: draw_surrogate(  # type: ignore[misc]
+                    directory / f"loss-map-{safe_name(n)}.png", p
+                )
+            if result.window is not None:
+                picture, name = deployment_picture(plan, result), receiver_name(plan, scene)
+                jobs[f"safe window {name}"] = lambda r=result, p=picture, n=name: draw_window(  # type: ignore[misc]
+                    directory / f"window-{safe_name(n)}.png", r, p, unit=unit, receiver=n
+                )
+    return jobs
+
+
+def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:
+    """Scores by set of pours, for `draw_discrepancy`."""
+    label = calibrated_label(evaluation)
+    if label is None:
+        return []
+    groups = []
+    for split, name in SPLITS.items():
+        own = evaluation.discrepancy[label].get(split)
+        if own is None:
+            continue
+        rivals = [scores.get(split) for other, scores in evaluation.discrepancy.items() if other.startswith("random ")]
+        groups.append(
+            DiscrepancyGroup(
+                name,
+                sum(pair.split == split and pair.theta == label for pair in evaluation.pairs),
+                own,
+                evaluation.discrepancy.get(UNCALIBRATED, {}).get(split),
+                [value for value in rivals if value is not None],
+                evaluation.mean_predictor.get(split),
+                evaluation.regression.get(split),
+                evaluation.posterior_mean.get(split),
+            )
+        )
+    return groups
+
+
+def calibration_picture(plan: CampaignPlan, result: Calibrated) -> SurrogatePicture | None:
+    """The discrepancy over θ; None if the plan calibrates nothing or no trial has a discrepancy."""
+    if plan.calibration is None:
+        return None
+    known = [(trial.theta, trial.discrepancy) for trial in result.trials if trial.discrepancy is not None]
+    shown = None if result.found is None else result.found.map
+    if not known and shown is None:
+        return None
+    return SurrogatePicture(
+        title=f"Discrepancy over θ: {', '.join(scene.receiver.name for scene in plan.calibration.scenes)}",
+        cost=DISCREPANCY.label,
+        space=plan.calibration.parameters,
+        points=[theta for theta, _ in known],
+        costs=[DISCREPANCY.factor * discrepancy for _, discrepancy in known],
+        best=None if result.found is None else result.found.theta.model_dump(),
+        largest=DISCREPANCY.factor,
+        **_surrogate(shown, DISCREPANCY),
+    )
+
+
+def deployment_picture(plan: CampaignPlan, result: Deployed) -> SurrogatePicture | None:
+    """The loss over actions with numbered pours; None before the first data."""
+    if plan.deployment is None:
+        return None
+    unit = deployment_unit(plan.deployment)
+    known = [(pour, pour.loss) for pour in result.weighed if pour.loss is not None]
+    if not known and result.map is None:
+        return None
+    return SurrogatePicture(
+        title=f"Loss over actions: {receiver_name(plan, result.scene)} ({result.strategy})",
+        cost=unit.label,
+        space=plan.deployment.actions,
+        points=[pour.action_si for pour, _ in known],
+        costs=[unit.factor * loss for _, loss in known],
+        best=None if result.recommended is None else result.recommended.action_si,
+        best_name="best action",
+        numbers=[pour.number for pour, _ in known],
+        simulated=[one.action_si for one in result.simulated],
+        largest=unit.factor * largest_loss(plan.deployment),
+        **_surrogate(result.map, unit),
+    )
+
+
+def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[PourSeries]:
+    """Pours by receiver, for `draw_spillage`; refused ones (nothing was poured) are left out."""
+    series = []
+    for scene, result in deployments_of(results).items():
+        pours = [pour for pour in result.pours if pour.status in ("weighed", "failed")]
+        if not pours:
+            continue
+        losses = [
+            unit.factor * pour.loss if pour.status == "weighed" and pour.loss is not None else None for pour in pours
+        ]
+        predictions = [
+            None
+            if pour.predicted is None
+            else _prediction_interval(
+                Prediction(
+                    pour.predicted, pour.predicted_deviation or 0.0, pour.predicted_scatter, pour.predicted_band
+                ),
+                unit,
+            )
+            for pour in pours
+        ]
+        series.append(PourSeries(f"{receiver_name(plan, scene)} ({result.strategy})", losses, predictions))
+    return series
+
+
+def _prediction_interval(predicted: Prediction, unit: LossUnit) -> tuple[float, float, float]:
+    low, high = predicted.of_a_pour()
+    return unit.factor * at_least_nothing(predicted.mean), unit.factor * low, unit.factor * high
+
+
+def _surrogate(shown: DisplayedMap | None, unit: LossUnit) -> dict[str, Any]:
+    """The map of a figure: its axes, and the values of the other axes."""
+    if shown is None:
+        return {}
+    return {
+        "mean": unit.factor * np.maximum(np.asarray(shown.mean, float), 0.0),  # see `at_least_nothing`
+        "deviation": unit.factor * np.asarray(shown.deviation, float),
+        "over": shown.over,
+        "held": shown.held,
+    }
 
 
 TOP = 1.08
