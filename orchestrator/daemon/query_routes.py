@@ -110,20 +110,21 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
     if item.run is not None:
         directory = daemon.settings.runs / item.run
 
+        # A process that was killed leaves a journal that ends in the middle of the pour.
+        live = daemon.progress(item) is not None
+
         def read() -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
             def plan() -> CampaignPlan:
                 return job_of(daemon.settings, item, daemon.settings.rig(item.rig)).campaign
 
-            return daemon.pours.of(directory, plan), summary_of(directory)
+            found = daemon.pours.of(directory, plan, live=live)
+            return [pour.model_dump() for pour in found], summary_of(directory)
 
         try:
             pours, summary = await asyncio.to_thread(read)
         except (ConfigError, RunError, KeyError):  # for example, a rig that the settings no longer contain
             summary = await asyncio.to_thread(summary_of, directory)
     table = campaign_out(request, daemon, item).model_dump()
-    if daemon.progress(item) is None:  # the process was killed, so the journal ends in the middle of the pour
-        for pour in pours:
-            pour["state"] = "unknown" if pour["state"] == "under way" else pour["state"]
     deeds = daemon.store.deeds(item.id)
     return CampaignDetailOut.model_validate({**table, "pours_made": pours, "summary": summary, "deeds": deeds})
 

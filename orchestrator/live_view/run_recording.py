@@ -19,8 +19,7 @@ from orchestrator.live_view.blueprints import Moment, campaign_blueprint
 from orchestrator.live_view.cell_view import CellScene
 from orchestrator.live_view.learning_view import MAPPED, LearningStage
 from orchestrator.live_view.machine_view import MachineView, StatusView
-from orchestrator.live_view.playback import PlaybackQueue
-from orchestrator.live_view.recording_sink import RecordingSink
+from orchestrator.live_view.recording_sink import PlaybackQueue, RecordingSink
 from orchestrator.live_view.simulation_view import SimulatedStage
 from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Suggest, Suggested
 from orchestrator.results.loss_units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
@@ -39,8 +38,8 @@ from orchestrator.runs.events import (
     StageOpened,
     StrategyProgressed,
 )
+from orchestrator.runs.stages import scenes_of
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from sim_engine.scene import Scene
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -239,19 +238,6 @@ class CampaignRecording:
     def _action(self, pour: Pour) -> str:
         plan = self._plan.calibration if is_calibration(self._plan, pour) else self._plan.deployment
         return pour.action.display(*(plan.actions.names if plan is not None else ()))
-
-
-def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
-    """Return all scenes of a campaign by name."""
-    scenes: dict[str, Scene] = {}
-    if plan.calibration is not None:
-        for records in (plan.calibration.records, plan.calibration.transfer):
-            if records is not None:
-                scenes[records.scene.name] = records.scene
-        scenes.update({scene.name: scene for scene in plan.calibration.poured})
-    if plan.deployment is not None:
-        scenes.update({scene.name: scene for scene in plan.deployment.scenes})
-    return scenes
 
 
 def blueprint_of(plan: CampaignPlan, moment: Moment) -> rrb.Blueprint:

@@ -99,7 +99,7 @@ def run_page(summary: RunSummary, resolved: Mapping[str, Any] | None = None) -> 
         mode=MODES.get(summary.mode, summary.mode),
         mode_look=summary.mode,
         finished=summary.state == State.FINISHED,
-        lead=f"Begun {_date(summary.begun)}, last entry {_date(summary.ended)}.{seed}",
+        lead=f"Begun {_date(summary.began_at)}, last entry {_date(summary.ended_at)}.{seed}",
         run=summary,
         stages=wording.stage_table(summary),
         cost=wording.cost_table(summary),

@@ -301,10 +301,12 @@ class RunSummary(Totals):
     state: str = "queued"
     """State of the run when the summary was made."""
 
-    begun: float | None = None
-    """Seconds since 1970, as `ended`, the time of the last entry of the journal."""
+    began_at: float | None = None
+    """Seconds since 1970."""
 
-    ended: float | None = None
+    ended_at: float | None = None
+    """When the last entry of the journal was written."""
+
     standing: tuple[str, ...] = ()
     """State of an unfinished run and the next steps, and damage of its records."""
 
@@ -327,7 +329,7 @@ class RunSummary(Totals):
     """Laboratory, versions, and the check of the records."""
 
     stages: tuple[StageSummary, ...] = ()
-    pours: tuple[PourSummary, ...] = ()
+    pours_made: tuple[PourSummary, ...] = ()
     questions: tuple[QuestionSummary, ...] = ()
     notes: tuple[LogEntry, ...] = ()
     decisions: tuple[LogEntry, ...] = ()

@@ -204,9 +204,9 @@ def _of_record(
     return {
         "run": run,
         "state": str(record.state),
-        "begun": record.header.created or None,
-        "ended": record.ended or None,
-        "standing": (*standing, *(() if check is None else _damage(check))),
+        "began_at": record.header.created or None,
+        "ended_at": record.ended or None,
+        "standing": (*(() if check is None else _damage(check)), *standing),
         "stages": tuple(
             StageSummary(
                 stage=one.name,
@@ -217,7 +217,7 @@ def _of_record(
             )
             for one in record.stages.values()
         ),
-        "pours": tuple(pour_summaries(plan, record, live=live)),
+        "pours_made": tuple(pour_summaries(plan, record, live=live)),
         "questions": tuple(
             QuestionSummary(time=one.time, stage=one.stage, question=one.text, answer=one.answer)
             for one in record.questions
@@ -499,5 +499,4 @@ def _programs(versions: Mapping[str, Any]) -> dict[str, str]:
     return {
         "Python": python,
         "packages": ", ".join(f"{name} {text}" for name, text in packages.items()) or "not recorded",
-        "Decant": packages.get("decant", ""),
     }

@@ -118,7 +118,7 @@ def _shown(values: Mapping[str, float | None]) -> dict[str, str]:
 def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> list[str]:
     load = "" if scene is None else f" {1e3 * scene.liquid.mass:.0f} g of {scene.liquid.name}"
     cup = "" if scene is None else f" from {scene.pourer.name}"
-    said = [f"To pour{load}{cup} into {row.receiver}, use the action below."]
+    said = [f"To pour{load}{cup} into {row.receiver}, use the recommended action."]
     if row.predicted_loss is not None:
         mean = unit.text(row.predicted_loss, row.predicted_deviation)
         scatter = unit.scatter(row.predicted_scatter).removeprefix(", a pour ")
@@ -621,8 +621,8 @@ def receiver_table(summary: RunSummary) -> ResultTable:
 
 def pour_tables(summary: RunSummary) -> list[ResultTable]:
     """Every requested pour, one table for each stage."""
-    stages = dict.fromkeys(pour.stage for pour in summary.pours)
-    return [_pour_table(stage, [pour for pour in summary.pours if pour.stage == stage]) for stage in stages]
+    stages = dict.fromkeys(pour.stage for pour in summary.pours_made)
+    return [_pour_table(stage, [pour for pour in summary.pours_made if pour.stage == stage]) for stage in stages]
 
 
 def _pour_table(stage: str, pours: Sequence[PourSummary]) -> ResultTable:

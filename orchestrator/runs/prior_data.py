@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from orchestrator.journal.codec import Results, decode_outcome, decode_request, decode_results
+from orchestrator.journal.codec import Results, decode_results
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.run_record import read_record
-from orchestrator.requests import Pour, Poured
 from orchestrator.runs.fingerprint import scene_by_content
 from orchestrator.strategies.calibration.pour_design import DesignPoured
 from orchestrator.strategies.campaign_plan import RecordedPour
@@ -62,9 +61,7 @@ def read_former_run(directory: Path) -> PreviousRun:
     pours = tuple(
         (
             pour.request.scene,
-            _recorded(
-                pour.request.action, pour.measured, splits.get((pour.stage, pour.request.number), "train")
-            ),
+            _recorded(pour.request.action, pour.measured, splits.get((pour.stage, pour.request.number), "train")),
         )
         for pour in sorted(weighed, key=lambda pour: pour.time or 0.0)
         if pour.measured is not None

@@ -16,7 +16,7 @@ from actors.optimizer.questions import Data, SuggestProblem
 from actors.optimizer.suggest import propose, slices
 from actors.runtime.child_process import child_environment
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.live_view.map_images import slices_picture, surrogate_picture
+from orchestrator.live_view.learning_view import slices_picture, surrogate_picture
 from orchestrator.live_view.rerun_subscriber import QueueThread, RerunMonitor
 from orchestrator.live_view.run_recording import CampaignRecording
 from orchestrator.live_view.simulation_view import simulation_rrd

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.results.prediction_scores import draw_scored, write_scored
-from orchestrator.results.prediction_scores import ScoredRow, rank_correlation, score, scores
+from orchestrator.results.prediction_scores import ScoredRow, draw_scored, rank_correlation, score, scores, write_scored
 from sim_engine.action import DEG, Action
 from sim_engine.prediction_band import SampleStatistics, band
 from tests.orchestrator.reported import is_picture

@@ -12,20 +12,23 @@ import pytest
 from matplotlib.collections import PathCollection
 from matplotlib.text import Text
 
-from orchestrator.results import spillage_figures as figures_module
+from orchestrator.results import run_figures as figures_module
 from orchestrator.results import surrogate_figures as maps_module
-from orchestrator.results.run_figures import draw_figures
 from orchestrator.results.console_view import summary_table
 from orchestrator.results.figure_style import display_value, display_values, log_ticks
 from orchestrator.results.loss_units import loss_unit
-from orchestrator.results.run_figures import DiscrepancyGroup, PourSeries, draw_discrepancy, draw_spillage
-from orchestrator.results.stage_views import (
+from orchestrator.results.run_figures import (
+    DiscrepancyGroup,
+    PourSeries,
     calibration_picture,
     deployment_picture,
     discrepancy_groups,
-    evaluation_of,
+    draw_discrepancy,
+    draw_figures,
+    draw_spillage,
     pour_series,
 )
+from orchestrator.results.stage_views import evaluation_of
 from orchestrator.results.summarise import summarise
 from orchestrator.results.surrogate_figures import SurrogatePicture, draw_posterior, draw_surrogate, draw_trials
 from sim_engine.action import DEG, Action
@@ -134,7 +137,7 @@ def test_expected_losses_below_zero_are_shown_as_zero_and_stored_as_they_are(
     )
     summary = summarise(plan, {"narrow cup": deployed})
     assert summary.receivers["narrow cup"].predicted_loss == -0.013
-    assert "0.00 ± 1.40 %" in shown(summary_table(plan, summary))
+    assert "0.00 ± 1.40 %" in shown(summary_table(summary))
     assert "-" not in loss_unit(Loss()).text(-0.013, 0.014)
     (told,) = set(pour_series(plan, {"narrow cup": deployed}, loss_unit(Loss()))[0].predicted)
     assert told == pytest.approx((0.0, 0.0, 0.78), abs=0.01)
@@ -150,7 +153,7 @@ def test_receivers_are_called_by_their_own_name_unless_two_share_it(results: dic
     deployed = {"narrow cup": results["narrow cup"]}
     assert draw_figures(tmp_path, plan, deployed)["loss map narrow"].name == "loss-map-narrow.png"
     assert pour_series(plan, deployed, loss_unit(Loss()))[0].receiver == "narrow (D3)"
-    text = shown(summary_table(plan, summarise(plan, deployed)))
+    text = shown(summary_table(summarise(plan, deployed)))
     assert "narrow " in text
     assert "narrow cup" not in text
     low = replace(watched.NARROW, name="low", fixed={"height": 0.02})

@@ -19,12 +19,12 @@ from actors.optimizer.optimizer_actor import Proposer
 from orchestrator.cli.app import app
 from orchestrator.cli.foreground_run import report_of_what_stands
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
 from orchestrator.journal.journal_check import JournalCheck
-from orchestrator.journal.run_record import CampaignResult, read_record
+from orchestrator.journal.run_record import CampaignResult, RecordedDecision, read_record
 from orchestrator.results import figure_style as style
 from orchestrator.results.html_report import run_page
-from orchestrator.results.publishing import Published, publish, summary_of
+from orchestrator.results.publishing import Published, publish
+from orchestrator.results.summarise import summarise
 from orchestrator.run_errors import RunError
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.run_folder import create_run
@@ -111,7 +111,7 @@ def test_it_says_what_to_do_what_to_expect_and_what_nobody_knows(made: Made) -> 
     said, row = texts(made.page), next(iter(made.published.summary.receivers.values()))
     assert row.best_action_si is not None
     assert f"{row.best_action_si['x_offset'] * 1e3:.3g} mm" in said
-    assert "To pour 100 g of water from beaker into narrow, use the action below." in said
+    assert "To pour 100 g of water from beaker into narrow, use the recommended action." in said
     assert "No safe window was looked for" in said
     assert "The recommended action was not poured again" in said
     assert "The bench was VIRTUAL: no robot moved and no liquid was weighed." in said
@@ -120,8 +120,7 @@ def test_it_says_what_to_do_what_to_expect_and_what_nobody_knows(made: Made) -> 
 
 
 def test_every_pour_stands_in_a_table_with_its_grams(made: Made) -> None:
-    with JournalReader(made.result.directory / JOURNAL_NAME) as journal:
-        pours = read_record(journal).pours
+    pours = read_record(made.result.directory).pours
     assert len(pours) == 5
     said = texts(made.page)
     for pour in pours:
@@ -140,15 +139,20 @@ def test_names_and_reasons_that_are_html_stay_text(made: Made) -> None:
         for one in plan.deployment.scenes
     ]
     plan = replace(plan, deployment=replace(plan.deployment, scenes=tuple(scenes)))
-    with JournalReader(made.result.directory / JOURNAL_NAME) as journal:
-        record = read_record(journal)
-    record.pours[0].came, record.pours[0].reason = "failed", SCRIPT
+    record = read_record(made.result.directory)
+    record.pours[0].state, record.pours[0].reason = "failed", SCRIPT
     record.notes.append((0.0, SCRIPT))
-    record.decisions.append((SCRIPT, SCRIPT))
-    summary = summary_of(plan, made.result, {f"loss map {SCRIPT}": made.published.figures["discrepancy map"]})
-    damaged = JournalCheck(Path(SCRIPT), problems=(SCRIPT,))
-    versions = {"campaign": SCRIPT, "packages": {SCRIPT: SCRIPT}}
-    page = run_page(plan, summary, record, Path(SCRIPT), versions=versions, check=damaged)
+    record.decisions.append(RecordedDecision(0.0, SCRIPT, SCRIPT, {}, 0))
+    summary = summarise(
+        plan,
+        made.result.results,
+        record=record,
+        run=SCRIPT,
+        figures={f"loss map {SCRIPT}": made.published.figures["discrepancy map"]},
+        versions={"campaign": SCRIPT, "packages": {SCRIPT: SCRIPT}},
+        check=JournalCheck(Path(SCRIPT), problems=(SCRIPT,)),
+    )
+    page = run_page(summary, plan.resolved)
     assert "WARNING: the records of this run are damaged or incomplete" in page
     assert "<script" not in page
     assert page.count("&lt;script&gt;") > 10

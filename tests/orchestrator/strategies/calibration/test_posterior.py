@@ -13,7 +13,8 @@ from actors.optimizer.questions import Posterior
 from orchestrator.config.file_loading import load_discrepancy, load_parameters, load_posterior
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.results.publishing import theta_file
-from orchestrator.results.surrogate_figures import draw_posterior, posterior_lines
+from orchestrator.results.surrogate_figures import draw_posterior
+from orchestrator.results.wording import posterior_lines
 from orchestrator.strategies.calibration.calibration_scores import ScoredPair, Scores
 from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.posterior_summary import (

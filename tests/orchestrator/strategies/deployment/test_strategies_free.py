@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import Data
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
+from orchestrator.journal.journal import Kind
 from orchestrator.journal.run_record import POOL_RESTS, Occupancy, read_record
+from orchestrator.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
 from orchestrator.strategies.deployment.bench_offset import thinned
 from orchestrator.strategies.deployment.costing import Prices, PricesSettings
 from orchestrator.strategies.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
@@ -236,8 +236,7 @@ def test_killed_in_the_middle_of_free_simulations_it_goes_on_from_its_journal(tm
     assert _run(tmp_path / "run", 0.2, resume=True).state == "finished"
     assert logical_record(tmp_path / "run")[: len(before)] == before
     assert set(finished_times(tmp_path / "run").values()) == {1}
-    with JournalReader(tmp_path / "run" / JOURNAL_NAME) as journal:
-        (found,) = occupancies(journal.entries(), 2).values()
+    (found,) = read_record(tmp_path / "run", slots=2).occupancies.values()
     assert found.fraction is not None
     assert 0.0 < found.fraction <= 1.0
 

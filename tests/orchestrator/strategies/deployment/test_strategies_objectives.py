@@ -251,13 +251,13 @@ def test_people_read_the_front_at_the_end_with_what_it_costs_and_how_it_is_poure
     assert summary.loss == "objectives"
     console = Console(width=200)
     with console.capture() as capture:
-        console.print(summary_table(plan, summary))
+        console.print(summary_table(summary))
     text = capture.get()
     assert "spillage + time [%]" in text
     front = found.result().front
     first = front[0].objectives
-    assert f"cup, nothing beats: spillage {100 * first['spillage']:.1f} ± " in text
-    assert text.count("nothing beats") == len(front)
+    assert f"Nothing beats spillage {100 * first['spillage']:.1f} ± " in text
+    assert text.count("Nothing beats") == len(front)
     assert "deg/s, max angle" in text
     assert any("under random weights" in decision.text for decision in found.decisions)
     assert played.pours == []
