@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -84,7 +84,7 @@ def display_value(name: str, value: float | None) -> str:
     return f"{value / display_factor(name):.3g} {display_unit(name)}".rstrip()
 
 
-def display_values(values: dict[str, float | None]) -> str:
+def display_values(values: Mapping[str, float | None]) -> str:
     """Several named quantities in one line, from SI values: 'angular velocity 41.2 deg/s, x offset 104 mm'."""
     return ", ".join(f"{name.replace('_', ' ')} {display_value(name, value)}" for name, value in values.items())
 
@@ -196,7 +196,7 @@ def number(value: float) -> str:
     return f"{value:.6g}" if abs(value) < 1000 else f"{value:,.0f}".replace(",", " ")
 
 
-def at_ends(values: dict[str, float | None], axes: tuple[Axis, ...]) -> list[str]:
+def at_ends(values: Mapping[str, float | None], axes: tuple[Axis, ...]) -> list[str]:
     """Searched values that lie at an end of their range: 'angular velocity at its upper end (150 deg/s)'.
 
     Args:

@@ -20,9 +20,9 @@ from orchestrator.journal.run_record import PourState
 from orchestrator.strategies.calibration.calibration_scores import CalibrationGain
 from orchestrator.strategies.calibration.posterior_summary import PosteriorSummary
 from orchestrator.strategies.deployment.confirmation import Confirmed
-from orchestrator.strategies.deployment.deployment_result import ParetoAction, RiskFound
+from orchestrator.strategies.deployment.deployment_result import ParetoAction, Recommended, RiskFound
 from orchestrator.strategies.deployment.model_monitoring import Believed
-from orchestrator.strategies.deployment.real_pours import Foretold
+from orchestrator.strategies.deployment.real_pours import Foretold, PourRow
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from sim_engine.liquids import SimulationParameters
@@ -230,34 +230,15 @@ class ReceiverSummary(ResultPart):
 
     refused_pours: int
     simulations: int
-    first_loss: float | None
-    first_spillage: float | None
-    best_loss: float | None
-    best_spillage: float | None
-    best_pour: int | None
-    """Number of the pour with the smallest loss."""
+    first: PourRow | None
+    """The first weighed pour."""
 
-    best_delivered_g: float | None
-    """Mass in the receiver after this pour."""
+    best: PourRow | None
+    """The pour with the smallest loss."""
 
-    best_delivered_ml: float | None
-    """Volume in the receiver, from the liquid's density."""
+    recommended: Recommended | None
+    """The recommended action and its predicted loss."""
 
-    best_measured_action: dict[str, float | None] | None
-    """Action of this pour in display units."""
-
-    best_action: dict[str, float | None] | None
-    """The recommended action in display units."""
-
-    best_action_si: dict[str, float] | None
-    predicted_loss: float | None
-    """Expected loss of the recommended action."""
-
-    predicted_deviation: float | None
-    predicted_scatter: float | None
-    predicted_spillage: float | None
-    predicted_spillage_deviation: float | None
-    untrustworthy_simulation: bool
     trust: Foretold | Believed
     gave_up: str | None
     ended: str | None

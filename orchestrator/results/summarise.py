@@ -49,7 +49,7 @@ from orchestrator.strategies.calibration.calibration_base import CalibratedTheta
 from orchestrator.strategies.calibration.calibration_scores import Scores
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.confirmation import Confirmed
-from orchestrator.strategies.deployment.deployment_result import Deployed, Recommended
+from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.repeated_simulation import Foreseen
 from sim_engine.model_validity import NotCovered
 from sim_engine.outcome import normalised_spillage
@@ -115,9 +115,11 @@ def summarise(
         campaign=plan.name,
         seed=plan.seed,
         advice=advised,
-        without_advice=() if advised else wording.without_advice(plan, record, calibrated=found is not None),
-        open_questions=wording.open_questions(
-            plan, record, open_theta, calibrated=found is not None, dropped_events=dropped_events
+        without_advice=() if advised else tuple(wording.without_advice(plan, record, calibrated=found is not None)),
+        open_questions=tuple(
+            wording.open_questions(
+                plan, record, open_theta, calibrated=found is not None, dropped_events=dropped_events
+            )
         ),
         asked=wording.what_was_asked(plan),
         cost=wording.cost(record, totals.occupancy, _time_scale(plan)),
@@ -129,7 +131,7 @@ def summarise(
         predicted_deviation=deviation,
         posterior=posterior,
         parameters=() if found is None else _parameters(plan.calibration, found),
-        theta_sentences=wording.theta_sentences(expected, deviation, posterior, space, gain),
+        theta_sentences=tuple(wording.theta_sentences(expected, deviation, posterior, space, gain)),
         discrepancy=discrepancy,
         loss=None if plan.deployment is None else plan.deployment.loss_name,
         loss_label="" if plan.deployment is None else deployment_unit(plan.deployment).label,
@@ -179,7 +181,7 @@ def summarise_record(
         campaign=record.header.name,
         seed=catalogued.get("seed"),
         mode=catalogued.get("mode") or "none",
-        without_advice=about or ("This run recommends no action that can be read here.",),
+        without_advice=tuple(about) or ("This run recommends no action that can be read here.",),
         asked={"campaign": record.header.name},
         cost=wording.cost(record, {}),
         settings={
@@ -362,9 +364,6 @@ def _receivers(
     }
 
 
-_NOTHING: dict[str, None] = dict.fromkeys(Recommended.model_fields)
-
-
 def _receiver(
     plan: DeploymentPlan | None,
     name: str,
@@ -373,15 +372,13 @@ def _receiver(
     not_covered: Sequence[NotCovered],
     confirmed: Confirmed | None,
 ) -> ReceiverSummary:
-    pours, best = result.weighed, result.best
+    pours, best, advised = result.weighed, result.best, result.recommended
     liquid = None
     if plan is not None:
         liquid = next((scene.liquid for scene in plan.scenes if scene.name == result.scene), None)
     prediction = None if predicted is None else predicted.over_seeds
     received = None if prediction is None else prediction.get("received")
     delivered = None if received is None or liquid is None else received.mean * liquid.mass
-    recommended: Mapping[str, Any] = _NOTHING if result.recommended is None else dict(result.recommended)
-    unit = SPILLAGE if plan is None else deployment_unit(plan)
     return ReceiverSummary(
         receiver=name,
         strategy=result.strategy,
@@ -390,22 +387,9 @@ def _receiver(
         failures=tuple(f"pour {row.number}: {row.reason}" for row in result.pours if row.status == "failed"),
         refused_pours=result.refused_pours,
         simulations=result.simulations,
-        first_loss=pours[0].loss if pours else None,
-        first_spillage=pours[0].spillage if pours else None,
-        best_loss=None if best is None else best.loss,
-        best_spillage=None if best is None else best.spillage,
-        best_pour=None if best is None else best.number,
-        best_delivered_g=None if best is None else best.delivered_g,
-        best_delivered_ml=None if best is None else best.delivered_ml,
-        best_measured_action=None if best is None else best.action,
-        best_action=recommended["action"],
-        best_action_si=recommended["action_si"],
-        predicted_loss=recommended["predicted_loss"],
-        predicted_deviation=recommended["predicted_deviation"],
-        predicted_scatter=recommended["predicted_scatter"],
-        predicted_spillage=recommended["predicted_spillage"],
-        predicted_spillage_deviation=recommended["predicted_spillage_deviation"],
-        untrustworthy_simulation=result.trust.alarm,
+        first=pours[0] if pours else None,
+        best=best,
+        recommended=advised,
         trust=result.trust,
         gave_up=result.gave_up,
         ended=result.ended,
@@ -414,12 +398,12 @@ def _receiver(
         window=result.window,
         prediction=prediction,
         prediction_band=None if predicted is None else predicted.band,
-        at_bounds=tuple(style.at_ends(dict(recommended["action_si"] or {}), () if plan is None else plan.actions.axes)),
+        at_bounds=() if plan is None or advised is None else tuple(style.at_ends(advised.action_si, plan.actions.axes)),
         predicted_delivered_g=None if delivered is None else 1e3 * delivered,
         predicted_delivered_ml=None if delivered is None or liquid is None else liquid.millilitres(delivered),
         confirmed=confirmed,
         not_covered=tuple(not_covered),
-        texts=_receiver_texts(result, confirmed, unit),
+        texts=_receiver_texts(result, confirmed, SPILLAGE if plan is None else deployment_unit(plan)),
     )
 
 

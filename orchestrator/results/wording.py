@@ -90,9 +90,9 @@ def advice(plan: CampaignPlan, receivers: Mapping[str, ReceiverSummary]) -> tupl
 
 def _advice(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> Advice:
     window, open_points = "", tuple(_open(row))
-    if row.best_action_si is None:
+    if row.recommended is None:
         why = row.gave_up or "nothing was learnt that an action could be chosen by"
-        said: Sequence[str] = [f"No action is recommended: {why}."]
+        said = (f"No action is recommended: {why}.",)
         return Advice(receiver=row.receiver, action={}, fixed={}, sentences=said, window="", open=open_points)
     if row.window is not None:
         window = _sentence(window_line(row.window, unit))
@@ -103,7 +103,7 @@ def _advice(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> Advice
         )
     return Advice(
         receiver=row.receiver,
-        action=_shown(row.best_action_si),
+        action=_shown(row.recommended.action_si),
         fixed={} if scene is None else _shown(scene.fixed),
         sentences=tuple(_sentences(scene, row, unit)),
         window=window,
@@ -119,9 +119,9 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
     load = "" if scene is None else f" {1e3 * scene.liquid.mass:.0f} g of {scene.liquid.name}"
     cup = "" if scene is None else f" from {scene.pourer.name}"
     said = [f"To pour{load}{cup} into {row.receiver}, use the recommended action."]
-    if row.predicted_loss is not None:
-        mean = unit.text(row.predicted_loss, row.predicted_deviation)
-        scatter = unit.scatter(row.predicted_scatter).removeprefix(", a pour ")
+    if (expected := row.recommended) is not None:
+        mean = unit.text(expected.predicted_loss, expected.predicted_deviation)
+        scatter = unit.scatter(expected.predicted_scatter).removeprefix(", a pour ")
         said.append(f"Expect {unit.meaning} of {mean}{scatter and f'; single pours differ from that by {scatter}'}.")
     if row.prediction is not None:
         said.append(_prediction(row))
@@ -131,7 +131,7 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
         loss = row.confirmed.loss
         times = "once more" if loss.count == 1 else f"{loss.count} more times"
         said.append(f"Poured {times} after it was chosen, it came to {unit.text(loss.mean, loss.deviation)}.")
-    if row.best_loss is not None:
+    if row.texts["best measured"]:
         best = f"The best of {row.pours} weighed pours came to {row.texts['best measured']}"
         said.append(f"{best}; the least of several is a lucky one, so that it is not what to expect of the next.")
     if row.risk is not None:
@@ -164,7 +164,7 @@ def _compromise(one: ParetoAction) -> str:
         f"{name.replace('_', ' ')} {100 * at_least_nothing(mean):.1f} ± {100 * one.deviations[name]:.1f} %"
         for name, mean in one.objectives.items()
     ]
-    return f"{', '.join(parts)} with {style.display_values(dict(one.action_si))}"
+    return f"{', '.join(parts)} with {style.display_values(one.action_si)}"
 
 
 def amount_text(grams: float | None, millilitres: float | None) -> str:
@@ -203,9 +203,9 @@ def _open(row: ReceiverSummary) -> list[str]:
         said.append(f"Better actions may lie beyond what was searched: {', '.join(row.at_bounds)}.")
     if not _is_confirmed(row) and (alarm := trust_line(row.trust)) is not None:
         said.append(_sentence(alarm))
-    if row.gave_up and row.best_action_si is not None:
+    if row.gave_up and row.recommended is not None:
         said.append(_sentence(row.gave_up))
-    if row.best_action_si is not None:
+    if row.recommended is not None:
         said += _poured_again(row)
     if row.failed_pours:
         what = "1 pour failed" if row.failed_pours == 1 else f"{row.failed_pours} pours failed"
@@ -214,7 +214,7 @@ def _open(row: ReceiverSummary) -> list[str]:
     confirming = () if row.confirmed is None else row.confirmed.pours
     if lost := [f"pour {pour.number}: {pour.failed}" for pour in confirming if pour.failed]:
         said.append(f"Confirming pours that failed: {'; '.join(lost)}.")
-    if row.risk is None and row.best_action_si is not None:
+    if row.risk is None and row.recommended is not None:
         said.append("Errors of grip, placement and speed entered only as far as they happened in these pours.")
     return said + [f"Not simulated at this action, {one.kind}: {one.text}." for one in row.not_covered]
 
@@ -609,7 +609,7 @@ def receiver_table(summary: RunSummary) -> ResultTable:
     shown = [
         row
         for row in summary.receivers.values()
-        if any(value is not None for value in (row.first_loss, row.best_loss, row.predicted_loss))
+        if row.recommended is not None or any(one is not None and one.loss is not None for one in (row.first, row.best))
     ]
     heads = list(dict.fromkeys(head for row in shown for head in row.texts))
     rows = [

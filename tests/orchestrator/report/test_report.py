@@ -136,7 +136,9 @@ def test_expected_losses_below_zero_are_shown_as_zero_and_stored_as_they_are(
         map=changed(learnt.map, mean=(np.array(learnt.map.mean) - 0.5).tolist()),
     )
     summary = summarise(plan, {"narrow cup": deployed})
-    assert summary.receivers["narrow cup"].predicted_loss == -0.013
+    recommended = summary.receivers["narrow cup"].recommended
+    assert recommended is not None
+    assert recommended.predicted_loss == -0.013
     assert "0.00 ± 1.40 %" in shown(summary_table(summary))
     assert "-" not in loss_unit(Loss()).text(-0.013, 0.014)
     (told,) = set(pour_series(plan, {"narrow cup": deployed}, loss_unit(Loss()))[0].predicted)

@@ -109,8 +109,8 @@ def test_the_same_figure_is_the_same_file(tmp_path: Path) -> None:
 
 def test_it_says_what_to_do_what_to_expect_and_what_nobody_knows(made: Made) -> None:
     said, row = texts(made.page), next(iter(made.published.summary.receivers.values()))
-    assert row.best_action_si is not None
-    assert f"{row.best_action_si['x_offset'] * 1e3:.3g} mm" in said
+    assert row.recommended is not None
+    assert f"{row.recommended.action_si['x_offset'] * 1e3:.3g} mm" in said
     assert "To pour 100 g of water from beaker into narrow, use the recommended action." in said
     assert "No safe window was looked for" in said
     assert "The recommended action was not poured again" in said

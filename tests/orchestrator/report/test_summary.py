@@ -49,14 +49,14 @@ def test_summary_tells_theta_discrepancies_losses_actions_and_files(results: dic
     assert summary.simulations == 60
     assert summary.discrepancy["test"]["calibrated"] == results["evaluation"].discrepancy["calibrated"]["test"]
     assert summary.discrepancy["test"]["random_theta"] == results["evaluation"].random_median["test"]
-    assert (receiver.first_loss, receiver.best_loss) == (losses[0], min(losses))
-    assert receiver.best_pour == 1 + losses.index(min(losses))
-    assert receiver.best_action == deployed.recommended.action
+    assert (receiver.first.loss, receiver.best.loss) == (losses[0], min(losses))
+    assert receiver.best.number == 1 + losses.index(min(losses))
+    assert receiver.recommended == deployed.recommended
 
     text = shown(summary_table(summary))
     assert display_value("particles", summary.theta.particles) in text
     assert "12.34" in text
-    assert f"{100 * min(losses):.2f} % (pour {receiver.best_pour})" in text
+    assert f"{100 * min(losses):.2f} % (pour {receiver.best.number})" in text
     assert display_values(deployed.recommended.action_si) in text
     assert "campaign.rrd" in text
 
@@ -143,7 +143,7 @@ def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(re
     )
     summary = summarise(plan, {"narrow cup": deployed, "prediction:narrow cup": foreseen})
     receiver = summary.receivers["narrow cup"]
-    assert (receiver.best_delivered_g, receiver.best_delivered_ml) == (best.delivered_g, best.delivered_ml)
+    assert receiver.best == best
     assert receiver.predicted_delivered_g == pytest.approx(900.0 * liquid.mass)
     assert receiver.predicted_delivered_ml == pytest.approx(900.0 * liquid.mass / liquid.density * 1e3)
     text = shown(summary_table(summary))
