@@ -205,6 +205,19 @@ def validate(
     call(verb.validate, files)
 
 
+@app.command(epilog=examples("decant migrate my.yaml rig.yaml"))
+def migrate(
+    files: Annotated[
+        list[Path],
+        typer.Argument(help="Campaign, study, vessel, laboratory or daemon files; rewritten.", show_default=False),
+    ],
+) -> None:
+    """Rename what earlier versions called otherwise, in place; comments and layout stay."""
+    from orchestrator.cli import file_commands as verb
+
+    call(verb.migrate, files)
+
+
 @app.command(epilog=examples("decant init lab", "decant run lab/campaigns/quickstart.yaml"))
 def init(directory: Annotated[Path, typer.Argument(help="An empty folder, or one that does not exist yet.")]) -> None:
     """Copy example files into a folder: campaigns, laboratories, studies, vessels and weighed pours."""

@@ -1,6 +1,7 @@
-"""The commands `decant validate`, `decant init` and `decant plugins`.
+"""The commands `decant validate`, `decant migrate`, `decant init` and `decant plugins`.
 
 - `validate` reads files, builds vessels and tries actions; it starts nothing.
+- `migrate` rewrites files of earlier versions.
 - `init` copies example files into a folder.
 - `plugins` lists the plug-ins of installed packages, including those that can't be used.
 """
@@ -71,6 +72,49 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             for text in dict.fromkeys(warned):
                 mention(text)
             return f"campaign, seed {plan.seed}", [str(problem) for problem in problems]
+
+
+def migrate(paths: list[Path]) -> None:
+    """Rename retired keys and values in files, in place; comments and layout are kept.
+
+    Raises:
+        RefusalError: a file can't be read, or has problems that a person has to solve (exit code 2).
+    """
+    from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
+    from orchestrator.config.migration import migrate_file
+    from orchestrator.config.yaml.file_access import resolved
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.config.yaml.yaml_source import Document, kind_of
+
+    def load_study(path: Path) -> object:
+        from orchestrator.study.study_file import load_study
+
+        return load_study(path)
+
+    def load_daemon(path: Path) -> object:
+        from orchestrator.daemon.daemon_settings import load_settings
+
+        return load_settings(path)
+
+    kinds = {"vessel": load_vessel, "laboratory": load_laboratory, "study": load_study, "campaign": load_campaign}
+    left = 0
+    for path in paths:
+        try:
+            kind = kind_of(Document.read(resolved(path)).data)
+            result = migrate_file(path, load_daemon if kind is None else kinds[kind])
+        except (ConfigError, OSError) as error:
+            say(str(error))
+            left += 1
+            continue
+        for line, old, new in result.renamed:
+            print(f"{path}:{line}: {old} -> {new}")
+        if not result.renamed and not result.problems:
+            print(f"{path}: nothing to rename")
+        if result.problems:
+            left += 1
+            say("\n".join(map(str, result.problems)))
+    if left:
+        raise RefusalError(f"{left} of {len(paths)} file(s) have problems that can't be solved by renaming", BAD_INPUT)
 
 
 def init(directory: Path) -> None:

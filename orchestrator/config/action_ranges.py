@@ -17,7 +17,7 @@ from sim_engine.action import ACTION_DIMENSIONS, Dimension
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import Pivot
 from sim_engine.search_space import Axis, Scale, Space
-from sim_engine.settings.model import MADE, Section, Text
+from sim_engine.settings.model import MADE, Settings, Text
 from sim_engine.settings.quantity import Quantity
 
 EXAMPLES = {
@@ -39,7 +39,7 @@ EXAMPLES = {
 """A valid value of every action dimension and simulation parameter, for messages and schemas."""
 
 
-class RangeSection(Section):
+class RangeSection(Settings):
     """Bounds of a searched quantity: `[lowest, highest]`, or with a scale `{range: [...], scale: log}`."""
 
     required: ClassVar[dict[str, str]] = {"range": "[lowest, highest]"}
@@ -100,7 +100,7 @@ def title(name: str) -> str:
     return name.title().replace("_", "")
 
 
-def described(section: type[Section], field: str) -> str | None:
+def described(section: type[Settings], field: str) -> str | None:
     """Description of a section's field."""
     return section.model_fields[field].description
 
@@ -120,7 +120,7 @@ def dimension_quantity(dimension: Dimension, *, words: bool = False) -> Quantity
     )
 
 
-class PriorSection(Section):
+class PriorSection(Settings):
     """Prior of a searched dimension: a normal distribution, truncated at the ends of the range."""
 
     mean: Any = None
@@ -160,7 +160,7 @@ def _action_range_model(dimension: Dimension) -> type[RangeSection]:
     return range_model(name, quantity, ActionRangeSection, prior=field)
 
 
-class PivotPoint(Section):
+class PivotPoint(Settings):
     """A horizontal line in the frame of the upright pourer."""
 
     required: ClassVar[dict[str, str]] = {"x": "0 mm", "z": "50 mm"}
@@ -176,7 +176,7 @@ def _pivot_form(value: Any) -> str:
     return "word" if isinstance(value, str) else "point"
 
 
-class MotionBase(Section):
+class MotionBase(Settings):
     """Values of the motion that are not searched."""
 
     pivot: (
@@ -222,7 +222,7 @@ def _motion_model() -> type[MotionBase]:
     return model
 
 
-class ActionsBase(Section):
+class ActionsBase(Settings):
     """Searched dimensions of the motion, each with its range; any subset."""
 
     constraints: list[Text] | None = None

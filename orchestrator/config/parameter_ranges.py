@@ -11,7 +11,7 @@ from orchestrator.config.action_ranges import EXAMPLES, RangeSection, described,
 from orchestrator.strategies.campaign_plan import NormalPrior
 from sim_engine.liquids import ParameterInfo, SimulationParameters
 from sim_engine.search_space import Axis
-from sim_engine.settings.model import MADE, Section
+from sim_engine.settings.model import MADE, Settings
 from sim_engine.settings.quantity import Quantity
 
 SEARCHED_TOLERANCES = 3.0
@@ -73,7 +73,7 @@ def _parameter_form(value: Any) -> str:
     return "searched" if isinstance(value, (list, Mapping)) else "fixed"
 
 
-class ParametersBase(Section):
+class ParametersBase(Settings):
     """Parameters: a value fixes one; a range, or a measured value with a tolerance, makes calibration search it."""
 
     def fixed(self) -> dict[str, float]:

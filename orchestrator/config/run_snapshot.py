@@ -19,7 +19,7 @@ from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from orchestrator.config.yaml.yaml_writer import as_file
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
-from sim_engine.settings.model import Section
+from sim_engine.settings.model import Settings
 from sim_engine.vessel.shapes import MeshShape, ProfileShape, VesselSpec
 
 
@@ -109,18 +109,18 @@ def vessel_record(vessel: VesselSpec) -> dict[str, Any]:
         case MeshShape():
             unit = {} if shape.unit is None else {"unit": shape.unit}
             return {"name": vessel.name, "mesh": str(shape.path), "up": shape.up, **unit}
-        case Section():
+        case Settings():
             return {"name": vessel.name, shape.kind: written(shape)}
         case _:
             raise TypeError(f"a vessel of the kind {shape.kind!r} can't be written down")
 
 
-def _common(base: Mapping[str, Any], section: type[Section]) -> dict[str, Any]:
+def _common(base: Mapping[str, Any], section: type[Settings]) -> dict[str, Any]:
     """The keys of a section that are common to all strategies."""
     return {key: value for key, value in base.items() if key in section.written_keys()}
 
 
-def written(section: Section) -> dict[str, Any]:
+def written(section: Settings) -> dict[str, Any]:
     """A section without a file, in the format of a file."""
     return as_file(section, Place(Document(Path.cwd() / "written")), References(Report()))
 

@@ -12,7 +12,7 @@ from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.yaml_source import Place, Report
 from sim_engine.errors import did_you_mean
 from sim_engine.liquids import KNOWN, NEUTRAL, ROOM, Liquid, Properties, find, look_up, split_share
-from sim_engine.settings.model import MADE, FilePath, Name, Number, Section, Text
+from sim_engine.settings.model import MADE, FilePath, Name, Number, Settings, Text
 from sim_engine.settings.quantity import Quantity, parse_quantity
 from sim_engine.vessel.shapes import VESSELS, LengthUnit, MeshShape, ProfileShape, Shape, VesselSpec
 
@@ -23,7 +23,7 @@ Thickness = Annotated[float, Quantity("m", "4 mm", lower=2e-4, upper=0.1)]
 Point = Annotated[tuple[Number, Number], Field(description="[r, z]")]
 
 
-class ProfileSection(Section):
+class ProfileSection(Settings):
     """A surface of revolution."""
 
     required: ClassVar[dict[str, str]] = {
@@ -53,7 +53,7 @@ class ProfileSection(Section):
     """Uncertainty of the rim's height, one standard deviation; all points move in proportion."""
 
 
-class VesselBase(Section):
+class VesselBase(Settings):
     """A vessel: a profile of [r, z] points, a mesh of its solid, or a source that an installed package adds."""
 
     required: ClassVar[dict[str, str]] = {"name": "beaker"}
@@ -74,10 +74,10 @@ class VesselBase(Section):
     """Axis of the mesh that points out of the opening; z unless given."""
 
 
-def further_sources() -> dict[str, type[Section]]:
+def further_sources() -> dict[str, type[Settings]]:
     """Sources of vessels that packages add, by their keys in a vessel's file."""
     own = VesselBase.model_fields.keys()
-    return {kind: shape for kind, shape in VESSELS.all.items() if kind not in own and issubclass(shape, Section)}
+    return {kind: shape for kind, shape in VESSELS.all.items() if kind not in own and issubclass(shape, Settings)}
 
 
 def _vessel_file() -> type[VesselBase]:
@@ -95,7 +95,7 @@ def _vessel_file() -> type[VesselBase]:
 VesselFile: Any = _vessel_file()
 
 
-class LiquidFile(Section):
+class LiquidFile(Settings):
     """The liquid, given by its name if it is in the [table](liquids.md#the-table), or by its properties."""
 
     name: Text = "water"

@@ -17,7 +17,7 @@ from orchestrator.journal.codec import to_json
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.liquids import Liquid
 from sim_engine.scene import Scene
-from sim_engine.settings.model import BY_CONTENT, FREE, marks_of
+from sim_engine.settings.model import BY_CONTENT, NOT_IN_FINGERPRINT, SET_BY_PROGRAM, marks_of
 from sim_engine.vessel.shapes import ProfileShape
 
 
@@ -51,7 +51,7 @@ def deciding(value: Any) -> Any:
         fields = {
             name: (getattr(value, name), mark)
             for name, mark in marks_of(type(value)).items()
-            if mark != FREE and name not in free
+            if mark not in (NOT_IN_FINGERPRINT, SET_BY_PROGRAM) and name not in free
         }
         return {
             name: hashlib.sha256(found.read_bytes()).hexdigest() if mark == BY_CONTENT else deciding(found)

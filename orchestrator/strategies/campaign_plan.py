@@ -29,7 +29,7 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import MINIMUM_POURED, Loss
 from sim_engine.scene import PoseError, Scene
 from sim_engine.search_space import Space
-from sim_engine.settings.model import FREE, PourCount, Problems, Section
+from sim_engine.settings.model import NOT_IN_FINGERPRINT, PourCount, Problems, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from orchestrator.strategies.strategy import Strategy
 
 
-class StrategySettings(Section):
+class StrategySettings(Settings):
     """Settings that all strategies have in common."""
 
     tag: ClassVar[str] = "strategy"
@@ -66,6 +66,8 @@ class StrategySettings(Section):
 
 class CalibrationSettings(StrategySettings):
     """Settings of a calibration, which fits θ to the weighed spills."""
+
+    default_tag: ClassVar[str] = "C4"
 
     has_prior: ClassVar[bool] = False
     """Whether the strategy averages over a prior of actions, so that `actions` may define one."""
@@ -265,7 +267,7 @@ class RecordSet:
 
     scene: Scene
     pours: tuple[RecordedPour, ...]
-    path: Annotated[Path, FREE]
+    path: Annotated[Path, NOT_IN_FINGERPRINT]
     lip_radius: float | None = None
     columns: dict[str, str] = field(default_factory=dict)
 
@@ -288,7 +290,7 @@ class ExistingPours:
     """
 
     pours: dict[str, tuple[RecordedPour, ...]]
-    path: Annotated[Path, FREE]
+    path: Annotated[Path, NOT_IN_FINGERPRINT]
     counts: bool = False
     left_out: tuple[str, ...] = ()
     lip_radius: float | None = None
@@ -471,16 +473,16 @@ class CampaignPlan:
 
     name: str
     seed: int
-    source: Annotated[Path, FREE]
+    source: Annotated[Path, NOT_IN_FINGERPRINT]
     laboratory: LaboratorySpec
     parameters: SimulationParameters
     calibration: CalibrationPlan | None
     deployment: DeploymentPlan | None
-    outputs: Annotated[OutputPlan, FREE]
+    outputs: Annotated[OutputPlan, NOT_IN_FINGERPRINT]
     parallel_simulations: int = 2
-    on_unknown: Annotated[Literal["ask", "repeat"], FREE] = "ask"
-    resolved: Annotated[dict[str, Any], FREE] = field(default_factory=dict)
-    laboratory_source: Annotated[Path | None, FREE] = field(default=None, compare=False)
+    on_unknown: Annotated[Literal["ask", "repeat"], NOT_IN_FINGERPRINT] = "ask"
+    resolved: Annotated[dict[str, Any], NOT_IN_FINGERPRINT] = field(default_factory=dict)
+    laboratory_source: Annotated[Path | None, NOT_IN_FINGERPRINT] = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)

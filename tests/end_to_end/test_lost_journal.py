@@ -22,11 +22,11 @@ from orchestrator.config.file_loading import load_campaign
 from orchestrator.journal.journal import JOURNAL_NAME, Entry, Kind
 from orchestrator.journal.journal_check import LEDGER_NAME, JournalDamagedError, read_ledger
 from orchestrator.runs.run_folder import find_run
-from tests.end_to_end import small
-from tests.end_to_end.command import Workplace, ended, started_after_they_were_finished
-from tests.patience import PATIENCE
+from tests.support import small_campaign
+from tests.support.command_process import Workplace, ended, started_after_they_were_finished
+from tests.support.waiting import PATIENCE
 
-CAMPAIGN = small.CAMPAIGN.replace("directory: runs,", "directory: runs, figures: false, rrd: false,")
+CAMPAIGN = small_campaign.CAMPAIGN.replace("directory: runs,", "directory: runs, figures: false, rrd: false,")
 
 RUN = ("run", "small.yaml", "--in-process")
 RESUME = (*RUN, "--resume", "--run")
@@ -54,7 +54,7 @@ def two_poured(place: Workplace) -> Callable[[list[Entry]], bool]:
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a campaign that was killed after its second pour."""
     folder = tmp_path_factory.mktemp("killed")
-    small.write_campaign(folder, CAMPAIGN)
+    small_campaign.write_campaign(folder, CAMPAIGN)
     place = Workplace(folder)
     try:
         process, _ = place.interrupt(two_poured(place), signal.SIGKILL, *RUN)

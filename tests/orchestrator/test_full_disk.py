@@ -21,8 +21,8 @@ from orchestrator.runs.events import Event, LogLine
 from orchestrator.strategies.campaign_plan import OutputPlan
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
-from tests.orchestrator.scripted import Script, one_stage, pour, run, states
-from tests.orchestrator.toy import ToyBench, ToyLaboratory, toy_plan
+from tests.support.scripted_strategy import Script, one_stage, pour, run, states
+from tests.support.toy_campaign import ToyBench, ToyLaboratory, toy_plan
 
 SIZE = 60 * MB
 

@@ -22,7 +22,7 @@ from orchestrator.journal.journal_check import BEGUN, LEDGER_NAME, JournalDamage
 from orchestrator.journal.journal_file import FORMAT, Header, JournalError, JournalLockedError
 from orchestrator.states import State
 from orchestrator.study.study_folder import StudyError, opened
-from tests.orchestrator.study_files import small
+from tests.support.study_files import small
 
 HEADER = Header("toy", {"seed": 7, "deployment": {"pours": 3}})
 

@@ -19,8 +19,8 @@ from orchestrator.runs.events import (
 from orchestrator.runs.stage_scheduler import is_recorded
 from sim_engine.outcome import RecordedFrames
 from sim_engine.scene import PourTask
-from tests.orchestrator.scripted import run
-from tests.orchestrator.toy import ToyLaboratory, logical_record, toy_plan
+from tests.support.scripted_strategy import run
+from tests.support.toy_campaign import ToyLaboratory, logical_record, toy_plan
 
 
 def test_a_watcher_that_raises_is_reported_once_and_changes_nothing(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from sim_engine.hydrostatics import level, predicted_end_of_flow, retained_volume, tilting_cup_outflow
 from sim_engine.vessel.shapes import ProfileShape, VesselSpec, cylinder
 from sim_engine.vessel.vessel import build_vessel
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 CUP = build_vessel(cylinder("cup", inner_radius=0.04, inner_height=0.1))
 BOTTLE = build_vessel(

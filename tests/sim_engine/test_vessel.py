@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from sim_engine.vessel.distance_grid import MARGIN, MAXIMUM_NODES
 from sim_engine.vessel.shapes import ProfileShape, VesselError, VesselSpec, cylinder
 from sim_engine.vessel.vessel import Vessel, build_vessel, check_holds
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 BEAKER = build_vessel(cylinder("beaker", inner_radius=0.04, inner_height=0.1))
 

@@ -14,14 +14,14 @@ from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
 from sim_engine.errors import shown_path
 from sim_engine.liquids import Liquid
-from sim_engine.settings.model import Section
+from sim_engine.settings.model import Settings
 from sim_engine.vessel.shapes import VesselSpec
 
-S = TypeVar("S", bound=Section)
+S = TypeVar("S", bound=Settings)
 
 YAML_SUFFIXES = (".yaml", ".yml", ".json")
 
-KINDS: dict[type[Section], str] = {VesselFile: "vessel", LaboratoryFile: "laboratory"}
+KINDS: dict[type[Settings], str] = {VesselFile: "vessel", LaboratoryFile: "laboratory"}
 """Kinds of whole files that their keys identify."""
 
 
@@ -30,7 +30,7 @@ class References:
     """Follows paths from files to files. Problems in any of them are added to the report with their own place."""
 
     report: Report
-    _read: dict[tuple[Path, type[Section]], tuple[Section, Place] | None] = field(default_factory=dict)
+    _read: dict[tuple[Path, type[Settings]], tuple[Settings, Place] | None] = field(default_factory=dict)
     _vessels: dict[tuple[Path, Any], VesselSpec | None] = field(default_factory=dict)
 
     def section(self, value: Any, place: Place, model: type[S]) -> tuple[S, Place] | None:

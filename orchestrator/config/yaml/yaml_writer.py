@@ -12,13 +12,13 @@ from pydantic import Tag
 from orchestrator.config.yaml.file_access import resolved
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.yaml_source import Place
-from sim_engine.settings.model import IN_FILE, FieldMark, Section
+from sim_engine.settings.model import IN_FILE, FieldMark, Settings
 from sim_engine.settings.quantity import Quantity
 
 T = TypeVar("T")
 
 
-def as_file(section: Section, place: Place, references: References, *, whole: bool = True) -> dict[str, Any]:
+def as_file(section: Settings, place: Place, references: References, *, whole: bool = True) -> dict[str, Any]:
     """A section in the format of a file, JSON-ready: loading it gives an equal section.
 
     Defaults are written (unless the section is recorded as given), numbers keep all digits, paths are absolute, and
@@ -39,7 +39,7 @@ class _Writer:
     references: References
     whole: bool
 
-    def section(self, section: Section, place: Place) -> dict[str, Any]:
+    def section(self, section: Settings, place: Place) -> dict[str, Any]:
         table: dict[str, Any] = {}
         for key, name in section.written_keys().items():
             value, info = getattr(section, name), type(section).model_fields[name]
@@ -51,7 +51,7 @@ class _Writer:
         return table
 
     def _value(self, value: Any, annotation: Any, metadata: tuple[Any, ...], place: Place) -> Any:
-        if isinstance(value, Section):
+        if isinstance(value, Settings):
             return as_file(value, place, self.references, whole=self.whole)
         if isinstance(value, str):
             return self._text(value, annotation, metadata, place)
@@ -85,11 +85,11 @@ def _parts(annotation: Any) -> list[tuple[Any, tuple[Any, ...]]]:
     return [(annotation, ())]
 
 
-def _behind_a_path(annotation: Any) -> type[Section] | None:
+def _behind_a_path(annotation: Any) -> type[Settings] | None:
     """The section that may be in its own file, referenced by a path."""
     for part, metadata in _parts(annotation):
         if any(isinstance(m, Tag) and m.tag == "inline" for m in metadata):
-            return typing.cast("type[Section]", part)
+            return typing.cast("type[Settings]", part)
     return None
 
 

@@ -17,7 +17,7 @@ from orchestrator.cli.vessel_tables import read_photograph
 from orchestrator.config.file_loading import load_vessel
 from sim_engine.vessel.profile import volume
 from sim_engine.vessel.vessel import build_vessel
-from tests.measured import FOCAL, Bench
+from tests.support.measured_vessel import FOCAL, Bench
 
 VESSELS = Path("configs/vessels")
 

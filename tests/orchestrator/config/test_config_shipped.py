@@ -26,7 +26,7 @@ from orchestrator.config.json_schema import (
 from orchestrator.config.yaml.yaml_source import Document
 from sim_engine.action import DEG, Action
 from sim_engine.vessel.shapes import MeshShape
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 CAMPAIGNS = sorted((CONFIGS / "campaigns").glob("*.yaml"))

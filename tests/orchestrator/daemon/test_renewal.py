@@ -14,7 +14,7 @@ from actors.simulators.shared_pool import WarmSimulators
 from orchestrator.daemon import restart as renewal
 from orchestrator.daemon import supervisor
 from orchestrator.daemon.restart import MOST, RENEWED, DaemonRestart, RayWatch
-from tests.orchestrator.daemon.served import held, run, serving
+from tests.support.toy_daemon import held, run, serving
 
 
 def test_a_pour_is_finished_before_and_its_campaign_goes_on_after(

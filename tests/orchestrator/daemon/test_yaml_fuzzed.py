@@ -16,8 +16,8 @@ from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.daemon.submission_bundle import Files, pack
 from orchestrator.daemon.submissions import Submission, SubmissionError, prepare
-from tests.depth import examples
-from tests.end_to_end.small import write_campaign
+from tests.support.hypothesis_examples import examples
+from tests.support.small_campaign import write_campaign
 
 pytestmark = [pytest.mark.slow, pytest.mark.hypothesis]
 

@@ -14,8 +14,8 @@ from orchestrator.strategies.deployment.deployment_base import MAX_REFUSED
 from orchestrator.strategies.strategy import Strategy
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, replay
 from sim_engine.outcome import Loss, PourMeasurement
-from tests.orchestrator.plans import deployment_plan
-from tests.orchestrator.toys import narrow_cup, narrow_cup_biased
+from tests.support.plans import deployment_plan
+from tests.support.toy_spillage import narrow_cup, narrow_cup_biased
 
 STRATEGIES = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
 

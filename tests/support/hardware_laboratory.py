@@ -71,9 +71,9 @@ outputs: {directory: runs, rrd: false}
 
 def write_rig(folder: Path, address: str) -> Path:
     """A campaign of pours on hardware, with its laboratory and vessels; returns the campaign's file."""
-    from tests.end_to_end import small
+    from tests.support import small_campaign
 
-    path = small.write_campaign(folder)
+    path = small_campaign.write_campaign(folder)
     write_laboratory(folder / "rig.yaml", address)
     path = folder / "rigged.yaml"
     path.write_text(CAMPAIGN, encoding="utf-8")

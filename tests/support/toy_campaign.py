@@ -46,7 +46,7 @@ from sim_engine.outcome import Loss, PourMeasurement, PourOutcome, SimulatedPour
 from sim_engine.scene import PourTask, Scene
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.shapes import cylinder
-from tests.orchestrator import plans
+from tests.support import plans
 
 SPACE = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0.08, 0.15)))
 SCENE = Scene(
