@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from actors.optimizer.questions import Suggestion, SuggestProblem
 from actors.optimizer.suggest import slices
+from orchestrator.journal.run_record import RecordedPour
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
 from orchestrator.requests import Pour, Poured, Suggest, Suggested
@@ -30,6 +31,7 @@ from orchestrator.results.loss_units import (
     unit_of_pour,
 )
 from orchestrator.results.stage_views import receiver_names
+from orchestrator.results.summarise import pour_summary
 from orchestrator.runs.events import RequestFinished
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.strategies.campaign_plan import CampaignPlan
@@ -77,8 +79,6 @@ class LearningStage:
         self._drawn: dict[str, float] = {}
         self._waiting: dict[str, Callable[[], bytes]] = {}
         self._least: dict[str, float] = {}
-        self.best: dict[str, str] = {}
-        """Text for the best pour so far, by the receiver's name."""
         self.trust = ""
         """Result of the model check, as text."""
 
@@ -104,13 +104,13 @@ class LearningStage:
         """Associate a stage with a scene."""
         self._scene_of_stage[stage] = scene
 
-    def poured(self, request: Pour, outcome: Poured) -> str:
+    def poured(self, stage: str, request: Pour, outcome: Poured) -> str:
         """Log a weighed pour; return a description."""
         measured, unit = outcome.measurement, unit_of_pour(self._plan, request)
+        said = pour_summary(self._plan, RecordedPour(stage, 0, request, "weighed", measured)).line
         value = loss_of_pour(self._plan, request, measured)
-        weights = f"{1e3 * measured.spilled:.1f} g spilled, {1e3 * measured.retained:.1f} g left in the pourer"
         if value is None:
-            return f"pour {request.number}: too little was poured for a loss ({weights})"
+            return said
         calibrating = is_calibration(self._plan, request)
         place = f"{PLACE}/{CALIBRATION if calibrating else safe_name(request.scene)}/loss"
         shown = unit.factor * value
@@ -121,15 +121,10 @@ class LearningStage:
             for name, end in zip(("low", "high"), request.predicted.of_a_pour(), strict=True):
                 label = f"{100 * LEVEL:.0f} % band, {'upper' if name == 'high' else 'lower'} end [{unit.unit}]"
                 self._number(f"{place}/predicted_{name}", unit.factor * end, label, "#f0c27a", width=1.5)
-        name = self._names.get(request.scene, request.scene)
         if not calibrating:
-            self._best(request.scene, place, shown, unit.unit, name)
-        return f"pour {request.number} of {name}: {shown:.2f} {unit.unit} ({weights})"
-
-    def _best(self, scene: str, place: str, shown: float, unit: str, name: str) -> None:
-        self._least[scene] = least = min(shown, self._least.get(scene, shown))
-        self._number(f"{place}/best", least, f"best so far [{unit}]", style.GOOD)
-        self.best[name] = f"{least:.2f} {unit}"
+            self._least[request.scene] = least = min(shown, self._least.get(request.scene, shown))
+            self._number(f"{place}/best", least, f"best so far [{unit.unit}]", style.GOOD)
+        return said
 
     def suggested(self, event: RequestFinished, request: Suggest, outcome: Suggested) -> None:
         """Draw the surrogate of a suggestion, unless it was drawn recently."""

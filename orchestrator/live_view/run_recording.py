@@ -125,7 +125,7 @@ class CampaignRecording:
             case CampaignClosed():
                 self._learning.flush(event.time)
                 self._say(f"ended: {event.state}")
-                self._machine.outcome(self.status.page())
+                self._machine.outcome(self.status.page(self._learning.trust))
                 self._show("replaying")
             case StageOpened():
                 self._say(f"stage {event.stage} begins", source=event.stage)
@@ -143,14 +143,13 @@ class CampaignRecording:
                     self._machine.lane("arm", doing)
             case StrategyProgressed():
                 self._learning.learnt(event.result, event.time)
-                self.status.best, self.status.trust = self._learning.best, self._learning.trust
             case DecisionMade():
                 level = "warning" if event.decision.urgent else "info"
                 self._decided = event.decision.text
                 self._say(event.decision.text, level, event.stage)
             case LogLine():
                 self._say(event.text, event.level, event.stage)
-        self._machine.status(self.status.page())
+        self._machine.status(self.status.page(self._learning.trust))
 
     def _say(self, text: str, level: str = "info", source: str = "") -> None:
         self._machine.line(text, level, source or "campaign")
@@ -206,8 +205,7 @@ class CampaignRecording:
                 self._simulation(event, request, outcome)
             case Pour() as request, Poured() as outcome:
                 self._learning.about(event.stage, request.scene)
-                self._say(self._learning.poured(request, outcome), source=event.stage)
-                self.status.best = self._learning.best
+                self._say(self._learning.poured(event.stage, request, outcome), source=event.stage)
                 measured, shown = outcome.measurement, self._balance.finish(outcome.measurement)
                 self._cell.finish(
                     self._scenes[request.scene],

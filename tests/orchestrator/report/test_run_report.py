@@ -22,13 +22,16 @@ from orchestrator.config.file_loading import load_campaign
 from orchestrator.journal.journal_check import JournalCheck
 from orchestrator.journal.run_record import CampaignResult, RecordedDecision, read_record
 from orchestrator.results import figure_style as style
+from orchestrator.results.console_view import summary_table
 from orchestrator.results.html_report import run_page
 from orchestrator.results.publishing import Published, publish
+from orchestrator.results.run_summary import summary_json
 from orchestrator.results.summarise import summarise
 from orchestrator.run_errors import RunError
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.run_folder import create_run
 from orchestrator.strategies.campaign_plan import CampaignPlan
+from tests.support.example_results import shown
 from tests.support.small_campaign import CAMPAIGN, write_campaign
 from tests.support.toy_campaign import ToyBench, ToyLaboratory
 
@@ -275,3 +278,28 @@ def test_the_library_writes_it_too(made: Made, tmp_path: Path) -> None:
 
     page = library.open_run(made.result.directory).report(tmp_path / "page.html")
     assert texts(page.read_text(encoding="utf-8")) == texts(made.page)
+
+
+def test_console_page_json_and_library_show_one_text_for_each_result(made: Made) -> None:
+    import html
+    import json
+
+    import decant as library
+
+    console = " ".join(shown(summary_table(made.published.summary), width=400).split())
+    page = " ".join(texts(made.page).split())
+    data = json.loads(json.dumps(summary_json(library.open_run(made.result.directory).summary)))
+    (receiver,) = data["receivers"].values()
+    (advice,) = data["advice"]
+    everywhere = [*filter(None, receiver["texts"].values()), *advice["sentences"], advice["window"], *advice["open"]]
+    everywhere += data["theta_sentences"]
+    assert len(everywhere) > 10
+    for text in everywhere:
+        assert text in console
+        assert html.unescape(text) in page
+    for pour in data["pours_made"]:
+        assert pour["predicted"] in page
+        assert pour["calibration"] or pour["measured"] in page
+        assert f"{pour['spilled_g']:.1f}" in page
+    assert all(use["text"] in console and use["text"] in page for use in data["occupancy"].values())
+    assert all(text in page for text in (*data["cost"].values(), *data["open_questions"], *data["asked"].values()))
