@@ -5,10 +5,8 @@ Figures use Matplotlib's Agg canvas without pyplot and without a window system.
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterator, Mapping
-from contextvars import ContextVar
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -118,6 +116,11 @@ def new_figure(
     return figure, figure.subplots(rows, columns, **kwargs)
 
 
+def entitle(figure: Figure, title: str) -> None:
+    """Set the title of a whole figure."""
+    figure.suptitle(title, fontsize=12.5, color=INK, x=0.02, ha="left")
+
+
 def dress(axes: Axes, *, title: str = "", x: str = "", y: str = "", grid: str | None = "y") -> None:
     """Set title, labels and a thin grid; remove the box."""
     axes.set_title(title, fontsize=11, loc="left", color=INK, pad=8)
@@ -215,47 +218,21 @@ def at_ends(values: Mapping[str, float | None], axes: tuple[Axis, ...]) -> list[
     return said
 
 
-_UNSAVED: ContextVar[list[Figure] | None] = ContextVar("unsaved figures", default=None)
+def save(figure: Figure, path: Path, formats: Sequence[str] = ()) -> Path:
+    """Write a PNG; the folder is made if needed.
 
-
-@contextlib.contextmanager
-def unsaved() -> Iterator[list[Figure]]:
-    """Collect figures instead of writing PNGs within this context, for notebooks."""
-    figures: list[Figure] = []
-    token = _UNSAVED.set(figures)
-    try:
-        yield figures
-    finally:
-        _UNSAVED.reset(token)
-
-
-_ALSO: ContextVar[tuple[str, ...]] = ContextVar("other formats", default=())
-
-
-@contextlib.contextmanager
-def also_as(*suffixes: str) -> Iterator[None]:
-    """Write every PNG in these additional formats within this context ('.svg' or '.pdf'), for print."""
-    token = _ALSO.set(suffixes)
-    try:
-        yield
-    finally:
-        _ALSO.reset(token)
-
-
-def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG (with other formats, inside `also_as`), unless `unsaved` collects it; the folder is made if needed.
+    Args:
+        path: PNG to write.
+        formats: suffixes of additional files next to it ('.svg' or '.pdf'), for print.
 
     Raises:
         OSError: a file can't be written.
     """
     from matplotlib import rc_context
 
-    if (figures := _UNSAVED.get()) is not None:
-        figures.append(figure)
-        return path
     path.parent.mkdir(parents=True, exist_ok=True)
     with rc_context({"svg.hashsalt": path.stem}):  # the same figure gives the same file
-        for suffix in (path.suffix, *_ALSO.get()):
+        for suffix in (path.suffix, *formats):
             undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
             figure.savefig(path.with_suffix(suffix), dpi=DPI, facecolor="white", metadata=undated)
             figure.set_layout_engine("none")  # keep the layout of the first format

@@ -1,9 +1,9 @@
 """Figures of pours, simulated and planned, and of vessels, as cross-sections in the plane y = 0.
 
-- `draw_pour` and `simulation_png`: snapshots of a pour from the side, and the shares of the liquid over time.
+- `draw_pour` and `simulation_figure`: snapshots of a pour from the side, and the shares of the liquid over time.
 - `section` and `place`: outlines of a mesh in its plane y = 0, and their transformation by a pose.
 - `draw_solid`: a mesh of a vessel.
-- `draw_path` and `path_png`: an arm's planned path: the pour from the side, and the arm in its cell.
+- `draw_path`: an arm's planned path: the pour from the side, and the arm in its cell.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 import math
 import textwrap
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -125,16 +124,12 @@ IN_POURER, _FALLING, _RECEIVED, SPILLED, _ESCAPED = (int(state) for state in Par
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
-def simulation_png(path: Path, task: PourTask, result: SimulatedPour) -> Path:
-    """Figure of one simulated pour, for `decant simulate --png`.
+def simulation_figure(task: PourTask, result: SimulatedPour) -> Figure:
+    """Figure of one simulated pour.
 
     Args:
-        path: PNG to write.
         task: the simulated task, with `record_rate` > 0.
         result: its result.
-
-    Returns:
-        `path`.
 
     Raises:
         ValueError: the result has no frames.
@@ -153,7 +148,6 @@ def simulation_png(path: Path, task: PourTask, result: SimulatedPour) -> Path:
         title += f"   [not valid: {outcome.invalid}]"
     note = f"{action}; {style.display_value('particles', outcome.particles)} particles, seed {outcome.seed}"
     return draw_pour(
-        path,
         result,
         build_vessel(scene.pourer),
         build_vessel(scene.receiver),
@@ -164,7 +158,6 @@ def simulation_png(path: Path, task: PourTask, result: SimulatedPour) -> Path:
 
 
 def draw_pour(
-    path: Path,
     result: SimulatedPour,
     pourer: Solid,
     receiver: Solid,
@@ -173,11 +166,10 @@ def draw_pour(
     note: str = "",
     receiver_shift: tuple[float, float] = (0.0, 0.0),
     snapshots: int = 4,
-) -> Path:
+) -> Figure:
     """Snapshots of a pour from the side (vessels cut at y = 0), above the shares of the liquid over time.
 
     Args:
-        path: PNG to write.
         result: a simulated pour with frames.
         pourer: its surface.
         receiver: its surface; its position is x and z = `receiver_shift` [m].
@@ -185,9 +177,6 @@ def draw_pour(
         note: second line.
         receiver_shift: x and z of the receiver [m].
         snapshots: number of snapshots.
-
-    Returns:
-        `path`.
 
     Raises:
         ValueError: the result has no frames.
@@ -232,7 +221,7 @@ def draw_pour(
     _timeline(timeline, times, shares, times[chosen])
     if note:
         figure.supxlabel(note, fontsize=8.5, color=style.GREY, x=0.01, ha="left")
-    return style.save(figure, path)
+    return figure
 
 
 def _shares(states: Any) -> Floats:
@@ -327,7 +316,7 @@ def _timeline(axes: Axes, times: Floats, shares: Floats, marks: Floats) -> None:
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8.5, frameon=False, reverse=True)
 
 
-def draw_solid(name: str, vessel: Vessel, path: Path) -> Path:
+def draw_solid(name: str, vessel: Vessel) -> Figure:
     """The cross-section of a mesh through its middle."""
     figure, axes = style.new_figure(size=(6.0, 5.0))
     for loop in section(vessel.solid_vertices, vessel.solid_faces):
@@ -340,7 +329,7 @@ def draw_solid(name: str, vessel: Vessel, path: Path) -> Path:
     )
     axes.set_aspect("equal")
     axes.margins(0.08)
-    return style.save(figure, path)
+    return figure
 
 
 # ---- planned paths
@@ -353,29 +342,18 @@ _MARGIN = 40.0
 """Margin around the close-up of the pour [mm]."""
 
 
-def path_png(
-    file: Path, path: PourPath, spec: UrArmSpec, pourer: Vessel, receiver: Vessel, *, title: str, note: str = ""
-) -> Path:
-    """Write the figure of a path.
+def draw_path(
+    path: PourPath, spec: UrArmSpec, pourer: Vessel, receiver: Vessel, *, title: str, note: str = ""
+) -> Figure:
+    """Figure of an arm's path.
 
     Args:
-        file: PNG to write.
         path: the planned path.
         spec: settings of the arm and its cell.
         pourer, receiver: geometry.
         title: first line.
         note: text below the title.
-
-    Returns:
-        `file`.
     """
-    return style.save(draw_path(path, spec, pourer, receiver, title=title, note=note), file)
-
-
-def draw_path(
-    path: PourPath, spec: UrArmSpec, pourer: Vessel, receiver: Vessel, *, title: str, note: str = ""
-) -> Figure:
-    """The figure of `path_png`."""
     from actors.arm.planning.frames import cell_transforms
     from actors.arm.planning.trajectory import SampledPath
 

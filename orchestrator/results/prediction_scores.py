@@ -8,12 +8,15 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from orchestrator.config.weighed_pours import column_name
 from orchestrator.results import figure_style as style
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.prediction_band import PredictionInterval, SampleStatistics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -177,17 +180,13 @@ def write_scored(path: Path, rows: Sequence[ScoredRow], dimensions: Sequence[str
     return path
 
 
-def draw_scored(path: Path, rows: Sequence[ScoredRow], *, title: str, note: str) -> Path:
+def draw_scored(rows: Sequence[ScoredRow], *, title: str, note: str) -> Figure:
     """Measured against predicted spillage, each with its prediction interval; pours outside their interval are ringed.
 
     Args:
-        path: PNG to write.
         rows: in any order; rows without r or prediction are left out.
         title: first line.
         note: description of the predictor.
-
-    Raises:
-        OSError: it can't be written.
     """
     figure, axes = style.new_figure(size=(6.6, 6.4))
     top = 0.0
@@ -255,4 +254,4 @@ def draw_scored(path: Path, rows: Sequence[ScoredRow], *, title: str, note: str)
         fontsize=8.0,
         color=style.GREY,
     )
-    return style.save(figure, path)
+    return figure

@@ -17,7 +17,7 @@ from orchestrator.results import validity_warnings as regimes
 from orchestrator.results.html_report import REPORT_NAME, run_page
 from orchestrator.results.run_figures import draw_figures
 from orchestrator.results.run_summary import SUMMARY_NAME, RunSummary, Totals, write_summary
-from orchestrator.results.stage_views import evaluation_of, receiver_names, theta_of
+from orchestrator.results.stage_views import evaluation_of, theta_of
 from orchestrator.results.summarise import pool_use, summarise, summarise_record
 from orchestrator.runs.run_folder import read_versions
 from orchestrator.states import State
@@ -255,5 +255,4 @@ def not_simulated(plan: CampaignPlan, tell: Callable[[str], None] = _log.warning
         plan: of the campaign.
         tell: called if that can't be worked out.
     """
-    warnings = worked_out(lambda: regimes.campaign_warnings(plan), tell)
-    return regimes.lines(warnings, receiver_names(plan))
+    return regimes.lines(worked_out(lambda: regimes.campaign_warnings(plan), tell))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,58 +71,46 @@ def draw_figures(
         Name of each figure → its PNG.
     """
     drawn: dict[str, Path] = {}
-    with style.also_as(*formats):
-        for name, job in _jobs(directory, plan, results).items():
-            try:
-                drawn[name] = job()
-            except Exception as error:
-                _log.warning("figure '%s' was not drawn: %s: %s", name, type(error).__name__, error)
+    for name, draw in _drawings(plan, results).items():
+        try:
+            drawn[name] = style.save(draw(), directory / f"{safe_name(name.replace(' ', '-'))}.png", formats)
+        except Exception as error:
+            _log.warning("figure '%s' was not drawn: %s: %s", name, type(error).__name__, error)
     return drawn
 
 
 def figures_of(plan: CampaignPlan, results: Results) -> dict[str, Figure]:
     """The same figures for notebooks, not written to files. An error in a figure is raised."""
-    found = {}
-    for name, job in _jobs(Path(), plan, results).items():
-        with style.unsaved() as figures:
-            job()
-        found[name] = figures[0]
-    return found
+    return {name: draw() for name, draw in _drawings(plan, results).items()}
 
 
-def _jobs(directory: Path, plan: CampaignPlan, results: Results) -> dict[str, Callable[[], Path]]:
+def _drawings(plan: CampaignPlan, results: Results) -> dict[str, Callable[[], Figure]]:
     """The functions that draw the figures, by name."""
-    jobs: dict[str, Callable[[], Path]] = {}
+    found: dict[str, Callable[[], Figure]] = {}
     calibration, evaluation, theta = calibration_of(results), evaluation_of(results), theta_of(results)
     if calibration is not None and (picture := calibration_picture(plan, calibration)) is not None:
-        jobs["discrepancy map"] = lambda p=picture: draw_surrogate(directory / "discrepancy-map.png", p)  # type: ignore[misc]
+        found["discrepancy map"] = partial(draw_surrogate, picture)
         if picture.held and picture.points:
-            jobs["discrepancy trials"] = lambda p=picture: draw_trials(directory / "discrepancy-trials.png", p)  # type: ignore[misc]
-    if theta is not None and plan.calibration is not None and (posterior := theta.posterior) is not None:
+            found["discrepancy trials"] = partial(draw_trials, picture)
+    if theta is not None and plan.calibration is not None and theta.posterior is not None:
         space, best = plan.calibration.parameters, theta.theta.model_dump()
-        jobs["posterior"] = lambda: draw_posterior(directory / "posterior.png", posterior, space, best)
+        found["posterior"] = partial(draw_posterior, theta.posterior, space, best)
     if evaluation is not None and (groups := discrepancy_groups(evaluation)):
-        jobs["test discrepancy"] = lambda: draw_discrepancy(
-            directory / "test-discrepancy.png", groups, title=f"How far the simulator is from the balance: {plan.name}"
-        )
-    if plan.deployment is not None:
-        unit = deployment_unit(plan.deployment)
-        if series := pour_series(plan, results, unit):
-            jobs["spillage against pours"] = lambda: draw_spillage(
-                directory / "spillage.png", series, cost=unit.label, title=f"What every pour came to: {plan.name}"
-            )
-        for scene, result in deployments_of(results).items():
-            if (picture := deployment_picture(plan, result)) is not None:
-                name = receiver_name(plan, scene)
-                jobs[f"loss map {name}"] = lambda p=picture, n=name: draw_surrogate(  # type: ignore[misc]
-                    directory / f"loss-map-{safe_name(n)}.png", p
-                )
-            if result.window is not None:
-                picture, name = deployment_picture(plan, result), receiver_name(plan, scene)
-                jobs[f"safe window {name}"] = lambda r=result, p=picture, n=name: draw_window(  # type: ignore[misc]
-                    directory / f"window-{safe_name(n)}.png", r, p, unit=unit, receiver=n
-                )
-    return jobs
+        title = f"How far the simulator is from the balance: {plan.name}"
+        found["test discrepancy"] = partial(draw_discrepancy, groups, title=title)
+    if plan.deployment is None:
+        return found
+    unit = deployment_unit(plan.deployment)
+    if series := pour_series(plan, results, unit):
+        title = f"What every pour came to: {plan.name}"
+        found["spillage against pours"] = partial(draw_spillage, series, cost=unit.label, title=title)
+    for scene, result in deployments_of(results).items():
+        picture, name = deployment_picture(plan, result), receiver_name(plan, scene)
+        if picture is not None:
+            found[f"loss map {name}"] = partial(draw_surrogate, picture)
+        if result.window is not None:
+            found[f"safe window {name}"] = partial(draw_window, result, picture, unit=unit, receiver=name)
+    return found
 
 
 def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:
@@ -265,17 +254,13 @@ class PourSeries:
         return running
 
 
-def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title: str) -> Path:
+def draw_spillage(series: Sequence[PourSeries], *, cost: str, title: str) -> Figure:
     """Loss against pours, one panel for each receiver: measured, best so far, and prediction interval.
 
     Args:
-        path: PNG to write.
         series: one per receiver.
         cost: label of the loss with its unit.
         title: title of the whole figure.
-
-    Returns:
-        `path`.
 
     Raises:
         ValueError: no receiver, or a receiver without pours.
@@ -287,7 +272,7 @@ def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title:
     figure, axes = style.new_figure(
         rows, columns, size=(max(6.4, 4.2 * columns), 0.6 + 3.7 * rows), squeeze=False, sharey=True
     )
-    figure.suptitle(title, fontsize=12.5, color=style.INK, x=0.02, ha="left")
+    style.entitle(figure, title)
     top = 0.0
     for place, one in enumerate(series):
         panel = axes[place // columns, place % columns]
@@ -298,7 +283,7 @@ def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title:
     axes[0, 0].set_ylim(0.0, TOP * top or 1.0)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    return style.save(figure, path)
+    return figure
 
 
 def _pour_title(series: PourSeries, cost: str) -> str:
@@ -394,18 +379,14 @@ class DiscrepancyGroup:
     posterior: float | None = None
 
 
-def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: str) -> Path:
+def draw_discrepancy(groups: Sequence[DiscrepancyGroup], *, title: str) -> Figure:
     """Mean |Δ| of θ* and its posterior compared with rivals.
 
     The rivals are the uncalibrated θ, random θ (median, quartiles), the mean of the training pours, and the regression.
 
     Args:
-        path: PNG to write.
         groups: sets of pours; values are fractions (0 … 1), shown in percent.
         title: title of the figure.
-
-    Returns:
-        `path`.
 
     Raises:
         ValueError: no group.
@@ -461,7 +442,7 @@ def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: s
     axes.set_xticks(middles, [f"{g.name}\n{g.pours} pour{'s' * (g.pours != 1)}" for g in groups], fontsize=9.5)
     axes.tick_params(axis="x", length=0)
     figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    return style.save(figure, path)
+    return figure
 
 
 def _random(values: Sequence[float]) -> tuple[str, float | None, str, tuple[float, float] | None]:

@@ -199,7 +199,7 @@ class Advice(ResultPart):
 class NotSimulated(ResultPart):
     """An effect that is not simulated in part of an action space."""
 
-    receiver: str = ""
+    receiver: str
     """Display name of the scene."""
 
     kind: str

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from orchestrator.journal.codec import Results
 from orchestrator.journal.journal_check import JournalCheck
@@ -54,9 +54,6 @@ from orchestrator.strategies.repeated_simulation import Foreseen
 from sim_engine.model_validity import NotCovered
 from sim_engine.outcome import normalised_spillage
 
-if TYPE_CHECKING:
-    from orchestrator.results.validity_warnings import SpaceWarning
-
 MODES = {"virtual": "VIRTUAL", "hardware": "REAL", "none": "SIMULATION ONLY"}
 """Text of the badge by the bench's mode."""
 
@@ -76,7 +73,7 @@ def summarise(
     figures: Mapping[str, Path] | None = None,
     recording: Path | None = None,
     dropped_events: int = 0,
-    not_covered: Mapping[str, Sequence[SpaceWarning]] | None = None,
+    not_covered: Mapping[str, Sequence[NotSimulated]] | None = None,
     best_not_covered: Mapping[str, Sequence[NotCovered]] | None = None,
     totals: Totals | None = None,
 ) -> RunSummary:
@@ -107,7 +104,6 @@ def summarise(
     receivers = _receivers(plan, results, best_not_covered or {})
     advised = wording.advice(plan, receivers)
     totals = totals or Totals()
-    names = receiver_names(plan)
     open_theta = [] if found is None else wording.about_theta(gain, posterior, discrepancy)
     return RunSummary(
         **dict(totals),
@@ -136,10 +132,7 @@ def summarise(
         loss=None if plan.deployment is None else plan.deployment.loss_name,
         loss_label="" if plan.deployment is None else deployment_unit(plan.deployment).label,
         receivers=receivers,
-        not_covered={
-            scene: tuple(NotSimulated(receiver=names.get(scene, scene), **one.as_json()) for one in several)
-            for scene, several in (not_covered or {}).items()
-        },
+        not_covered={scene: tuple(several) for scene, several in (not_covered or {}).items()},
         figures=dict(figures or {}),
         recording=recording,
         dropped_events=dropped_events,

@@ -53,7 +53,7 @@ QUICKSTART, TWIN = ROOT / "configs/campaigns/quickstart.yaml", ROOT / "configs/l
 
 PASSING = {"time", "t", "seconds", "cpu_s", "pid", "created"}
 PASSING |= {"pool_busy", "pool_useful", "arm_longest_wait_s", "arm_mean_wait_s"}
-PASSING |= {"began_at", "ended_at", "cost", "settings"}
+PASSING |= {"began_at", "ended_at", "cost", "occupancy", "settings"}
 """Keys of what depends on the day, the machine and the process."""
 
 UNPORTABLE = (

@@ -103,8 +103,7 @@ def test_the_same_figure_is_the_same_file(tmp_path: Path) -> None:
     def drawn(folder: Path) -> bytes:
         figure, axes = style.new_figure(size=(3.0, 2.0))
         axes.plot([0, 1], [1, 0], "o")
-        with style.also_as(".svg", ".pdf"):
-            style.save(figure, folder / "line.png")
+        style.save(figure, folder / "line.png", (".svg", ".pdf"))
         return b"".join((folder / f"line.{kind}").read_bytes() for kind in ("png", "svg", "pdf"))
 
     assert drawn(tmp_path / "first") == drawn(tmp_path / "second")

@@ -75,7 +75,9 @@ def test_summary_file_has_what_was_summarised_and_the_results_read_back(
 
 def test_summary_file_is_what_its_schema_says(results: dict[str, Any], tmp_path: Path) -> None:
     plan = example_run.campaign()
-    warning = NotSimulated(kind="wetting", share=0.1, text="", action_si={"x_offset": 0.1}, hit=1, tried=5)
+    warning = NotSimulated(
+        receiver="cup", kind="wetting", share=0.1, text="", action_si={"x_offset": 0.1}, hit=1, tried=5
+    )
     summary = summarise(plan, results, totals=Totals(occupancy={"narrow cup": BUSY}))
     written = json.loads(write_summary(tmp_path, changed(summary, not_covered={"cup": (warning,)})).read_text())
     validator = jsonschema.Draft202012Validator(summary_schema())
