@@ -34,6 +34,7 @@ from orchestrator.config.yaml.section_validation import sections_in
 from orchestrator.daemon import daemon_settings as daemon
 from orchestrator.daemon.notifications import NotifySection
 from orchestrator.states import State
+from orchestrator.strategies.campaign_plan import OutputSettings
 from orchestrator.strategies.deployment import disturbances as pose
 from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.disturbances import RiskSettings
@@ -47,10 +48,12 @@ from orchestrator.strategies.deployment.safe_window import WindowSettings
 from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES
 from orchestrator.study import study_file as study
 from sim_engine.action import ACTION_DIMENSIONS
-from sim_engine.liquids import KNOWN, ROOM, SimulationParameters
+from sim_engine.liquids import KNOWN, ROOM, LiquidSettings, SimulationParameters
+from sim_engine.outcome import Loss
 from sim_engine.settings.model import Choice, Settings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.validation import sensitivity
+from sim_engine.vessel.shapes import ProfileShape
 
 FOLDER = Path(__file__).parent
 MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
@@ -69,12 +72,12 @@ SECTIONS: dict[str, type[Settings]] = {
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
     "data": campaign.DataSection,
-    "loss": campaign.LossSection,
+    "loss": Loss,
     "objective": Objective,
-    "outputs": campaign.OutputsSection,
-    "liquid": vessel.LiquidFile,
+    "outputs": OutputSettings,
+    "liquid": LiquidSettings,
     "vessel": vessel.VesselFile,
-    "profile": vessel.ProfileSection,
+    "profile": ProfileShape,
     "laboratory": laboratory.LaboratoryFile,
     "ray": cluster.RaySection,
     "arm": arm_sections.UrArmSection,
@@ -116,7 +119,7 @@ OF_SECTIONS = {
     "PoseErrorSection": "[pose error](#bench)",
     "PoseNoiseSection": "standard deviations of the [pose error](#bench)",
     "TransferSection": "[transfer](#pours)",
-    "LossSection": "[loss](#losses)",
+    "Loss": "[loss](#losses)",
     "Objective": "[objective](#objectives)",
     **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
     "RiskSettings": "[risk](#risk-and-the-safe-window)",
@@ -126,13 +129,13 @@ OF_SECTIONS = {
     "RiskLimitSettings": "[risk_limit](#ignorance-limits-and-the-end)",
     "StopSettings": "[stop](#ignorance-limits-and-the-end)",
     "DataSection": "[data](#existing-data)",
-    "ProfileSection": "[profile](#vessels)",
+    "ProfileShape": "[profile](#vessels)",
     "Motion": "[motion](#motion-and-actions)",
     "Actions": "[actions](#motion-and-actions)",
     "Parameters": "[parameters](#simulator)",
     "VesselFile": "[vessel](#vessels) or the path of its file",
     "LaboratoryFile": "[laboratory](#laboratories) or the path of its file",
-    "LiquidFile": "[liquid](#liquid) or the path of its file",
+    "LiquidSettings": "[liquid](#liquid) or the path of its file",
     "LevelSection": "[level](#studies)",
     **{
         model.__name__: f"`{{{', '.join(model.written_keys())}}}`, [each](#studies) a mapping"

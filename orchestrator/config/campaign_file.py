@@ -12,14 +12,19 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import Field, create_model
 
-from orchestrator.config.action_ranges import Actions as ActionsModel
-from orchestrator.config.action_ranges import Motion as MotionModel
 from orchestrator.config.laboratory_file import LaboratoryFile
-from orchestrator.config.parameter_ranges import Parameters as ParametersModel
-from orchestrator.config.vessel_file import LiquidFile, VesselFile
-from orchestrator.strategies.campaign_plan import CalibrationSettings, DeploymentSettings, Design, StrategySettings
+from orchestrator.config.search_ranges import Actions, Motion, Parameters
+from orchestrator.config.vessel_file import VesselFile
+from orchestrator.strategies.campaign_plan import (
+    CalibrationSettings,
+    DeploymentSettings,
+    Design,
+    OutputSettings,
+    StrategySettings,
+)
 from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES, calibrations, deployments
-from sim_engine.outcome import LossName
+from sim_engine.liquids import LiquidSettings
+from sim_engine.outcome import Loss
 from sim_engine.settings.model import (
     MADE,
     FilePath,
@@ -37,11 +42,6 @@ from sim_engine.settings.model import (
     tagged,
 )
 from sim_engine.settings.quantity import Quantity
-
-# Created at import from the declarations in sim_engine; a type checker sees them as Any.
-Actions: Any = ActionsModel
-Motion: Any = MotionModel
-Parameters: Any = ParametersModel
 
 
 class TransferSection(Settings):
@@ -147,16 +147,6 @@ class DataSection(Settings):
     """Columns that have another name in the CSV: {Decant's name: name in the file}."""
 
 
-class LossSection(Settings):
-    """Loss that deployment minimises."""
-
-    name: LossName = "spilled_and_retained"
-    """(spilled + w·retained) / loaded; or the paper's: normalised, grams, particles."""
-
-    retained_weight: Annotated[float, Quantity("1", "1.0", 0.0, 100.0)] | None = None
-    """Weight w of the retained liquid; 1 unless given."""
-
-
 AnyObjective: Any = tagged(OBJECTIVES.all)
 
 
@@ -178,7 +168,7 @@ class DeploymentSection(Settings):
     actions: Actions | None = None
     """Searched dimensions; the campaign's `actions` unless given."""
 
-    loss: LossSection | None = None
+    loss: Loss | None = None
     """Loss that is minimised."""
 
     objectives: list[AnyObjective] | None = None
@@ -243,25 +233,6 @@ class SimulatorSection(Settings):
     """Parameters θ: a value fixes one, a range makes calibration search it; the others have their defaults."""
 
 
-class OutputsSection(Settings):
-    """Outputs in addition to the journal."""
-
-    directory: FilePath | None = None
-    """Folder of the runs; 'runs' in the working directory unless given."""
-
-    rrd: Switch = True
-    """Write a recording for the viewer."""
-
-    figures: Switch = True
-    """Write figures at the end."""
-
-    record_rate: Annotated[float, Quantity("1/s", "10 1/s", 0.0, 10.0)] = 10.0
-    """Frames of particles per simulated second."""
-
-    recorded_simulations: SimulationCount = 6
-    """Number of simulations that are recorded with their particles."""
-
-
 class CampaignFile(Settings):
     """A campaign: calibrate the simulator, deploy with the calibrated parameters, or both."""
 
@@ -280,7 +251,7 @@ class CampaignFile(Settings):
     laboratory: PathOr[LaboratoryFile] | None = None
     """Laboratory in which it runs."""
 
-    liquid: PathOr[LiquidFile] | None = None
+    liquid: PathOr[LiquidSettings] | None = None
     """Liquid that is poured."""
 
     pourer: PathOr[VesselFile] | None = None
@@ -314,5 +285,5 @@ class CampaignFile(Settings):
     """Logical slots for parallel simulations, independent of the machine: the same seed gives the same requests on any
     machine."""
 
-    outputs: OutputsSection = OutputsSection()
+    outputs: OutputSettings = OutputSettings()
     """Outputs in addition to the journal."""

@@ -15,7 +15,7 @@ from actors.laboratory_settings import LaboratorySpec
 from orchestrator.config.campaign_file import CampaignFile
 from orchestrator.config.campaign_resolution import resolve_campaign
 from orchestrator.config.laboratory_file import LaboratoryFile, resolve_laboratory
-from orchestrator.config.parameter_ranges import parameter_quantity
+from orchestrator.config.search_ranges import parameter_quantity
 from orchestrator.config.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.config.yaml.file_access import resolved
 from orchestrator.config.yaml.references import References

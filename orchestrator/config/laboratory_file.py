@@ -18,7 +18,7 @@ from actors.interfaces import OperatorSpec
 from actors.laboratory_settings import LaboratorySpec, RaySpec, VirtualBenchSpec
 from orchestrator.config.arm_file import ARMS, ArmSettings, CellSection
 from orchestrator.config.balance_file import any_balance, resolve_balance
-from orchestrator.config.parameter_ranges import parameter_quantity
+from orchestrator.config.search_ranges import parameter_quantity
 from orchestrator.config.yaml.yaml_source import Place, Report
 from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
 from sim_engine.liquids import SimulationParameters

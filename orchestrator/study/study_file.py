@@ -19,13 +19,13 @@ from pydantic import Field, create_model
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.laboratory_file import HiddenLiquid, LaboratoryFile
-from orchestrator.config.parameter_ranges import Parameters, ParametersBase
+from orchestrator.config.run_snapshot import as_file
+from orchestrator.config.search_ranges import Parameters, ParametersBase
 from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
-from orchestrator.config.yaml.yaml_writer import as_file
 from orchestrator.strategies.calibration.continuous_calibration import C4Settings
 from orchestrator.strategies.calibration.pointwise_calibration import C1Settings, C2Settings, C3Settings
 from orchestrator.strategies.campaign_plan import CampaignPlan, StrategySettings
@@ -213,7 +213,7 @@ class StudyFile(Settings):
     laboratory: PathOr[LaboratoryFile] | None = None
     """Laboratory that replaces the campaign's: a virtual one with a bench, simulated directly or over wires."""
 
-    parameters: Parameters | None = None  # type: ignore[valid-type]
+    parameters: Parameters | None = None
     """Parameters that replace the campaign's of the same names: a value fixes one, a range searches it."""
 
     search: list[Text] | None = None

@@ -161,7 +161,7 @@ def test_a_run_with_a_damaged_journal_is_refused_with_the_pours_that_were_made(
     assert any(problem in text for text in json.loads(checked.stdout)["problems"])
 
     plan = load_campaign(place.folder / "small.yaml")
-    plan = replace(plan, outputs=replace(plan.outputs, directory=run.parent))
+    plan = replace(plan, outputs=plan.outputs.model_copy(update={"directory": str(run.parent)}))
     with pytest.raises(JournalDamagedError, match=re.escape(problem)):
         find_run(plan)  # without a name it is found by its journal, or by its ledger
 

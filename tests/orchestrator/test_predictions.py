@@ -58,7 +58,7 @@ def repeated(count: int = 5, seed: int = 3, loss: Loss | None = None) -> Repeate
 
 
 def test_the_prediction_is_the_mean_of_fresh_seeds_with_their_deviation() -> None:
-    strategy = repeated(loss=Loss("grams"))
+    strategy = repeated(loss=Loss(name="grams"))
     assert isinstance(strategy, Strategy)
     played = StrategyHarness(narrow_cup).run(strategy)
     assert {(r.action, r.purpose) for r in played.simulations} == {(ACTION, "predict")}

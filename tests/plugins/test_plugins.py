@@ -282,7 +282,7 @@ class Wish(Objective):
     name: Literal["wish"] = "wish"
 
 class Bowl(Shape):
-    kind: Literal["bowl"] = "bowl"
+    kind = "bowl"
 """
 
 

@@ -229,7 +229,7 @@ class Rig:
 
     async def campaign(self, life: Life, *, resume: bool) -> None:
         """The same, awaited."""
-        plan = replace(self.plan, outputs=replace(self.plan.outputs, directory=life.place))
+        plan = replace(self.plan, outputs=self.plan.outputs.model_copy(update={"directory": str(life.place)}))
         life.directory.mkdir(parents=True, exist_ok=True)
 
         def answer(question: str, options: Sequence[str]) -> str:

@@ -19,12 +19,15 @@ BOTTLE = build_vessel(
     VesselSpec(
         name="bottle",
         shape=ProfileShape(
-            inner=((0.0, 0.0), (0.03, 0.0), (0.03, 0.1), (0.012, 0.11), (0.012, 0.13)), wall=0.002, floor=0.002
+            unit="m",
+            inner=((0.0, 0.0), (0.03, 0.0), (0.03, 0.1), (0.012, 0.11), (0.012, 0.13)),
+            wall=0.002,
+            floor=0.002,
         ),
     )
 )
 CONE = build_vessel(
-    VesselSpec(name="cone", shape=ProfileShape(inner=((0.0, 0.0), (0.05, 0.1)), wall=0.003, floor=0.003))
+    VesselSpec(name="cone", shape=ProfileShape(unit="m", inner=((0.0, 0.0), (0.05, 0.1)), wall=0.003, floor=0.003))
 )
 
 

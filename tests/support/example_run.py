@@ -41,7 +41,7 @@ from orchestrator.runs.events import (
     StageOpened,
     StrategyProgressed,
 )
-from orchestrator.strategies.campaign_plan import CampaignPlan, OutputPlan
+from orchestrator.strategies.campaign_plan import CampaignPlan, OutputSettings
 from orchestrator.strategies.repeated_simulation import Foreseen
 from orchestrator.strategies.strategy import Progress, Strategy
 from sim_engine.action import DEG, Action
@@ -92,7 +92,7 @@ def campaign(*, pours: int = 3) -> CampaignPlan:
         SimulationParameters(),
         calibration,
         deployment,
-        OutputPlan(Path("runs")),
+        OutputSettings(),
     )
 
 

@@ -37,7 +37,7 @@ from orchestrator.requests import (
 )
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import StageDefinition
-from orchestrator.strategies.campaign_plan import CampaignPlan, OutputPlan
+from orchestrator.strategies.campaign_plan import CampaignPlan, OutputSettings
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Progress
 from sim_engine.action import DEG
@@ -69,7 +69,7 @@ def toy_plan(directory: Path, **changes: Any) -> CampaignPlan:
         "parameters": THETA,
         "calibration": None,
         "deployment": deployment,
-        "outputs": OutputPlan(directory, record_rate=10.0, recorded_simulations=2),
+        "outputs": OutputSettings(directory=str(directory), record_rate=10.0, recorded_simulations=2),
         "parallel_simulations": 2,
     }
     return CampaignPlan(**(values | changes))

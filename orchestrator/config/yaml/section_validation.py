@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from orchestrator.config.action_ranges import EXAMPLES
+from orchestrator.config.search_ranges import EXAMPLES
 from orchestrator.config.yaml.yaml_source import Loc, Place, Report
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.errors import did_you_mean

@@ -242,8 +242,8 @@ def test_quantities_are_shown_in_the_units_that_people_type() -> None:
 
 def test_losses_are_shown_in_their_own_unit() -> None:
     assert loss_unit(Loss()).text(0.0123, 0.005) == "1.23 ± 0.50 %"
-    assert loss_unit(Loss("grams")).text(2.46) == "2.46 g"
-    assert loss_unit(Loss("particles")).text(17.0) == "17 particles"
+    assert loss_unit(Loss(name="grams")).text(2.46) == "2.46 g"
+    assert loss_unit(Loss(name="particles")).text(17.0) == "17 particles"
     assert "0.5 × retained" in loss_unit(Loss(retained_weight=0.5)).label
 
 
