@@ -182,7 +182,7 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
         "mean wait, ms": 1e3 * float(np.mean(bench.occupancy.waits)),
         "longest answer, ms": 1e3 * max(bench.answers),
         "CPU, s": time.thread_time() - begun,
-        "alarm": float(stage.trust.alarm),
+        "alarm": float(stage.model_check.alarm),
         "reported": bench.true(stage.recommended.action_si),
     }
     for pours in (n for n in AFTER if n <= asked.pours):

@@ -1,4 +1,4 @@
-"""The only reader of journals outside the engine: what a run did, finished or not, in readable form.
+"""The only reader of journals outside the engine: the history of a run, finished or not, in readable form.
 
 - `read_record` returns a `RunRecord`: stages, pours, questions, notes, decisions and times. `RecordReader` goes on
   where it stopped, for pages that ask again at every event.
@@ -219,7 +219,7 @@ class RunRecord:
 
 
 class RecordReader:
-    """Reads a run's journal, and what was added to it since the last call.
+    """Reads a run's journal, and later the entries that were added since the last call.
 
     Args:
         slots: maximum number of simulations at a time, for the use of the pool.

@@ -166,14 +166,14 @@ class LearningStage:
                 self._picture(draw, now, lambda: png(theta_picture(found)))
         if isinstance(result, Deployed):
             place = f"{PLACE}/{safe_name(result.scene)}/trust"
-            if isinstance(result.trust, Believed):
-                self.trust = result.trust.text
-                if result.trust.after:
-                    share = result.trust.after[-1].ignorance
+            if isinstance(result.model_check, Believed):
+                self.trust = result.model_check.text
+                if result.model_check.after:
+                    share = result.model_check.after[-1].ignorance
                     label = "probability that the simulator says nothing of this bench"
                     self._number(place, share, label, style.ESCAPED, marker=8.0)
-            elif result.trust.z_scores:
-                z = result.trust.z_scores[-1]
+            elif result.model_check.z_scores:
+                z = result.model_check.z_scores[-1]
                 label = "worse than simulated by so many σ (2 and more: distrust)"
                 self._number(place, z, label, style.ESCAPED, marker=8.0)
 

@@ -1,4 +1,4 @@
-"""What follows a run, whoever drove it: its recording is closed, its figures, summary, θ* and report are written."""
+"""Publishing of a run: its figures, result document, θ* and report are written into its folder."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Published:
-    """What was written about a run.
+    """The files that were written about a run.
 
     Attributes:
         figures: by name.
@@ -62,7 +62,7 @@ def publish(
 ) -> Published:
     """Write a run's figures (if the plan wants any), `theta.json`, `summary.json` and the report.
 
-    A run that has not finished may be published, too: its report says where it stands. Safe to call again: the files
+    A run that has not finished may be published, too: its report describes its state. Safe to call again: the files
     are then written again.
 
     Args:
@@ -164,7 +164,7 @@ def report_on(
     *,
     draw: bool = True,
 ) -> tuple[Path, dict[str, Path]]:
-    """Draw a run's figures anew, and write the page about it, wherever the run stands.
+    """Draw a run's figures again, and write the page about it, wherever the run stands.
 
     Args:
         path: of the page; in the run's folder unless given.
@@ -219,7 +219,7 @@ def theta_file(found: CalibratedTheta, scored: Scores | None = None) -> dict[str
 
     Args:
         found: by the calibration.
-        scored: θ* on the weighed pours; None: nobody knows what it left over.
+        scored: θ* on the weighed pours; None: the rest is unknown.
     """
     theta = found.theta.model_dump()
     data: dict[str, Any] = {"theta": recommended_theta(found.theta, scored).model_dump()}
@@ -249,7 +249,7 @@ def worked_out(
 
 
 def not_simulated(plan: CampaignPlan, tell: Callable[[str], None] = _log.warning) -> list[str]:
-    """What is not simulated in a campaign's action spaces: lines for the user before it begins.
+    """Effects that are not simulated in a campaign's action spaces: lines for the user before it begins.
 
     Args:
         plan: of the campaign.

@@ -1,7 +1,7 @@
-"""The figures of a run: what is drawn of its results, and the figures of losses and discrepancies.
+"""The figures of a run: the choice of figures for its results, and those of losses and discrepancies.
 
 - `draw_figures` writes all figures into a folder; `figures_of` returns them for notebooks.
-- `draw_spillage` and `draw_discrepancy` draw losses against pours, and θ* beside its rivals.
+- `draw_spillage` and `draw_discrepancy` draw losses against pours, and θ* next to its rivals.
 """
 
 from __future__ import annotations
@@ -197,7 +197,7 @@ def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[Po
             if pour.predicted is None
             else _prediction_interval(
                 Prediction(
-                    pour.predicted, pour.predicted_deviation or 0.0, pour.predicted_scatter, pour.predicted_band
+                    pour.predicted, pour.predicted_deviation or 0.0, pour.predicted_scatter, pour.predicted_interval
                 ),
                 unit,
             )

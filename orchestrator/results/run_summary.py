@@ -22,7 +22,7 @@ from orchestrator.strategies.calibration.posterior_summary import PosteriorSumma
 from orchestrator.strategies.deployment.confirmation import Confirmed
 from orchestrator.strategies.deployment.deployment_result import ParetoAction, Recommended, RiskFound
 from orchestrator.strategies.deployment.model_monitoring import Believed
-from orchestrator.strategies.deployment.real_pours import Foretold, PourRow
+from orchestrator.strategies.deployment.real_pours import PourRow, PredictionCheck
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from sim_engine.liquids import SimulationParameters
@@ -120,7 +120,7 @@ class PourSummary(ResultPart):
     """Whether its loss is the smallest one of its stage."""
 
     remark: str
-    """What is unusual: why it failed, what is unknown, what the operator said."""
+    """Remarks: the reason of a failure, an unknown outcome, the operator's answer."""
 
     loaded_g: float | None
     spilled_g: float | None
@@ -177,7 +177,7 @@ class ParameterSummary(ResultPart):
 
 
 class Advice(ResultPart):
-    """What a deployment recommends for one receiver, in words with units."""
+    """Recommendation of a deployment for one receiver, in words with units."""
 
     receiver: str
     action: dict[str, str]
@@ -245,16 +245,16 @@ class ReceiverSummary(ResultPart):
     recommended: Recommended | None
     """The recommended action and its predicted loss."""
 
-    trust: Foretold | Believed
+    model_check: PredictionCheck | Believed
     gave_up: str | None
     ended: str | None
-    front: tuple[ParetoAction, ...] | None
+    pareto_front: tuple[ParetoAction, ...] | None
     risk: RiskFound | None
     window: WindowFound | None
     prediction: dict[str, SampleStatistics] | None
     """Result of repeated simulations of the recommended action with new seeds, by quantity."""
 
-    prediction_band: PredictionInterval | None
+    prediction_interval: PredictionInterval | None
     """Prediction interval of r for a single pour with it: includes seeds, θ, the residual of calibration, and
     resolution."""
 
@@ -301,10 +301,10 @@ class RunSummary(Totals):
     """For each receiver."""
 
     without_advice: tuple[str, ...] = ()
-    """What the run came to, if it recommends no action."""
+    """Outcome of a run that recommends no action."""
 
     open_questions: tuple[str, ...] = ()
-    """What the run leaves open, beyond the advice."""
+    """Open questions that do not depend on the receiver."""
 
     asked: dict[str, str] = Field(default_factory=dict)
     """The campaign's settings for readers who have not seen its file."""
@@ -340,7 +340,7 @@ class RunSummary(Totals):
     """θ* with its region."""
 
     theta_sentences: tuple[str, ...] = ()
-    """What is known of θ*, and what is not."""
+    """Knowledge of θ*, and its gaps."""
 
     discrepancy: dict[str, dict[str, float | None]] = Field(default_factory=dict)
     """Mean |r − c_s| by split and predictor, as fractions of the poured liquid."""
@@ -349,7 +349,7 @@ class RunSummary(Totals):
     """Name of the loss that deployments minimise."""
 
     loss_label: str = ""
-    """What it means, with its unit."""
+    """Its meaning and unit."""
 
     receivers: dict[str, ReceiverSummary] = Field(default_factory=dict)
     """By scene."""

@@ -50,7 +50,7 @@ from orchestrator.strategies.calibration.calibration_scores import Scores
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.confirmation import Confirmed
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.repeated_simulation import Foreseen
+from orchestrator.strategies.repeated_simulation import PredictionStatistics
 from sim_engine.model_validity import NotCovered
 from sim_engine.outcome import normalised_spillage
 
@@ -194,7 +194,7 @@ def _plain(values: Mapping[str, float | None]) -> str:
 def _of_record(
     plan: CampaignPlan | None, record: RunRecord, run: str, live: bool, check: JournalCheck | None
 ) -> dict[str, Any]:
-    """What the journal has."""
+    """The fields that come from the journal."""
     standing = wording.standing(record, run) if run else []
     return {
         "run": run,
@@ -294,12 +294,12 @@ def pour_summary(
 
 def _remark(state: str, pour: RecordedPour) -> str:
     said = {
-        "unknown": "UNKNOWN: it had begun, and nobody knows what came of it",
+        "unknown": "UNKNOWN: it had begun, and its outcome is not known",
         "under way": "under way",
         "asked": "asked for, not begun",
         "failed": f"failed: {pour.reason}",
     }.get(state, "")
-    answer = f"a person said: {pour.answer}" if pour.answer else ""
+    answer = f"the operator answered: {pour.answer}" if pour.answer else ""
     return "; ".join(filter(None, (said, answer)))
 
 
@@ -361,7 +361,7 @@ def _receiver(
     plan: DeploymentPlan | None,
     name: str,
     result: Deployed,
-    predicted: Foreseen | None,
+    predicted: PredictionStatistics | None,
     not_covered: Sequence[NotCovered],
     confirmed: Confirmed | None,
 ) -> ReceiverSummary:
@@ -383,14 +383,14 @@ def _receiver(
         first=pours[0] if pours else None,
         best=best,
         recommended=advised,
-        trust=result.trust,
+        model_check=result.model_check,
         gave_up=result.gave_up,
         ended=result.ended,
-        front=result.front,
+        pareto_front=result.pareto_front,
         risk=result.risk,
         window=result.window,
         prediction=prediction,
-        prediction_band=None if predicted is None else predicted.band,
+        prediction_interval=None if predicted is None else predicted.interval,
         at_bounds=() if plan is None or advised is None else tuple(style.at_ends(advised.action_si, plan.actions.axes)),
         predicted_delivered_g=None if delivered is None else 1e3 * delivered,
         predicted_delivered_ml=None if delivered is None or liquid is None else liquid.millilitres(delivered),

@@ -29,15 +29,15 @@ from orchestrator.strategies.calibration.posterior_summary import PosteriorSumma
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.deployment.deployment_result import ParetoAction, RiskFound
 from orchestrator.strategies.deployment.model_monitoring import DOUBT, Believed
-from orchestrator.strategies.deployment.real_pours import Foretold
+from orchestrator.strategies.deployment.real_pours import PredictionCheck
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from sim_engine.prediction_band import PredictionInterval
 from sim_engine.scene import Scene
 from sim_engine.search_space import Axis, Space
 
 
-def trust_line(trust: Foretold | Believed) -> str | None:
-    """What the pours say of the simulator; None where that is nothing.
+def trust_line(trust: PredictionCheck | Believed) -> str | None:
+    """The judgement of the pours about the simulator; None if there is none.
 
     Args:
         trust: of a deployment's result.
@@ -98,7 +98,7 @@ def _advice(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> Advice
         window = _sentence(window_line(row.window, unit))
     else:
         window = (
-            "No safe window was looked for: nobody has checked how far this action may be missed. D1 looks for one "
+            "No safe window was looked for: how far this action may be missed is not known. D1 looks for one "
             "where the campaign has 'window: {tolerance: …}'."
         )
     return Advice(
@@ -125,8 +125,8 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
         said.append(f"Expect {unit.meaning} of {mean}{scatter and f'; single pours differ from that by {scatter}'}.")
     if row.prediction is not None:
         said.append(_prediction(row))
-    if row.prediction_band is not None:
-        said.append(_sentence(band_line(row.prediction_band)))
+    if row.prediction_interval is not None:
+        said.append(_sentence(band_line(row.prediction_interval)))
     if row.confirmed is not None and row.confirmed.loss is not None:
         loss = row.confirmed.loss
         times = "once more" if loss.count == 1 else f"{loss.count} more times"
@@ -136,10 +136,10 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
         said.append(f"{best}; the least of several is a lucky one, so that it is not what to expect of the next.")
     if row.risk is not None:
         said.append(_sentence(risk_line(row.risk, unit)))
-    said += [f"Nothing beats {_compromise(one)}." for one in row.front or ()]
+    said += [f"Nothing beats {_compromise(one)}." for one in row.pareto_front or ()]
     if row.ended:
         said.append(f"The search ended: {row.ended.rstrip('.')}.")
-    if _is_confirmed(row) and (trust := trust_line(row.trust)) is not None:
+    if _is_confirmed(row) and (trust := trust_line(row.model_check)) is not None:
         said.append(_sentence(trust))
     return said
 
@@ -193,7 +193,7 @@ def pool_line(busy: float | None, useful: float | None, longest_wait: float | No
 
 def _is_confirmed(row: ReceiverSummary) -> bool:
     """Whether the pours confirm the judgement about the simulator without doubt."""
-    trust = row.trust
+    trust = row.model_check
     return isinstance(trust, Believed) and bool(trust.after) and trust.after[-1].ignorance < DOUBT
 
 
@@ -201,7 +201,7 @@ def _open(row: ReceiverSummary) -> list[str]:
     said = []
     if row.at_bounds:
         said.append(f"Better actions may lie beyond what was searched: {', '.join(row.at_bounds)}.")
-    if not _is_confirmed(row) and (alarm := trust_line(row.trust)) is not None:
+    if not _is_confirmed(row) and (alarm := trust_line(row.model_check)) is not None:
         said.append(_sentence(alarm))
     if row.gave_up and row.recommended is not None:
         said.append(_sentence(row.gave_up))
@@ -210,7 +210,7 @@ def _open(row: ReceiverSummary) -> list[str]:
     if row.failed_pours:
         what = "1 pour failed" if row.failed_pours == 1 else f"{row.failed_pours} pours failed"
         why = f": {'; '.join(row.failures)}" if row.failures else ""
-        said.append(f"{what}{why}. Nobody weighed them.")
+        said.append(f"{what}{why}. They were not weighed.")
     confirming = () if row.confirmed is None else row.confirmed.pours
     if lost := [f"pour {pour.number}: {pour.failed}" for pour in confirming if pour.failed]:
         said.append(f"Confirming pours that failed: {'; '.join(lost)}.")
@@ -227,7 +227,7 @@ def _poured_again(row: ReceiverSummary) -> list[str]:
     if not count:
         return [
             "The recommended action was not poured again after it was chosen ('confirm' in the campaign does that): "
-            "what is expected of it is a model's word."
+            "what is expected of it is a prediction."
         ]
     if count >= FEW:
         return []
@@ -241,7 +241,7 @@ def open_questions(
     """Open questions after a run that do not depend on the receiver.
 
     Args:
-        theta: what is open about θ*, see `about_theta`.
+        theta: open questions about θ*, see `about_theta`.
         calibrated: whether θ* was found.
         dropped_events: number of events missing in the recording.
     """
@@ -249,7 +249,7 @@ def open_questions(
     if plan.laboratory.mode == "virtual" and (record.pours or plan.laboratory.pours):
         said.append(
             "The bench was VIRTUAL: no robot moved and no liquid was weighed. What the hidden liquid of that bench did "
-            "is another simulation's word, and a real cup may behave otherwise."
+            "is simulated, too, and a real cup may behave otherwise."
         )
     said += theta
     if not calibrated and plan.calibration is None:
@@ -307,7 +307,7 @@ def theta_sentences(
     space: Space | None,
     gain: CalibrationGain | None,
 ) -> list[str]:
-    """What is known of θ*: its expected discrepancy, its posterior over the searched space, whether it is justified."""
+    """The knowledge of θ*: its expected discrepancy, its posterior over the searched space, whether it is justified."""
     said = []
     if expected is not None:
         said.append(f"Expected {DISCREPANCY.meaning} of θ*: {DISCREPANCY.text(expected, deviation or 0.0)}.")
@@ -346,7 +346,7 @@ def _interval(name: str, low: float, high: float) -> str:
 
 
 def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -> list[str]:
-    """What a run that recommends no action came to.
+    """The outcome of a run that recommends no action.
 
     Args:
         calibrated: whether θ* was found.
@@ -425,8 +425,8 @@ def standing(record: RunRecord, run: str) -> list[str]:
     unknown = [f"pour {pour.request.number} of {pour.stage}" for pour in record.unknown_pours]
     if unknown:
         said.append(
-            f"{' and '.join(unknown).capitalize()} had begun, and nobody has said what came of it. It is not repeated "
-            "by software. Whoever can, weighs what was spilled and what is left in the pourer, and answers on resuming."
+            f"{' and '.join(unknown).capitalize()} had begun, and its outcome is not known. It is not repeated by "
+            "software. Weigh what was spilled and what is left in the pourer, and answer on resuming."
         )
     said += [f"A question is open: {q.text}" for q in record.questions if q.answer is None]
     match state:
@@ -438,8 +438,8 @@ def standing(record: RunRecord, run: str) -> list[str]:
             said.append("Nothing was started yet.")
         case _:
             said.append(
-                "When this page was made a process had the run, or had died with it without a word: the page shows "
-                f"what the journal held at that moment. If nothing runs any more, go on by {again}."
+                "When this page was made, a process had the run, or had died with it: the page shows "
+                f"what the journal held at that moment. If it no longer runs, go on by {again}."
             )
     return said
 
@@ -569,13 +569,13 @@ def question_table(summary: RunSummary) -> ResultTable:
                 time.strftime("%Y-%m-%d %H:%M", time.localtime(one.time)),
                 one.stage,
                 one.question,
-                "nobody has answered" if one.answer is None else one.answer,
+                "not answered" if one.answer is None else one.answer,
             ],
             "bad" if one.answer is None else "",
         )
         for one in summary.questions
     ]
-    return ResultTable("What people were asked", ["when", "stage", "question", "answer"], rows)
+    return ResultTable("Questions to the operator", ["when", "stage", "question", "answer"], rows)
 
 
 def theta_table(summary: RunSummary) -> ResultTable:
@@ -655,7 +655,7 @@ def _bare(name: str, value: float | None) -> str:
 
 
 def validity_table(summary: RunSummary) -> ResultTable:
-    """What is not simulated in the action spaces."""
+    """Effects that are not simulated in the action spaces."""
     rows = [
         TableRow([one.receiver, one.kind.replace("_", " "), f"{one.hit} of {one.tried}", one.text])
         for several in summary.not_covered.values()

@@ -1,6 +1,7 @@
 """Prediction for one action: the same pour is simulated with several new seeds.
 
-`RepeatedSimulation` requests the simulations; `Foreseen` is its result. It does not search for better actions.
+`RepeatedSimulation` requests the simulations; `PredictionStatistics` is its result. It does not search for better
+actions.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from sim_engine.prediction_band import PredictionInterval, SampleStatistics, ban
 from sim_engine.scene import PoseError
 
 
-class Foreseen(StageResult):
+class PredictionStatistics(StageResult):
     """Statistics of repeated simulations of one action with new seeds.
 
     The loss includes simulations in which the cups touched because of an error. The fractions do not, because they are
@@ -48,7 +49,7 @@ class Foreseen(StageResult):
     over_seeds: dict[str, SampleStatistics]
     """Mean and standard deviation of every fraction, of 'spillage' r = spilled / poured, and of the 'loss'."""
 
-    band: PredictionInterval | None = None
+    interval: PredictionInterval | None = None
     """Prediction interval for r of a single pour; null if no simulation has an r."""
 
 
@@ -143,18 +144,18 @@ class RepeatedSimulation:
         answered = len(self._losses) + self._lost
         return Progress(answered, answered + len(self._open) + len(self._unissued))
 
-    def result(self) -> Foreseen:
+    def result(self) -> PredictionStatistics:
         """Mean and standard deviation over the seeds answered so far."""
         over_seeds = spreads(self._outcomes)
         loss = SampleStatistics.of(self._losses)
         if loss is not None:
             over_seeds["loss"] = loss
-        return Foreseen(
+        return PredictionStatistics(
             scene=self._costing.scene.name,
             simulations=self.progress().simulations,
             simulations_lost=self._lost,
             thetas=self._thetas,
             touching=self._touching,
             over_seeds=over_seeds,
-            band=band_of(self._outcomes, self._discrepancy),
+            interval=band_of(self._outcomes, self._discrepancy),
         )

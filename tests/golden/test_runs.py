@@ -41,7 +41,7 @@ from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.replay import ToldStep, read_history
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import stages_of
-from orchestrator.strategies.deployment.real_pours import Foretold
+from orchestrator.strategies.deployment.real_pours import PredictionCheck
 from orchestrator.strategies.stage_result import StageResult
 from tests.golden import old_runs
 from tests.golden.golden import ROOT, Golden, agree, compact, line, normalised
@@ -244,7 +244,7 @@ def test_old_run_with_a_model_that_is_retired_is_listed_and_reported_but_not_res
     run = decant.open_run(folder)
     assert (run.result.state, run.result.pours, len(run.pours)) == ("finished", 4, 4)
     (found,) = deployments_of(run.result.results).values()
-    assert isinstance(found.trust, Foretold)
+    assert isinstance(found.model_check, PredictionCheck)
     (runs / "pooled.yaml").write_text((folder / "resolved.json").read_text(encoding="utf-8"), encoding="utf-8")
     refused = typed(runs, "run", "pooled.yaml", "--resume")
     assert refused.endswith("exit 2\n\n")

@@ -148,7 +148,7 @@ def test_a_plan_ends_with_fresh_simulations_of_what_it_recommends(tmp_path: Path
     mean, deviation = (100 * getattr(found["spillage"], name) for name in ("mean", "deviation"))
     assert f"Simulated again with 3 fresh seeds: spilled / poured {mean:.2f} ± {deviation:.2f} %" in text
     assert "(mean ± standard deviation)" in text
-    band = summary.receivers["cup"].prediction_band
+    band = summary.receivers["cup"].prediction_interval
     assert band is not None
     assert band.low < found["spillage"].mean < band.high
     assert f"Nine single pours in ten spill {band.percent(2)} of what is poured" in text
@@ -160,7 +160,7 @@ def test_what_calibration_left_over_widens_the_band_of_a_planned_pour() -> None:
     for discrepancy in (None, 0.6):
         strategy = RepeatedSimulation(Costing(Loss(), SCENE, THETA), ACTION, 5, 3, discrepancy=discrepancy)
         StrategyHarness(narrow_cup).run(strategy)
-        found = strategy.result().band
+        found = strategy.result().interval
         assert found is not None
         bands.append(found)
     assert bands[1].low < bands[0].low < bands[0].high < bands[1].high

@@ -42,7 +42,7 @@ from orchestrator.runs.events import (
     StrategyProgressed,
 )
 from orchestrator.strategies.campaign_plan import CampaignPlan, OutputSettings
-from orchestrator.strategies.repeated_simulation import Foreseen
+from orchestrator.strategies.repeated_simulation import PredictionStatistics
 from orchestrator.strategies.strategy import Progress, Strategy
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
@@ -65,7 +65,9 @@ ACTIONS = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset",
 THETA = Space((Axis("particles", 500, 4000, "log", integer=True), Axis("cohesion", 0.0, 0.1)))
 ACTION = Action(angular_velocity=40 * DEG, x_offset=0.09, height=0.05)
 PARTICLES = 300
-LEARNT = Foreseen(scene="narrow cup", simulations=0, simulations_lost=0, thetas=0, touching=0, over_seeds={})
+LEARNT = PredictionStatistics(
+    scene="narrow cup", simulations=0, simulations_lost=0, thetas=0, touching=0, over_seeds={}
+)
 """For events whose result nobody looks at."""
 
 

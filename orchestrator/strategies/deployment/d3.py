@@ -35,7 +35,7 @@ from orchestrator.strategies.deployment.model_monitoring import (
     StopSettings,
     Trust,
 )
-from orchestrator.strategies.deployment.real_pours import Foretold, PourTrial
+from orchestrator.strategies.deployment.real_pours import PourTrial, PredictionCheck
 from orchestrator.strategies.strategy import Progress, Strategy
 from sim_engine.action import described
 from sim_engine.liquids import SimulationParameters
@@ -330,7 +330,7 @@ class Hybrid(Deployment[D3Settings]):
 
     # -- results ---------------------------------------------------------------------------------------------------
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> Foretold | Believed:
+    def _trusted(self, weighed: Sequence[PourTrial]) -> PredictionCheck | Believed:
         return super()._trusted(weighed) if self._trust is None else self._trust.result()
 
     def result(self) -> Deployed:

@@ -17,7 +17,7 @@ from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Deployed, Recommended, RiskFound, SimulatedAction
 from orchestrator.strategies.deployment.model_monitoring import Believed
 from orchestrator.strategies.deployment.objectives import Vector
-from orchestrator.strategies.deployment.real_pours import Foretold, PourTrial, expecting, former_pours, trust
+from orchestrator.strategies.deployment.real_pours import PourTrial, PredictionCheck, expecting, former_pours, trust
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from orchestrator.strategies.deployment.scalarization import Scalarization
 from orchestrator.strategies.optimizer_queries import OptimizerQueries
@@ -295,7 +295,7 @@ class Deployment(ABC, Generic[S]):
         """Steps done, steps in all."""
         return Progress(pours=min(self._counted, self._plan.pours), of_pours=self._plan.pours)
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> Foretold | Believed:
+    def _trusted(self, weighed: Sequence[PourTrial]) -> PredictionCheck | Believed:
         """How far the first pours bore out what was predicted."""
         return trust(weighed)
 
@@ -319,10 +319,10 @@ class Deployment(ABC, Generic[S]):
             former_pours=len(self._former),
             refused_pours=self._refused,
             failed_pours=sum(p.status == "failed" for p in self._pours),
-            trust=self._trusted([p for p in self._pours if p.status == "weighed" and p.cost is not None]),
+            model_check=self._trusted([p for p in self._pours if p.status == "weighed" and p.cost is not None]),
             gave_up=self._gave_up,
             objectives=names,
-            front=None if front is None else tuple(front),
+            pareto_front=None if front is None else tuple(front),
             map=None if latest is None else displayed_map(latest.surrogate, self._plan.actions),
             recommended=None if self._final is None else self._recommended(self._final),
             risk=None if self._final is None else self._risk_found(self._final),

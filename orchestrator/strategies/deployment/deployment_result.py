@@ -7,7 +7,7 @@ from typing import Literal
 
 from actors.optimizer.questions import Suggestion
 from orchestrator.strategies.deployment.model_monitoring import Believed, BenchFound
-from orchestrator.strategies.deployment.real_pours import Foretold, PourRow
+from orchestrator.strategies.deployment.real_pours import PourRow, PredictionCheck
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from orchestrator.strategies.stage_result import DisplayedMap, ResultPart, StageResult, displayed_action
 from sim_engine.prediction_band import SampleStatistics
@@ -154,7 +154,7 @@ class Deployed(StageResult):
     failed_pours: int
     """Pours that went wrong."""
 
-    trust: Foretold | Believed
+    model_check: PredictionCheck | Believed
     """How far the first pours were from what was predicted, or what all of them say of the simulator."""
 
     gave_up: str | None = None
@@ -169,7 +169,7 @@ class Deployed(StageResult):
     objectives: tuple[str, ...] = ()
     """Names of several objectives; empty with a plain loss."""
 
-    front: tuple[ParetoAction, ...] | None = None
+    pareto_front: tuple[ParetoAction, ...] | None = None
     """What nothing beats, where that was looked for."""
 
     map: DisplayedMap | None = None

@@ -61,7 +61,7 @@ class PourRow(ResultPart):
     predicted_scatter: float | None
     """Scatter of a single pour around the expected loss."""
 
-    predicted_band: tuple[float, float] | None = None
+    predicted_interval: tuple[float, float] | None = None
     """Interval that should contain nine pours in ten; None without a prediction."""
 
     loss: float | None
@@ -86,7 +86,7 @@ class PourRow(ResultPart):
     """The same as a volume [ml], from the liquid's density."""
 
 
-class Foretold(ResultPart):
+class PredictionCheck(ResultPart):
     """Deviation of the first pours from their predictions."""
 
     z_scores: tuple[float, ...]
@@ -159,7 +159,7 @@ class PourTrial:
             predicted=None if predicted is None else predicted.mean,
             predicted_deviation=None if predicted is None else predicted.deviation,
             predicted_scatter=None if predicted is None else predicted.scatter,
-            predicted_band=None if predicted is None else predicted.of_a_pour(),
+            predicted_interval=None if predicted is None else predicted.of_a_pour(),
             loss=self.cost,
             objectives={} if self.vector is None else dict(zip(objectives, self.vector, strict=False)),
             spillage=None if weighed is None else normalised_spillage(weighed.fractions),
@@ -196,7 +196,7 @@ def former_pours(
     return tuple(found)
 
 
-def trust(weighed: Sequence[PourTrial]) -> Foretold:
+def trust(weighed: Sequence[PourTrial]) -> PredictionCheck:
     """Compare the first pours with their predictions, in predicted standard deviations (noise included).
 
     An inaccurate simulator makes D3 worse than no prior at all. The user is therefore warned.
@@ -207,4 +207,4 @@ def trust(weighed: Sequence[PourTrial]) -> Foretold:
             spread = math.hypot(trial.predicted.deviation, trial.noise)
             scores.append((trial.cost - trial.predicted.mean) / max(spread, 1e-9))
     mean = sum(map(abs, scores)) / len(scores) if scores else None
-    return Foretold(z_scores=tuple(scores), alarm=len(scores) >= 3 and mean is not None and mean > TRUST_LIMIT)
+    return PredictionCheck(z_scores=tuple(scores), alarm=len(scores) >= 3 and mean is not None and mean > TRUST_LIMIT)

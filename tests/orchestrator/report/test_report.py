@@ -126,7 +126,7 @@ def test_expected_losses_below_zero_are_shown_as_zero_and_stored_as_they_are(
         learnt,
         recommended=changed(learnt.recommended, predicted_loss=-0.013, predicted_deviation=0.014),
         pours=[
-            changed(p, predicted=-0.005, predicted_deviation=0.008, predicted_scatter=0.006, predicted_band=None)
+            changed(p, predicted=-0.005, predicted_deviation=0.008, predicted_scatter=0.006, predicted_interval=None)
             for p in learnt.pours
         ],
         map=changed(learnt.map, mean=(np.array(learnt.map.mean) - 0.5).tolist()),

@@ -224,7 +224,7 @@ def test_a_pour_that_nobody_knows_of_is_called_so_and_its_liquid_is_not_made_up(
     assert done.exit_code == 0, done.output
     said = texts((directory / "report.html").read_text(encoding="utf-8"))
     assert "This run is not finished. Its state is 'unknown'" in said
-    assert "Pour 2 of pours had begun, and nobody has said what came of it." in said
+    assert "Pour 2 of pours had begun, and its outcome is not known." in said
     assert "2 begun, 1 weighed, 1 of unknown outcome" in said
     assert f"--resume --run {directory.name}" in said
     assert "It is not repeated by software" in said

@@ -16,8 +16,8 @@ from orchestrator.results.run_summary import NotSimulated, PoolUse, RunSummary, 
 from orchestrator.results.summarise import summarise
 from orchestrator.results.wording import pool_line
 from orchestrator.strategies.deployment.model_monitoring import Belief, Believed
-from orchestrator.strategies.deployment.real_pours import Foretold
-from orchestrator.strategies.repeated_simulation import Foreseen
+from orchestrator.strategies.deployment.real_pours import PredictionCheck
+from orchestrator.strategies.repeated_simulation import PredictionStatistics
 from sim_engine.prediction_band import SampleStatistics
 from tests.support import example_run
 from tests.support.example_results import changed, shown
@@ -91,11 +91,11 @@ def test_summary_file_is_what_its_schema_says(results: dict[str, Any], tmp_path:
 def test_summary_warns_of_an_untrustworthy_simulator_failed_pours_and_dropped_events(
     results: dict[str, Any],
 ) -> None:
-    trust = Foretold(z_scores=(9.0, 9.0, 9.0), alarm=True)
+    trust = PredictionCheck(z_scores=(9.0, 9.0, 9.0), alarm=True)
     pours = [*results["narrow cup"].pours]
     for index, why in ((1, "pour_failed: the gripper slipped"), (2, "pour_unknown: declared lost by the operator")):
         pours[index] = changed(pours[index], status="failed", reason=why)
-    poured = changed(results["narrow cup"], failed_pours=2, trust=trust, pours=tuple(pours))
+    poured = changed(results["narrow cup"], failed_pours=2, model_check=trust, pours=tuple(pours))
     plan = example_run.campaign()
     text = shown(summary_table(summarise(plan, {"narrow cup": poured}, dropped_events=12)))
     assert "the simulator may not fit this vessel" in text
@@ -120,7 +120,7 @@ def test_what_pours_say_of_the_simulator_is_known_where_it_is_borne_out_and_open
         text="the simulator is as it is",
     )
     plan = example_run.campaign()
-    poured = changed(results["narrow cup"], trust=trust)
+    poured = changed(results["narrow cup"], model_check=trust)
     (said,) = summarise(plan, {"narrow cup": poured}).advice
     assert ("The simulator is as it is." in said.sentences) == known
     assert ("The simulator is as it is." in said.open) != known
@@ -135,7 +135,7 @@ def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(re
     for pour in deployed.weighed:
         assert pour.delivered_g == pytest.approx(1e3 * liquid.mass - pour.spilled_g - pour.retained_g, abs=1e-9)
         assert pour.delivered_ml == pytest.approx(pour.delivered_g / liquid.density * 1e3)
-    foreseen = Foreseen(
+    foreseen = PredictionStatistics(
         scene="narrow cup",
         simulations=2,
         simulations_lost=0,

@@ -17,7 +17,7 @@ from orchestrator.results.figure_style import new_figure
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta, TriedOnPours
 from orchestrator.strategies.calibration.calibration_scores import ScoredPair, Scores
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.deployment.real_pours import Foretold, PourRow
+from orchestrator.strategies.deployment.real_pours import PourRow, PredictionCheck
 from orchestrator.strategies.stage_result import DisplayedMap
 from orchestrator.study.report.calibration_figures import draw_calibrations
 from orchestrator.study.report.cell_results import at_pour, gather, running_least
@@ -141,7 +141,7 @@ def poured(arm: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
         former_pours=0,
         refused_pours=1,
         failed_pours=0,
-        trust=Foretold(z_scores=(), alarm=False),
+        model_check=PredictionCheck(z_scores=(), alarm=False),
     )
 
 

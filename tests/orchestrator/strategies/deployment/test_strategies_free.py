@@ -127,7 +127,7 @@ def test_a_person_who_is_asked_about_the_simulator_is_answered_before_the_next_p
     play.run(log)
     assert [r.number for r in play.pours] == [1, 2, 3, 4, 5, 6]
     assert sum(isinstance(r, Ask) for r in play.asked) == 1
-    assert strategy.result().trust.followed == "go on"
+    assert strategy.result().model_check.followed == "go on"
 
 
 # -- nobody waits ----------------------------------------------------------------------------------------------------

@@ -228,7 +228,7 @@ def test_the_front_is_reported_with_actions_that_pour_and_none_beats_another(str
     found = make(strategy, (SPILLAGE, TIME), 1, pareto=True, pours=12, iterations=16)
     played = play(found)
     result = decode_result(json.loads(json.dumps(encode_result(found.result()), allow_nan=False)))
-    front = result.front
+    front = result.pareto_front
     assert len(front) >= 3
     vectors = [(row.objectives["spillage"], row.objectives["time"]) for row in front]
     assert undominated(vectors) == list(range(len(vectors)))
@@ -254,7 +254,7 @@ def test_people_read_the_front_at_the_end_with_what_it_costs_and_how_it_is_poure
         console.print(summary_table(summary))
     text = capture.get()
     assert "spillage + time [%]" in text
-    front = found.result().front
+    front = found.result().pareto_front
     first = front[0].objectives
     assert f"Nothing beats spillage {100 * first['spillage']:.1f} ± " in text
     assert text.count("Nothing beats") == len(front)
