@@ -238,7 +238,7 @@ def check(name: str, *, as_json: bool) -> None:
                 "complete": not found.problems,
                 "problems": found.problems,
                 "entries": found.entries,
-                "entries_without_chain": found.unchecked,
+                "entries_without_chain": 0 if found.chained else found.entries,
                 "pours": found.pours,
             }
         )

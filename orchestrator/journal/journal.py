@@ -39,12 +39,10 @@ from orchestrator.journal.journal_check import (
 )
 from orchestrator.journal.journal_file import (
     MB,
-    WITHOUT_CHAIN,
     EventRow,
     Header,
     JournalError,
     Reserve,
-    add_chain,
     chain_of,
     chained,
     check_format,
@@ -275,6 +273,7 @@ class Journal(JournalReader):
             connection = opened.enter_context(closing(connect_writer(path)))
             if not has_tables(connection, path):
                 lay_out(connection, header, path)
+            check_format(connection.execute("select format from header").fetchone()[0], path, resuming=True)
             journal = cls(path, lock, connection)
             journal._check_same_campaign(header)
             journal._ledger = journal._open_ledger()
@@ -358,7 +357,7 @@ class Journal(JournalReader):
             raise
 
     def _open_ledger(self) -> PourLedger:
-        """The ledger, with all entries of the journal about pours. A journal of an older version gets its hash chain.
+        """The ledger, with all entries of the journal about pours.
 
         Raises:
             JournalError: it can't be written.
@@ -366,17 +365,13 @@ class Journal(JournalReader):
         path = self.path.with_name(LEDGER_NAME)
         try:
             if not path.is_file():
-                old = self._lines_about_pours(after=0)
                 (seq, digest), created = self._last, self.header.created
                 body = {"name": self.header.name, "created": created, "entries": seq}
-                ledger = PourLedger.begin(path, [LedgerLine(seq, digest.hex(), created, BEGUN, "", body), *old])
+                ledger = PourLedger.begin(path, [LedgerLine(seq, digest.hex(), created, BEGUN, "", body)])
             else:
                 ledger = PourLedger.resume(path)
                 if missing := self._lines_about_pours(after=max(line.seq for line in read_ledger(path))):
                     ledger.append(missing)
-            if self._connection.execute("select format from header").fetchone()[0] == WITHOUT_CHAIN:
-                add_chain(self._connection)
-                checkpoint(self._connection)
             return ledger
         except (sqlite3.OperationalError, OSError) as error:
             raise JournalError(
@@ -384,17 +379,11 @@ class Journal(JournalReader):
             ) from error
 
     def _lines_about_pours(self, *, after: int) -> list[LedgerLine]:
-        found = [
+        return [
             LedgerLine(row[0], digest.hex(), row[2], row[3], row[1], json.loads(row[4]))
             for row, digest in chain_of(self._connection)
             if row[0] > after and row[3] in _IN_LEDGER
         ]
-        if any(line.kind == Kind.POUR_STARTED and "number" not in line.body for line in found):
-            asked = {entry.body["id"]: entry.body["request"] for entry in self.entries(kinds=[Kind.REQUESTED])}
-            for line in found:
-                if line.kind == Kind.POUR_STARTED:
-                    line.body["number"] = asked[line.body["id"]]["number"]
-        return found
 
     def close(self) -> None:
         """Release file, lock and reserve. May be called twice."""

@@ -240,8 +240,7 @@ class JournalCheck:
         problems: one text each; empty: the records are complete and unchanged.
         pours: pours that have begun, from the ledger.
         entries: number of entries in the journal.
-        unchecked: number of entries written before the journal had a chain; earlier changes to them can't be found. In
-            a journal of an older version, all entries.
+        chained: whether the journal has a hash chain; a journal of version 0.2 has none, so changes can't be found.
         begun: whether there is a run; False in a folder where a run died before its first entry.
     """
 
@@ -249,7 +248,7 @@ class JournalCheck:
     problems: tuple[str, ...] = ()
     pours: tuple[str, ...] = ()
     entries: int = 0
-    unchecked: int = 0
+    chained: bool = True
     begun: bool = True
 
     @property
@@ -257,10 +256,8 @@ class JournalCheck:
         """The result as one sentence without a full stop."""
         if self.problems:
             return f"damaged or incomplete: {'; '.join(self.problems)}"
-        if self.unchecked == 0:
+        if self.chained:
             return f"complete and unchanged ({self.entries} entries)"
-        if self.unchecked < self.entries:
-            return f"complete; the first {self.unchecked} of {self.entries} entries are older than the hash chain"
         return f"not verifiable: the journal ({self.entries} entries) is of a version without a hash chain"
 
     def require(self) -> None:
@@ -388,8 +385,7 @@ def _checked(
             )
     if ledger is None and not problems and not old and (entries or [name for name in traces if _is_record(name)]):
         problems.append(f"{LEDGER_NAME}, the ledger of pours, is missing")
-    before = ledger[0].body.get("entries", 0) if ledger else 0
-    return JournalCheck(path, tuple(problems), pours, entries, entries if old else int(before))
+    return JournalCheck(path, tuple(problems), pours, entries, not old)
 
 
 def _is_record(name: str) -> bool:

@@ -32,7 +32,7 @@ FORMAT = 3
 """Version of the tables and of the entries' bodies. A journal of another version is refused."""
 
 WITHOUT_CHAIN = 2
-"""The version before the hash chain. Such a journal can be read; resuming it adds the chain."""
+"""The format of version 0.2, before the hash chain. Such a journal can be read, and not resumed."""
 
 _CHAIN = """
 create table chain (seq integer primary key, digest blob not null) strict;
@@ -82,17 +82,19 @@ class Header:
     created: float = 0.0
 
 
-def check_format(found: int, path: Path) -> None:
-    """Check that this version of Decant can read a journal.
+def check_format(found: int, path: Path, *, resuming: bool = False) -> None:
+    """Check that this version of Decant can read a journal, or resume it.
 
     Raises:
         JournalError: another version wrote it.
     """
-    if found not in (FORMAT, WITHOUT_CHAIN):
-        raise JournalError(
-            f"{path}: written in format {found}, this version of Decant reads format {FORMAT}; "
-            "go on with the version that began the run (see versions.json beside it) or begin a new run"
-        )
+    if found == FORMAT or (found == WITHOUT_CHAIN and not resuming):
+        return
+    does = "resumes" if resuming else "reads"
+    raise JournalError(
+        f"{path}: written in format {found}, this version of Decant {does} format {FORMAT}; "
+        "go on with the version that began the run (see versions.json beside it) or begin a new run"
+    )
 
 
 EventRow = tuple[int, str, float, str, str]
@@ -122,15 +124,6 @@ def chain_of(connection: sqlite3.Connection) -> Iterator[tuple[EventRow, bytes]]
     for row in connection.execute("select seq, stage, t, kind, body from event order by seq"):
         digest = chained(digest, row)
         yield row, digest
-
-
-def add_chain(connection: sqlite3.Connection) -> None:
-    """Add the hash chain to a journal of the version before it, in one transaction."""
-    digests = [(row[0], digest) for row, digest in chain_of(connection)][1:]
-    connection.executescript(f"begin immediate; {_CHAIN}")
-    connection.executemany("insert into chain values (?, ?)", digests)
-    connection.execute("update header set format = ?", [FORMAT])
-    connection.execute("commit")
 
 
 def checkpoint(connection: sqlite3.Connection) -> None:
