@@ -35,6 +35,7 @@ class RecordedPour:
 
     Attributes:
         state: 'under way': it has begun; 'unknown': the run ended during the pour, so it has no outcome.
+        outcome: as recorded; None without one.
         measured: the measurement, if it was weighed.
         reason: why it failed.
         answer: the operator's answer about it; '' without one.
@@ -48,6 +49,7 @@ class RecordedPour:
     state: PourState = "asked"
     measured: PourMeasurement | None = None
     reason: str = ""
+    outcome: Outcome | None = None
     answer: str = ""
     time: float | None = None
     seconds: float | None = None
@@ -349,7 +351,8 @@ class RecordReader:
     @staticmethod
     def _poured(pour: RecordedPour, entry: Entry) -> None:
         pour.time, pour.seconds = entry.t, entry.body.get("seconds")
-        match decode_outcome(entry.body["outcome"]):
+        pour.outcome = decode_outcome(entry.body["outcome"])
+        match pour.outcome:
             case Poured(measurement):
                 pour.state, pour.measured = "weighed", measurement
             case Failed(_, reason):

@@ -511,7 +511,7 @@ def _listed(names: Iterable[str]) -> str:
 
 
 @dataclass(frozen=True)
-class TableRow:
+class ResultRow:
     """A row of a table; its first cell is the row's name.
 
     Attributes:
@@ -533,13 +533,13 @@ class ResultTable:
 
     caption: str
     header: Sequence[str]
-    rows: Sequence[TableRow]
+    rows: Sequence[ResultRow]
     numbers: frozenset[int] = frozenset()
 
     def filled(self) -> ResultTable:
         """A copy without empty columns."""
         kept = [i for i in range(len(self.header)) if i == 0 or any(row.cells[i].strip("—") for row in self.rows)]
-        rows = [TableRow([row.cells[i] for i in kept], row.look) for row in self.rows]
+        rows = [ResultRow([row.cells[i] for i in kept], row.look) for row in self.rows]
         numbers = frozenset(place for place, i in enumerate(kept) if i in self.numbers)
         return ResultTable(self.caption, [self.header[i] for i in kept], rows, numbers)
 
@@ -547,7 +547,7 @@ class ResultTable:
 def stage_table(summary: RunSummary) -> ResultTable:
     """Progress of each stage."""
     rows = [
-        TableRow(
+        ResultRow(
             [one.stage, one.state, *(str(n or "") for n in (one.pours, one.simulations, one.unusable_simulations))]
         )
         for one in summary.stages
@@ -558,13 +558,13 @@ def stage_table(summary: RunSummary) -> ResultTable:
 
 def cost_table(summary: RunSummary) -> ResultTable:
     """Costs of the run."""
-    return ResultTable("Cost", ["what", "how much"], [TableRow(pair) for pair in summary.cost.items()])
+    return ResultTable("Cost", ["what", "how much"], [ResultRow(pair) for pair in summary.cost.items()])
 
 
 def question_table(summary: RunSummary) -> ResultTable:
     """Questions to the operator and their answers."""
     rows = [
-        TableRow(
+        ResultRow(
             [
                 time.strftime("%Y-%m-%d %H:%M", time.localtime(one.time)),
                 one.stage,
@@ -581,7 +581,7 @@ def question_table(summary: RunSummary) -> ResultTable:
 def theta_table(summary: RunSummary) -> ResultTable:
     """θ* with its region."""
     level = "region" if summary.posterior is None else f"{100 * summary.posterior.level:.0f} % of the θ that fit"
-    rows = [TableRow([one.name, one.value, one.region, one.searched]) for one in summary.parameters]
+    rows = [ResultRow([one.name, one.value, one.region, one.searched]) for one in summary.parameters]
     return ResultTable("θ* with its region", ["parameter", "θ*", level, "searched"], rows).filled()
 
 
@@ -596,7 +596,7 @@ def score_table(summary: RunSummary) -> ResultTable:
         "regression": "GP regression of training pours",
     }
     rows = [
-        TableRow([SPLITS[split], *("—" if (v := row.get(name)) is None else f"{100 * v:.2f}" for name in columns)])
+        ResultRow([SPLITS[split], *("—" if (v := row.get(name)) is None else f"{100 * v:.2f}" for name in columns)])
         for split, row in summary.discrepancy.items()
         if any(value is not None for value in row.values())
     ]
@@ -613,7 +613,7 @@ def receiver_table(summary: RunSummary) -> ResultTable:
     ]
     heads = list(dict.fromkeys(head for row in shown for head in row.texts))
     rows = [
-        TableRow([row.receiver, row.strategy, *(row.texts.get(head, "") or "—" for head in heads)]) for row in shown
+        ResultRow([row.receiver, row.strategy, *(row.texts.get(head, "") or "—" for head in heads)]) for row in shown
     ]
     header = ["receiver", "strategy", *heads]
     return ResultTable(summary.loss_label, header, rows, frozenset(range(2, len(header)))).filled()
@@ -640,7 +640,7 @@ def _pour_table(stage: str, pours: Sequence[PourSummary]) -> ResultTable:
             pour.remark,
         ]
         look = "best" if pour.best else "bad" if pour.state in ("failed", "unknown") else ""
-        rows.append(TableRow(cells, look))
+        rows.append(ResultRow(cells, look))
     header = ["pour", *(style.label(name) for name in searched), "loaded [g]", "spilled [g]", "retained [g]"]
     header += ["spilled / poured [%]", "expected", "came to", "remark"]
     what = "" if pours[0].calibration else f"; expected and came to: {pours[0].loss}"
@@ -657,7 +657,7 @@ def _bare(name: str, value: float | None) -> str:
 def validity_table(summary: RunSummary) -> ResultTable:
     """Effects that are not simulated in the action spaces."""
     rows = [
-        TableRow([one.receiver, one.kind.replace("_", " "), f"{one.hit} of {one.tried}", one.text])
+        ResultRow([one.receiver, one.kind.replace("_", " "), f"{one.hit} of {one.tried}", one.text])
         for several in summary.not_covered.values()
         for one in several
     ]

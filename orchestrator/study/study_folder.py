@@ -2,7 +2,7 @@
 
 - `CellResult` is the content of a result file; `read_result` and `write_result` access it.
 - `opened` locks the folder for one process and checks its settings.
-- `code_now` and `warning` compare the code that made the finished cells with the current one.
+- `code_now` and `code_warning` compare the code that made the finished cells with the current one.
 
 Cells are run in `study_runner`.
 """
@@ -191,7 +191,7 @@ def made_by(results: Mapping[str, CellResult]) -> Counter[tuple[tuple[str, str],
     return Counter(tuple(result.code.items()) for result in results.values())
 
 
-def warning(results: Mapping[str, CellResult]) -> str | None:
+def code_warning(results: Mapping[str, CellResult]) -> str | None:
     """Warning for a study that continues with other code than that of its finished cells; None if the code is equal.
 
     Args:
@@ -210,7 +210,7 @@ def warning(results: Mapping[str, CellResult]) -> str | None:
     )
 
 
-def told(results: Mapping[str, CellResult]) -> str:
+def code_summary(results: Mapping[str, CellResult]) -> str:
     """Text for the page: the number of different codes of the cells, and their digests."""
     count = made_by(results)
     if not count:

@@ -16,7 +16,6 @@ from types import TracebackType
 
 from tests.support.waiting import PATIENCE
 
-
 PROMPT = "> "
 """Ends every prompt of the commands."""
 

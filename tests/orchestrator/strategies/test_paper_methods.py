@@ -21,15 +21,14 @@ from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import D3Settings, Hybrid
 from orchestrator.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, StrategyHarness
-from orchestrator.study.cell_process import run_cell
-from orchestrator.study.report.calibration_figures import draw_calibrations
-from orchestrator.study.report.cell_results import gather
-from orchestrator.study.report.deployment_figures import draw_deployments
-from orchestrator.study.report.figure_panels import colour
-from orchestrator.study.report.study_tables import tables
+from orchestrator.study.calibration_figures import colour, draw_calibrations
+from orchestrator.study.deployment_figures import draw_deployments
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import finished_results, read_result
+from orchestrator.study.study_page import tables
 from orchestrator.study.study_plan import StudyPlan, cells_of
+from orchestrator.study.study_runner import run_cell
+from orchestrator.study.study_statistics import gather
 from tests.support.campaign_files import CAMPAIGN, DEPLOYED, report, write
 from tests.support.study_files import read, written
 from tests.support.toy_spillage import calibration_spill, narrow_cup, narrow_cup_biased, weighed
