@@ -24,7 +24,7 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 
 from pydantic import BaseModel, ValidationError
 
-from orchestrator.journal.upgrade import upgraded_request, upgraded_result
+from orchestrator.journal.upgrade import upgraded_outcome, upgraded_request, upgraded_result
 from orchestrator.requests import Outcome, Request
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.stage_result import StageResult
@@ -55,7 +55,7 @@ def encode_outcome(outcome: Outcome) -> dict[str, Any]:
 
 def decode_outcome(data: Mapping[str, Any]) -> Outcome:
     """Inverse of `encode_outcome`. Raises CodecError."""
-    return cast(Outcome, from_json(data, Outcome))
+    return cast(Outcome, from_json(upgraded_outcome(data), Outcome))
 
 
 def canonical(data: Any) -> str:
@@ -304,9 +304,7 @@ DECLARED_IN = (
     "orchestrator.strategies.calibration.calibration_base",
     "orchestrator.strategies.calibration.calibration_scores",
     "orchestrator.strategies.deployment.deployment_result",
-    "orchestrator.strategies.deployment.confirmation",
-    "orchestrator.strategies.repeated_simulation",
-    "orchestrator.strategies.single_pour",
+    "orchestrator.strategies.single_action",
     "orchestrator.study.study_strategies",
 )
 """Modules that declare Decant's own kinds of results; named as text, so that results do not import strategies."""

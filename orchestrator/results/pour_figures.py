@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from actors.arm.arm_settings import UrArmSpec
     from actors.arm.planned_pour import PourPath
-    from actors.arm.planning.frames import Transforms
+    from actors.arm.planning.kinematics import Transforms
     from actors.arm.planning.trajectory import SampledPath
     from sim_engine.outcome import SimulatedPour
     from sim_engine.scene import PourTask
@@ -354,7 +354,7 @@ def draw_path(
         title: first line.
         note: text below the title.
     """
-    from actors.arm.planning.frames import cell_transforms
+    from actors.arm.planning.kinematics import cell_transforms
     from actors.arm.planning.trajectory import SampledPath
 
     stretches = [SampledPath.of(name, getattr(path, name), spec) for name, _, _ in _WAYS]

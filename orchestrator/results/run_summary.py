@@ -19,11 +19,11 @@ from orchestrator.journal.codec import kinds
 from orchestrator.journal.run_record import PourState
 from orchestrator.strategies.calibration.calibration_scores import CalibrationGain
 from orchestrator.strategies.calibration.posterior_summary import PosteriorSummary
-from orchestrator.strategies.deployment.confirmation import Confirmed
 from orchestrator.strategies.deployment.deployment_result import ParetoAction, Recommended, RiskFound
 from orchestrator.strategies.deployment.model_monitoring import Believed
 from orchestrator.strategies.deployment.real_pours import PourRow, PredictionCheck
 from orchestrator.strategies.deployment.safe_window import WindowFound
+from orchestrator.strategies.single_action import Confirmed
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from sim_engine.liquids import SimulationParameters
 from sim_engine.model_validity import NotCovered

@@ -48,9 +48,8 @@ from orchestrator.results.stage_views import (
 from orchestrator.strategies.calibration.calibration_base import CalibratedTheta
 from orchestrator.strategies.calibration.calibration_scores import Scores
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
-from orchestrator.strategies.deployment.confirmation import Confirmed
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.repeated_simulation import PredictionStatistics
+from orchestrator.strategies.single_action import Confirmed, PredictedPour
 from sim_engine.model_validity import NotCovered
 from sim_engine.outcome import normalised_spillage
 
@@ -361,7 +360,7 @@ def _receiver(
     plan: DeploymentPlan | None,
     name: str,
     result: Deployed,
-    predicted: PredictionStatistics | None,
+    predicted: PredictedPour | None,
     not_covered: Sequence[NotCovered],
     confirmed: Confirmed | None,
 ) -> ReceiverSummary:

@@ -20,13 +20,14 @@ from typing import Any
 
 from pydantic import SerializeAsAny, field_validator
 
-from actors.runtime.ray_cluster import sources, versions
+from actors.runtime.ray_cluster import versions
 from orchestrator.journal.codec import decode_result, digest, first_difference, from_json, to_json
 from orchestrator.journal.journal_file import locked_alone
 from orchestrator.journal.upgrade import upgraded_fingerprint
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from orchestrator.study.study_plan import StudyCell, StudyPlan, study_fingerprint
+from sim_engine.solver_fingerprint import folder_digest
 
 CELLS, RESULT, LOG, SETTINGS = "cells", "result.json", "process-{}.log", "study.json"
 SOURCE = "study-file.txt"
@@ -180,8 +181,8 @@ def code_now() -> dict[str, str]:
     here = versions()
     return {
         "decant": here.decant,
-        "optimiser": sources(_ROOT / "actors" / "optimizer"),
-        "strategies": sources(_ROOT / "orchestrator" / "strategies"),
+        "optimiser": folder_digest(_ROOT / "actors" / "optimizer"),
+        "strategies": folder_digest(_ROOT / "orchestrator" / "strategies"),
         "solver": here.simulator,
     }
 

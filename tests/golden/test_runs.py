@@ -30,7 +30,6 @@ from orchestrator.daemon.event_feed import event_json
 from orchestrator.journal.codec import encode_request, first_difference
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
 from orchestrator.journal.run_record import read_result
-from orchestrator.journal.upgrade import upgraded_request
 from orchestrator.progress.console_progress import ProgressDisplay
 from orchestrator.requests import Request
 from orchestrator.results.console_view import summary_table
@@ -272,7 +271,7 @@ def test_old_run_is_replayed(name: str, runs: Path) -> None:
                 requests = strategy.ask(step.slots)
                 assert len(requests) == len(step.ids)
                 for key, request in zip(step.ids, requests, strict=True):
-                    before, now = _sorted(upgraded_request(history.requests[key])), _sorted(encode_request(request))
+                    before, now = _sorted(encode_request(history.request(key))), _sorted(encode_request(request))
                     assert agree(before, now), f"stage {stage.name}, request {key}:\n- {before}\n+ {now}"
                     open_[key], asked = request, asked + 1
             if history.result is not None:

@@ -17,7 +17,7 @@ from orchestrator.results.summarise import summarise
 from orchestrator.results.wording import pool_line
 from orchestrator.strategies.deployment.model_monitoring import Belief, Believed
 from orchestrator.strategies.deployment.real_pours import PredictionCheck
-from orchestrator.strategies.repeated_simulation import PredictionStatistics
+from orchestrator.strategies.single_action import PredictedPour
 from sim_engine.prediction_band import SampleStatistics
 from tests.support import example_run
 from tests.support.example_results import changed, shown
@@ -135,7 +135,7 @@ def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(re
     for pour in deployed.weighed:
         assert pour.delivered_g == pytest.approx(1e3 * liquid.mass - pour.spilled_g - pour.retained_g, abs=1e-9)
         assert pour.delivered_ml == pytest.approx(pour.delivered_g / liquid.density * 1e3)
-    foreseen = PredictionStatistics(
+    foreseen = PredictedPour(
         scene="narrow cup",
         simulations=2,
         simulations_lost=0,

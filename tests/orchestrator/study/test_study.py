@@ -18,7 +18,6 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from actors.runtime.ray_cluster import sources
 from actors.simulators.local_worker import thread_pool
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign
@@ -44,6 +43,7 @@ from orchestrator.study.study_runner import run_cell
 from orchestrator.study.study_strategies import FinalPour
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement
+from sim_engine.solver_fingerprint import folder_digest
 from tests.support import toy_study
 from tests.support.fake_simulator import make_fake
 from tests.support.study_files import ROOT, read, small, without, written
@@ -263,12 +263,11 @@ def test_other_code_than_that_of_finished_cells_is_named_once_and_is_no_error(tm
     text = code_warning({"a": same, "b": older, "c": same}) or ""
     assert "1 finished by other code (strategies: changed since)" in text
     assert "\n" not in text
-    assert sources(tmp_path / "nothing") not in code_now().values(), "a folder of the code has moved"
+    assert folder_digest(tmp_path / "nothing") not in code_now().values(), "a folder of the code has moved"
     (tmp_path / "a.py").write_text("x = 1", encoding="utf-8")
-    before = sources(tmp_path)
+    before = folder_digest(tmp_path)
     (tmp_path / "a.py").write_text("x = 2", encoding="utf-8")
-    assert sources(tmp_path) != before
-    assert sources(tmp_path / "nothing") not in code_now().values()  # the folders that count exist
+    assert folder_digest(tmp_path) != before
 
 
 def test_two_commands_can_not_run_one_study(tmp_path: Path) -> None:
