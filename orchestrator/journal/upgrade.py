@@ -92,18 +92,13 @@ _RENAMED = {
 
 def upgraded_result(data: Data) -> Data:
     """A stage's result as this version reads it. Of a comparison of pours with simulations its scores are left."""
-    names = _RENAMED.get(str(data.get("kind")), {})
-    data = {names.get(key, key): value for key, value in data.items()}
+    data = _renamed(data, _RENAMED.get(str(data.get("kind")), {}))
     if data.get("kind") != "deployment":
         return data
-    rows = [{_POUR.get(key, key): value for key, value in row.items()} for row in data.get("pours", ())]
     check = data.get("model_check")
     if isinstance(check, Mapping) and "mean_z" in check:
-        check = {key: check[key] for key in ("z_scores", "alarm")}
-    return {**data, "pours": rows, "model_check": check}
-
-
-_POUR = {"predicted_interval": "predicted_interval"}
+        data["model_check"] = {key: check[key] for key in ("z_scores", "alarm")}
+    return data | {"pours": [_renamed(row, {"predicted_band": "predicted_interval"}) for row in data.get("pours", ())]}
 
 
 def upgraded_fingerprint(data: dict[str, Any]) -> dict[str, Any]:
