@@ -35,7 +35,7 @@ from players import AXES, SCENE, interval, simulated, unit
 from skipping_clock import SkippingLoop, run
 
 from actors.interfaces import ProgressCallback
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
 from orchestrator.journal.run_record import POOL_RESTS, Occupancy
@@ -160,7 +160,7 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
             name="dyna",
             seed=seed,
             source=Path(folder) / "dyna.yaml",
-            laboratory=LaboratorySpec("numbers"),
+            laboratory=LaboratorySettings(name="numbers"),
             parameters=SimulationParameters(particles=500),
             calibration=None,
             deployment=arm,

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import check_journal, has_begun
 from orchestrator.journal.run_record import CampaignResult, read_result
@@ -120,13 +120,12 @@ class RunResources:
     approved_checksum: str = ""
     subscribers: Sequence[Watcher] = ()
     recorder: Callable[[CampaignPlan, Path], RerunMonitor | None] | None = None
-    laboratory: Callable[[LaboratorySpec, bool], Laboratory] | None = None
+    laboratory: Callable[[LaboratorySettings, bool], Laboratory] | None = None
 
-    def settings(self, campaign: CampaignPlan) -> LaboratorySpec:
+    def settings(self, campaign: CampaignPlan) -> LaboratorySettings:
         """The campaign's laboratory as it is opened with these resources."""
         spec = campaign.laboratory
-        return replace(
-            spec,
+        return spec.with_values(
             in_process=self.in_process or spec.in_process,
             accepted_checksum=self.approved_checksum,
             ray=None if self.simulators is not None else spec.ray,

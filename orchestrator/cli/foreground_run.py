@@ -33,7 +33,7 @@ from orchestrator.cli.console import (
 
 if TYPE_CHECKING:
     from actors.interfaces import Operator
-    from actors.laboratory_settings import LaboratorySpec
+    from actors.laboratory_settings import LaboratorySettings
     from orchestrator.journal.run_record import CampaignResult
     from orchestrator.live_view.live_server import LiveView
     from orchestrator.live_view.rerun_subscriber import RerunMonitor
@@ -351,7 +351,7 @@ def file_trouble(error: OSError, directory: Path) -> str:
 
 
 def person_at_the_terminal(
-    spec: LaboratorySpec, paused: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext
+    spec: LaboratorySettings, paused: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext
 ) -> Operator | None:
     """Who answers the bench's questions; None where a virtual operator does.
 
@@ -359,24 +359,22 @@ def person_at_the_terminal(
         spec: of the laboratory.
         paused: entered while a question is open.
     """
-    from actors.bench.bench_factory import needs_person
     from orchestrator.cli.terminal_operator import TerminalOperator
 
-    if not needs_person(spec) or spec.arm is None:
+    if not spec.needs_person or spec.arm is None:
         return None
     return TerminalOperator(spec.operator, paused=paused)
 
 
-def check_somebody_is_there(spec: LaboratorySpec) -> None:
+def check_somebody_is_there(spec: LaboratorySettings) -> None:
     """A bench that asks a person needs a terminal to ask at.
 
     Raises:
         RefusalError: there is none (exit code 2).
     """
-    from actors.bench.bench_factory import needs_person
     from orchestrator.cli.terminal_operator import somebody_at_the_terminal
 
-    if needs_person(spec) and not somebody_at_the_terminal():
+    if spec.needs_person and not somebody_at_the_terminal():
         raise RefusalError(
             f"laboratory {spec.name} asks a person (operator: answers: person), and there is no terminal to ask at; "
             "run this in a terminal, with nothing piped into it",

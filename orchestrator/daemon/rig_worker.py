@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from actors.bench.bench_factory import needs_person
 from actors.interfaces import LaboratoryError
 from actors.laboratory import WarmSimulators
 from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -140,7 +139,7 @@ class Running:
         asking, key, rig = self._common.asking, self.item.id, self._rig.name
         plan, live = request.campaign, self._common.live
         load = next(iter(scenes_of(plan).values())).liquid.mass  # a campaign has one liquid
-        asks = request.pours and needs_person(plan.laboratory)
+        asks = request.pours and plan.laboratory.needs_person
         assert self._tally is not None
 
         def recorder(plan: CampaignPlan, run: Path) -> RerunMonitor | None:

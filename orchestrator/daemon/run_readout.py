@@ -16,10 +16,10 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from actors.balance.balance_settings import look_at_balance
+from actors.balance.balance_settings import balance_diagnostics
 from actors.interfaces import LaboratoryError
 from actors.laboratory import reached
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.journal.codec import CodecError
 from orchestrator.journal.journal_file import JournalError
@@ -75,7 +75,7 @@ def summary_of(directory: Path) -> dict[str, Any] | None:
     return found
 
 
-def found_at(spec: LaboratorySpec) -> dict[str, str]:
+def found_at(spec: LaboratorySettings) -> dict[str, str]:
     """Describe the state of a bench for the operator. Takes seconds.
 
     Args:
@@ -85,12 +85,14 @@ def found_at(spec: LaboratorySpec) -> dict[str, str]:
         Findings by device; a device that can't be read has an entry with the reason.
     """
     if spec.arm is None:
-        return {"bench": "made of numbers: it has no arm and no balance that could be read"}
+        return {"bench": "simulated: it has no arm and no balance that could be read"}
     found: dict[str, str] = {}
     try:
         with reached(spec) as ready:
             assert ready.arm is not None
-            checks = ready.arm.look().checks(None, accept="", virtual=True) + look_at_balance(ready.balance, tare=False)
+            checks = ready.arm.diagnostics().checks(None, accept="", virtual=True) + balance_diagnostics(
+                ready.balance, tare=False
+            )
     except (LaboratoryError, OSError, ValueError) as error:
         return {"bench": f"can't be read: {error}"}
     for check in checks:

@@ -91,7 +91,13 @@ _RENAMED = {
 
 
 def upgraded_result(data: Data) -> Data:
-    """A stage's result as this version reads it. Of a comparison of pours with simulations its scores are left."""
+    """A stage's result as this version reads it.
+
+    Of a comparison of pours with simulations, the scores are left. Of a study's table, the number of its simulations is
+    left: their outcomes are in the journal, too.
+    """
+    if data.get("kind") == "table":
+        return {key: value for key, value in data.items() if key != "rows"}
     data = _renamed(data, _RENAMED.get(str(data.get("kind")), {}))
     if data.get("kind") != "deployment":
         return data
@@ -104,9 +110,26 @@ def upgraded_result(data: Data) -> Data:
 def upgraded_fingerprint(data: dict[str, Any]) -> dict[str, Any]:
     """A fingerprint of a campaign or study, comparable with one of this version where it means the same in both."""
     data = {**data, "deployment": _upgraded_plan(data["deployment"])} if "deployment" in data else data
+    if isinstance(laboratory := data.get("laboratory"), Mapping) and "cell" not in laboratory:
+        data = {**data, "laboratory": _upgraded_laboratory(laboratory)}
     if isinstance(arms := data.get("deployments"), Mapping):  # of a study
         data = {**data, "deployments": {label: _upgraded_plan(plan) for label, plan in arms.items()}}
     return data
+
+
+def _upgraded_laboratory(laboratory: Data) -> Data:
+    """A laboratory without an arm; one with an arm can't be resumed."""
+    bench = laboratory["bench"]
+    if bench is None:
+        return {**laboratory, "cell": None}
+    balance = {name: bench[f"balance_{name}"] for name in ("resolution", "noise", "drift")}
+    kept = {name: bench[name] for name in ("pose_error", "pose_noise", "time_scale", "operator_time")}
+    liquid = {name: value for name, value in bench["liquid"].items() if name not in _NUISANCES}
+    balance["settling_time"] = bench["settling_time"]
+    return {**laboratory, "cell": None, "bench": {"liquid": liquid, **kept, "balance": balance}}
+
+
+_NUISANCES = ("receiver_x", "receiver_y", "receiver_z", "tilt_zero", "speed_factor")
 
 
 def _upgraded_plan(plan: Any) -> Any:

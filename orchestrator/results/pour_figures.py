@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from actors.arm.arm_settings import UrArmSpec
+    from actors.arm.arm_settings import UrArmSettings
     from actors.arm.planned_pour import PourPath
     from actors.arm.planning.kinematics import Transforms
     from actors.arm.planning.trajectory import SampledPath
@@ -343,7 +343,7 @@ _MARGIN = 40.0
 
 
 def draw_path(
-    path: PourPath, spec: UrArmSpec, pourer: Vessel, receiver: Vessel, *, title: str, note: str = ""
+    path: PourPath, spec: UrArmSettings, pourer: Vessel, receiver: Vessel, *, title: str, note: str = ""
 ) -> Figure:
     """Figure of an arm's path.
 
@@ -404,9 +404,11 @@ def _near(
     style.dress(axes, title="the pour from the side", x=_AXES[0], y=_AXES[2], grid="both")
 
 
-def _cell(axes: Axes, pour: SampledPath, spec: UrArmSpec, world: Transforms, seen: tuple[int, int]) -> None:
+def _cell(axes: Axes, pour: SampledPath, spec: UrArmSettings, world: Transforms, seen: tuple[int, int]) -> None:
     """The box of the arm's limits, and the arm at the start of the pour and at its largest tilt."""
-    corners = np.array(list(itertools.product(*zip(spec.limits.box_low, spec.limits.box_high, strict=True))))
+    corners = np.array(
+        list(itertools.product(*zip(spec.limits.box.low.vector, spec.limits.box.high.vector, strict=True)))
+    )
     _outline(axes, world.apply(corners)[:, list(seen)], label="box of the laboratory's file")
     largest = int(np.argmax(pour.tilts))
     for index, colour, name in ((0, style.PALE, "arm, upright"), (largest, style.FALLING, "arm, largest tilt")):

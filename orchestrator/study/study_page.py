@@ -419,7 +419,7 @@ def _settings(study: StudyPlan) -> list[str]:
 
 
 def _level(level: Level) -> str:
-    liquid = ", ".join(f"{name} {value:g}" for name, value in level.bench.liquid.of_the_solver().items())
+    liquid = ", ".join(f"{name} {value:g}" for name, value in level.bench.theta.of_the_solver().items())
     error, noise = level.bench.pose_error, level.bench.pose_noise
     off = ", ".join(f"{1e3 * value:g}" for value in (error.x, error.y, error.z))
     scatter = ", ".join(f"{1e3 * value:g}" for value in (noise.x, noise.y, noise.z))
