@@ -89,9 +89,9 @@ def at_price(plan: CalibrationPlan, row: Row) -> CalibrationPlan:
     pours = sum(scored.pour.split == TRAINED_ON and scored.pour.spillage is not None for scored in recorded(plan))
     kind, names = calibrations()[row.name], plan.parameters.names
     settings = kind.like(plan.settings, simulations=row.budget)
-    if (initial := getattr(settings, "initial", None)) is not None:
+    if (initial := getattr(settings, "initial_samples", None)) is not None:
         trials = row.budget if row.name == "C4" else max(row.budget // pours, 1)
-        settings = settings.model_copy(update={"initial": min(initial, trials)})
+        settings = settings.model_copy(update={"initial_samples": min(initial, trials)})
     complaints = Complaints()
     settled = settings.settled(names, pours, complaints)
     if settled is None or complaints.any:

@@ -36,7 +36,7 @@ from orchestrator.daemon.notifications import NotifySection
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import OutputSettings
 from orchestrator.strategies.deployment import disturbances as pose
-from orchestrator.strategies.deployment.costing import PricesSettings
+from orchestrator.strategies.deployment.costing import CostSettings
 from orchestrator.strategies.deployment.disturbances import RiskSettings
 from orchestrator.strategies.deployment.model_monitoring import (
     DiscrepancyPolicySettings,
@@ -67,8 +67,8 @@ SECTIONS: dict[str, type[Settings]] = {
     "deployment": campaign.DeploymentSection,
     "risk": RiskSettings,
     "window": WindowSettings,
-    "prices": PricesSettings,
-    "ignorance": DiscrepancyPolicySettings,
+    "costs": CostSettings,
+    "discrepancy_policy": DiscrepancyPolicySettings,
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
     "data": campaign.DataSettings,
@@ -124,10 +124,10 @@ OF_SECTIONS = {
     **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
     "RiskSettings": "[risk](#risk-and-the-safe-window)",
     "WindowSettings": "[window](#risk-and-the-safe-window)",
-    "PricesSettings": "[prices](#prices)",
-    "DiscrepancyPolicySettings": "[ignorance](#ignorance-limits-and-the-end)",
-    "RiskLimitSettings": "[risk_limit](#ignorance-limits-and-the-end)",
-    "StopSettings": "[stop](#ignorance-limits-and-the-end)",
+    "CostSettings": "[costs](#costs)",
+    "DiscrepancyPolicySettings": "[discrepancy policy](#discrepancy-limits-and-the-end)",
+    "RiskLimitSettings": "[risk_limit](#discrepancy-limits-and-the-end)",
+    "StopSettings": "[stop](#discrepancy-limits-and-the-end)",
     "DataSettings": "[data](#existing-data)",
     "ProfileShape": "[profile](#vessels)",
     "Motion": "[motion](#motion-and-actions)",

@@ -129,7 +129,7 @@ class PourAsk:
     show: Callable[[RecordedFrames], None] | None = None
 
     @property
-    def record_rate(self) -> float:
+    def frame_rate(self) -> float:
         """Frame rate of the hidden liquid's particles [1/s]; 0 without a live view. The simulation is unaffected."""
         return 0.0 if self.show is None else WATCHED_RATE
 
@@ -260,7 +260,7 @@ class VirtualBench(GroundTruth):
         scene = replace(pour.scene, liquid=pour.scene.liquid.model_copy(update={"mass": mass}))
         shift = PoseError(x=error.x, y=error.y, z=error.z)
         task = PourTask(scene, pour.action, SimulationParameters(), 0, pose_error=shift, motion=motion)
-        task = replace(task, record_rate=pour.record_rate)
+        task = replace(task, frame_rate=pour.frame_rate)
         simulated = await hidden_pour(self._spec, self._simulators, task, pour.seed)
         pour.shown(simulated.frames)
         spill = spill_of(simulated.outcome, mass)

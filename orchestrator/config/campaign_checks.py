@@ -85,7 +85,7 @@ def _misses(
             action = scene.action({"x_offset": 0.0, **values})
         except ValueError:
             continue  # no such action, which is reported elsewhere
-        key = (scene.pourer, scene.liquid, scene.pivot, scene.hold_cap, action)
+        key = (scene.pourer, scene.liquid, scene.pivot, scene.max_hold_time, action)
         if key not in known:
             known[key] = _landing(scene, action, pourer, receiver)
         landing = known[key]

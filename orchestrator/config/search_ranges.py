@@ -173,6 +173,8 @@ def _pivot_form(value: Any) -> str:
 class MotionBase(Settings):
     """Values of the motion that are not searched."""
 
+    retired: ClassVar[dict[str, str]] = {"hold_cap": "max_hold_time"}
+
     pivot: (
         Annotated[
             Annotated[Literal["lip"], Tag("word")] | Annotated[PivotPoint, Tag("point")], Discriminator(_pivot_form)
@@ -181,7 +183,7 @@ class MotionBase(Settings):
     ) = None
     """Line about which the pourer turns: 'lip', or {x: ..., z: ...} in the frame of the upright pourer."""
 
-    hold_cap: Annotated[float, Quantity("s", "5 s", 0.0, 60.0)] | None = None
+    max_hold_time: Annotated[float, Quantity("s", "5 s", 0.0, 60.0)] | None = None
     """Maximum duration of a hold 'until_flow_ends'."""
 
     def fixed(self) -> dict[str, float | None]:

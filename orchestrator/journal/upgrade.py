@@ -12,9 +12,38 @@ from typing import Any
 
 Data = Mapping[str, Any]
 
+NAMES = {
+    "hold_cap": "max_hold_time",
+    "per_axis": "points_per_axis",
+    "per_pour": "simulations_per_pour",
+    "gain_below": "min_gain",
+    "record_rate": "frame_rate",
+}
+"""Names of 0.2 that had one meaning, and those of this version."""
+
+NAMES_BESIDE = {
+    "strategy": {"initial": "initial_samples", "prices": "costs", "ignorance": "discrepancy_policy"},
+    "probability": {"otherwise": "fallback"},
+    "recorded_simulations": {"rrd": "recording"},
+}
+"""Names of 0.2 that changed in mappings with a certain key."""
+
+
+def renamed(data: Any) -> Any:
+    """Data of 0.2 with the names of this version."""
+    if isinstance(data, Mapping):
+        names = NAMES.copy()
+        for key, more in NAMES_BESIDE.items():
+            names |= more if key in data else {}
+        return {names.get(key, key): renamed(value) for key, value in data.items()}
+    if isinstance(data, list | tuple) and data and not isinstance(data[0], int | float):
+        return [renamed(item) for item in data]
+    return data
+
 
 def upgraded_request(data: Data) -> Data:
     """A request as this version reads it. A question with the mean 'pooled' has 'scaled', the nearest one."""
+    data = renamed(data)
     problem = data.get("problem")
     if not isinstance(problem, Mapping) or "widening" not in problem:
         return data
@@ -24,6 +53,7 @@ def upgraded_request(data: Data) -> Data:
 
 def upgraded_result(data: Data) -> Data:
     """A stage's result as this version reads it. Of a comparison of pours with simulations its scores are left."""
+    data = renamed(data)
     trust = data.get("trust")
     if not isinstance(trust, Mapping) or "mean_z" not in trust:
         return data
@@ -32,6 +62,7 @@ def upgraded_result(data: Data) -> Data:
 
 def upgraded_fingerprint(data: dict[str, Any]) -> dict[str, Any]:
     """A fingerprint of a campaign or study, comparable with one of this version where it means the same in both."""
+    data = renamed(data)
     data = {**data, "deployment": _upgraded_plan(data["deployment"])} if "deployment" in data else data
     if isinstance(arms := data.get("deployments"), Mapping):  # of a study
         data = {**data, "deployments": {label: _upgraded_plan(plan) for label, plan in arms.items()}}
@@ -49,6 +80,7 @@ def _upgraded_plan(plan: Any) -> Any:
 
 def upgraded_campaign(data: Any) -> Any:
     """A recorded campaign as this version loads it, for all but resuming. A retired model becomes the default one."""
+    data = renamed(data)
     deployment = data.get("deployment") if isinstance(data, Mapping) else None
     if not isinstance(deployment, Mapping) or deployment.get("strategy") != "D3":
         return data
@@ -59,6 +91,6 @@ def upgraded_campaign(data: Any) -> Any:
 def _without_retired(settings: Data, *retired: str) -> dict[str, Any]:
     """D3's settings without some keys, and without the price of a simulation, which decided nothing."""
     kept = {key: value for key, value in settings.items() if key not in retired}
-    if isinstance(prices := kept.get("prices"), Mapping):
-        kept["prices"] = {key: value for key, value in prices.items() if key != "simulation"}
+    if isinstance(costs := kept.get("costs"), Mapping):
+        kept["costs"] = {key: value for key, value in costs.items() if key != "simulation"}
     return kept

@@ -92,7 +92,7 @@ def task_of(plan: CampaignPlan, run: Path, pour: PouredOnce, particles: int | No
         theta = theta.model_copy(update={"particles": particles})
     scene = scenes_of(plan)[pour.request.scene]
     scene = replace(scene, liquid=scene.liquid.model_copy(update={"mass": pour.measured.loaded}))
-    task = PourTask(scene, pour.request.action, theta, pour.request.seed % 2**31, record_rate=DETAIL)
+    task = PourTask(scene, pour.request.action, theta, pour.request.seed % 2**31, frame_rate=DETAIL)
     arm, record = plan.laboratory.arm, pour.measured.notes.get("executed")
     figure = None if arm is None else arm.figure()
     executed = None if figure is None or not record else figure.executed(record)

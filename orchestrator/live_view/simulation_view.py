@@ -104,7 +104,7 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
 
     Args:
         path: `.rrd` to write; replaced if it exists.
-        task: simulated task, with `record_rate` > 0.
+        task: simulated task, with `frame_rate` > 0.
         result: result of the simulation.
         title: title of the recording; default: names of the vessels, and the seed.
 

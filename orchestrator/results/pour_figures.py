@@ -121,7 +121,7 @@ def simulation_png(path: Path, task: PourTask, result: SimulatedPour) -> Path:
 
     Args:
         path: PNG to write.
-        task: the simulated task, with `record_rate` > 0.
+        task: the simulated task, with `frame_rate` > 0.
         result: its result.
 
     Returns:

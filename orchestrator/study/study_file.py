@@ -78,32 +78,35 @@ def _arm(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
     name = f"{settings.model_fields['strategy'].default}ArmSection"
     model = create_model(name, __base__=ArmSection, __doc__=ArmSection.__doc__, **fields)
     model.required = ArmSection.required | required
+    model.retired = {old: new for old, new in settings.retired.items() if new in keys}
     model.variant = settings.model_fields["strategy"].default
     return model
 
 
-C1Arm: Any = _arm(C1Settings, "per_axis", per_axis="10")
+C1Arm: Any = _arm(C1Settings, "points_per_axis", points_per_axis="10")
 C2Arm: Any = _arm(C2Settings, "samples", samples="18")
-C3Arm: Any = _arm(C3Settings, "iterations", "initial", "kappa", iterations="59")
-C4Arm: Any = _arm(C4Settings, "simulations", "initial", "kappa", simulations="108")
-D2Arm: Any = _arm(D2Settings, "pours", "mean", "initial", "kappa", pours="15")
+C3Arm: Any = _arm(C3Settings, "iterations", "initial_samples", "kappa", iterations="59")
+C4Arm: Any = _arm(C4Settings, "simulations", "initial_samples", "kappa", simulations="108")
+D2Arm: Any = _arm(D2Settings, "pours", "mean", "initial_samples", "kappa", pours="15")
 
 
-class D1ArmSection(_arm(D1Settings, "simulations_per_iteration", "initial", "kappa")):  # type: ignore[misc]
+class D1ArmSection(_arm(D1Settings, "simulations_per_iteration", "initial_samples", "kappa")):  # type: ignore[misc]
     """A compared strategy: its number of repetitions and its budget."""
 
     iterations: list[PositiveSimulationCount] = Field(default=[15], min_length=1)
     """Iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
 
 
-class D3ArmSection(_arm(D3Settings, "pours", "prior_simulations", "initial", "kappa", pours="15")):  # type: ignore[misc]
+class D3ArmSection(_arm(D3Settings, "pours", "prior_simulations", "initial_samples", "kappa", pours="15")):  # type: ignore[misc]
     """A compared strategy: its number of repetitions and its budget."""
 
-    per_pour: SimulationCount | None = None
+    retired: ClassVar[dict[str, str]] = D3Settings.retired
+
+    simulations_per_pour: SimulationCount | None = None
     """Simulations between two pours; not 'free', because the requests would then depend on the clock."""
 
 
-class C4ActiveArmSection(_arm(C4Settings, "simulations", "initial", "kappa", simulations="108", pours="6")):  # type: ignore[misc]
+class C4ActiveArmSection(_arm(C4Settings, "simulations", "initial_samples", "kappa", simulations="108", pours="6")):  # type: ignore[misc]
     """C4 with pours that it chooses itself, each by its expected information about the deployments."""
 
     pours: PositivePourCount | None = None

@@ -31,8 +31,8 @@ HARDWARE = (
 )
 
 BUDGETS = (
-    *("grid", "per_axis", "samples", "simulations"),
-    *("pours", "iterations", "simulations_per_iteration", "prior_simulations", "per_pour", "prices", "mean"),
+    *("grid", "points_per_axis", "samples", "simulations"),
+    *("pours", "iterations", "simulations_per_iteration", "prior_simulations", "simulations_per_pour", "costs", "mean"),
     *("risk_limit", "stop", "good_enough"),
 )
 """Settings that an arm does not take from the base campaign, because the study defines each budget."""
@@ -129,11 +129,15 @@ def calibration_arms(
             changes["averaging"] = "noise" if written == "C4_paper" else shared
         settings = kind.like(base_settings, without=BUDGETS, **changes)
         budget = getattr(settings, "iterations", None) or getattr(settings, "simulations", None)
-        if (initial := getattr(settings, "initial", None)) is not None and budget is not None and initial > budget:
-            if "initial" in changes:
+        if (
+            (initial := getattr(settings, "initial_samples", None)) is not None
+            and budget is not None
+            and initial > budget
+        ):
+            if "initial_samples" in changes:
                 key = next(key for key in arm.required if key != "repetitions")
-                report.add(at.at("initial"), f"{initial} random θ don't fit into {key}: {budget}")
-            settings = settings.model_copy(update={"initial": budget})
+                report.add(at.at("initial_samples"), f"{initial} random θ don't fit into {key}: {budget}")
+            settings = settings.model_copy(update={"initial_samples": budget})
         settled = settings.settled(base.parameters.names, train, PlacedProblems(at, report, frozenset()))
         if settled is None:
             continue

@@ -66,14 +66,20 @@ def calibration(**changes: Any) -> CalibrationPlan:
         "holdout": 1,
         "simulations": 5,
         "random_baseline": 3,
-        "initial": 4,
+        "initial_samples": 4,
     }
     return plans.calibration(**values | changes)
 
 
 def campaign(directory: Path, **changes: Any) -> CampaignPlan:
     deployment = plans.deployment(
-        scenes=(SCENE, NARROW), actions=SPACE, loss=Loss(), pours=2, prior_simulations=4, per_pour=2, initial=3
+        scenes=(SCENE, NARROW),
+        actions=SPACE,
+        loss=Loss(),
+        pours=2,
+        prior_simulations=4,
+        simulations_per_pour=2,
+        initial_samples=3,
     )
     values = {"calibration": calibration(), "deployment": deployment, "on_unknown": "repeat"}
     return toy_plan(directory, **(values | changes))
@@ -261,8 +267,8 @@ def test_the_calibrated_and_the_random_meet_the_same_seeds(tmp_path: Path) -> No
     ("settings", "order"),
     [
         (D3Settings(pours=2), "logical"),
-        (D3Settings(pours=2, per_pour=0), "logical"),
-        (D3Settings(pours=2, per_pour="free"), "completion"),
+        (D3Settings(pours=2, simulations_per_pour=0), "logical"),
+        (D3Settings(pours=2, simulations_per_pour="free"), "completion"),
         (D2Settings(pours=2), "logical"),
     ],
 )
@@ -280,7 +286,10 @@ def test_free_simulations_fill_the_time_of_a_pour(tmp_path: Path) -> None:
     plan = campaign(tmp_path, calibration=None)
     assert plan.deployment is not None
     plan = replace(
-        plan, deployment=replace(plan.deployment.with_settings(per_pour="free", prior_simulations=3), scenes=(SCENE,))
+        plan,
+        deployment=replace(
+            plan.deployment.with_settings(simulations_per_pour="free", prior_simulations=3), scenes=(SCENE,)
+        ),
     )
     room = laboratory()
     assert room.bench is not None

@@ -124,7 +124,7 @@ def test_a_process_keeps_to_one_backend(simulator: PourSimulator) -> None:
 
 
 def test_recorded_frames_show_the_liquid_from_the_start_of_a_slow_pour(simulator: PourSimulator) -> None:
-    slow = dataclasses.replace(task(1, speed=20.0), record_rate=5.0)
+    slow = dataclasses.replace(task(1, speed=20.0), frame_rate=5.0)
     run = simulator.simulate(slow)
     frames = run.frames
     assert frames is not None

@@ -24,7 +24,7 @@ from actors.optimizer.questions import (
 from orchestrator.requests import Answered, Ask, Decision, Outcome, Pour, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.campaign_plan import DeploymentPlan, Premises
 from orchestrator.strategies.deployment.bench_offset import play_of, thinned
-from orchestrator.strategies.deployment.costing import Prices, PricesSettings
+from orchestrator.strategies.deployment.costing import Costs, CostSettings
 from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_monitoring import (
@@ -50,10 +50,16 @@ if TYPE_CHECKING:
 class D3Settings(SearchSettings):
     """D3: real pours with a simulated prior."""
 
+    retired: ClassVar[dict[str, str]] = SearchSettings.retired | {
+        "per_pour": "simulations_per_pour",
+        "prices": "costs",
+        "ignorance": "discrepancy_policy",
+    }
+
     removed: ClassVar[dict[str, str]] = {
         "trust": (
-            "was retired; remove it: 'model: adaptive' weighs the simulator by every pour ('ignorance' says what "
-            "follows), 'model: residual' always believes it"
+            "was retired; remove it: 'model: adaptive' weighs the simulator by every pour ('discrepancy_policy' says "
+            "what follows), 'model: residual' always believes it"
         ),
         "model: pooled": "was retired; write 'adaptive', or 'residual' for the paper's",
         "model: scaled": "was retired; write 'adaptive', or 'residual' for the paper's",
@@ -63,19 +69,19 @@ class D3Settings(SearchSettings):
     """Real pours with a simulated prior."""
 
     prior_simulations: SimulationCount = 37
-    """Simulations before the first pour; with 'per_pour: free' at most so many."""
+    """Simulations before the first pour; with 'simulations_per_pour: free' at most so many."""
 
-    per_pour: CountOrFree = 2
+    simulations_per_pour: CountOrFree = 2
     """Simulations told between two pours; 'free': for as long as they are worth it."""
 
-    prices: PricesSettings | None = None
-    """With 'per_pour: free': what a pour and a simulation cost."""
+    costs: CostSettings | None = None
+    """With 'simulations_per_pour: free': what a pour and a simulation cost."""
 
     model: Literal["adaptive", "residual"] = "adaptive"
     """How simulations enter the surrogate of pours; 'adaptive' averages over ways in which the simulator may be wrong,
     'residual' is the paper's, which always believes it."""
 
-    ignorance: DiscrepancyPolicySettings | None = None
+    discrepancy_policy: DiscrepancyPolicySettings | None = None
     """With 'model: adaptive': what follows when the simulator seems to say nothing of this bench."""
 
     risk_limit: RiskLimitSettings | None = None
@@ -90,7 +96,7 @@ class D3Settings(SearchSettings):
     @property
     def beside(self) -> int | None:
         """Simulations told between two pours; None: for as long as a pour takes."""
-        return None if self.per_pour == "free" else int(self.per_pour)
+        return None if self.simulations_per_pour == "free" else int(self.simulations_per_pour)
 
     @property
     def adaptive(self) -> bool:
@@ -120,15 +126,17 @@ class D3Settings(SearchSettings):
     @property
     def spending(self) -> str:
         """What it spends into one receiver, in words."""
-        return f"{self.prior_simulations} simulations, then {self.pours} pours with {self.per_pour} beside each"
+        beside = self.simulations_per_pour
+        return f"{self.prior_simulations} simulations, then {self.pours} pours with {beside} beside each"
 
     def check(self, premises: Premises, complaints: Problems) -> None:
-        """Prices decide only where simulations go on for as long as they are worth it."""
+        """Costs decide only where simulations go on for as long as they are worth it."""
         super().check(premises, complaints)
-        if self.prices is not None and self.beside is not None:
-            text = f"decides nothing with 'per_pour: {self.per_pour}'; write 'per_pour: free', or remove it"
-            complaints.add(text, "prices", key=True)
-        for key in () if self.adaptive else ("ignorance", "risk_limit", "stop", "good_enough"):
+        if self.costs is not None and self.beside is not None:
+            given = f"'simulations_per_pour: {self.simulations_per_pour}'"
+            text = f"decides nothing with {given}; write 'simulations_per_pour: free', or remove it"
+            complaints.add(text, "costs", key=True)
+        for key in () if self.adaptive else ("discrepancy_policy", "risk_limit", "stop", "good_enough"):
             if getattr(self, key) is not None:
                 complaints.add(f"needs 'model: adaptive', not '{self.model}'", key, key=True)
 
@@ -141,10 +149,10 @@ class D3Settings(SearchSettings):
         """What follows on what the pours say of the simulator, in units of a loss whose largest value is given."""
         limit = None if self.risk_limit is None else Limit(worst * self.risk_limit.loss, self.risk_limit.probability)
         return Rules(
-            ignorance=self.ignorance or DiscrepancyPolicySettings(),
+            discrepancy_policy=self.discrepancy_policy or DiscrepancyPolicySettings(),
             limit=limit,
-            otherwise="go on" if self.risk_limit is None else self.risk_limit.otherwise,
-            gain_below=None if self.stop is None else worst * self.stop.gain_below,
+            fallback="go on" if self.risk_limit is None else self.risk_limit.fallback,
+            min_gain=None if self.stop is None else worst * self.stop.min_gain,
             good_enough=None if self.good_enough is None else worst * self.good_enough,
         )
 
@@ -161,9 +169,9 @@ class Hybrid(Deployment[D3Settings]):
     cost, f_r(a) = f_s(a) + δ(a): its posterior mean is the prior mean, its posterior covariance adds to δ's. The first
     pour is the minimiser of the prior mean; every further one minimises m(a) − κ s(a) given the weighed pours.
 
-    With `per_pour = k`, one question answers with the next pour and k places where a simulation would matter
-    most, which are simulated beside the pour and enter the prior: learning from real trials interleaved with planning
-    in a model (Dyna). With `per_pour = 'free'`, simulations go on for as long as the pour takes.
+    With `simulations_per_pour = k`, one question answers with the next pour and k places where a simulation would
+    matter most, which are simulated beside the pour and enter the prior: learning from real trials interleaved with
+    planning in a model (Dyna). With `simulations_per_pour = 'free'`, simulations go on for as long as the pour takes.
 
     `model` says how simulations enter the surrogate. The above is 'residual', the paper's, which always believes the
     simulator; 'adaptive' averages over the ways in which it may be wrong, and weighs them by every pour.
@@ -216,7 +224,7 @@ class Hybrid(Deployment[D3Settings]):
             self._simulate(suggestion, "prior")
 
         if len(self._trials) == 0:
-            count = min(max(self._settings.initial, 1), self._settings.prior_simulations)
+            count = min(max(self._settings.initial_samples, 1), self._settings.prior_simulations)
             self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
         elif self._trials.ready:
             self._compromise.weigh(exploring=True)
@@ -363,7 +371,7 @@ LOST_IN_A_ROW = 20
 
 
 class FreeHybrid(Hybrid):
-    """D3 whose simulations are chosen, and ended, by what they are worth: Dyna with prices.
+    """D3 whose simulations are chosen, and ended, by what they are worth: Dyna with costs.
 
     Every simulation is made where one more of them would lower the least expected real cost most (the acquisition
     'knowledge'). Before the first pour that is set against the value of a pour, each by the seconds it costs; the pour
@@ -376,12 +384,12 @@ class FreeHybrid(Hybrid):
     data by a few steps. The picture of the surrogate is asked for beside a pour.
 
     Limitations: in completion order the clock decides what is asked for; only the journal repeats a run. A front is
-    looked for without prices, with fits afresh.
+    looked for without costs, with fits afresh.
     """
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         super().__init__(plan, scene, parameters, seed)
-        self._prices = Prices(self._settings.prices or PricesSettings(), self._costing.worst)
+        self._costs = Costs(self._settings.costs or CostSettings(), self._costing.worst)
         self._out: set[str] = set()
         self._awaited: int | None = None
         self._rested_at: int | None = None
@@ -396,7 +404,7 @@ class FreeHybrid(Hybrid):
         """As D3, and learn what a simulation costs."""
         super().tell(request, outcome)
         if isinstance(request, Simulate) and isinstance(outcome, Simulated):
-            self._prices.learn(outcome.outcome.cpu_s)
+            self._costs.learn(outcome.outcome.cpu_s)
         if isinstance(request, Pour):
             self._rested_at = None
 
@@ -439,7 +447,7 @@ class FreeHybrid(Hybrid):
     def _next_prior(self) -> None:
         settings, trials = self._settings, self._trials
         if len(trials) == 0 and settings.prior_simulations > 0:
-            count = min(max(settings.initial, trials.width), settings.prior_simulations)
+            count = min(max(settings.initial_samples, trials.width), settings.prior_simulations)
             question = self._problem(Data(), acquisition="sobol", count=count)
             self._put(question, "start", lambda suggestion: self._simulate(suggestion, "prior"))
         elif len(trials) >= settings.prior_simulations:
@@ -449,7 +457,7 @@ class FreeHybrid(Hybrid):
             def weighed(suggestion: Suggestion) -> None:
                 if suggestion.values and suggestion.pour_value is not None and not self._compromise.exploring:
                     one, pour = suggestion.values[0], suggestion.pour_value
-                    if self._prices.prefers_pour(one, pour, trials.width):
+                    if self._costs.prefers_pour(one, pour, trials.width):
                         self._decide_to_pour(self._comparison(one, pour), one, pour)
                         return
                 self._simulate(suggestion, "prior")
@@ -470,7 +478,7 @@ class FreeHybrid(Hybrid):
             if suggestion.surrogate is not None:
                 self._latest_map = suggestion
             one, pour = (suggestion.values or (0.0,))[0], suggestion.pour_value or 0.0
-            exhausted = bool(suggestion.values) and self._prices.is_idle(one, self._trials.width)
+            exhausted = bool(suggestion.values) and self._costs.is_idle(one, self._trials.width)
             if exhausted and not self._compromise.exploring:
                 self._rest(f"what is left to learn, only pours tell: {self._comparison(one, pour)}", one, pour)
             elif self._trials.lost_in_a_row >= LOST_IN_A_ROW:
@@ -540,8 +548,8 @@ class FreeHybrid(Hybrid):
     # -- results ---------------------------------------------------------------------------------------------------
 
     def _comparison(self, one: float, pour: float) -> str:
-        seconds = self._prices.simulation(self._trials.width)
-        return f"a simulation promises {one:.2g} for {seconds:.2g} s, a pour {pour:.2g} for {self._prices.pour:g} s"
+        seconds = self._costs.simulation(self._trials.width)
+        return f"a simulation promises {one:.2g} for {seconds:.2g} s, a pour {pour:.2g} for {self._costs.pour:g} s"
 
     def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
         if not suggestion.values or suggestion.pour_value is None:

@@ -161,7 +161,10 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "no such campaign": (lambda d: {**d, "campaign": "nothing.yaml"}, "campaign: no such file"),
     "another's key": (
-        lambda d: {**d, "calibration": {**d["calibration"], "C1": {"repetitions": 1, "per_axis": 2, "samples": 3}}},
+        lambda d: {
+            **d,
+            "calibration": {**d["calibration"], "C1": {"repetitions": 1, "points_per_axis": 2, "samples": 3}},
+        },
         "calibration.C1.samples: belongs to C2, not to C1",
     ),
     "no budget": (

@@ -118,7 +118,7 @@ def make(name: str, dimension: int) -> Any:
             pours=4,
             iterations=6,
             prior_simulations=7,
-            per_pour=1,
+            simulations_per_pour=1,
             noise="varying",
             model="residual",
         )
@@ -126,7 +126,7 @@ def make(name: str, dimension: int) -> Any:
     grid = {parameter: 2 if i < 3 else 1 for i, parameter in enumerate(parameters.names)}
     budgets = {"C1": {"grid": grid}, "C2": {"samples": 6}, "C3": {"iterations": 6}, "C4": {"simulations": 12}}
     calibration: CalibrationPlan = calibration_plan(
-        strategy=name, actions=actions, parameters=parameters, fixed_parameters={}, initial=4, **budgets[name]
+        strategy=name, actions=actions, parameters=parameters, fixed_parameters={}, initial_samples=4, **budgets[name]
     )
     return KINDS[name](calibration, measured(dimension), 5)
 
