@@ -95,7 +95,7 @@ class ArmSpec(ABC):
     Attributes:
         kind: as registered in `decant.arms`, and as written in files.
         stand_in: 'module:callable' that makes, from these settings, the emulator of the arm on a virtual bench. See
-            `actors.bench.device_emulators.ArmEmulator`; '' for a driver that only simulates.
+            `actors.bench.virtual_bench.ArmEmulator`; '' for a driver that only simulates.
         time_scale: bench seconds per second of the clock; 1 for hardware, 0 to skip all waits.
         announcement: from the operator's consent to the first movement [s].
         untilt_speed: angular velocity at which a stopped, tilted pourer is brought upright [rad/s].

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingStatus, Reply
     from actors.balance.serial_balance import SerialBalance
     from actors.balance.simulated_balance import Load
-    from actors.bench.device_emulators import ArmEmulator, History
     from actors.bench.pour_feasibility import plan_pour
+    from actors.bench.virtual_bench import ArmEmulator, History
     from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
     from actors.optimizer.questions import Data, Suggestion, SuggestProblem
     from orchestrator.config.arm_file import ArmSettings, CellSection
@@ -292,7 +292,7 @@ _SOURCES = {
     ),
     "actors.arm.arm_settings": ("ArmDiagnostics", "ArmSpec"),
     "actors.arm.planned_pour": ("ExecutedMotion", "MotionPath"),
-    "actors.bench.device_emulators": ("ArmEmulator", "History"),
+    "actors.bench.virtual_bench": ("ArmEmulator", "History"),
     "actors.bench.pour_feasibility": ("plan_pour",),
     "orchestrator.config.arm_file": ("ArmSettings", "CellSection"),
     "orchestrator.config.yaml.yaml_source": ("Place", "Report"),

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from actors.interfaces import LaboratoryError
-from actors.simulators.local_worker import InProcessSimulatorPool
+from actors.simulators.local_worker import thread_pool
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.run_errors import RunError
 from orchestrator.run_service import RunRequest, RunResources, RunService
@@ -109,7 +109,7 @@ def work(path: Path, resources: RunResources | None = None) -> None:
     code_now()  # of the sources that this process has read, before anybody changes them
     study = load_study(path)
     cells = {cell.id: cell for cell in cells_of(study)}
-    simulators = InProcessSimulatorPool()
+    simulators = thread_pool()
     resources = resources or RunResources(in_process=True, simulators=simulators)
     for name in named_cells():
         problem = None

@@ -20,7 +20,7 @@ from typing import Any
 
 from pydantic import SerializeAsAny, field_validator
 
-from actors.runtime.cluster_nodes import sources, versions
+from actors.runtime.ray_cluster import sources, versions
 from orchestrator.journal.codec import digest, first_difference, from_json, to_json
 from orchestrator.journal.journal_file import locked_alone
 from orchestrator.journal.stage_results import decode_result
@@ -181,7 +181,7 @@ def code_now() -> dict[str, str]:
     here = versions()
     return {
         "decant": here.decant,
-        "optimiser": sources(_ROOT / "actors" / "optimizer" / "core"),
+        "optimiser": sources(_ROOT / "actors" / "optimizer"),
         "strategies": sources(_ROOT / "orchestrator" / "strategies"),
         "solver": here.simulator,
     }

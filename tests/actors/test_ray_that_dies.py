@@ -12,6 +12,7 @@ import psutil
 import pytest
 
 from tests.reliability import strikes
+from tests.support.waiting import PATIENCE
 
 pytestmark = pytest.mark.ray
 
@@ -22,7 +23,7 @@ import asyncio, json, sys
 from actors.laboratory import open_laboratory
 from actors.optimizer.questions import Data, SuggestProblem
 from actors.laboratory_settings import LaboratorySpec
-from actors.simulators.shared_pool import WarmSimulators
+from actors.laboratory import WarmSimulators
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
 from sim_engine.scene import PourTask
@@ -95,6 +96,9 @@ def test_whoever_asks_simulators_or_optimiser_is_told_what_ray_has_lost(whose: s
                     process.kill()
             else:
                 assert strikes.cut(p.pid for p in children if p.name() in ("raylet", "gcs_server")) > 2
+                # Ray ends its workers as soon as it notices; until then a quick simulation still has a result.
+                workers = [p for p in children if p.name() in ("ray::SimulatorProcess", "ray::Proposer")]
+                assert psutil.wait_procs(workers, PATIENCE)[1] == []
             program.stdin.write("\n")
             program.stdin.flush()
             simulator, optimiser, closing, said = [json.loads(line) for line in program.stdout if line[0] == '"']

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from actors.simulators.shared_pool import WarmSimulators
+from actors.laboratory import WarmSimulators
 from orchestrator.daemon import restart as renewal
 from orchestrator.daemon import supervisor
 from orchestrator.daemon.restart import MOST, RENEWED, DaemonRestart, RayWatch

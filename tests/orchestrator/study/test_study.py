@@ -18,8 +18,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from actors.runtime.cluster_nodes import sources
-from actors.simulators.local_worker import InProcessSimulatorPool
+from actors.runtime.ray_cluster import sources
+from actors.simulators.local_worker import thread_pool
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.requests import Failed, Poured, Slots
@@ -222,7 +222,7 @@ def test_the_cells_of_a_worker_share_a_simulator_and_none_of_them_closes_it(tmp_
     changes = {"deployment": deployment, "mismatch": read("quick")["mismatch"][:1], "confirm": 1}
     study = small(tmp_path, **changes, calibration=None)
     log = tmp_path / "simulator.log"
-    simulators = InProcessSimulatorPool(make=make_fake(log=log))
+    simulators = thread_pool(make=make_fake(log=log))
     resources = RunResources(in_process=True, simulators=simulators)
     pours = [run_cell(study, cell, study.folder, resources).pours for cell in cells_of(study)]
     assert len(pours) > 1
@@ -263,6 +263,7 @@ def test_other_code_than_that_of_finished_cells_is_named_once_and_is_no_error(tm
     text = warning({"a": same, "b": older, "c": same}) or ""
     assert "1 finished by other code (strategies: changed since)" in text
     assert "\n" not in text
+    assert sources(tmp_path / "nothing") not in code_now().values(), "a folder of the code has moved"
     (tmp_path / "a.py").write_text("x = 1", encoding="utf-8")
     before = sources(tmp_path)
     (tmp_path / "a.py").write_text("x = 2", encoding="utf-8")
