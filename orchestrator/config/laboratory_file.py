@@ -21,7 +21,7 @@ from orchestrator.config.balance_file import any_balance, resolve_balance
 from orchestrator.config.search_ranges import parameter_quantity
 from orchestrator.config.yaml.yaml_source import Place, Report
 from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
-from sim_engine.liquids import SimulationParameters
+from sim_engine.liquids import RETIRED_PARAMETERS, SimulationParameters
 from sim_engine.scene import PoseError
 from sim_engine.settings.model import MADE, Count, Name, Settings, Switch, tagged
 from sim_engine.settings.quantity import Quantity
@@ -133,6 +133,8 @@ class BalanceSection(Settings):
 
 class HiddenLiquidBase(Settings):
     """θ of the 'real' liquid of the virtual bench. Hidden: calibration never reads it."""
+
+    retired: ClassVar[dict[str, str]] = RETIRED_PARAMETERS
 
     def parameters(self) -> SimulationParameters:
         """The hidden θ; missing values have their defaults."""

@@ -18,7 +18,7 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 from orchestrator.strategies.campaign_plan import NormalPrior
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
-from sim_engine.liquids import ParameterInfo, SimulationParameters
+from sim_engine.liquids import RETIRED_PARAMETERS, ParameterInfo, SimulationParameters
 from sim_engine.scene import Pivot
 from sim_engine.search_space import Axis, Scale, Space
 from sim_engine.settings.model import MADE, Problems, Settings, Text
@@ -321,6 +321,8 @@ def _parameter_form(value: Any) -> str:
 
 class ParametersBase(Settings):
     """Parameters: a value fixes one; a range, or a measured value with a tolerance, makes calibration search it."""
+
+    retired: ClassVar[dict[str, str]] = RETIRED_PARAMETERS
 
     def fixed(self) -> dict[str, float]:
         """Parameters with a value, SI."""

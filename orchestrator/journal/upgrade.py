@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sim_engine.liquids import RETIRED_PARAMETERS
+
 Data = Mapping[str, Any]
 
 NAMES = {
@@ -32,13 +34,15 @@ NAMES_BESIDE = {
 def renamed(data: Any) -> Any:
     """Data of 0.2 with the names of this version."""
     if isinstance(data, Mapping):
-        names = NAMES.copy()
+        names = NAMES | RETIRED_PARAMETERS
         for key, more in NAMES_BESIDE.items():
             names |= more if key in data else {}
+        if "Pa*s" in str(data.get("viscosity")):  # of a liquid in a recorded campaign, and no parameter
+            names.pop("viscosity")
         return {names.get(key, key): renamed(value) for key, value in data.items()}
     if isinstance(data, list | tuple) and data and not isinstance(data[0], int | float):
         return [renamed(item) for item in data]
-    return data
+    return RETIRED_PARAMETERS.get(data, data) if isinstance(data, str) else data
 
 
 def upgraded_request(data: Data) -> Data:

@@ -18,7 +18,7 @@ from sim_engine.validation import wall_tightness as walls
 from sim_engine.validation import whole_pours as pours
 from sim_engine.validation.case_result import CaseResult, Figure, Measurement, Series, at_least
 
-PLAIN = SimulationParameters(cohesion=0.0, viscosity=1.0, friction=0.0)
+PLAIN = SimulationParameters(cohesion=0.0, xsph_rate=1.0, friction=0.0)
 """θ of the cases, as their references assume. Water's own viscosity has no effect in a cup, a liquid has no dry
 friction, and tension acts on drips only. A little XSPH viscosity replaces the effects that a finer solver would
 resolve."""
@@ -173,7 +173,7 @@ def _dam_break(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measu
 
 
 def _cohesion(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    free = PLAIN.model_copy(update={"viscosity": 0.0})
+    free = PLAIN.model_copy(update={"xsph_rate": 0.0})
     found = droplet.cube_to_sphere(2_000, free)
     curves: list[Series] = []
     tensions: dict[int, float] = {}

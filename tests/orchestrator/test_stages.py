@@ -61,7 +61,7 @@ def calibration(**changes: Any) -> CalibrationPlan:
         "scene": SCENE,
         "actions": SPACE,
         "parameters": PARAMETERS,
-        "fixed_parameters": {"particles": 700, "viscosity": 4.0},
+        "fixed_parameters": {"particles": 700, "xsph_rate": 4.0},
         "pour_count": 5,
         "holdout": 1,
         "simulations": 5,
@@ -102,7 +102,7 @@ def test_a_whole_campaign_calibrates_and_then_pours_with_what_it_found(tmp_path:
     result = run(tmp_path / "run", campaign(tmp_path), watchers=[events.append])
     assert list(result.results) == ["pours", "calibration", "evaluation", "deployment:cup", "deployment:narrow"]
     theta = result.results["calibration"].found.theta
-    assert (theta.particles, theta.viscosity) == (700, 4.0)
+    assert (theta.particles, theta.xsph_rate) == (700, 4.0)
     done = [e for e in events if isinstance(e, RequestFinished)]
     deployed = [e.request for e in done if e.stage.startswith("deployment") and isinstance(e.request, Simulate)]
     assert deployed
@@ -133,7 +133,7 @@ def test_a_theta_that_the_pours_do_not_justify_is_not_deployed_and_everything_pu
     assert (gain.recommended, gain.pours) == ("uncalibrated", 5)
     scored = [e for e in events if isinstance(e, RequestFinished) and e.stage == "evaluation"]
     assert len(scored) == work_of(plan, ["evaluation"])["evaluation"].simulations == 2 * 5
-    plain = SimulationParameters(particles=700, viscosity=4.0)
+    plain = SimulationParameters(particles=700, xsph_rate=4.0)
     assert evaluation.thetas["uncalibrated"] == plain
     assert {
         event.request.parameters

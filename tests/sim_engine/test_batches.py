@@ -41,7 +41,7 @@ def simulator() -> PourSimulator:
 def test_a_batch_pours_what_each_pour_does_alone_bit_for_bit(simulator: PourSimulator) -> None:
     tasks = [
         task(1),
-        task(2, speed=60.0, viscosity=8.0),
+        task(2, speed=60.0, xsph_rate=8.0),
         task(3, particles=450, cohesion=0.06),
         task(4, scene=OTHER, friction=0.2),
         task(1),

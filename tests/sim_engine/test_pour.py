@@ -43,7 +43,7 @@ def task(
         "hold_time": 0.5,
         **action,
     }
-    theta = SimulationParameters.from_values({"particles": particles, "viscosity": 1.0, **(parameters or {})})
+    theta = SimulationParameters.from_values({"particles": particles, "xsph_rate": 1.0, **(parameters or {})})
     scene = Scene("test", pourer, receiver, liquid)
     return PourTask(scene, Action.compose({}, values), theta, seed, frame_rate, pose_error)
 
@@ -109,7 +109,7 @@ def test_frames_follow_each_particle_and_the_cup(plain: SimulatedPour) -> None:
 
 
 def test_liquid_in_flight_falls_with_g(simulator: PourSimulator) -> None:
-    frames = run(simulator, frame_rate=50.0, height=0.3, parameters={"viscosity": 0.0, "cohesion": 0.0}).frames
+    frames = run(simulator, frame_rate=50.0, height=0.3, parameters={"xsph_rate": 0.0, "cohesion": 0.0}).frames
     assert frames is not None
     accelerations = []
     for k in range(len(frames.times) - 2):
@@ -189,9 +189,9 @@ def test_thin_walls_hold_fast_liquid(simulator: PourSimulator, wall: float, part
 
 def test_viscosity_and_cohesion_are_felt(simulator: PourSimulator) -> None:
     easy = {"max_angle": 100 * DEG, "x_offset": 0.11}
-    thin = run(simulator, parameters={"viscosity": 0.0, "cohesion": 0.0}, **easy).outcome
-    thick = run(simulator, parameters={"viscosity": 40.0, "cohesion": 0.0}, **easy).outcome
-    sticky = run(simulator, parameters={"viscosity": 0.0, "cohesion": 0.2}, **easy).outcome
+    thin = run(simulator, parameters={"xsph_rate": 0.0, "cohesion": 0.0}, **easy).outcome
+    thick = run(simulator, parameters={"xsph_rate": 40.0, "cohesion": 0.0}, **easy).outcome
+    sticky = run(simulator, parameters={"xsph_rate": 0.0, "cohesion": 0.2}, **easy).outcome
     # What is not felt changes no bit of a pour.
     assert thick.curve_poured[: len(thin.curve_poured)] != thin.curve_poured
     assert sticky.curve_poured[: len(thin.curve_poured)] != thin.curve_poured[: len(sticky.curve_poured)]

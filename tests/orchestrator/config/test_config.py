@@ -242,7 +242,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           object_store: 300 MB
           ray: {{address: "head.local:6379", bench_resource: left_bench}}
           bench:
-            liquid: {{particles: 3100, cohesion: 31 mN/m, viscosity: 7 Hz, friction: 0.31}}
+            liquid: {{particles: 3100, cohesion: 31 mN/m, xsph_rate: 7 Hz, friction: 0.31}}
             pose_error: {{x: 1.1 mm, y: -2 mm, z: 0.7 mm, tilt: 0.7 deg, speed_factor: 1.03}}
             pose_noise: {{x: 0.3 mm, y: 0.4 mm, tilt: 0.2 deg, speed_factor: 0.02}}
             balance: {{resolution: 0.01 g, noise: 0.2 g, drift: 0.5 g/min, settling_time: 2.5 s}}
@@ -259,7 +259,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           y_offset: 3 mm
           height: 55 mm
         simulator:
-          parameters: {{particles: {{range: [700, 900], scale: log}}, cohesion: 0.04 N/m, viscosity: [1 1/s, 9 1/s]}}
+          parameters: {{particles: {{range: [700, 900], scale: log}}, cohesion: 0.04 N/m, xsph_rate: [1 1/s, 9 1/s]}}
         calibration:
           receiver: {vessels}/tumbler.yaml
           motion: {{x_offset: 97 mm}}
@@ -299,7 +299,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     lab = plan.laboratory
     assert (lab.name, lab.simulators, lab.in_process, lab.object_store_mb) == ("odd", 3, True, 300)
     assert lab.ray == RaySpec("head.local:6379", "left_bench")
-    assert (bench.liquid.particles, bench.liquid.viscosity, bench.liquid.friction) == (3100, 7.0, 0.31)
+    assert (bench.liquid.particles, bench.liquid.xsph_rate, bench.liquid.friction) == (3100, 7.0, 0.31)
     assert dataclasses.astuple(bench.pose_error) == pytest.approx((0.0011, -0.002, 0.7 * DEG, 1.03, 0.0007))
     assert dataclasses.astuple(bench.pose_noise) == pytest.approx((0.0003, 0.0004, 0.2 * DEG, 0.02, 0.0))
     assert (bench.time_scale, bench.operator_time, bench.settling_time) == pytest.approx((12.0, 60.0, 2.5))
@@ -321,7 +321,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     )
     assert [(a.name, a.lower, a.upper, a.scale, a.integer) for a in calibration.parameters.axes] == [
         ("particles", 700.0, 900.0, "log", True),
-        ("viscosity", 1.0, 9.0, "linear", False),
+        ("xsph_rate", 1.0, 9.0, "linear", False),
     ]
     assert calibration.fixed_parameters["cohesion"] == pytest.approx(0.04)
     assert plan.parameters.particles == 900, "the default, as far as the range allows"

@@ -114,7 +114,7 @@ def value_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> st.SearchStrate
         most = min((m.le for m in flat if isinstance(m, annotated_types.Le)), default=40)
         return st.integers(int(least), int(most))  # type: ignore[call-overload]
     if origin is dict:
-        return st.fixed_dictionaries({name: st.integers(1, 4) for name in ("particles", "cohesion", "viscosity")})
+        return st.fixed_dictionaries({name: st.integers(1, 4) for name in ("particles", "cohesion", "xsph_rate")})
     raise AssertionError(f"settings of type {annotation} are not generated: teach this function to write one")
 
 

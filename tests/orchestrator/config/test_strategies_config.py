@@ -268,6 +268,9 @@ def test_retired_keys_and_values_are_refused_together_with_their_places(tmp_path
         ("strategy: D1", "strategy: D1\n  initial: 4", "initial_samples"),
         ("strategy: D1", "strategy: D1\n  motion: {hold_cap: 4 s}", "max_hold_time"),
         ("deployment:", "outputs: {rrd: false}\ndeployment:", "recording"),
+        ("deployment:", "simulator: {parameters: {viscosity: 3 1/s}}\ndeployment:", "xsph_rate"),
+        ("deployment:", "simulator: {parameters: {eddies: 0.1}}\ndeployment:", "smagorinsky_constant"),
+        ("deployment:", "simulator: {parameters: {lip_drop: 0.4}}\ndeployment:", "rim_correction"),
         ("deployment:", "outputs: {record_rate: 4 1/s}\ndeployment:", "frame_rate"),
     ],
 )

@@ -147,7 +147,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "nothing to confirm": (lambda d: without({**d, "confirm": 1}, "deployment"), "confirm: there is no deployment"),
     "unknown level": (lambda d: {**d, "compared": "huge"}, "compared: no such level; there are small, large"),
     "level twice": (lambda d: {**d, "mismatch": [d["mismatch"][0]] * 2}, "mismatch[1]: a level 'small'"),
-    "not searched": (lambda d: {**d, "search": ["viscosity"]}, "search[0]: 'viscosity' is not searched"),
+    "not searched": (lambda d: {**d, "search": ["xsph_rate"]}, "search[0]: 'xsph_rate' is not searched"),
     "nothing left to search": (
         lambda d: {
             **without(d, "search"),

@@ -42,10 +42,10 @@ ACTIONS = (
 PARAMETERS = (
     Axis("particles", 300, 4000, "log", integer=True),
     Axis("cohesion", 0.0, 0.1),
-    Axis("viscosity", 0.5, 10.0, "log"),
+    Axis("xsph_rate", 0.5, 10.0, "log"),
     Axis("friction", 0.0, 0.5),
     Axis("wall_distance", 0.4, 1.5),
-    Axis("lip_drop", 0.0, 1.0),
+    Axis("rim_correction", 0.0, 1.0),
 )
 NAMES = ("C1", "C2", "C3", "C4", "D1", "D2", "D3")
 KINDS: dict[str, Any] = {
