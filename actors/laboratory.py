@@ -71,9 +71,9 @@ def check_bench_packages(spec: LaboratorySpec) -> None:
     Raises:
         LaboratoryError: some are not; the text names them and their extra.
     """
-    if spec.arm is None or (spec.arm.stand_in == "" and spec.arm.missing() is None and spec.balance is None):
+    if spec.arm is None or (spec.arm.emulator == "" and spec.arm.missing() is None and spec.balance is None):
         return
-    needed = ["psutil"] if spec.mode == "virtual" and spec.arm.stand_in else []
+    needed = ["psutil"] if spec.mode == "virtual" and spec.arm.emulator else []
     if spec.balance is not None and isinstance(spec.balance.device, SerialBalanceSpec):
         needed.append("serial")
     missing = [module for module in needed if not installed(module)]

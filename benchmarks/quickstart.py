@@ -50,10 +50,10 @@ CAMPAIGN = ROOT / "configs" / "campaigns" / "quickstart.yaml"
 
 
 def _with_lookahead() -> None:
-    def mismatch(*args: Any, **changes: Any) -> ModelDiscrepancy:
-        return ModelDiscrepancy(*args, **{**changes, "looks_ahead": True})
+    def discrepancy(*args: Any, **changes: Any) -> ModelDiscrepancy:
+        return ModelDiscrepancy(*args, **{**changes, "lookahead": True})
 
-    vars(d3).update(Mismatch=mismatch)
+    vars(d3).update(ModelDiscrepancy=discrepancy)
 
 
 ARMS: dict[str, Callable[[], None]] = {

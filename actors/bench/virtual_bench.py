@@ -89,7 +89,7 @@ class History:
 
 
 class ArmEmulator(Protocol):
-    """The emulator that an arm's driver connects to; created from an `ArmSpec`, which names it in `stand_in`."""
+    """The emulator that an arm's driver connects to; created from an `ArmSpec`, which names it in `emulator`."""
 
     @property
     def arm(self) -> ArmSpec:
@@ -115,9 +115,9 @@ class ArmEmulator(Protocol):
 
 def emulator_of(arm: ArmSpec) -> ArmEmulator | None:
     """Start the emulator of an arm; None if the arm's driver is a simulation itself."""
-    if not arm.stand_in:
+    if not arm.emulator:
         return None
-    module, _, name = arm.stand_in.partition(":")
+    module, _, name = arm.emulator.partition(":")
     return cast(ArmEmulator, getattr(importlib.import_module(module), name)(arm))
 
 
@@ -135,7 +135,7 @@ class BenchEmulators:
         self._weighs = balance
         self._balance: BalanceEmulator | None = None
         try:
-            self._balance = None if balance is None else balance.stand_in()
+            self._balance = None if balance is None else balance.start_emulator()
         except BaseException:
             self.close()
             raise
@@ -446,7 +446,7 @@ class FollowedBench(VirtualBench):
 
     def _motion(self, executed: Executed | None, grip_tilt: float) -> SampledMotion | None:
         """The true motion of the pourer from the pour's first pose on; None if the pourer never left it."""
-        from actors.arm.planning.frames import pourer_motion
+        from actors.arm.planning.kinematics import pourer_motion
 
         if self._gap:
             raise LaboratoryError(

@@ -18,18 +18,17 @@ import asyncio
 import contextlib
 import dataclasses
 import functools
-import hashlib
 import importlib.metadata
 import json
 import socket
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from actors.interfaces import LaboratoryError, Notice
 from actors.runtime.child_process import python_module, run
+from sim_engine.solver_fingerprint import ROOT, folder_digest
 
 if TYPE_CHECKING:
     from actors.laboratory_settings import RaySpec
@@ -187,7 +186,7 @@ def versions() -> Versions:
     return Versions(
         python=sys.version.split()[0],
         decant=_installed("decant"),
-        simulator=sources(Path(__file__).parents[2] / "sim_engine"),
+        simulator=folder_digest(ROOT / "sim_engine"),
         taichi=_installed("taichi"),
         numpy=_installed("numpy"),
     )
@@ -198,16 +197,6 @@ def _installed(package: str) -> str:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return "not installed"
-
-
-def sources(folder: Path) -> str:
-    """Digest of a folder's Python sources."""
-    digest = hashlib.sha256()
-    for path in sorted(folder.rglob("*.py")):
-        if path.parent.name == "validation":
-            continue  # it evaluates outcomes but does not produce any
-        digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()[:12]
 
 
 def check_cluster(spec: RaySpec, *, need_bench: bool) -> list[Node]:

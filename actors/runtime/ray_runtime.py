@@ -124,11 +124,8 @@ class _Session:
     @property
     def dead(self) -> list[str]:
         """Ray's own processes that have died."""
-        import psutil
-
         processes = {} if self.private is None else self.private.processes
-        dead = [name for name, p in processes.items() if not p.is_running() or p.status() == psutil.STATUS_ZOMBIE]
-        return dead
+        return [name for name, process in processes.items() if not _runs(process)]
 
 
 _session: _Session | None = None
@@ -418,6 +415,7 @@ def _start_private(private: _PrivateRay, spec: LaboratorySpec) -> None:
     """
     import psutil
     import ray
+    from ray.util.placement_group import placement_group
 
     for attempt in range(3):
         try:
@@ -445,7 +443,15 @@ def _start_private(private: _PrivateRay, spec: LaboratorySpec) -> None:
         raise LaboratoryError(f"Ray listens on {address} instead of this machine only; was it imported too early?")
     children = [p for p in psutil.Process().children() if p.environ().get(MARK) == str(private.folder)]
     private.processes = {p.name(): p for p in children}
-    private.membership = ray.util.placement_group([{_PROGRAM: 1.0}])
+    private.membership = placement_group([{_PROGRAM: 1.0}])
+
+
+def _runs(process: psutil.Process) -> bool:
+    import psutil
+
+    with contextlib.suppress(psutil.Error):
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    return False
 
 
 def _is_cut_off(membership: Any) -> bool:

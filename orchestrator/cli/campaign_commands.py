@@ -128,7 +128,7 @@ def plan_pour(
     from orchestrator.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
     from orchestrator.strategies.deployment.deployment_result import Deployed
-    from orchestrator.strategies.repeated_simulation import Foreseen
+    from orchestrator.strategies.single_action import PredictedPour
 
     plan = planning_plan(read_campaign(path, laboratory, seed), parameters, receiver, iterations)
     assert plan.deployment is not None
@@ -158,7 +158,7 @@ def plan_pour(
         if recommended is None:
             raise RefusalError(f"{stage.name}: no action could be planned; every simulation failed. See {directory}")
         receiver_name = stage.name.removeprefix(DEPLOYMENT)
-        repeated = result_of(run_result.results, PREDICTION + receiver_name, Foreseen).over_seeds
+        repeated = result_of(run_result.results, PREDICTION + receiver_name, PredictedPour).over_seeds
         spillage = repeated.get("spillage")
         told = published.summary.receivers[result.scene]
         answers.append(

@@ -29,7 +29,7 @@ from orchestrator.runs.safety_approval import SafetyRecordError, required_checks
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm, Executed
     from orchestrator.strategies.campaign_plan import CampaignPlan
-    from orchestrator.strategies.single_pour import WeighedPour
+    from orchestrator.strategies.single_action import WeighedPour
     from sim_engine.action import Action
     from sim_engine.scene import Scene
 
@@ -230,7 +230,7 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
     from orchestrator.journal.stage_results import result_of
     from orchestrator.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import StageDefinition
-    from orchestrator.strategies.single_pour import OnePour, OnePoured
+    from orchestrator.strategies.single_action import OnePour, OnePoured
 
     plan = dataclasses.replace(
         _only(chosen),

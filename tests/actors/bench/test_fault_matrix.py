@@ -19,7 +19,7 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.arm.planning.frames import pourer_motion
+from actors.arm.planning.kinematics import pourer_motion
 from actors.bench.bench_operators import VirtualOperator
 from actors.interfaces import LaboratoryError, NotPouredError, OperatorSpec, UnknownPourError
 from sim_engine.action import DEG

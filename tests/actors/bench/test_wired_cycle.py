@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from actors.arm.planned_pour import unpack
-from actors.arm.planning.frames import pourer_motion
+from actors.arm.planning.kinematics import pourer_motion
 from actors.balance.weighing_plan import Placement
 from actors.bench.virtual_bench import History
 from actors.interfaces import InvalidActionError, NotPouredError, OperatorSpec, PourProgress
