@@ -173,7 +173,7 @@ def _pivot_form(value: Any) -> str:
 class MotionBase(Settings):
     """Values of the motion that are not searched."""
 
-    retired: ClassVar[dict[str, str]] = {"max_hold_time": "max_hold_time"}
+    retired: ClassVar[dict[str, str]] = {"hold_cap": "max_hold_time"}
 
     pivot: (
         Annotated[

@@ -156,7 +156,7 @@ class C1Settings(DesignSettings):
 
     examples: ClassVar[dict[str, str]] = {"grid": "{particles: 5, cohesion: 6}", "points_per_axis": "10"}
 
-    retired: ClassVar[dict[str, str]] = {"points_per_axis": "points_per_axis"}
+    retired: ClassVar[dict[str, str]] = {"per_axis": "points_per_axis"}
 
     strategy: Literal["C1"] = "C1"
     """A uniform grid."""
@@ -267,7 +267,7 @@ class C3Settings(DesignSettings):
 
     examples: ClassVar[dict[str, str]] = {"iterations": "59"}
 
-    retired: ClassVar[dict[str, str]] = {"initial_samples": "initial_samples"}
+    retired: ClassVar[dict[str, str]] = {"initial": "initial_samples"}
 
     strategy: Literal["C3"] = "C3"
     """Bayesian optimisation, each θ on all training pours."""

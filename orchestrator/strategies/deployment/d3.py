@@ -54,8 +54,8 @@ class D3Settings(SearchSettings):
     """D3: real pours with a simulated prior."""
 
     retired: ClassVar[dict[str, str]] = SearchSettings.retired | {
-        "simulations_per_pour": "simulations_per_pour",
-        "costs": "costs",
+        "per_pour": "simulations_per_pour",
+        "prices": "costs",
         "ignorance": "discrepancy_policy",
     }
 

@@ -38,7 +38,7 @@ from sim_engine.settings.model import PositiveSimulationCount
 class SearchSettings(DeploymentSettings):
     """Settings of D1, D2 and D3: Bayesian optimisation."""
 
-    retired: ClassVar[dict[str, str]] = {"initial_samples": "initial_samples"}
+    retired: ClassVar[dict[str, str]] = {"initial": "initial_samples"}
 
     kappa: Kappa = 2.0
     """κ of the lower confidence bound."""

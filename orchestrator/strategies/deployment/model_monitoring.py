@@ -67,7 +67,7 @@ class RiskLimitSettings(Settings):
 class StopSettings(Settings):
     """D3 with `model: adaptive`: when no further pour is worth it."""
 
-    retired: ClassVar[dict[str, str]] = {"min_gain": "min_gain"}
+    retired: ClassVar[dict[str, str]] = {"gain_below": "min_gain"}
 
     min_gain: Annotated[float, Quantity("1", "0.2 %", 1e-5, 1.0)] = 0.002
     """Share of what spilling the whole load would cost: ends when no further pour is expected to save as much."""

@@ -260,18 +260,18 @@ def test_retired_keys_and_values_are_refused_together_with_their_places(tmp_path
 @pytest.mark.parametrize(
     ("old", "retired", "new"),
     [
-        ("strategy: D1", "strategy: D3\n  pours: 5\n  simulations_per_pour: 2", "simulations_per_pour"),
-        ("strategy: D1", "strategy: D3\n  pours: 5\n  costs: {pour: 75 s}", "costs"),
+        ("strategy: D1", "strategy: D3\n  pours: 5\n  per_pour: 2", "simulations_per_pour"),
+        ("strategy: D1", "strategy: D3\n  pours: 5\n  prices: {pour: 75 s}", "costs"),
         ("strategy: D1", "strategy: D3\n  pours: 5\n  ignorance: {policy: ask}", "discrepancy_policy"),
         ("strategy: D1", "strategy: D3\n  pours: 5\n  risk_limit: {otherwise: stop}", "fallback"),
-        ("strategy: D1", "strategy: D3\n  pours: 5\n  stop: {min_gain: 1 %}", "min_gain"),
-        ("strategy: D1", "strategy: D1\n  initial_samples: 4", "initial_samples"),
-        ("strategy: D1", "strategy: D1\n  motion: {max_hold_time: 4 s}", "max_hold_time"),
-        ("deployment:", "outputs: {recording: false}\ndeployment:", "recording"),
-        ("deployment:", "simulator: {parameters: {xsph_rate: 3 1/s}}\ndeployment:", "xsph_rate"),
-        ("deployment:", "simulator: {parameters: {smagorinsky_constant: 0.1}}\ndeployment:", "smagorinsky_constant"),
-        ("deployment:", "simulator: {parameters: {rim_correction: 0.4}}\ndeployment:", "rim_correction"),
-        ("deployment:", "outputs: {frame_rate: 4 1/s}\ndeployment:", "frame_rate"),
+        ("strategy: D1", "strategy: D3\n  pours: 5\n  stop: {gain_below: 1 %}", "min_gain"),
+        ("strategy: D1", "strategy: D1\n  initial: 4", "initial_samples"),
+        ("strategy: D1", "strategy: D1\n  motion: {hold_cap: 4 s}", "max_hold_time"),
+        ("deployment:", "outputs: {rrd: false}\ndeployment:", "recording"),
+        ("deployment:", "simulator: {parameters: {viscosity: 3 1/s}}\ndeployment:", "xsph_rate"),
+        ("deployment:", "simulator: {parameters: {eddies: 0.1}}\ndeployment:", "smagorinsky_constant"),
+        ("deployment:", "simulator: {parameters: {lip_drop: 0.4}}\ndeployment:", "rim_correction"),
+        ("deployment:", "outputs: {record_rate: 4 1/s}\ndeployment:", "frame_rate"),
     ],
 )
 def test_a_renamed_key_is_an_error_that_states_the_present_name(
