@@ -178,6 +178,13 @@ class ArmSpec(ABC):
             arm.close()
         return ArmDiagnostics(facts.checksum, facts.serial, facts.model, facts.version, facts.problem)
 
+    def readiness(self) -> DeviceCheck | None:
+        """Read whether a motion could begin now, for a display while no run uses the arm.
+
+        The reading is short, changes nothing, and does not connect the driver. None if this kind of arm offers none.
+        """
+        return None
+
 
 @dataclass(frozen=True)
 class UrArmSpec(ArmSpec):
@@ -270,3 +277,10 @@ class UrArmSpec(ArmSpec):
         """See `ArmSpec.look`."""
         look: ArmDiagnostics = resolve_name("actors.arm.ur.commissioning:UrDiagnostics").at(self)
         return look
+
+    def readiness(self) -> DeviceCheck | None:
+        """See `ArmSpec.readiness`."""
+        if not self.address:
+            return None
+        check: DeviceCheck = resolve_name("actors.arm.ur.commissioning:readiness")(self)
+        return check

@@ -138,6 +138,9 @@ def list_campaigns(*, at: At, as_json: bool) -> None:
             say(f"EMERGENCY STOP{of} by {stop['by']}, {_clock(stop['time'])}: {stop['reason'] or 'no reason given'}")
     for problem in status["problems"]:
         say(f"problem: {problem}")
+    for rig in status["rigs"]:
+        if (arm := rig["arm"]) and arm["state"] != "ok":
+            say(f"arm of {rig['name']}: {arm['text']}" + (f" → {arm['advice']}" if arm["advice"] else ""))
     if status["queue_paused"]:
         say("the queue is paused: decant resume")
     rows = [("CAMPAIGN", "STATE", "RIG", "SUBMITTED", "")]

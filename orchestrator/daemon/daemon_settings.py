@@ -170,6 +170,9 @@ class DaemonSettings:
     quick_start: bool = field(default=True, compare=False)
     """Whether simulators start at once instead of with the first campaign."""
 
+    arm_interval: float = field(default=5.0, compare=False)
+    """Interval at which the state of an idle arm is read [s]."""
+
     @property
     def runs(self) -> Path:
         """Folder of the runs' folders."""

@@ -74,7 +74,7 @@ def rigs_out(daemon: Supervisor) -> list[RigOut]:
         running = worker.running
         checkpoint = "" if running is None else running.checkpoint
         campaign = None if running is None else running.item.id
-        stop = daemon.emergencies.get(name)
+        stop, arm = daemon.emergencies.get(name), worker.arm
         found.append(
             RigOut.model_validate(
                 {
@@ -83,6 +83,14 @@ def rigs_out(daemon: Supervisor) -> list[RigOut]:
                     "campaign": campaign,
                     "checkpoint": checkpoint,
                     "emergency": stop,
+                    "arm": None
+                    if arm is None
+                    else {
+                        "state": arm.check.state,
+                        "text": arm.check.found,
+                        "advice": arm.check.advice,
+                        "time": arm.time,
+                    },
                 }
             )
         )

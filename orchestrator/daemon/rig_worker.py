@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+from actors.arm.arm_settings import ArmSpec
 from actors.bench.bench_factory import needs_person
-from actors.interfaces import LaboratoryError
+from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.simulators.shared_pool import WarmSimulators
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.daemon_settings import DaemonSettings, Rig
@@ -269,6 +270,26 @@ RETRY = 30.0
 """Before a lane that was kept from beginning looks again [s]."""
 
 
+@dataclass(frozen=True)
+class ArmStatus:
+    """Whether the arm of a rig can move, as last read while no campaign used it.
+
+    Attributes:
+        check: result and remedy, as in `decant doctor`.
+        time: of the first reading with this result, in seconds since 1970.
+    """
+
+    check: DeviceCheck
+    time: float
+
+
+def _readiness(arm: ArmSpec) -> DeviceCheck | None:
+    try:
+        return arm.readiness()
+    except (LaboratoryError, OSError, ValueError) as error:
+        return DeviceCheck("motion", "fail", str(error), "see 'decant doctor'")
+
+
 class Whole(Protocol):
     """What a lane needs of the daemon that it is a part of.
 
@@ -310,6 +331,8 @@ class Lane:
         self.running: Running | None = None
         self.wake = asyncio.Event()
         self.latched = daemon.is_stopped(rig.name)
+        self.arm: ArmStatus | None = None
+        self._reading_arm = asyncio.Lock()
         self._background: set[asyncio.Task[None]] = set()
         self._resting = asyncio.Event()
         self._resting.set()
@@ -322,18 +345,43 @@ class Lane:
         """Until cancelled."""
         while True:
             self.wake.clear()
-            item = self._next()
-            if item is None:
+            async with self._reading_arm:  # no run begins during a reading, and no reading during a run
+                item = self._next()
+                self.running = None if item is None else Running(self._common, item, self.rig)
+            if item is None or self.running is None:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(RETRY):
                         await self.wake.wait()
                 continue
             self._resting.clear()
             try:
-                await self._run(item)
+                await self._run(self.running)
             finally:
                 self.running = None
                 self._resting.set()
+
+    async def watch_arm(self) -> None:
+        """Keep `arm` current while no campaign uses the rig, until cancelled.
+
+        A reading changes nothing on the controller, and no run begins before it has ended.
+        """
+        spec = self.rig.spec
+        if spec is None or spec.arm is None or spec.mode != "hardware":
+            return
+        while True:
+            async with self._reading_arm:
+                if self.running is None and not self._daemon.stopping:
+                    check = await asyncio.to_thread(_readiness, spec.arm)
+                    self._show_arm(check)
+            await asyncio.sleep(self._common.settings.arm_interval)
+
+    def _show_arm(self, check: DeviceCheck | None) -> None:
+        if check is None:
+            self.arm = None
+        elif self.arm is None or self.arm.check != check:
+            self.arm = ArmStatus(check, time.time())
+            body = {"rig": self.rig.name, "state": check.state, "text": check.found, "advice": check.advice}
+            self._common.feed.tell("ArmStatusChanged", body)
 
     async def close(self) -> None:
         """Come to rest."""
@@ -371,9 +419,9 @@ class Lane:
         self._daemon.problem("disk", text if free < settings.keep_free else None)
         return free >= settings.keep_free
 
-    async def _run(self, item: QueueItem) -> None:
-        store, feed = self._common.store, self._common.feed
-        self.running = running = Running(self._common, item, self.rig)
+    async def _run(self, running: Running) -> None:
+        store, feed, item = self._common.store, self._common.feed, running.item
+        self._show_arm(None)
         store.change(item.id, state="preparing", reason="", begun=item.begun or time.time(), armed=False)
         feed.tell("CampaignLeased", {"rig": self.rig.name}, item.id)
         if self._daemon.suspect and not any(one.running for one in self._daemon.lanes.values() if one is not self):

@@ -224,6 +224,20 @@ class EmergencyOut(_Out):
     reason: str
 
 
+class ArmStatusOut(_Out):
+    """Whether an arm can move, with the text that a run or `decant doctor` would give."""
+
+    state: Literal["ok", "warn", "fail"]
+    """'ok': it can move; 'fail': it can't; 'warn': the controller doesn't report it."""
+
+    text: str
+    advice: str
+    """Remedy; '' if none is needed."""
+
+    time: float
+    """Time since which it has been so."""
+
+
 class RigOut(_Out):
     """A laboratory that one campaign at a time leases."""
 
@@ -237,6 +251,9 @@ class RigOut(_Out):
 
     emergency: EmergencyOut | None
     """Emergency stop of this rig alone; the stop of all rigs is part of the status."""
+
+    arm: ArmStatusOut | None
+    """Last reading while no campaign used the rig; null during a run and without hardware."""
 
 
 class WhatMovesOut(_Out):

@@ -87,6 +87,9 @@ class Supervisor:
         self._tasks += [
             asyncio.create_task(worker.work(), name=f"rig {worker.rig.name}") for worker in self.lanes.values()
         ]
+        self._tasks += [
+            asyncio.create_task(worker.watch_arm(), name=f"arm of {worker.rig.name}") for worker in self.lanes.values()
+        ]
         if self.settings.quick_start:
             self._tasks.append(asyncio.create_task(self._warm_up(), name="simulators"))
         self.feed.tell("DaemonStarted", {"rigs": [rig.name for rig in self.settings.rigs]})

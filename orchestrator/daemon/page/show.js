@@ -52,7 +52,8 @@ const MOVING = ["approach", "tilt", "hold", "return"];
 
 /** One rig in the header: its state and, if there are several, a stop of its own, and its mode if they differ. */
 export function cellLine(rig, campaign, { stopped, several, mixed, up }, acts) {
-  const state = stopped ? el("strong", { class: "badge stopped" }, "STOPPED") : !campaign ? "idle" :
+  const blocked = rig.arm?.state === "fail" ? "arm can't move" : "idle";
+  const state = stopped ? el("strong", { class: "badge stopped" }, "STOPPED") : !campaign ? blocked :
     MOVING.includes(rig.checkpoint) ? "arm moves" : stateText(campaign.state);
   return el("li", { class: rig.mode },
     el("span", {}, el("b", {}, rig.name), mixed ? [" ", modeBadge(rig.mode)] : "", up ? ": " : " (last known): ", state),
@@ -79,11 +80,20 @@ export function stopCard(stop, asking, waiting, acts) {
   ] : button(`ask ${stop.rig}`, all ? "Clear the stop" : `Clear the stop of ${stop.rig}`, async () => acts.askClear(stop.rig), "plain danger"));
 }
 
+/** Whether an idle arm can move, and what to do if it can't. */
+function armStatus(arm) {
+  if (!arm) return null;
+  if (arm.state === "ok") return el("p", { class: "arm" }, `Arm: ${arm.text}.`);
+  return el("p", { class: "arm problem" }, el("b", {}, arm.state === "fail" ? `The arm can't move: ${arm.text}` : `Arm: ${arm.text}`, `, since ${clock(arm.time)}.`),
+    arm.advice ? ` ${arm.advice[0].toUpperCase()}${arm.advice.slice(1)}.` : "");
+}
+
 export function rigCard(rig, campaign, acts) {
   const idle = !campaign;
   const progress = campaign?.progress;
   return el("article", { class: `card ${rig.mode}`, "aria-label": `rig ${rig.name}` },
     el("h3", {}, rig.name, " ", modeBadge(rig.mode)),
+    armStatus(rig.arm),
     idle ? el("p", { class: "quiet" }, "Nothing runs here.") : [
       el("p", { class: "what" }, el("b", {}, campaign.name), ` ${stateText(campaign.state)}`,
         campaign.wish !== "run" ? ` (asked to ${campaign.wish})` : ""),

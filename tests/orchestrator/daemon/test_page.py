@@ -16,6 +16,7 @@ from typing import Any
 import httpx
 import pytest
 
+from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import OperatorQuestion
 from actors.laboratory_settings import LaboratorySpec
 from orchestrator.catalogue.run_registry import VARIABLE
@@ -24,6 +25,7 @@ from orchestrator.daemon.access_control import Role, token_of
 from orchestrator.daemon.daemon_settings import Rig
 from tests.orchestrator.daemon.browsing import OnPort, browser, on_port
 from tests.orchestrator.daemon.served import HeldBench, HeldLaboratory
+from tests.orchestrator.daemon.test_arm_status import hardware_rig
 from tests.orchestrator.toy import ToyOptimizer, ToySimulators
 from tests.patience import PATIENCE
 
@@ -201,6 +203,20 @@ def test_the_default_answer_to_clearing_a_stop_keeps_it(page: Any, tmp_path: Pat
             page.keyboard.press(act)
             page.get_by_role("button", name="No, stay stopped").wait_for(state="detached")
         assert lab.do(lab.served.get("/status"))["emergency"]["by"] == "admin"
+
+
+@pytest.mark.realtime
+def test_the_card_of_an_idle_rig_says_why_its_arm_cannot_move_and_what_to_do(page: Any, tmp_path: Path) -> None:
+    with VirtualController.start("127.81.4.9", "ur10e") as controller:
+        rig = hardware_rig(tmp_path, controller.address, "ur10e")
+        with on_port(tmp_path, rigs=(rig,), arm_interval=0.1) as lab:
+            page.goto(lab.address(Role.VIEWER))
+            card = page.get_by_role("article", name="rig rig")
+            card.get_by_text("Arm: the arm is ready to move").wait_for()
+            controller.fault("protective_stop", reason="a test")
+            card.get_by_text("The arm can't move: protective stop is in force").wait_for()
+            card.get_by_text("Find the cause, then unlock it on the teach pendant").wait_for()
+            page.locator("#cells li").filter(has_text="rig: arm can't move").wait_for()
 
 
 def test_with_two_rigs_each_is_stopped_and_cleared_alone_and_all_together(page: Any, tmp_path: Path) -> None:
