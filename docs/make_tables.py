@@ -19,7 +19,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from orchestrator.catalogue.catalogue_index import TABLES as CATALOGUE
-from orchestrator.cli.solver_report import kept_records
+from orchestrator.cli.physics_command import kept_records
 from orchestrator.config import arm_file as arm_sections
 from orchestrator.config import arm_file as cell
 from orchestrator.config import campaign_file as campaign

@@ -338,10 +338,10 @@ def _client(daemon: bool) -> Iterator[CatalogueClient]:
     """Open a client of this machine's catalogue or of the daemon's."""
     try:
         if daemon:
-            from orchestrator.cli.queue_actions import talking
+            from orchestrator.cli.queue_commands import connected_client
             from orchestrator.daemon.daemon_client import RemoteCatalogueClient
 
-            with talking((None, None)) as client, _refusing():
+            with connected_client(None, None) as client, _refusing():
                 yield RemoteCatalogueClient(client)
         else:
             from orchestrator.catalogue.catalogue_client import LocalCatalogueClient

@@ -1,8 +1,11 @@
-"""Arguments and options that several commands share, and `call`, which runs a command."""
+"""Arguments and options that several commands share.
+
+`command` turns a function with such parameters into a command of the application.
+"""
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -100,16 +103,6 @@ def examples(*commands: str) -> str:
     return "Examples:\n\n" + "\n\n".join(f"`{command}`" for command in commands)
 
 
-def given(options: dict[str, Any], *left_out: str) -> dict[str, Any]:
-    """Return a command's options by name, for the function that does its work.
-
-    Args:
-        options: `locals()` at the beginning of the command.
-        left_out: names that the function does not take; `--quiet` has already been applied.
-    """
-    return {name: value for name, value in options.items() if name not in ("quiet", *left_out)}
-
-
 def _expanded(path: Path) -> Path:
     from sim_engine.settings.model import in_home
 
@@ -125,9 +118,6 @@ def _in_home(value: Any) -> Any:
         return _expanded(value)
     if isinstance(value, list | tuple):
         return type(value)(_in_home(item) for item in value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        paths = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-        return dataclasses.replace(value, **{name: _in_home(item) for name, item in paths.items()})
     return value
 
 
@@ -139,3 +129,16 @@ def call(verb: Callable[..., None], *args: Any, **kwargs: Any) -> None:
         fail(refusal)
     except KeyboardInterrupt:
         fail(RefusalError("interrupted before anything had begun", INTERRUPTED))
+
+
+def command(work: Callable[..., None]) -> Callable[..., None]:
+    """Make a command of a function whose parameters declare its arguments and options.
+
+    The command does what `call` does; `--quiet` has been applied by its own callback.
+    """
+
+    @functools.wraps(work)
+    def run(*args: Any, **kwargs: Any) -> None:
+        call(work, *args, **kwargs)
+
+    return run

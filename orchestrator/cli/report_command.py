@@ -7,14 +7,8 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Json, Quiet, call, examples
+from orchestrator.cli.command_options import Json, Quiet
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, print_json, say
-
-EXAMPLES = examples(
-    "decant report quickstart-20300131-1              # a run in the folder runs/",
-    "decant report runs/quickstart-20300131-1 --pdf -o for-the-lab-meeting.html",
-    "decant report configs/studies/quick.yaml         # or the study's folder",
-)
 
 RUNS = Path("runs")
 """Folder in which names without a folder are searched."""
@@ -43,10 +37,6 @@ def report(
     with its expected deviation, and lists open questions. Runs that are paused, failed or unknown have reports too,
     which state this.
     """
-    call(_report, what, output=output, pdf=pdf, as_json=as_json)
-
-
-def _report(what: Path, *, output: Path | None, pdf: bool, as_json: bool) -> None:
     from orchestrator.cli.foreground_run import check_output
     from orchestrator.journal.journal import JOURNAL_NAME
     from orchestrator.study.study_folder import SETTINGS

@@ -16,18 +16,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import LiveAt, Quiet, call, examples
+from orchestrator.cli.command_options import LiveAt, Quiet
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, say
 
 if TYPE_CHECKING:
     from orchestrator.live_view.live_server import LiveView
     from orchestrator.strategies.campaign_plan import CampaignPlan
-
-EXAMPLES = examples(
-    "decant view quickstart-20300131-1                    # a run of the folder runs/",
-    "decant view runs/first runs/second                   # side by side",
-    "decant view runs/first --pour 7 --particles 5000     # simulate pour 7 again with 5000 particles",
-)
 
 
 def view(
@@ -60,18 +54,6 @@ def view(
     Several runs are shown side by side, on the timeline of simulated time. With --pour, the liquid of one pour is
     simulated again from the journal; -o keeps that recording.
     """
-    call(_view, recordings, pour=pour, particles=particles, stage=stage, output=output, at=at)
-
-
-def _view(
-    recordings: list[Path],
-    *,
-    pour: int | None,
-    particles: int | None,
-    stage: str | None,
-    output: Path | None,
-    at: str | None,
-) -> None:
     from orchestrator.cli.foreground_run import check_output
     from sim_engine.resources import installed
 

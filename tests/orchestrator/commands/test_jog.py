@@ -14,7 +14,7 @@ from actors.arm.arm_interface import ArmPose
 from actors.arm.arm_settings import UrArmSpec
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import LaboratoryError
-from orchestrator.cli.jogging import JogError, Jogging, JogStep, parse_step, steps_home
+from orchestrator.cli.motion_control import JogError, Jogging, JogStep, parse_step, steps_home
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.runs.safety_approval import SafetyRecord, write_record
 from tests.orchestrator import hardware

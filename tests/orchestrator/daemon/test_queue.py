@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
-from orchestrator.cli.queue_actions import submit
+from orchestrator.cli.queue_commands import submit
 from orchestrator.config.file_loading import load_campaign, load_laboratory
 from orchestrator.daemon.daemon_settings import DESK, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import QueueItem
@@ -180,7 +180,9 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
             sent.update(body)
             return {"id": "x", "rig": "desk", "needs_arming": False}
 
-    monkeypatch.setattr("orchestrator.cli.queue_actions.talking", lambda at: contextlib.nullcontext(Told()))
+    monkeypatch.setattr(
+        "orchestrator.cli.queue_commands.connected_client", lambda url, state: contextlib.nullcontext(Told())
+    )
     arguments = ["submit", str(campaign_in(tmp_path)), "--parameters", str(theta), "--receiver", str(bowl)]
     refused = CliRunner().invoke(app, arguments)
     assert refused.exit_code == 2
@@ -238,16 +240,12 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
             return {"id": "risky-1", "rig": "none", "needs_arming": False}
 
     @contextlib.contextmanager
-    def talking(at: Any) -> Any:
+    def connected(url: Any, state: Any) -> Any:
         yield Client()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orchestrator.cli.queue_actions.talking", talking)
-        source = with_risk(tmp_path).source
-        at: Any = None
-        submit(
-            source, wanted="plan", rig="", priority=0, laboratory=None, seed=None, parameters=theta, at=at, as_json=True
-        )
+        patch.setattr("orchestrator.cli.queue_commands.connected_client", connected)
+        submit(with_risk(tmp_path).source, verb="plan", parameters=theta, as_json=True)
     (body,) = sent
     settings = DaemonSettings(tmp_path / "state", in_process=True)
     submission = Submission(text=body["text"], files=body["files"], verb="plan")
