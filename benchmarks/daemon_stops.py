@@ -29,7 +29,7 @@ from ruamel.yaml import YAML
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client
-from orchestrator.daemon.submission_bundle import Files, pack
+from orchestrator.daemon.submissions import Files, pack
 
 ROOT = Path(__file__).parents[1]
 READERS = 200

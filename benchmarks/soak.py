@@ -36,7 +36,7 @@ from ruamel.yaml import YAML
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client, DaemonError
-from orchestrator.daemon.submission_bundle import Files, pack
+from orchestrator.daemon.submissions import Files, pack
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.results import figure_style as style
 

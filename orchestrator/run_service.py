@@ -26,6 +26,7 @@ from orchestrator.journal.run_record import CampaignResult, read_result
 from orchestrator.requests import Pour
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import CampaignStateChanged, Event, PourProgressed, RequestFinished, Watcher
+from orchestrator.runs.resume import AskOperator
 from orchestrator.runs.run_folder import create_run
 from orchestrator.runs.stages import (
     POSTERIOR_DRAWS,
@@ -35,7 +36,6 @@ from orchestrator.runs.stages import (
     prediction_stages,
     stages_of,
 )
-from orchestrator.runs.unknown_pours import AskOperator
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
 

@@ -121,10 +121,10 @@ def _in_home(value: Any) -> Any:
     return value
 
 
-def call(verb: Callable[..., None], *args: Any, **kwargs: Any) -> None:
+def call(work: Callable[..., None], /, *args: Any, **kwargs: Any) -> None:
     """Run a command; a refusal is printed and sets the exit code. `~` in paths is the home directory."""
     try:
-        verb(*map(_in_home, args), **{name: _in_home(value) for name, value in kwargs.items()})
+        work(*map(_in_home, args), **{name: _in_home(value) for name, value in kwargs.items()})
     except RefusalError as refusal:
         fail(refusal)
     except KeyboardInterrupt:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from orchestrator.live_view.rerun_subscriber import RerunMonitor
     from orchestrator.results.publishing import Published
     from orchestrator.run_service import RunHandle, RunRequest, RunResources
-    from orchestrator.runs.unknown_pours import AskOperator
+    from orchestrator.runs.resume import AskOperator
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
 
@@ -314,7 +314,7 @@ def given_up_pours(directory: Path) -> list[str]:
     from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
     from orchestrator.journal.journal_file import JournalError
     from orchestrator.requests import Pour
-    from orchestrator.runs.replay import read_history
+    from orchestrator.runs.resume import read_history
 
     found: list[str] = []
     with contextlib.suppress(JournalError), JournalReader(directory / JOURNAL_NAME) as journal:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from actors.arm.arm_interface import NotAcceptedError
 from actors.interfaces import LaboratoryError
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, say
-from orchestrator.runs.safety_approval import SafetyRecordError, required_checksum
+from orchestrator.runs.motion_approval import SafetyRecordError, required_checksum
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm, ArmFacts, Executed, PlannedPour
@@ -64,7 +64,7 @@ def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed
     Raises:
         RefusalError: motion is not enabled (exit code 2).
     """
-    from orchestrator.runs.motion_envelope import campaign_pours, envelope, envelope_lines, pour_count
+    from orchestrator.runs.motion_approval import campaign_pours, envelope, envelope_lines, pour_count
 
     laboratory = plan.laboratory
     if not any(stage.pours for stage in stages):

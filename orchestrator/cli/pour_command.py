@@ -174,7 +174,7 @@ def _draw(chosen: Chosen, png: Path) -> None:
 
 
 def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
-    from orchestrator.runs.motion_envelope import report_lines
+    from orchestrator.runs.motion_approval import report_lines
 
     planned, laboratory = chosen.path, chosen.plan.laboratory
     assert planned is not None
@@ -233,8 +233,7 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
     from orchestrator.cli.motion_control import confirm
     from orchestrator.journal.stage_results import result_of
     from orchestrator.run_service import RunRequest, RunResources
-    from orchestrator.runs.motion_envelope import report_lines
-    from orchestrator.runs.safety_approval import SafetyRecordError, required_checksum
+    from orchestrator.runs.motion_approval import SafetyRecordError, report_lines, required_checksum
     from orchestrator.runs.stages import StageDefinition
     from orchestrator.strategies.single_pour import OnePour, OnePoured
 
@@ -309,9 +308,8 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
     from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
     from orchestrator.cli.motion_control import EmptyCycle, confirm, connected
-    from orchestrator.runs.motion_envelope import report_lines
+    from orchestrator.runs.motion_approval import SafetyRecordError, report_lines, required_checksum
     from orchestrator.runs.run_folder import create_run
-    from orchestrator.runs.safety_approval import SafetyRecordError, required_checksum
 
     laboratory = plan.laboratory
     assert laboratory.arm is not None

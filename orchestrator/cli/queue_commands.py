@@ -132,7 +132,7 @@ def submit(
 ) -> None:
     """Add a campaign to the daemon's queue, with copies of all files that it refers to."""
     from orchestrator.cli.foreground_run import read_campaign
-    from orchestrator.daemon.submission_bundle import pack
+    from orchestrator.daemon.submissions import pack
 
     plan = read_campaign(campaign, laboratory, seed)
     if (parameters, receiver, iterations) != (None, None, None):

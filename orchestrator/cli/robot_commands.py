@@ -53,7 +53,7 @@ def doctor(
     from actors.interfaces import DeviceCheck, LaboratoryError
     from actors.laboratory import check_bench_packages, reached
     from orchestrator.installed_plugins import broken
-    from orchestrator.runs.safety_approval import SafetyRecordError, read_record
+    from orchestrator.runs.motion_approval import SafetyRecordError, read_record
 
     spec = read_laboratory(laboratory)
     if spec.arm is None:
@@ -158,7 +158,7 @@ def _accept(path: Path, look: ArmDiagnostics) -> SafetyRecord:
         RefusalError: the controller does not report them, or the record can't be written.
     """
     from actors.arm.arm_settings import SafetyRecord
-    from orchestrator.runs.safety_approval import record_path, write_record
+    from orchestrator.runs.motion_approval import record_path, write_record
 
     if not look.checksum or not look.serial:
         raise RefusalError(
@@ -194,7 +194,7 @@ def jog(laboratory: Laboratory, arm: Arm = False) -> None:
     from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
     from orchestrator.cli.motion_control import ANNOUNCEMENT, Jogging, confirm, connected, require_flag, typed_line
-    from orchestrator.runs.safety_approval import SafetyRecordError, accepted_checksum
+    from orchestrator.runs.motion_approval import SafetyRecordError, accepted_checksum
 
     spec = read_laboratory(laboratory)
     if spec.arm is None:

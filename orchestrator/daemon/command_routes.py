@@ -20,7 +20,6 @@ from orchestrator.daemon.access_control import Admin, Daemon, Operator, Viewer
 from orchestrator.daemon.daemon_store import ENDED, QueueItem
 from orchestrator.daemon.query_routes import campaign_out, found_item, status
 from orchestrator.daemon.remote_operator import AnswerError, question_json
-from orchestrator.daemon.rig_worker import job_of
 from orchestrator.daemon.schemas import (
     AnswerIn,
     ArmIn,
@@ -33,11 +32,10 @@ from orchestrator.daemon.schemas import (
     SubmissionIn,
     WhatMovesOut,
 )
-from orchestrator.daemon.submissions import Submission, SubmissionError, prepare
+from orchestrator.daemon.submissions import Submission, SubmissionError, prepare, run_request
 from orchestrator.daemon.supervisor import RequestRefusedError, Supervisor
 from orchestrator.run_errors import RunError
-from orchestrator.runs.motion_envelope import campaign_pours, envelope, envelope_lines, pour_count
-from orchestrator.runs.safety_approval import required_checksum
+from orchestrator.runs.motion_approval import campaign_pours, envelope, envelope_lines, pour_count, required_checksum
 
 
 class MotionNotEnabledError(RunError):
@@ -55,7 +53,7 @@ def what_moves(daemon: Supervisor, item: QueueItem) -> WhatMovesOut:
     if item.state in ENDED:
         raise MotionNotEnabledError(f"{item.id} is {item.state}")
     try:
-        work = job_of(daemon.settings, item, daemon.settings.rig(item.rig))
+        work = run_request(daemon.settings, item, daemon.settings.rig(item.rig))
         required_checksum(work.campaign)
         arm = work.campaign.laboratory.arm
         assert arm is not None

@@ -16,7 +16,7 @@ from actors.balance.readings import typed_weight
 from actors.interfaces import LaboratoryError
 from actors.interfaces import OperatorQuestion as BenchQuestion
 from orchestrator.daemon.daemon_store import Store, StoredQuestion
-from orchestrator.runs.unknown_pours import parse_answer
+from orchestrator.runs.resume import parse_answer
 
 GIVE_UP = "give up"
 

@@ -24,7 +24,7 @@ from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, DesiredSta
 from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.remote_operator import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.run_readout import prune_recordings
-from orchestrator.daemon.submission_bundle import CAMPAIGN, THETA, load_confined
+from orchestrator.daemon.submissions import CAMPAIGN, THETA, load_confined
 from orchestrator.journal.disk_reserve import MB, free_space
 from orchestrator.journal.journal_file import JournalError
 from orchestrator.journal.run_record import CampaignResult
@@ -36,8 +36,8 @@ from orchestrator.run_errors import RunError
 from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService, read_theta, task_request
 from orchestrator.runs.events import CampaignStateChanged, StageOpened
 from orchestrator.runs.request_executor import PourUnknownError, RequestExecutorError
+from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.stages import scenes_of
-from orchestrator.runs.unknown_pours import OperatorNeededError
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
@@ -56,7 +56,7 @@ class Common:
     live: LiveView | None = None
 
 
-def job_of(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunRequest:
+def run_request(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunRequest:
     """The run of a submitted campaign, from its snapshot. Takes a moment, and no event loop.
 
     Raises:
@@ -119,7 +119,7 @@ class Running:
             asyncio.CancelledError: it was paused, stopped, aborted.
             RunError, LaboratoryError, ConfigError, OSError: it can't go on.
         """
-        found = await asyncio.to_thread(job_of, self._common.settings, self.item, self._rig)
+        found = await asyncio.to_thread(run_request, self._common.settings, self.item, self._rig)
         request, warned = await asyncio.to_thread(_prepared, found)
         assert request.folder is not None
         for text in warned:
@@ -222,7 +222,7 @@ class Running:
         """After a stop: publish the results so far, as those of a finished run."""
 
         def work() -> None:
-            RunService().publish_so_far(job_of(self._common.settings, self.item, self._rig))
+            RunService().publish_so_far(run_request(self._common.settings, self.item, self._rig))
 
         if self.item.run is not None:
             await asyncio.to_thread(work)
@@ -458,7 +458,7 @@ class Lane:
     def _checksum(self, item: QueueItem) -> str:
         if self.rig.source is None or self.rig.mode != "hardware":
             return ""
-        from orchestrator.runs.safety_approval import accepted_checksum
+        from orchestrator.runs.motion_approval import accepted_checksum
 
         return accepted_checksum(self.rig.source) or ""
 

@@ -195,7 +195,11 @@ class RequestExecutor:
         return Poured(measurement)
 
     async def suggest(
-        self, request: Suggest, *, started: Callable[[], None], retrying: Callable[[str], None]
+        self,
+        request: Suggest,
+        *,
+        started: Callable[[], None] = lambda: None,
+        retrying: Callable[[str], None] = lambda text: None,
     ) -> Outcome:
         """Query the optimiser, up to `SUGGESTIONS` times. No layer below repeats a query.
 

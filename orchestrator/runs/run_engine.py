@@ -34,18 +34,20 @@ from orchestrator.runs.events import (
     Watchers,
 )
 from orchestrator.runs.fingerprint import fingerprint
-from orchestrator.runs.replay import StageHistory, read_history, replayed_events
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor, RequestExecutorError
-from orchestrator.runs.run_folder import write_provenance
-from orchestrator.runs.speculative_requests import RequestForecast
-from orchestrator.runs.stage_scheduler import StageScheduler
-from orchestrator.runs.stages import StageDefinition, scenes_of, stage_seed, stages_of
-from orchestrator.runs.unknown_pours import (
+from orchestrator.runs.resume import (
     AskOperator,
     OperatorNeededError,
+    StageHistory,
+    read_history,
+    replayed_events,
     settle_open_questions,
     settle_unknown_pours,
 )
+from orchestrator.runs.run_folder import write_provenance
+from orchestrator.runs.speculation import RequestForecast
+from orchestrator.runs.stage_scheduler import StageScheduler
+from orchestrator.runs.stages import StageDefinition, scenes_of, stage_seed, stages_of
 from orchestrator.states import RESTING, State, check_transition
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.stage_result import StageResult
@@ -253,8 +255,10 @@ class _Run:
         if not stage.pours or len(later) < 2 or not executor.simulators.separate:
             yield
             return
-        forecast = RequestForecast(later, results, self._plan.seed, self._plan.parallel_simulations, executor)
-        task = asyncio.create_task(forecast.run(), name=f"rehearsal beside {stage.name}")
+        forecast = RequestForecast(
+            later, results, self._plan.seed, self._plan.parallel_simulations, executor.ahead, executor.suggest
+        )
+        task = asyncio.create_task(forecast.run(), name=f"forecast during {stage.name}")
         try:
             yield
         finally:

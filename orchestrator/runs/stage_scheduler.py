@@ -37,9 +37,8 @@ from orchestrator.runs.events import (
     StrategyProgressed,
     Watchers,
 )
-from orchestrator.runs.replay import StageHistory, replay, replayed_events
 from orchestrator.runs.request_executor import RequestExecutor
-from orchestrator.runs.unknown_pours import needs_answer, weighed_by_hand
+from orchestrator.runs.resume import StageHistory, needs_answer, replay, replayed_events, weighed_by_hand
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Strategy
 from sim_engine.outcome import RecordedFrames

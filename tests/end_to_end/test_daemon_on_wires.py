@@ -19,7 +19,7 @@ from actors.emulators.ur_controller.controller_process import VirtualController
 from orchestrator.daemon.access_control import Role, token_of
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.journal.journal import Kind
-from orchestrator.runs.safety_approval import SafetyRecord, write_record
+from orchestrator.runs.motion_approval import SafetyRecord, write_record
 from tests.end_to_end.command import pour_under_way
 from tests.end_to_end.test_daemon_killed import Laboratory, opened
 from tests.orchestrator import hardware

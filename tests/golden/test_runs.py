@@ -38,7 +38,7 @@ from orchestrator.results.publishing import publish
 from orchestrator.results.stage_views import deployments_of
 from orchestrator.runs.events import Event, PourProgressed, StrategyProgressed
 from orchestrator.runs.fingerprint import fingerprint
-from orchestrator.runs.replay import ToldStep, read_history
+from orchestrator.runs.resume import ToldStep, read_history
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import stages_of
 from orchestrator.strategies.deployment.real_pours import Foretold

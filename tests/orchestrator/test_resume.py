@@ -20,7 +20,7 @@ from actors.laboratory_settings import LaboratorySpec
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.journal.journal_file import JournalError, JournalLockedError
 from orchestrator.runs.events import Event, RequestFinished, StageClosed
-from orchestrator.runs.replay import ReplayError
+from orchestrator.runs.resume import ReplayError
 from orchestrator.runs.stages import StageDefinition
 from tests.depth import THOROUGH
 from tests.orchestrator import toy

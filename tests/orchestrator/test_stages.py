@@ -24,7 +24,7 @@ from orchestrator.results.publishing import publish
 from orchestrator.results.summarise import summarise
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import Event, RequestFinished
-from orchestrator.runs.motion_envelope import pour_count
+from orchestrator.runs.motion_approval import pour_count
 from orchestrator.runs.stages import deployed_theta, scenes_of, stages_of
 from orchestrator.strategies.campaign_plan import (
     CalibrationPlan,

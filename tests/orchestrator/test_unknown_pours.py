@@ -16,7 +16,7 @@ from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Failed, Poured
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import Event, RequestFinished
-from orchestrator.runs.unknown_pours import LOST, REPEAT, WEIGHED, OperatorNeededError, parse_answer
+from orchestrator.runs.resume import LOST, REPEAT, WEIGHED, OperatorNeededError, parse_answer
 from tests.orchestrator import toy
 from tests.orchestrator.killed import SMALL, killed_when_last, run
 from tests.orchestrator.toy import ToyLaboratory, answering, logical_record, run_toy, toy_plan

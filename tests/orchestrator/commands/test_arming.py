@@ -13,8 +13,16 @@ from typer.testing import CliRunner, Result
 from actors.emulators.ur_controller.controller_process import VirtualController
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.runs.motion_envelope import Envelope, campaign_pours, envelope, pour_count
-from orchestrator.runs.safety_approval import SafetyRecord, record_path, required_checksum, write_record
+from orchestrator.runs.motion_approval import (
+    Envelope,
+    SafetyRecord,
+    campaign_pours,
+    envelope,
+    pour_count,
+    record_path,
+    required_checksum,
+    write_record,
+)
 from orchestrator.runs.stages import stages_of
 from tests.orchestrator import hardware
 from tests.orchestrator.terminal import Terminal

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
 from orchestrator.cli.command_options import Answer
-from orchestrator.runs.unknown_pours import LOST, REPEAT
+from orchestrator.runs.resume import LOST, REPEAT
 from orchestrator.strategies.deployment.model_monitoring import OPTIONS
 from tests.orchestrator.commands.typed import ROOT, invoke, write_inputs
 

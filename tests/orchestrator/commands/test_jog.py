@@ -16,7 +16,7 @@ from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import LaboratoryError
 from orchestrator.cli.motion_control import JogError, Jogging, JogStep, parse_step, steps_home
 from orchestrator.config.file_loading import load_laboratory
-from orchestrator.runs.safety_approval import SafetyRecord, write_record
+from orchestrator.runs.motion_approval import SafetyRecord, write_record
 from tests.orchestrator import hardware
 from tests.orchestrator.terminal import Terminal
 

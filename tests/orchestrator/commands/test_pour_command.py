@@ -21,8 +21,8 @@ from actors.interfaces import UnknownPourError
 from orchestrator.cli.app import app
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
 from orchestrator.requests import Pour
+from orchestrator.runs.motion_approval import SafetyRecord, write_record
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor
-from orchestrator.runs.safety_approval import SafetyRecord, write_record
 from orchestrator.runs.stages import scenes_of
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan

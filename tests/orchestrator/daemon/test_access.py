@@ -27,7 +27,7 @@ from orchestrator.daemon.access_control import (
     Tokens,
     TooManyFailuresError,
 )
-from orchestrator.daemon.submission_bundle import SubmissionBundleError, unpack
+from orchestrator.daemon.submissions import SubmissionBundleError, unpack
 from tests.orchestrator.daemon.browsing import on_port
 from tests.orchestrator.daemon.served import Served, held, run, serving
 

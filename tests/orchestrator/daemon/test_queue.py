@@ -15,10 +15,8 @@ from orchestrator.cli.queue_commands import submit
 from orchestrator.config.file_loading import load_campaign, load_laboratory
 from orchestrator.daemon.daemon_settings import DESK, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import QueueItem
-from orchestrator.daemon.rig_worker import job_of
 from orchestrator.daemon.run_readout import Pours
-from orchestrator.daemon.submission_bundle import pack
-from orchestrator.daemon.submissions import Submission, SubmissionError, prepare
+from orchestrator.daemon.submissions import Submission, SubmissionError, pack, prepare, run_request
 from orchestrator.run_service import RunRequest
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.end_to_end.small import NARROW, write_campaign
@@ -47,9 +45,9 @@ def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
 
     def counted(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunRequest:
         read.append(item.id)
-        return job_of(settings, item, rig)
+        return run_request(settings, item, rig)
 
-    monkeypatch.setattr("orchestrator.daemon.query_routes.job_of", counted)
+    monkeypatch.setattr("orchestrator.daemon.query_routes.run_request", counted)
 
     async def work() -> None:
         async with serving(tmp_path, held) as served:
@@ -61,7 +59,7 @@ def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
             found = await served.until(key, "finished")
             assert [pour["state"] for pour in found["pours_made"]] == ["weighed"] * 3
             settings, item = served.daemon.settings, served.daemon.item(key)
-            plan = job_of(settings, item, settings.rig(item.rig)).campaign
+            plan = run_request(settings, item, settings.rig(item.rig)).campaign
             afresh = Pours().of(settings.runs / str(item.run), lambda: plan)
             assert found["pours_made"] == afresh
 
@@ -157,7 +155,7 @@ def test_a_campaign_for_no_rig_there_is_is_refused_with_those_there_are(tmp_path
     async def work() -> None:
         async with serving(tmp_path, HeldLaboratory) as served:
             from orchestrator.config.file_loading import load_campaign
-            from orchestrator.daemon.submission_bundle import pack
+            from orchestrator.daemon.submissions import pack
 
             text, files = pack(load_campaign(served.campaign))
             told = await served.post("/campaigns", {"text": text, "files": files, "rig": "lefft"}, status=422)
@@ -194,7 +192,7 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
         async with serving(tmp_path) as served:
             key = (await served.post("/campaigns", sent))["id"]
             found = await served.until(key, "finished")
-            plan = job_of(served.daemon.settings, served.daemon.item(key), Rig(DESK)).campaign
+            plan = run_request(served.daemon.settings, served.daemon.item(key), Rig(DESK)).campaign
             assert plan.parameters.friction == 0.21
             assert found["name"] == plan.name == "cup-plan"
             assert [scene.receiver.name for scene in plan.deployment.scenes] == ["bowl"]  # type: ignore[union-attr]
@@ -250,7 +248,7 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
     settings = DaemonSettings(tmp_path / "state", in_process=True)
     submission = Submission(text=body["text"], files=body["files"], verb="plan")
     item = prepare(settings, submission, "00000a", "somebody")
-    planned = job_of(settings, item, settings.rig(item.rig)).campaign
+    planned = run_request(settings, item, settings.rig(item.rig)).campaign
     assert planned.parameters.friction == 0.2
     assert planned.deployment is not None
     assert {one.friction for one in planned.deployment.thetas} == {0.1, 0.3}

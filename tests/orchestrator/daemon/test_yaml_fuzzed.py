@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_settings import DaemonSettings
-from orchestrator.daemon.submission_bundle import Files, pack
-from orchestrator.daemon.submissions import Submission, SubmissionError, prepare
+from orchestrator.daemon.submissions import Files, Submission, SubmissionError, pack, prepare
 from tests.depth import examples
 from tests.end_to_end.small import write_campaign
 

@@ -12,8 +12,8 @@ import pytest
 
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Suggest
+from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.stages import DEPLOYMENT, with_bench
-from orchestrator.runs.unknown_pours import OperatorNeededError
 from orchestrator.strategies.deployment.bench_offset import displacement, play_of
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.deployment_result import Deployed
