@@ -14,7 +14,7 @@ from actors.balance.balance_settings import BalanceSpec
 from actors.interfaces import OperatorSpec
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseError
-from sim_engine.settings.model import FREE
+from sim_engine.settings.model import NOT_IN_FINGERPRINT
 
 
 @dataclass(frozen=True)
@@ -75,16 +75,18 @@ class LaboratorySpec:
     """
 
     name: str
-    simulators: Annotated[int, FREE] = 0
+    simulators: Annotated[int, NOT_IN_FINGERPRINT] = 0
     bench: VirtualBenchSpec | None = None
     mode: str = "virtual"
-    in_process: Annotated[bool, FREE] = False
-    object_store_mb: Annotated[int, FREE] = 160
-    ray: Annotated[RaySpec | None, FREE] = None
+    in_process: Annotated[bool, NOT_IN_FINGERPRINT] = False
+    object_store_mb: Annotated[int, NOT_IN_FINGERPRINT] = 160
+    ray: Annotated[RaySpec | None, NOT_IN_FINGERPRINT] = None
     arm: ArmSpec | None = None
     balance: BalanceSpec | None = None
-    operator: Annotated[OperatorSpec, FREE] = field(default_factory=lambda: OperatorSpec(answers="virtual"))
-    accepted_checksum: Annotated[str, FREE] = ""
+    operator: Annotated[OperatorSpec, NOT_IN_FINGERPRINT] = field(
+        default_factory=lambda: OperatorSpec(answers="virtual")
+    )
+    accepted_checksum: Annotated[str, NOT_IN_FINGERPRINT] = ""
 
     @property
     def pours(self) -> bool:

@@ -41,7 +41,7 @@ from actors.optimizer.suggest import propose
 from orchestrator.results.pool_occupancy import RESTS, Occupancy
 from orchestrator.runs.events import DecisionMade, Event
 from orchestrator.runs.run_engine import run_campaign
-from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan, OutputPlan
+from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan, OutputSettings
 from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
@@ -164,7 +164,7 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
             parameters=SimulationParameters(particles=500),
             calibration=None,
             deployment=arm,
-            outputs=OutputPlan(Path(folder), record_rate=0.0),
+            outputs=OutputSettings(directory=folder, record_rate=0.0),
             parallel_simulations=asked.slots,
         )
         begun = time.thread_time()

@@ -29,7 +29,7 @@ from actors.bench.ground_truth import hidden_spill
 from actors.interfaces import InvalidActionError, ProgressCallback
 from orchestrator.results.pool_occupancy import Occupancy
 from orchestrator.runs.run_engine import run_campaign
-from orchestrator.strategies.campaign_plan import DeploymentPlan, OutputPlan
+from orchestrator.strategies.campaign_plan import DeploymentPlan, OutputSettings
 from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
@@ -143,7 +143,7 @@ def campaign(study: StudyPlan, arm: DeploymentPlan, seed: int, fluid: Fluid, ask
             parameters=replace_particles(study, asked.particles),
             calibration=None,
             deployment=arm,
-            outputs=OutputPlan(Path(folder), rrd=False, figures=False, record_rate=0.0),
+            outputs=OutputSettings(directory=folder, rrd=False, figures=False, record_rate=0.0),
             parallel_simulations=asked.slots,
         )
         result = run(run_campaign(plan, fluid, Path(folder) / "run", watchers=[fluid.watch]))

@@ -22,7 +22,7 @@ from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.vessel.shapes import VesselSpec
 from sim_engine.vessel.vessel import Vessel, build_vessel
-from tests.measured import FOCAL, Bench
+from tests.support.measured_vessel import FOCAL, Bench
 
 PAGE = Path("docs/vessels.md")
 PARTICLES = 600

@@ -34,6 +34,7 @@ from orchestrator.config.yaml.section_validation import sections_in
 from orchestrator.daemon import daemon_settings as daemon
 from orchestrator.daemon.notifications import NotifySection
 from orchestrator.states import State
+from orchestrator.strategies.campaign_plan import OutputSettings
 from orchestrator.strategies.deployment import disturbances as pose
 from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.disturbances import RiskSettings
@@ -47,15 +48,17 @@ from orchestrator.strategies.deployment.safe_window import WindowSettings
 from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES
 from orchestrator.study import study_file as study
 from sim_engine.action import ACTION_DIMENSIONS
-from sim_engine.liquids import KNOWN, ROOM, SimulationParameters
-from sim_engine.settings.model import Choice, Section
+from sim_engine.liquids import KNOWN, ROOM, LiquidSettings, SimulationParameters
+from sim_engine.outcome import Loss
+from sim_engine.settings.model import Choice, Settings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.validation import sensitivity
+from sim_engine.vessel.shapes import ProfileShape
 
 FOLDER = Path(__file__).parent
 MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
-SECTIONS: dict[str, type[Section]] = {
+SECTIONS: dict[str, type[Settings]] = {
     "campaign": campaign.CampaignFile,
     "simulator": campaign.SimulatorSection,
     "calibration": campaign.CalibrationSection,
@@ -69,12 +72,12 @@ SECTIONS: dict[str, type[Section]] = {
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
     "data": campaign.DataSection,
-    "loss": campaign.LossSection,
+    "loss": Loss,
     "objective": Objective,
-    "outputs": campaign.OutputsSection,
-    "liquid": vessel.LiquidFile,
+    "outputs": OutputSettings,
+    "liquid": LiquidSettings,
     "vessel": vessel.VesselFile,
-    "profile": vessel.ProfileSection,
+    "profile": ProfileShape,
     "laboratory": laboratory.LaboratoryFile,
     "ray": cluster.RaySection,
     "arm": arm_sections.UrArmSection,
@@ -116,7 +119,7 @@ OF_SECTIONS = {
     "PoseErrorSection": "[pose error](#bench)",
     "PoseNoiseSection": "standard deviations of the [pose error](#bench)",
     "TransferSection": "[transfer](#pours)",
-    "LossSection": "[loss](#losses)",
+    "Loss": "[loss](#losses)",
     "Objective": "[objective](#objectives)",
     **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
     "RiskSettings": "[risk](#risk-and-the-safe-window)",
@@ -126,13 +129,13 @@ OF_SECTIONS = {
     "RiskLimitSettings": "[risk_limit](#ignorance-limits-and-the-end)",
     "StopSettings": "[stop](#ignorance-limits-and-the-end)",
     "DataSection": "[data](#existing-data)",
-    "ProfileSection": "[profile](#vessels)",
+    "ProfileShape": "[profile](#vessels)",
     "Motion": "[motion](#motion-and-actions)",
     "Actions": "[actions](#motion-and-actions)",
     "Parameters": "[parameters](#simulator)",
     "VesselFile": "[vessel](#vessels) or the path of its file",
     "LaboratoryFile": "[laboratory](#laboratories) or the path of its file",
-    "LiquidFile": "[liquid](#liquid) or the path of its file",
+    "LiquidSettings": "[liquid](#liquid) or the path of its file",
     "LevelSection": "[level](#studies)",
     **{
         model.__name__: f"`{{{', '.join(model.written_keys())}}}`, [each](#studies) a mapping"
@@ -263,7 +266,7 @@ def catalogued(table: str) -> str:
     return _table(("column", "unit", "meaning"), rows)
 
 
-def section(model: type[Section]) -> str:
+def section(model: type[Settings]) -> str:
     """Keys of a section as people write them."""
     rows = []
     for key, name in model.written_keys().items():
@@ -276,7 +279,7 @@ def section(model: type[Section]) -> str:
     return _table(("key", "value", "unless given", "meaning"), rows)
 
 
-def variants(models: Mapping[str, type[Section]], common: type[Section]) -> str:
+def variants(models: Mapping[str, type[Settings]], common: type[Settings]) -> str:
     """Keys of a tagged union that not all sections of its kind have, each with the variants that have it."""
     owners: dict[tuple[str, ...], list[str]] = {}
     tag = next(iter(models.values())).tag
@@ -291,7 +294,7 @@ def variants(models: Mapping[str, type[Section]], common: type[Section]) -> str:
     return _table(("of", "key", "value", "unless given", "meaning"), rows)
 
 
-def _arms(model: type[Section]) -> dict[str, type[Section]]:
+def _arms(model: type[Settings]) -> dict[str, type[Settings]]:
     """Sections of the arms of a study, by the strategy that each is of."""
     found = [s for info in model.model_fields.values() for s in sections_in(info.annotation)]
     return {section.variant: section for section in found}
@@ -338,16 +341,16 @@ TABLES: dict[str, Callable[[], str]] = {
     "calibration-strategies": partial(variants, campaign.CALIBRATIONS, campaign.CalibrationSection),
     "deployment-strategies": partial(variants, campaign.DEPLOYMENTS, campaign.DeploymentSection),
     "objectives": partial(variants, OBJECTIVES.all, Objective),
-    "compared-calibration": partial(variants, _arms(study.CalibrationsSection), Section),
-    "compared-deployment": partial(variants, _arms(study.DeploymentsSection), Section),
+    "compared-calibration": partial(variants, _arms(study.CalibrationsSection), Settings),
+    "compared-deployment": partial(variants, _arms(study.DeploymentsSection), Settings),
 }
 
 
-def _default(key: str, info: FieldInfo, model: type[Section]) -> str:
-    if key in model.required:
+def _default(key: str, info: FieldInfo, model: type[Settings]) -> str:
+    if key in model.required_keys():
         return "must be given"
     value = info.get_default()
-    if value is None or value is PydanticUndefined or value == () or isinstance(value, Section):
+    if value is None or value is PydanticUndefined or value == () or isinstance(value, Settings):
         return ""
     quantity = next((m for m in info.metadata if isinstance(m, Quantity)), None)
     if quantity is not None and quantity.unit != "1":
@@ -381,14 +384,14 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
         return f"list of: {_value(typing.get_args(annotation)[0])}"
     if origin is tuple:
         inner = typing.get_args(annotation)
-        if isinstance(inner[0], type) and issubclass(inner[0], Section):
+        if isinstance(inner[0], type) and issubclass(inner[0], Settings):
             return f"list of: {_value(inner[0])}"
         if typing.get_args(inner[0])[-1:] == (...,):
             return "list of rows of numbers"
         return "`[x, y, z]`" if len(inner) == 3 else "list of `[r, z]`"
     if origin is dict:
         return "mapping"
-    if isinstance(annotation, type) and issubclass(annotation, Section):
+    if isinstance(annotation, type) and issubclass(annotation, Settings):
         return OF_SECTIONS.get(annotation.__name__, f"mapping: {_one_line(annotation.__doc__ or '')}")
     metadata = [deep for m in metadata for deep in (m.metadata if isinstance(m, FieldInfo) else [m])]
     if annotation is int:

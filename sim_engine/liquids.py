@@ -1,6 +1,6 @@
 """Liquids, and the parameters of the simulator.
 
-- `Liquid` is a load of liquid in SI units.
+- `Liquid` is a load of liquid in SI units; `LiquidSettings` describe it in files.
 - `SimulationParameters` are the parameters that calibration may change: θ_s, and nuisances of the bench.
 - `look_up` returns density, viscosity and surface tension of common laboratory liquids by name and temperature, from
   published data.
@@ -16,9 +16,13 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from sim_engine.errors import did_you_mean
+from sim_engine.settings.model import Problems, Settings, Text
+from sim_engine.settings.quantity import Quantity
 
 LARGEST_LIP_DROP = 1.0
 
@@ -431,3 +435,90 @@ def look_up(name: str, temperature: float = ROOM) -> Properties | None:
     if not low <= temperature <= high:
         raise ValueError(f"{liquid.name} is known from {low:g} to {high:g} °C, not at {temperature:g} °C")
     return liquid.at(temperature, share)
+
+
+PLAIN_WATER = Properties(density=998.0, dynamic_viscosity=1.0e-3, surface_tension=0.0728)
+"""Properties of water without a temperature; its surface tension is also the default of liquids outside the table."""
+
+
+class LiquidSettings(Settings):
+    """The liquid, given by its name if it is in the [table](liquids.md#the-table), or by its properties."""
+
+    name: Text = "water"
+    """A name in the table: 'ethanol', 'glycerol 80 %', 'sugar syrup 60 %', 'rapeseed oil' … Any other name needs
+    `density` and `viscosity` as well."""
+
+    temperature: Annotated[float, Quantity("degC", "20 degC", lower=0.0, upper=100.0)] | None = None
+    """Temperature at which the table is read; 20 °C unless given."""
+
+    mass: Annotated[float, Quantity("kg", "200 g", lower=1e-4, upper=20.0)] | None = None
+    """Mass that is loaded into the pourer; or give `volume`."""
+
+    volume: Annotated[float, Quantity("m^3", "200 mL", lower=1e-7, upper=0.02)] | None = None
+    """Volume that is loaded, from which the mass follows; or give `mass`, which is more accurate with a balance."""
+
+    density: Annotated[float, Quantity("kg/m^3", "998 kg/m^3", lower=101.0, upper=19_999.0)] | None = None
+    """Density; the table's unless given. Required for a liquid that is not in the table."""
+
+    surface_tension: Annotated[float, Quantity("N/m", "72.8 mN/m", lower=1e-3, upper=1.0)] | None = None
+    """Surface tension against air; the table's unless given, water's 72.8 mN/m for a liquid that is not in the table.
+    Liquids above 5 mm²/s are simulated with it; for thinner ones set the simulation parameter `cohesion`."""
+
+    viscosity: Annotated[float, Quantity("Pa*s", "1 mPa*s", lower=1e-5, upper=1e3)] | None = None
+    """Dynamic viscosity; the table's unless given. Required for a liquid that is not in the table. Above 5 mm²/s
+    (viscosity over density) it is simulated, and the liquid sticks to walls; for thinner ones set the simulation
+    parameter `viscosity`."""
+
+    contact_angle: Annotated[float, Quantity("rad", "40 deg", lower=0.0, upper=math.pi)] = NEUTRAL
+    """Contact angle on the vessels' walls. It agrees with theory if particles are finer than the capillary length (1.9
+    mm for oil, 2.7 mm for water). At the usual particle spacing it has an effect, which is not validated."""
+
+    def check_values(self, problems: Problems) -> None:
+        """Check that the load is given once, and that the liquid's properties are known."""
+        if self.mass is not None and self.volume is not None:
+            problems.add("the load has a mass already; keep one of 'mass' and 'volume'", "volume", key=True)
+        elif self.mass is None and self.volume is None and problems.valid("mass", "volume"):
+            problems.add("key 'mass' is missing; add for example 'mass: 200 g', or 'volume: 200 mL'", key=True)
+        try:
+            known = find(self.name) is not None
+        except ValueError as error:
+            problems.add(str(error), "name")
+            return
+        missing = [key for key in ("density", "viscosity") if self.value(key) is None]
+        if known:
+            try:
+                look_up(self.name, ROOM if self.temperature is None else self.temperature)
+            except ValueError as error:
+                problems.add(str(error), "temperature")
+        elif missing and problems.valid(*missing):
+            wanted = " and ".join(f"'{key}'" for key in missing)
+            problems.add(f"{_not_in_table(self.name)} To pour it, give its {wanted} as well", "name")
+        elif not missing and self.temperature is not None:
+            problems.add(f"has no effect: {_not_in_table(self.name)} Remove the temperature", "temperature")
+
+    def load(self) -> Liquid:
+        """The liquid, with the table's values of properties that are not given."""
+        plain = self.name == "water" and self.temperature is None
+        known = None if plain else look_up(self.name, ROOM if self.temperature is None else self.temperature)
+        known = known or PLAIN_WATER
+        density = known.density if self.density is None else self.density
+        return Liquid(
+            name=self.name,
+            mass=(self.volume or 0.0) * density if self.mass is None else self.mass,
+            density=density,
+            surface_tension=known.surface_tension if self.surface_tension is None else self.surface_tension,
+            dynamic_viscosity=known.dynamic_viscosity if self.viscosity is None else self.viscosity,
+            contact_angle=self.contact_angle,
+        )
+
+
+def _not_in_table(name: str) -> str:
+    plain, share = split_share(name)
+    meant = did_you_mean(plain, [one.name for one in KNOWN])
+    if meant is not None:
+        solution = next(one.share for one in KNOWN if one.name == meant) is not None
+        guess = f" Did you mean '{meant}{f' {60.0 if share is None else share:g} %' if solution else ''}'?"
+    else:
+        guess = ""
+    names = ", ".join(f"'{one.name}{' 60 %' if one.share else ''}'" for one in KNOWN)
+    return f"'{name}' is not in the table of liquids.{guess} The table has {names}."

@@ -13,10 +13,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sim_engine.settings.model import Settings
+from sim_engine.settings.quantity import Quantity
 
 
 class ParticleState(IntEnum):
@@ -194,18 +197,16 @@ def normalised_spillage(fractions: Fractions) -> float | None:
     return fractions.spilled / fractions.poured
 
 
-@dataclass(frozen=True)
-class Loss:
-    """A deployment loss.
+class Loss(Settings):
+    """Loss that deployment minimises."""
 
-    Attributes:
-        name: `spilled_and_retained` is Decant's default, (spilled + w·retained) / loaded. The paper's own:
-            `normalised` (spilled / poured), `grams` (spilled mass), `particles` (number spilled).
-        retained_weight: w of the default loss.
-    """
+    recorded_as_given: ClassVar[bool] = True
 
     name: LossName = "spilled_and_retained"
-    retained_weight: float = 1.0
+    """(spilled + w·retained) / loaded; or the paper's: normalised, grams, particles."""
+
+    retained_weight: Annotated[float, Quantity("1", "1.0", 0.0, 100.0)] = 1.0
+    """Weight w of the retained liquid, for spilled_and_retained."""
 
     def __call__(self, fractions: Fractions, *, loaded_mass: float, particles: int) -> float | None:
         """Loss of a pour, to be minimised; None if it is undefined.

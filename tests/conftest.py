@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from orchestrator.catalogue.run_registry import VARIABLE
-from tests.depth import load_profile
+from tests.support.hypothesis_examples import load_profile
 
 load_profile()
 

@@ -115,7 +115,7 @@ async def _played(plan: Any, directory: Path, pours: int | None) -> Any:
     """The campaign in a world whose spillage is a formula; paused after so many pours."""
     from actors.optimizer.optimizer_actor import Proposer
     from orchestrator.runs.run_engine import run_campaign
-    from tests.orchestrator.toy import ToyBench, ToyLaboratory
+    from tests.support.toy_campaign import ToyBench, ToyLaboratory
 
     class Optimizer:
         async def suggest(self, problem: Any) -> Any:

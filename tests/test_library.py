@@ -14,7 +14,7 @@ import pytest
 
 import decant
 from orchestrator.requests import Simulate
-from tests.depth import THOROUGH
+from tests.support.hypothesis_examples import THOROUGH
 
 ROOT = Path(__file__).parents[1]
 PAGE, NOTEBOOK = ROOT / "docs" / "library.md", ROOT / "docs" / "library.ipynb"
@@ -249,7 +249,7 @@ def fake_simulators(monkeypatch: pytest.MonkeyPatch) -> None:
     from functools import partial
 
     from actors.laboratory import open_laboratory
-    from tests.actors.conftest import make_fake
+    from tests.support.fake_simulator import make_fake
 
     monkeypatch.setattr("actors.laboratory.open_laboratory", partial(open_laboratory, make=make_fake()))
 

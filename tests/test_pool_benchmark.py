@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from actors.runtime.child_process import child_environment
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "pool_speed.py"
 

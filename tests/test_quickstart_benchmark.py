@@ -13,7 +13,7 @@ import pytest
 from orchestrator.strategy_harness import SCENE
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PourTask
-from tests.actors.conftest import make_fake
+from tests.support.fake_simulator import make_fake
 
 
 @pytest.fixture

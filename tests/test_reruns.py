@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from actors.runtime.child_process import run
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[1]
 

@@ -20,7 +20,7 @@ from actors.arm.arm_geometry import ArmLimits, Joints, Mount, Pose, RobotCell, V
 from actors.interfaces import DeviceCheck
 from sim_engine.action import Action
 from sim_engine.scene import Scene
-from sim_engine.settings.model import FREE
+from sim_engine.settings.model import NOT_IN_FINGERPRINT
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import ArmFigure, PlannedPour
@@ -213,7 +213,7 @@ class UrArmSpec(ArmSpec):
     limits: ArmLimits
     cell: RobotCell
     home: Joints
-    address: Annotated[str, FREE] = ""
+    address: Annotated[str, NOT_IN_FINGERPRINT] = ""
     mount: Mount = field(default_factory=Mount)
     tool: Pose = field(default_factory=Pose)
     payload: float = 0.0

@@ -20,7 +20,7 @@ from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.simulated_balance import PATIENCE, BalanceSettings, ScaleSettings, VirtualBalance
 from actors.balance.weighing_plan import Placement
 from actors.interfaces import DeviceCheck, LaboratoryError
-from sim_engine.settings.model import FREE
+from sim_engine.settings.model import NOT_IN_FINGERPRINT
 
 
 @dataclass(frozen=True)
@@ -271,17 +271,17 @@ class SerialBalanceSpec(BalanceDevice):
 
     kind: ClassVar[str] = "serial"
 
-    port: Annotated[str, FREE]
+    port: Annotated[str, NOT_IN_FINGERPRINT]
     dialect: str = AUTO
-    baud: Annotated[int | None, FREE] = None
-    format: Annotated[str | None, FREE] = None
-    handshake: Annotated[Handshake, FREE] = "none"
+    baud: Annotated[int | None, NOT_IN_FINGERPRINT] = None
+    format: Annotated[str | None, NOT_IN_FINGERPRINT] = None
+    handshake: Annotated[Handshake, NOT_IN_FINGERPRINT] = "none"
     settling: SettlingRule = field(default_factory=SettlingRule)
     step: float | None = None
     repeatability: float = 0.0
     interval: float = 0.15
     answer_time: float = 1.0
-    reconnect_time: Annotated[float, FREE] = 20.0
+    reconnect_time: Annotated[float, NOT_IN_FINGERPRINT] = 20.0
     time_scale: float = 1.0
     virtual: ScaleSettings | None = None
 

@@ -80,18 +80,16 @@ if TYPE_CHECKING:
     from sim_engine.scene import PoseError, Scene
     from sim_engine.search_space import Axis, Space
     from sim_engine.settings.model import (
-        FREE,
+        NOT_IN_FINGERPRINT,
         Choice,
         Count,
         Name,
         Number,
         PositiveCount,
         Problems,
+        Settings,
         Switch,
         Text,
-    )
-    from sim_engine.settings.model import (
-        Section as Settings,
     )
     from sim_engine.settings.quantity import Quantity
     from sim_engine.vessel.distance_grid import SignedDistanceGrid
@@ -100,8 +98,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ACTION_DIMENSIONS",
-    "FREE",
     "MAP_RESOLUTION",
+    "NOT_IN_FINGERPRINT",
     "THETA_MAP_RESOLUTION",
     "Acknowledgement",
     "Action",
@@ -217,7 +215,7 @@ __all__ = [
 _SOURCES = {
     # Settings
     "sim_engine.settings.model": (
-        "FREE",
+        "NOT_IN_FINGERPRINT",
         "Choice",
         "Count",
         "Name",
@@ -308,16 +306,13 @@ _SOURCES = {
 
 _SOURCE_OF = {name: module for module, names in _SOURCES.items() for name in names}
 
-_RENAMED = {"Settings": "Section"}
-"""Public name → the name in its module, if they differ."""
-
 if not TYPE_CHECKING:  # otherwise a type checker would accept misspelt names as Any
 
     def __getattr__(name: str) -> Any:
         """Import a name on first use (PEP 562)."""
         if name not in _SOURCE_OF:
             raise AttributeError(f"module 'decant.plugins' has no attribute '{name}'; it has {', '.join(__all__)}")
-        return getattr(import_module(_SOURCE_OF[name]), _RENAMED.get(name, name))
+        return getattr(import_module(_SOURCE_OF[name]), name)
 
 
 def __dir__() -> list[str]:

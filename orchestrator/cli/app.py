@@ -102,6 +102,7 @@ _add(
     "decant simulate my.yaml --from pours.csv --parameters theta.json --csv scored.csv --png scored.png",
 )
 _add(file_commands.validate, "decant validate my.yaml vase.yaml", "decant validate configs/campaigns/*.yaml")
+_add(file_commands.migrate, "decant migrate my.yaml rig.yaml")
 _add(file_commands.init, "decant init lab", "decant run lab/campaigns/quickstart.yaml")
 _add(file_commands.schema, "decant schema > campaign.json", "decant schema result > result.json")
 _add(

@@ -293,5 +293,5 @@ def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Pa
     except RunError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
     except OSError as error:
-        raise RefusalError(f"{plan.outputs.directory}: can't be written: {error.strerror}", BAD_INPUT) from None
+        raise RefusalError(f"{plan.outputs.folder}: can't be written: {error.strerror}", BAD_INPUT) from None
     return directory

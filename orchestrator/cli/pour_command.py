@@ -240,7 +240,7 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
     plan = dataclasses.replace(
         _only(chosen),
         name=f"{chosen.plan.name}-pour",
-        outputs=dataclasses.replace(chosen.plan.outputs, figures=False),
+        outputs=chosen.plan.outputs.model_copy(update={"figures": False}),
     )
     build: Callable[..., OnePour] = lambda results, seed: OnePour(chosen.scene, chosen.action, seed)  # noqa: E731
     request = RunRequest(plan, [StageDefinition(STAGE, build, pours=True)])
@@ -335,7 +335,7 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
     except LaboratoryError as error:
         raise RefusalError(str(error), FAILED) from None
     except OSError as error:
-        raise RefusalError(f"{plan.outputs.directory}: can't be written: {error.strerror}", BAD_INPUT) from None
+        raise RefusalError(f"{plan.outputs.folder}: can't be written: {error.strerror}", BAD_INPUT) from None
     record = {
         "mode": laboratory.mode,
         "laboratory": laboratory.name,

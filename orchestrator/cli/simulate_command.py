@@ -401,7 +401,7 @@ def _pours(scene: Scene, records: RecordSet | None, source: Path) -> tuple[Recor
 
     radius = None if records is None else records.lip_radius
     if radius is None and isinstance(scene.pourer.shape, ProfileShape):
-        radius = scene.pourer.shape.inner[-1][0]
+        radius = scene.pourer.shape.outline().inner[-1][0]
     table = read_records(
         source,
         loaded=scene.liquid.mass,

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Mapping
 
 from actors.optimizer.questions import Linear
-from orchestrator.config.action_ranges import dimension_quantity
+from orchestrator.config.search_ranges import dimension_quantity
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.errors import DecantError, did_you_mean
 from sim_engine.search_space import Space

@@ -21,7 +21,7 @@ from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planning.kinematics import MODELS
 from actors.arm.simulated_arm import NumbersSpec
 from orchestrator.config.yaml.yaml_source import Place, Report
-from sim_engine.settings.model import Number, Section, Text
+from sim_engine.settings.model import Number, Settings, Text
 from sim_engine.settings.plugin_registry import PluginRegistry
 from sim_engine.settings.quantity import Quantity
 
@@ -32,7 +32,7 @@ Length = Annotated[float, Quantity("m", "100 mm", -3.0, 3.0)]
 Angle = Annotated[float, Quantity("rad", "90 deg", -math.radians(363.0), math.radians(363.0))]
 
 
-class PointSection(Section):
+class PointSection(Settings):
     """A point in the gravity-aligned base frame. For an arm on a table, this is the base frame of the teach pendant."""
 
     required: ClassVar[dict[str, str]] = {"x": "650 mm", "y": "0 mm", "z": "80 mm"}
@@ -47,7 +47,7 @@ class PointSection(Section):
     """Height above the robot's mounting point."""
 
 
-class CellSection(Section):
+class CellSection(Settings):
     """Objects around the arm."""
 
     required: ClassVar[dict[str, str]] = {
@@ -65,10 +65,11 @@ class CellSection(Section):
     """Height of the surface below which nothing may move, in the gravity-aligned base frame."""
 
 
-class ArmSettings(Section):
+class ArmSettings(Settings):
     """Base class of the section `arm`. The field `kind` of a subclass has the name under which it is registered."""
 
     tag: ClassVar[str] = "kind"
+    default_tag: ClassVar[str] = "ur"
 
     @classmethod
     def unknown_tag(cls, word: str) -> str:
@@ -97,7 +98,7 @@ def _arm(loaded: object, name: str) -> type[ArmSettings]:
 
 
 ARMS: PluginRegistry[type[ArmSettings]] = PluginRegistry("decant.arms", "arm", _arm)
-"""Section classes of all installed kinds of arms."""
+"""Settings classes of all installed kinds of arms."""
 
 
 _LIMITS = ArmLimits((0.0,) * 3, (0.0,) * 3)
@@ -111,7 +112,7 @@ Speed = Annotated[float, Quantity("rad/s", "40 deg/s", 0.0, math.radians(360.0),
 Acceleration = Annotated[float, Quantity("rad/s^2", "80 deg/s^2", 0.0, math.radians(2000.0), positive=True)]
 
 
-class CentreSection(Section):
+class CentreSection(Settings):
     """A point in the flange's frame."""
 
     x: Length = 0.0
@@ -124,7 +125,7 @@ class CentreSection(Section):
     """Distance outwards from the flange."""
 
 
-class PoseSection(Section):
+class PoseSection(Settings):
     """Pose of a frame in another, as on the teach pendant: position and rotation vector."""
 
     x: Length = 0.0
@@ -146,7 +147,7 @@ class PoseSection(Section):
     """The z of the rotation vector."""
 
 
-class MountSection(Section):
+class MountSection(Settings):
     """Mounting of the robot: rotation about its own z axis, then tilt about the x axis of the base frame."""
 
     tilt: Annotated[float, Quantity("rad", "90 deg", -math.pi, math.pi)] = 0.0
@@ -156,7 +157,7 @@ class MountSection(Section):
     """Rotation about its own z axis."""
 
 
-class JointsSection(Section):
+class JointsSection(Settings):
     """The six joints, as named and displayed on the teach pendant."""
 
     required: ClassVar[dict[str, str]] = dict.fromkeys(JOINTS, "90 deg")
@@ -180,7 +181,7 @@ class JointsSection(Section):
     """Joint 6."""
 
 
-class BoxSection(Section):
+class BoxSection(Settings):
     """A box along the axes of the gravity-aligned base frame."""
 
     required: ClassVar[dict[str, str]] = {
@@ -195,7 +196,7 @@ class BoxSection(Section):
     """Corner with the largest x, y and z."""
 
 
-class PlaneSection(Section):
+class PlaneSection(Settings):
     """A plane that must not be crossed."""
 
     required: ClassVar[dict[str, str]] = {"normal": "[0, 1, 0]", "offset": "-400 mm"}
@@ -207,7 +208,7 @@ class PlaneSection(Section):
     """Distance of the plane from the base, along the normal."""
 
 
-class LimitsSection(Section):
+class LimitsSection(Settings):
     """Limits of the arm in this cell. Checked before a pour is planned, and again before any motion."""
 
     required: ClassVar[dict[str, str]] = {"box": "{low: {x: …, y: …, z: …}, high: {x: …, y: …, z: …}}"}
@@ -428,8 +429,6 @@ def _point(section: PointSection | None) -> Vector | None:
 
 class NumbersArmSection(ArmSettings):
     """A simulated arm without protocol: it makes every motion and has no geometry."""
-
-    required: ClassVar[dict[str, str]] = {"kind": "numbers"}
 
     kind: Literal["numbers"] = "numbers"
     """A simulated arm without protocol."""

@@ -26,7 +26,7 @@ from actors.balance.dialect_registry import BALANCES, dialects, kinds
 from actors.balance.simulated_balance import BalanceSettings, ScaleSettings
 from actors.balance.weighing_plan import Placement
 from orchestrator.config.yaml.yaml_source import Place, Report
-from sim_engine.settings.model import Choice, PositiveCount, Section, Text, tagged
+from sim_engine.settings.model import Choice, PositiveCount, Settings, Text, tagged
 from sim_engine.settings.quantity import Quantity
 
 _RULE = SettlingRule()
@@ -49,7 +49,7 @@ def dialect_names() -> list[str]:
     return [AUTO, *dialects()]
 
 
-class SettlingSection(Section):
+class SettlingSection(Settings):
     """Criteria for a settled weight."""
 
     readings: Annotated[int, Field(strict=True, ge=2, le=100)] = _RULE.readings
@@ -65,7 +65,7 @@ class SettlingSection(Section):
     """Maximum time for a weight to settle; then the weighing fails."""
 
 
-class VirtualScaleSection(Section):
+class VirtualScaleSection(Settings):
     """Data sheet of a virtual balance."""
 
     resolution: PositiveMass = _SHEET.resolution
@@ -84,13 +84,14 @@ class VirtualScaleSection(Section):
     """Time until the display is within 1 % of a change."""
 
 
-class BalanceDeviceSection(Section):
+class BalanceDeviceSection(Settings):
     """The balance: its placement and its connection.
 
     A package adds a kind with a subclass, registered in the entry-point group `decant.balances` under its `kind`.
     """
 
     tag: ClassVar[str] = "kind"
+    default_tag: ClassVar[str] = "serial"
 
     kind: str = ""
     """Kind of the balance; a literal in each subclass, equal to its registered name."""
@@ -222,7 +223,7 @@ _TYPED = ("kind", "placement", "load_tolerance", "step", "repeatability")
 
 def any_balance() -> Any:
     """The section type of any installed balance."""
-    return tagged(kinds(), default="serial")
+    return tagged(kinds())
 
 
 def resolve_balance(section: BalanceDeviceSection, place: Place, report: Report, *, mode: str) -> BalanceSpec | None:

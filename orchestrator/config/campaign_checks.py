@@ -22,9 +22,8 @@ import numpy as np
 from actors.arm.arm_settings import ArmSpec
 from actors.bench.pour_feasibility import vessel as built
 from actors.interfaces import InvalidActionError, UnreachablePlaceError
-from orchestrator.config.action_ranges import EXAMPLES
 from orchestrator.config.campaign_file import CampaignFile
-from orchestrator.config.parameter_ranges import ParameterRangeSection, ParametersBase
+from orchestrator.config.search_ranges import EXAMPLES, ParameterRangeSection, ParametersBase
 from orchestrator.config.yaml.file_access import why_not_writable
 from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.config.yaml.yaml_source import Document, Loc, Place, Report
@@ -431,7 +430,7 @@ def check_campaign(
         document = None  # a plan without a file
     checker = _Checker(plan.source, plan.laboratory.arm, document, warn, doing)
     at: Loc
-    if (problem := why_not_writable(plan.outputs.directory)) is not None:
+    if (problem := why_not_writable(plan.outputs.folder)) is not None:
         checker.add((("outputs", "directory"),), problem)
     if plan.calibration is not None:
         calibration, section = plan.calibration, ("calibration",)

@@ -12,14 +12,19 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import Field, create_model
 
-from orchestrator.config.action_ranges import Actions as ActionsModel
-from orchestrator.config.action_ranges import Motion as MotionModel
 from orchestrator.config.laboratory_file import LaboratoryFile
-from orchestrator.config.parameter_ranges import Parameters as ParametersModel
-from orchestrator.config.vessel_file import LiquidFile, VesselFile
-from orchestrator.strategies.campaign_plan import CalibrationSettings, DeploymentSettings, Design, StrategySettings
+from orchestrator.config.search_ranges import Actions, Motion, Parameters
+from orchestrator.config.vessel_file import VesselFile
+from orchestrator.strategies.campaign_plan import (
+    CalibrationSettings,
+    DeploymentSettings,
+    Design,
+    OutputSettings,
+    StrategySettings,
+)
 from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES, calibrations, deployments
-from sim_engine.outcome import LossName
+from sim_engine.liquids import LiquidSettings
+from sim_engine.outcome import Loss
 from sim_engine.settings.model import (
     MADE,
     FilePath,
@@ -29,8 +34,8 @@ from sim_engine.settings.model import (
     PositivePourCount,
     PositiveSimulationCount,
     PourCount,
-    Section,
     Seed,
+    Settings,
     SimulationCount,
     Switch,
     Text,
@@ -38,13 +43,8 @@ from sim_engine.settings.model import (
 )
 from sim_engine.settings.quantity import Quantity
 
-# Created at import from the declarations in sim_engine; a type checker sees them as Any.
-Actions: Any = ActionsModel
-Motion: Any = MotionModel
-Parameters: Any = ParametersModel
 
-
-class TransferSection(Section):
+class TransferSection(Settings):
     """Weighed pours in another scene, used only to evaluate the calibration."""
 
     required: ClassVar[dict[str, str]] = {"from": "transfer.csv", "receiver": "cone.yaml"}
@@ -59,7 +59,7 @@ class TransferSection(Section):
     """Values of the motion that differ from calibration's."""
 
 
-class PoursSection(Section):
+class PoursSection(Settings):
     """Pours to calibrate on: to be made (`count`), or weighed already (`from`, `from_run`)."""
 
     count: PositivePourCount | None = None
@@ -93,7 +93,7 @@ class PoursSection(Section):
     """Weighed pours in another scene, used only for evaluation."""
 
 
-class CalibrationSection(Section):
+class CalibrationSection(Settings):
     """Common keys of every calibration, which finds the simulation parameters that reproduce the weighed spillage."""
 
     required: ClassVar[dict[str, str]] = {"pours": "{count: 32, holdout: 4}"}
@@ -125,7 +125,7 @@ class CalibrationSection(Section):
         return settings_in(self, CalibrationSettings)  # type: ignore[type-abstract]
 
 
-class DataSection(Section):
+class DataSection(Settings):
     """Pours from before the campaign that deployment uses as data: from a CSV file, or from a previous run."""
 
     source: FilePath | None = Field(default=None, alias="from")
@@ -147,20 +147,10 @@ class DataSection(Section):
     """Columns that have another name in the CSV: {Decant's name: name in the file}."""
 
 
-class LossSection(Section):
-    """Loss that deployment minimises."""
-
-    name: LossName = "spilled_and_retained"
-    """(spilled + w·retained) / loaded; or the paper's: normalised, grams, particles."""
-
-    retained_weight: Annotated[float, Quantity("1", "1.0", 0.0, 100.0)] | None = None
-    """Weight w of the retained liquid; 1 unless given."""
-
-
 AnyObjective: Any = tagged(OBJECTIVES.all)
 
 
-class DeploymentSection(Section):
+class DeploymentSection(Settings):
     """Common keys of every deployment, which finds actions for vessels that calibration did not use."""
 
     pourer: PathOr[VesselFile] | None = None
@@ -178,7 +168,7 @@ class DeploymentSection(Section):
     actions: Actions | None = None
     """Searched dimensions; the campaign's `actions` unless given."""
 
-    loss: LossSection | None = None
+    loss: Loss | None = None
     """Loss that is minimised."""
 
     objectives: list[AnyObjective] | None = None
@@ -210,20 +200,20 @@ class LearningSection(DeploymentSection):
 T = TypeVar("T", bound=StrategySettings)
 
 
-def settings_in(section: Section, kind: type[T]) -> T:
+def settings_in(section: Settings, kind: type[T]) -> T:
     """The settings of a section's strategy, without the keys that all strategies have."""
     model = next(base for base in type(section).__mro__ if issubclass(base, kind) and base in STRATEGIES.all.values())
     values = {name: getattr(section, name) for name in model.model_fields}
     return model.model_construct(section.model_fields_set & model.model_fields.keys(), **values)
 
 
-def _variants(settings: Mapping[str, type[StrategySettings]], base: type[Section]) -> dict[str, type[Section]]:
+def _variants(settings: Mapping[str, type[StrategySettings]], base: type[Settings]) -> dict[str, type[Settings]]:
     """The sections of all strategies: their settings, with the common keys of their kind."""
-    found: dict[str, type[Section]] = {}
+    found: dict[str, type[Settings]] = {}
     for name, own in settings.items():
         learns = issubclass(own, DeploymentSettings) and own.learns_on_pours
         bases = (own, LearningSection if learns else base)
-        found[name] = create_model(f"{name}Section", __base__=bases, __doc__=own.__doc__, __cls_kwargs__=MADE)
+        found[name] = create_model(f"{name}Settings", __base__=bases, __doc__=own.__doc__, __cls_kwargs__=MADE)
         found[name].required = own.required | base.required
     return found
 
@@ -232,37 +222,18 @@ CALIBRATIONS = _variants(calibrations(), CalibrationSection)
 DEPLOYMENTS = _variants(deployments(), DeploymentSection)
 """Sections of all installed strategies, by name."""
 
-AnyCalibration: Any = tagged(CALIBRATIONS, default="C4")
+AnyCalibration: Any = tagged(CALIBRATIONS)
 AnyDeployment: Any = tagged(DEPLOYMENTS)
 
 
-class SimulatorSection(Section):
+class SimulatorSection(Settings):
     """The simulator."""
 
     parameters: Parameters | None = None
     """Parameters θ: a value fixes one, a range makes calibration search it; the others have their defaults."""
 
 
-class OutputsSection(Section):
-    """Outputs in addition to the journal."""
-
-    directory: FilePath | None = None
-    """Folder of the runs; 'runs' in the working directory unless given."""
-
-    rrd: Switch = True
-    """Write a recording for the viewer."""
-
-    figures: Switch = True
-    """Write figures at the end."""
-
-    record_rate: Annotated[float, Quantity("1/s", "10 1/s", 0.0, 10.0)] = 10.0
-    """Frames of particles per simulated second."""
-
-    recorded_simulations: SimulationCount = 6
-    """Number of simulations that are recorded with their particles."""
-
-
-class CampaignFile(Section):
+class CampaignFile(Settings):
     """A campaign: calibrate the simulator, deploy with the calibrated parameters, or both."""
 
     required: ClassVar[dict[str, str]] = {
@@ -280,7 +251,7 @@ class CampaignFile(Section):
     laboratory: PathOr[LaboratoryFile] | None = None
     """Laboratory in which it runs."""
 
-    liquid: PathOr[LiquidFile] | None = None
+    liquid: PathOr[LiquidSettings] | None = None
     """Liquid that is poured."""
 
     pourer: PathOr[VesselFile] | None = None
@@ -314,5 +285,5 @@ class CampaignFile(Section):
     """Logical slots for parallel simulations, independent of the machine: the same seed gives the same requests on any
     machine."""
 
-    outputs: OutputsSection = OutputsSection()
+    outputs: OutputSettings = OutputSettings()
     """Outputs in addition to the journal."""

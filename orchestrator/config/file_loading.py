@@ -15,7 +15,7 @@ from actors.laboratory_settings import LaboratorySpec
 from orchestrator.config.campaign_file import CampaignFile
 from orchestrator.config.campaign_resolution import resolve_campaign
 from orchestrator.config.laboratory_file import LaboratoryFile, resolve_laboratory
-from orchestrator.config.parameter_ranges import parameter_quantity
+from orchestrator.config.search_ranges import parameter_quantity
 from orchestrator.config.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.config.yaml.file_access import resolved
 from orchestrator.config.yaml.references import References
@@ -25,7 +25,7 @@ from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_
 from orchestrator.journal.upgrade import upgraded_campaign
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.liquids import SimulationParameters
-from sim_engine.settings.model import MADE, Section
+from sim_engine.settings.model import MADE, Settings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.vessel.shapes import VesselSpec
 
@@ -120,7 +120,7 @@ class _LooseQuantity(Quantity):
         return super().parse(value)
 
 
-class _ThetaBase(Section):
+class _ThetaBase(Settings):
     """Parameters as `decant calibrate` writes them: numbers in SI, or quantities with units."""
 
 

@@ -11,7 +11,7 @@ from orchestrator.config.campaign_file import CampaignFile
 from orchestrator.config.laboratory_file import LaboratoryFile
 from orchestrator.config.vessel_file import VesselFile
 from orchestrator.study.study_file import StudyFile
-from sim_engine.settings.model import SchemaGenerator, Section
+from sim_engine.settings.model import SchemaGenerator, Settings
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -69,6 +69,6 @@ def schema_text(schema: dict[str, Any]) -> str:
     return json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
 
 
-def _schema(model: type[Section], title: str) -> dict[str, Any]:
+def _schema(model: type[Settings], title: str) -> dict[str, Any]:
     schema = model.model_json_schema(by_alias=True, schema_generator=SchemaGenerator)
     return {"$schema": DIALECT, **schema, "title": title}

@@ -18,12 +18,12 @@ from actors.interfaces import OperatorSpec
 from actors.laboratory_settings import LaboratorySpec, RaySpec, VirtualBenchSpec
 from orchestrator.config.arm_file import ARMS, ArmSettings, CellSection
 from orchestrator.config.balance_file import any_balance, resolve_balance
-from orchestrator.config.parameter_ranges import parameter_quantity
+from orchestrator.config.search_ranges import parameter_quantity
 from orchestrator.config.yaml.yaml_source import Place, Report
 from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseError
-from sim_engine.settings.model import MADE, Count, Name, Section, Switch, tagged
+from sim_engine.settings.model import MADE, Count, Name, Settings, Switch, tagged
 from sim_engine.settings.quantity import Quantity
 
 _OPERATOR = OperatorSpec()
@@ -31,7 +31,7 @@ _OPERATOR = OperatorSpec()
 Patience = Annotated[float, Quantity("s", "30 min", 0.0, 7 * 86400.0, positive=True)]
 
 
-class OperatorSection(Section):
+class OperatorSection(Settings):
     """The operator, who refills, wipes and places the vessels, and confirms each step."""
 
     answers: Literal["person", "virtual"] | None = None
@@ -90,7 +90,7 @@ def _address(text: str) -> str:
 Address = Annotated[str, Strict(), AfterValidator(_address)]
 
 
-class RaySection(Section):
+class RaySection(Settings):
     """An existing Ray cluster; Decant connects to it and does not stop it."""
 
     required: ClassVar[dict[str, str]] = {"address": "10.0.0.1:6379"}
@@ -115,7 +115,7 @@ Duration = Annotated[float, Quantity("s", "85 s", 0.0, 3600.0)]
 Mass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.01)]
 
 
-class BalanceSection(Section):
+class BalanceSection(Settings):
     """The virtual balance."""
 
     resolution: Mass = _DEFAULT.balance_resolution
@@ -131,7 +131,7 @@ class BalanceSection(Section):
     """Time constant until a reading is stable."""
 
 
-class HiddenLiquidBase(Section):
+class HiddenLiquidBase(Settings):
     """θ of the 'real' liquid of the virtual bench. Hidden: calibration never reads it."""
 
     def parameters(self) -> SimulationParameters:
@@ -157,7 +157,7 @@ def hidden_liquid_model() -> type[HiddenLiquidBase]:
 HiddenLiquid: Any = hidden_liquid_model()
 
 
-class BenchSection(Section):
+class BenchSection(Settings):
     """Ground truth of a virtual bench: a liquid that differs from the simulator's, execution errors, and the speed of
     time."""
 
@@ -182,13 +182,13 @@ class BenchSection(Section):
     """Time to refill, place and wipe between two pours, in bench time; with an arm see 'operator'."""
 
 
-AnyArm: Any = tagged(ARMS.all, default="ur")
-"""Section type of all installed kinds of arms."""
+AnyArm: Any = tagged(ARMS.all)
+"""Settings type of all installed kinds of arms."""
 
 AnyBalance: Any = any_balance()
 
 
-class LaboratoryFile(Section):
+class LaboratoryFile(Settings):
     """The laboratory in which a campaign runs."""
 
     recorded_as_given: ClassVar[bool] = True

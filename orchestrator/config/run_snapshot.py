@@ -1,26 +1,31 @@
 """The self-contained record of a campaign that a run stores as `resolved.json`: the file with all values filled in.
 
-`campaign_record` writes a campaign's file. `record_of` writes a plan derived from another campaign, for example the
-cell of a study, as the base record with its changes. Loading a record gives the plan again.
+`as_file` writes any section in the format of its file; `record_of` writes a
+plan derived from another campaign, for example the cell of a study, as the base record with its changes. Loading a
+record gives the plan again.
 """
 
 from __future__ import annotations
 
+import typing
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from orchestrator.config.campaign_file import CalibrationSection, CampaignFile, LearningSection
+from pydantic import Tag
+
+from orchestrator.config.campaign_file import CalibrationSection, LearningSection
 from orchestrator.config.laboratory_file import HiddenLiquid
-from orchestrator.config.parameter_ranges import Parameters
+from orchestrator.config.search_ranges import Parameters
+from orchestrator.config.yaml.file_access import resolved
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
-from orchestrator.config.yaml.yaml_writer import as_file
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
-from sim_engine.settings.model import Section
-from sim_engine.vessel.shapes import MeshShape, ProfileShape, VesselSpec
+from sim_engine.settings.model import IN_FILE, FieldMark, Settings
+from sim_engine.settings.quantity import Quantity
+from sim_engine.vessel.shapes import MeshShape, VesselSpec
 
 
 def record_of(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
@@ -35,12 +40,11 @@ def record_of(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
         plan: plan of a study's cell, or for planning alone.
     """
     record = {key: value for key, value in base.items() if key not in ("calibration", "deployment")}
-    outputs = {**asdict(plan.outputs), "record_rate": f"{plan.outputs.record_rate!r} 1/s"}
     record |= {
         "name": plan.name,
         "seed": plan.seed,
         "on_unknown": plan.on_unknown,
-        "outputs": {**outputs, "directory": str(plan.outputs.directory)},
+        "outputs": written(plan.outputs),
         "laboratory": _laboratory(base["laboratory"], plan),
         "simulator": {"parameters": _parameters(plan)},
     }
@@ -99,41 +103,111 @@ def vessel_record(vessel: VesselSpec) -> dict[str, Any]:
     """A vessel in the format of its file."""
     shape = vessel.shape
     match shape:
-        case ProfileShape():
-            inner, thickness = [list(point) for point in shape.inner], {"wall": shape.wall, "floor": shape.floor}
-            lengths = {**thickness, **({"height_deviation": shape.height_deviation} if shape.height_deviation else {})}
-            profile = {"unit": "m", "inner": inner, **{key: f"{value!r} m" for key, value in lengths.items()}}
-            if shape.radius_deviations:
-                profile["radius_deviations"] = [list(row) for row in shape.radius_deviations]
-            return {"name": vessel.name, "profile": profile}
         case MeshShape():
             unit = {} if shape.unit is None else {"unit": shape.unit}
             return {"name": vessel.name, "mesh": str(shape.path), "up": shape.up, **unit}
-        case Section():
-            return {"name": vessel.name, shape.kind: written(shape)}
         case _:
-            raise TypeError(f"a vessel of the kind {shape.kind!r} can't be written down")
+            return {"name": vessel.name, shape.kind: written(shape)}
 
 
-def _common(base: Mapping[str, Any], section: type[Section]) -> dict[str, Any]:
+def _common(base: Mapping[str, Any], section: type[Settings]) -> dict[str, Any]:
     """The keys of a section that are common to all strategies."""
     return {key: value for key, value in base.items() if key in section.written_keys()}
 
 
-def written(section: Section) -> dict[str, Any]:
+def written(section: Settings) -> dict[str, Any]:
     """A section without a file, in the format of a file."""
     return as_file(section, Place(Document(Path.cwd() / "written")), References(Report()))
 
 
-def campaign_record(file: CampaignFile, root: Place, references: References, directory: Path) -> dict[str, Any]:
-    """The campaign in the format of campaign files, JSON-ready: loading it gives the same plan.
+T = TypeVar("T")
+
+
+def as_file(section: Settings, place: Place, references: References, *, whole: bool = True) -> dict[str, Any]:
+    """A section in the format of a file, JSON-ready: loading it gives an equal section.
+
+    Defaults are written (unless the section is recorded as given), numbers keep all digits, paths are absolute, and
+    sections from other files are included.
 
     Args:
-        file: the file's content, without problems.
-        root: place of the file's root.
+        section: the section, without problems.
+        place: place of the section.
         references: the references that read its other files.
-        directory: parent folder of its runs.
+        whole: whether defaults are included.
     """
-    record = as_file(file, root, references)
-    record["outputs"]["directory"] = str(directory)
-    return record
+    whole = whole and not section.recorded_as_given
+    return _Writer(references, whole).section(section.completed() if whole else section, place)
+
+
+@dataclass(frozen=True)
+class _Writer:
+    references: References
+    whole: bool
+
+    def section(self, section: Settings, place: Place) -> dict[str, Any]:
+        table: dict[str, Any] = {}
+        for key, name in section.written_keys().items():
+            value, info = getattr(section, name), type(section).model_fields[name]
+            if value is None or not (self.whole or name in section.model_fields_set):
+                continue
+            found = self._value(value, info.annotation, tuple(info.metadata), place.at(key))
+            if found != {}:  # an empty mapping has no content and could conflict with other keys
+                table[key] = found
+        return table
+
+    def _value(self, value: Any, annotation: Any, metadata: tuple[Any, ...], place: Place) -> Any:
+        if isinstance(value, Settings):
+            return as_file(value, place, self.references, whole=self.whole)
+        if isinstance(value, str):
+            return self._text(value, annotation, metadata, place)
+        if isinstance(value, Mapping):
+            return {key: self._value(item, Any, (), place.at(key)) for key, item in value.items()}
+        if isinstance(value, list | tuple):
+            hints = _items(annotation, len(value))
+            return [self._value(value[i], hint, (), place.at(i)) for i, hint in enumerate(hints)]
+        if isinstance(value, float) and (quantity := _find(Quantity, annotation, metadata)) is not None:
+            if quantity.unit != "1":
+                return f"{value!r} {quantity.unit}"
+            return round(value) if quantity.whole else value
+        return value
+
+    def _text(self, value: str, annotation: Any, metadata: tuple[Any, ...], place: Place) -> Any:
+        if _find(FieldMark, annotation, metadata) == IN_FILE:
+            return str(resolved(place.directory / value))
+        model = _behind_a_path(annotation)
+        found = None if model is None else self.references.section(value, place, model)
+        return value if found is None else as_file(*found, self.references, whole=self.whole)
+
+
+def _parts(annotation: Any) -> list[tuple[Any, tuple[Any, ...]]]:
+    """The alternatives of an annotation, each with its metadata: the members of unions, the content of Annotated."""
+    origin = typing.get_origin(annotation)
+    if origin is typing.Annotated:
+        inner, *metadata = typing.get_args(annotation)
+        return [(part, (*own, *metadata)) for part, own in _parts(inner)]
+    if origin in (typing.Union, type(int | str)):
+        return [found for part in typing.get_args(annotation) for found in _parts(part)]
+    return [(annotation, ())]
+
+
+def _behind_a_path(annotation: Any) -> type[Settings] | None:
+    """The section that may be in its own file, referenced by a path."""
+    for part, metadata in _parts(annotation):
+        if any(isinstance(m, Tag) and m.tag == "inline" for m in metadata):
+            return typing.cast("type[Settings]", part)
+    return None
+
+
+def _find(kind: type[T], annotation: Any, metadata: tuple[Any, ...]) -> T | None:
+    """The first metadata of one kind in an annotation."""
+    every = [*metadata, *(m for _, own in _parts(annotation) for m in own)]
+    return next((m for m in every if isinstance(m, kind)), None)
+
+
+def _items(annotation: Any, count: int) -> list[Any]:
+    """Annotations of the items of a list or tuple."""
+    for part, _ in _parts(annotation):
+        if typing.get_origin(part) in (list, tuple):
+            inner = [hint for hint in typing.get_args(part) if hint is not Ellipsis]
+            return inner if len(inner) == count else inner[:1] * count
+    return [Any] * count

@@ -12,8 +12,8 @@ from typing import Any
 
 from actors.optimizer.questions import Linear
 from orchestrator.config.action_assignments import parse_constraint
-from orchestrator.config.action_ranges import EXAMPLES, ActionsBase, MotionBase
 from orchestrator.config.campaign_file import CampaignFile
+from orchestrator.config.search_ranges import EXAMPLES, ActionsBase, MotionBase
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.yaml_errors import dotted
 from orchestrator.config.yaml.yaml_source import Place, Report

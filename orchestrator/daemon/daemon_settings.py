@@ -22,7 +22,7 @@ from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from orchestrator.daemon.notifications import NotifySection, problem_of
-from sim_engine.settings.model import Count, FilePath, Name, PositiveCount, Section, Switch, Text
+from sim_engine.settings.model import Count, FilePath, Name, PositiveCount, Settings, Switch, Text
 from sim_engine.settings.quantity import Quantity
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -37,7 +37,7 @@ Port = Annotated[int, Field(strict=True, ge=0, le=65535)]
 DAY = 86400.0
 
 
-class TlsSection(Section):
+class TlsSection(Settings):
     """A TLS certificate, for addresses that other machines can reach."""
 
     required: ClassVar[dict[str, str]] = {"certificate": "decant.crt", "key": "decant.key"}
@@ -49,7 +49,7 @@ class TlsSection(Section):
     """Its private key (PEM)."""
 
 
-class ListenSection(Section):
+class ListenSection(Settings):
     """Address of the API. By default, only this machine can reach it."""
 
     host: Text = "127.0.0.1"
@@ -68,7 +68,7 @@ class ListenSection(Section):
     """Largest request: a campaign with all files that it refers to."""
 
 
-class LiveSection(Section):
+class LiveSection(Settings):
     """A live view of running campaigns for browsers."""
 
     host: Text = "127.0.0.1"
@@ -78,7 +78,7 @@ class LiveSection(Section):
     """TCP port of the viewer's page; by default the usual one or the next free one."""
 
 
-class RecordingsSection(Section):
+class RecordingsSection(Settings):
     """Retention of recordings (`.rrd`). Journals, figures and summaries are always kept."""
 
     keep: Count | None = None
@@ -88,7 +88,7 @@ class RecordingsSection(Section):
     """Largest age of a recording; unlimited by default."""
 
 
-class DaemonFile(Section):
+class DaemonFile(Settings):
     """Settings of a daemon."""
 
     state: FilePath | None = None

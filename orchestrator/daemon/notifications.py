@@ -18,7 +18,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
-from sim_engine.settings.model import Section, Text
+from sim_engine.settings.model import Settings, Text
 from sim_engine.settings.quantity import Quantity
 
 QUEUE = 50
@@ -50,7 +50,7 @@ _EVENTS_WITH_DATA = (
 _log = logging.getLogger(__name__)
 
 
-class NotifySection(Section):
+class NotifySection(Settings):
     """Notifications by mail, webhook or chat."""
 
     required: ClassVar[dict[str, str]] = {"to": "['mailtos://user:password@smtp.example.org?to=me@example.org']"}

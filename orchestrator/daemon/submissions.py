@@ -161,7 +161,7 @@ def run_request(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunReque
     plan = load_confined(folder / CAMPAIGN, [folder.resolve()], rig.source)
     theta = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
     # A daemon never repeats a pour by itself: it asks the operator, whatever the campaign says.
-    plan = replace(plan, on_unknown="ask", outputs=replace(plan.outputs, directory=settings.runs))
+    plan = replace(plan, on_unknown="ask", outputs=plan.outputs.model_copy(update={"directory": str(settings.runs)}))
     request = task_request(plan, item.verb, given=theta)  # type: ignore[arg-type]  # written by us
     if item.run is None:
         return request

@@ -85,7 +85,7 @@ def loss_unit(loss: Loss) -> LossUnit:
 def named_loss_unit(name: str) -> LossUnit:
     """Display unit of a loss that is known only by name; other names are shares."""
     names: tuple[str, ...] = get_args(LossName)
-    return loss_unit(Loss(cast("LossName", name))) if name in names else SPILLAGE
+    return loss_unit(Loss(name=cast("LossName", name))) if name in names else SPILLAGE
 
 
 def deployment_unit(plan: DeploymentPlan) -> LossUnit:

@@ -17,8 +17,8 @@ from orchestrator.journal.codec import to_json
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.liquids import Liquid
 from sim_engine.scene import Scene
-from sim_engine.settings.model import BY_CONTENT, FREE, marks_of
-from sim_engine.vessel.shapes import ProfileShape
+from sim_engine.settings.model import BY_CONTENT, NOT_IN_FINGERPRINT, SET_BY_PROGRAM, marks_of
+from sim_engine.vessel.shapes import ProfileShape, Shape
 
 
 def fingerprint(plan: CampaignPlan) -> dict[str, Any]:
@@ -47,13 +47,16 @@ def deciding(value: Any) -> Any:
         CodecError: the value contains something that JSON can't represent.
     """
     if isinstance(value, BaseModel) or (dataclasses.is_dataclass(value) and not isinstance(value, type)):
+        if isinstance(value, ProfileShape):
+            value = value.outline()  # lengths in any unit are the same
         free = value.free_fields() if isinstance(value, Liquid | ProfileShape) else frozenset()
         fields = {
             name: (getattr(value, name), mark)
             for name, mark in marks_of(type(value)).items()
-            if mark != FREE and name not in free
+            if mark not in (NOT_IN_FINGERPRINT, SET_BY_PROGRAM) and name not in free
         }
-        return {
+        kind = {"kind": value.kind} if isinstance(value, Shape) else {}
+        return kind | {
             name: hashlib.sha256(found.read_bytes()).hexdigest() if mark == BY_CONTENT else deciding(found)
             for name, (found, mark) in fields.items()
         }

@@ -45,7 +45,7 @@ def create_run(plan: CampaignPlan) -> Path:
         NoSpaceError: there is too little space for a run.
         OSError: the directory can't be created.
     """
-    parent = plan.outputs.directory
+    parent = plan.outputs.folder
     require_space(parent, TO_BEGIN, "to begin a run")
     parent.mkdir(parents=True, exist_ok=True)
     name = plan.name if plan.laboratory.mode == "virtual" else f"{plan.name}-{plan.laboratory.mode}"
@@ -127,7 +127,7 @@ def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
         RunNotFoundError: no such run, or no unfinished run.
         JournalDamagedError: its journal has lost or changed entries, so that resuming it could repeat pours.
     """
-    parent = plan.outputs.directory
+    parent = plan.outputs.folder
     if run_id is not None:
         directory = parent / run_id
         if not has_begun(directory / JOURNAL_NAME):

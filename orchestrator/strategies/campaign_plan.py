@@ -29,7 +29,16 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import MINIMUM_POURED, Loss
 from sim_engine.scene import PoseError, Scene
 from sim_engine.search_space import Space
-from sim_engine.settings.model import FREE, PourCount, Problems, Section
+from sim_engine.settings.model import (
+    NOT_IN_FINGERPRINT,
+    FilePath,
+    PourCount,
+    Problems,
+    Settings,
+    SimulationCount,
+    Switch,
+)
+from sim_engine.settings.quantity import Quantity
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,7 +47,7 @@ if TYPE_CHECKING:
     from orchestrator.strategies.strategy import Strategy
 
 
-class StrategySettings(Section):
+class StrategySettings(Settings):
     """Settings that all strategies have in common."""
 
     tag: ClassVar[str] = "strategy"
@@ -66,6 +75,8 @@ class StrategySettings(Section):
 
 class CalibrationSettings(StrategySettings):
     """Settings of a calibration, which fits θ to the weighed spills."""
+
+    default_tag: ClassVar[str] = "C4"
 
     has_prior: ClassVar[bool] = False
     """Whether the strategy averages over a prior of actions, so that `actions` may define one."""
@@ -265,7 +276,7 @@ class RecordSet:
 
     scene: Scene
     pours: tuple[RecordedPour, ...]
-    path: Annotated[Path, FREE]
+    path: Annotated[Path, NOT_IN_FINGERPRINT]
     lip_radius: float | None = None
     columns: dict[str, str] = field(default_factory=dict)
 
@@ -288,7 +299,7 @@ class ExistingPours:
     """
 
     pours: dict[str, tuple[RecordedPour, ...]]
-    path: Annotated[Path, FREE]
+    path: Annotated[Path, NOT_IN_FINGERPRINT]
     counts: bool = False
     left_out: tuple[str, ...] = ()
     lip_radius: float | None = None
@@ -437,22 +448,28 @@ class DeploymentPlan(StagePlan):
         return self.loss.name if self.objectives is None else "objectives"
 
 
-@dataclass(frozen=True)
-class OutputPlan:
-    """Outputs in addition to the journal.
+class OutputSettings(Settings):
+    """Outputs in addition to the journal."""
 
-    Attributes:
-        directory: parent directory; each run gets a folder in it.
-        rrd, figures: whether the recording and the figures are made.
-        record_rate: frames of a recorded simulation per simulated second [1/s]; 0 records none.
-        recorded_simulations: number of simulations of a stage that keep their frames.
-    """
+    directory: FilePath | None = None
+    """Folder of the runs; 'runs' in the working directory unless given."""
 
-    directory: Path
-    rrd: bool = True
-    figures: bool = True
-    record_rate: float = 10.0
-    recorded_simulations: int = 6
+    rrd: Switch = True
+    """Write a recording for the viewer."""
+
+    figures: Switch = True
+    """Write figures at the end."""
+
+    record_rate: Annotated[float, Quantity("1/s", "10 1/s", 0.0, 10.0)] = 10.0
+    """Frames of particles per simulated second."""
+
+    recorded_simulations: SimulationCount = 6
+    """Number of simulations that are recorded with their particles."""
+
+    @property
+    def folder(self) -> Path:
+        """Parent of the runs' folders; absolute in the plan of a campaign."""
+        return Path(self.directory or "runs")
 
 
 @dataclass(frozen=True)
@@ -471,16 +488,16 @@ class CampaignPlan:
 
     name: str
     seed: int
-    source: Annotated[Path, FREE]
+    source: Annotated[Path, NOT_IN_FINGERPRINT]
     laboratory: LaboratorySpec
     parameters: SimulationParameters
     calibration: CalibrationPlan | None
     deployment: DeploymentPlan | None
-    outputs: Annotated[OutputPlan, FREE]
+    outputs: Annotated[OutputSettings, NOT_IN_FINGERPRINT]
     parallel_simulations: int = 2
-    on_unknown: Annotated[Literal["ask", "repeat"], FREE] = "ask"
-    resolved: Annotated[dict[str, Any], FREE] = field(default_factory=dict)
-    laboratory_source: Annotated[Path | None, FREE] = field(default=None, compare=False)
+    on_unknown: Annotated[Literal["ask", "repeat"], NOT_IN_FINGERPRINT] = "ask"
+    resolved: Annotated[dict[str, Any], NOT_IN_FINGERPRINT] = field(default_factory=dict)
+    laboratory_source: Annotated[Path | None, NOT_IN_FINGERPRINT] = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from orchestrator.strategies.calibration.calibration_scores import CalibrationEv
 from orchestrator.strategies.calibration.pointwise_calibration import C1Settings
 from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.calibration.pour_design import DesignedPours, DesignPoured, draw_allowed, stratified
-from orchestrator.strategies.campaign_plan import CampaignPlan, OutputPlan, RecordedPour, RecordSet
+from orchestrator.strategies.campaign_plan import CampaignPlan, OutputSettings, RecordedPour, RecordSet
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.strategy import Strategy
@@ -71,7 +71,9 @@ def _planned(
         name=cell.id,
         seed=cell.seed,
         laboratory=replace(base.laboratory, bench=bench),
-        outputs=OutputPlan(directory, rrd=False, figures=False, record_rate=0.0, recorded_simulations=0),
+        outputs=OutputSettings(
+            directory=str(directory), rrd=False, figures=False, record_rate=0.0, recorded_simulations=0
+        ),
         on_unknown="repeat",
     )
     match cell.kind:

@@ -19,13 +19,13 @@ from pydantic import Field, create_model
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.laboratory_file import HiddenLiquid, LaboratoryFile
-from orchestrator.config.parameter_ranges import Parameters, ParametersBase
+from orchestrator.config.run_snapshot import as_file
+from orchestrator.config.search_ranges import Parameters, ParametersBase
 from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
-from orchestrator.config.yaml.yaml_writer import as_file
 from orchestrator.strategies.calibration.continuous_calibration import C4Settings
 from orchestrator.strategies.calibration.pointwise_calibration import C1Settings, C2Settings, C3Settings
 from orchestrator.strategies.campaign_plan import CampaignPlan, StrategySettings
@@ -47,14 +47,14 @@ from sim_engine.settings.model import (
     PositivePourCount,
     PositiveSimulationCount,
     PourCount,
-    Section,
     Seed,
+    Settings,
     SimulationCount,
     Text,
 )
 
 
-class ArmSection(Section):
+class ArmSection(Settings):
     """A compared strategy: its number of repetitions and its budget."""
 
     required: ClassVar[dict[str, str]] = {"repetitions": "10"}
@@ -117,7 +117,7 @@ class C4ActiveArmSection(_arm(C4Settings, "simulations", "initial", "kappa", sim
         return {name: value for name, value in super().changes().items() if name in C4Settings.model_fields}
 
 
-class CalibrationsBase(Section):
+class CalibrationsBase(Settings):
     """The compared calibrations."""
 
     C1: C1Arm | None = None
@@ -140,7 +140,7 @@ class CalibrationsBase(Section):
     """C4 on fewer pours that are chosen actively. It is compared only; no deployment uses it."""
 
 
-class DeploymentsBase(Section):
+class DeploymentsBase(Settings):
     """The compared deployments, into each of the base campaign's receivers."""
 
     D1: D1ArmSection | None = None
@@ -159,7 +159,7 @@ class DeploymentsBase(Section):
     """D3 as in the paper: a GP of the residual around the simulations' mean, without a check."""
 
 
-def _with_others(base: type[Section], installed: Mapping[str, type[StrategySettings]]) -> Any:
+def _with_others(base: type[Settings], installed: Mapping[str, type[StrategySettings]]) -> Any:
     """Add a key for each strategy of an installed package, with the settings of the strategy."""
     fields: Any = {}
     for name, settings in installed.items():
@@ -167,7 +167,7 @@ def _with_others(base: type[Section], installed: Mapping[str, type[StrategySetti
             own = settings.model_fields.keys() - {"strategy"}
             meaning = settings.model_fields["strategy"].description
             fields[name] = (_arm(settings, *sorted(own)) | None, Field(None, description=meaning))
-    name = base.__name__.replace("Base", "Section")
+    name = base.__name__.replace("Base", "Settings")
     return create_model(name, __base__=base, __doc__=base.__doc__, __cls_kwargs__=MADE, **fields)
 
 
@@ -175,7 +175,7 @@ CalibrationsSection: Any = _with_others(CalibrationsBase, calibrations())
 DeploymentsSection: Any = _with_others(DeploymentsBase, deployments())
 
 
-class LevelSection(Section):
+class LevelSection(Settings):
     """Level of mismatch between the bench and the simulator."""
 
     required: ClassVar[dict[str, str]] = {"name": "moderate", "liquid": "{particles: 4000, cohesion: 0.05 N/m}"}
@@ -193,7 +193,7 @@ class LevelSection(Section):
     """Scatter of the pose error, drawn for each pour."""
 
 
-class StudyFile(Section):
+class StudyFile(Settings):
     """A study: repeated and compared calibrations and deployments of a campaign."""
 
     required: ClassVar[dict[str, str]] = {
@@ -213,7 +213,7 @@ class StudyFile(Section):
     laboratory: PathOr[LaboratoryFile] | None = None
     """Laboratory that replaces the campaign's: a virtual one with a bench, simulated directly or over wires."""
 
-    parameters: Parameters | None = None  # type: ignore[valid-type]
+    parameters: Parameters | None = None
     """Parameters that replace the campaign's of the same names: a value fixes one, a range searches it."""
 
     search: list[Text] | None = None

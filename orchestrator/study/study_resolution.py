@@ -22,7 +22,7 @@ from orchestrator.study.study_plan import ALL, CalibrationArm, DeploymentArm, Le
 from sim_engine.scene import PoseError
 
 if TYPE_CHECKING:
-    from sim_engine.settings.model import Section
+    from sim_engine.settings.model import Settings
 
 HARDWARE = (
     "laboratory '{}' is hardware. An arm moves only for one run, after '--arm' and with a person beside it; the cells "
@@ -67,7 +67,7 @@ def bench_of(laboratory: LaboratorySpec, at: Place, report: Report) -> VirtualBe
     return None
 
 
-def written_levels(sections: Sequence[Section] | None, root: Place, report: Report) -> list[Any] | None:
+def written_levels(sections: Sequence[Settings] | None, root: Place, report: Report) -> list[Any] | None:
     """The complete levels of mismatch; None if the file has none. Problems are added to the report."""
     found: list[Any] = []
     if sections is not None and not sections:
@@ -100,7 +100,7 @@ def levels_of(written: Sequence[Any] | None, laboratory: str, bench: VirtualBenc
 
 
 def calibration_arms(
-    section: Section | None,
+    section: Settings | None,
     base: CalibrationPlan,
     train: int,
     levels: tuple[str, ...],
@@ -148,7 +148,7 @@ def calibration_arms(
 
 
 def deployment_arms(
-    section: Section | None,
+    section: Settings | None,
     base: DeploymentPlan | None,
     calibrated: tuple[CalibrationArm, ...],
     root: Place,

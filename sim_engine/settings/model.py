@@ -1,10 +1,12 @@
-"""Common base of the sections of all files: strict keys, required keys, and values that may be in another file.
+"""Declaration of settings: a `Settings` class is both the mapping in a file and the value that the program uses.
 
-- `Section` is a mapping in a file; `tagged`, `word_or` and `Choice` make its variants. `Problems` collects errors with
-  their positions.
-- Types such as `Count`, `Name` and `FilePath` validate single values.
-- `FieldMark`s state how a field enters a run's fingerprint: `Annotated[Path, FREE]` on a field of a dataclass or a
-  pydantic model. The fingerprint reads them with `marks_of`.
+- A field without default is a required key. `Annotated[float, Quantity(…)]` converts units; types such as `Count`,
+  `Name` and `FilePath` validate single values; `tagged` and `Choice` make variants.
+- `Settings.check_values` holds the rules between keys. `Problems` collects their errors with positions in the file.
+- A file is validated with the context `FROM_FILE`: units are mandatory. Missing keys become None, so that all errors
+  are found in one pass (`orchestrator.config.yaml.section_validation`).
+- `FieldMark`s state how a field enters files and a run's fingerprint: `Annotated[Path, NOT_IN_FINGERPRINT]` on a field
+  of a dataclass or a pydantic model. `marks_of` returns them.
 """
 
 from __future__ import annotations
@@ -28,9 +30,15 @@ from pydantic import (
     GetJsonSchemaHandler,
     Strict,
     Tag,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+    model_validator,
 )
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError, PydanticKnownError, core_schema
+
+from sim_engine.settings.quantity import FROM_FILE, Quantity
 
 
 @dataclass(frozen=True)
@@ -40,11 +48,24 @@ class FieldMark:
     meaning: str
 
 
-FREE = FieldMark("decides no request")
+NOT_IN_FINGERPRINT = FieldMark("decides no request")
 """The field may change when a run is resumed: no request depends on it."""
+
+SET_BY_PROGRAM = FieldMark("set by the program")
+"""The field is no key of files; a program sets it from other settings. It is not part of the fingerprint."""
 
 BY_CONTENT = FieldMark("a file that matters by its content")
 """The field is the path of a file, which may move; the file's content matters."""
+
+
+@dataclass(frozen=True)
+class Example:
+    """Pydantic annotation: a valid value of a required key, for the message about a missing one.
+
+    A field without this annotation has the example of its `Quantity`.
+    """
+
+    text: str
 
 
 @functools.cache
@@ -216,12 +237,18 @@ class Problems(Protocol):
     def any(self) -> bool:
         """Whether these settings have a problem."""
 
+    def valid(self, *keys: str) -> bool:
+        """Whether none of these keys, or keys below them, has a problem; a missing required key has one."""
 
-class Section(BaseModel):
-    """A mapping in a file.
+    def within(self, *at: str | int) -> Problems:
+        """The same collection for the settings at a position, given by keys from these settings down to it."""
 
-    Every field is optional for pydantic; `required` names the mandatory keys. Thus a section with one invalid value
-    still takes part in the checks of the others, and all errors of a file are reported at once.
+
+class Settings(BaseModel):
+    """A mapping in a file, and the frozen value that the program uses.
+
+    A file's mapping is first a draft: required keys that are missing, and invalid ones, are None. Drafts take part in
+    `check_values`, so that all errors of a file are reported at once. The program receives it only without problems.
     """
 
     model_config = ConfigDict(
@@ -229,16 +256,22 @@ class Section(BaseModel):
     )
 
     required: ClassVar[dict[str, str]] = {}
-    """Mandatory keys, each with an example."""
+    """Keys that are mandatory in files although their fields have defaults, each with an example."""
 
     retired: ClassVar[dict[str, str]] = {}
-    """Keys, and values as 'key: value', of earlier versions, each with what to write instead."""
+    """Renamed keys of earlier versions, 'old key' → 'new key', and values, 'key: old value' → 'key: new value'."""
+
+    removed: ClassVar[dict[str, str]] = {}
+    """Keys, and values as 'key: value', of earlier versions without a counterpart, each with what to do instead."""
 
     recorded_as_given: ClassVar[bool] = False
     """Whether a run's record omits keys that were omitted, because some keys exclude others."""
 
     tag: ClassVar[str] = ""
-    """Key that distinguishes the variants of a tagged union; empty for a section without variants."""
+    """Key that distinguishes the variants of a tagged union; empty for settings without variants."""
+
+    default_tag: ClassVar[str] = ""
+    """The variant that is meant if that key is missing; empty if the key is required."""
 
     variant: ClassVar[str] = ""
     """For a variant under its own key: the name of the group of variants, so that keys of its siblings are known."""
@@ -249,9 +282,33 @@ class Section(BaseModel):
         return ""
 
     @classmethod
+    def tag_word(cls) -> str:
+        """The word that selects this variant."""
+        return cls.variant or str(cls.model_fields[cls.tag].default)
+
+    @classmethod
     def written_keys(cls) -> dict[str, str]:
         """Keys as written in files, mapped to field names."""
-        return {field.alias or name: name for name, field in cls.model_fields.items()}
+        marks = marks_of(cls)
+        return {field.alias or name: name for name, field in cls.model_fields.items() if marks[name] != SET_BY_PROGRAM}
+
+    @classmethod
+    def required_keys(cls) -> dict[str, str]:
+        """Keys that are mandatory in files, each with an example."""
+        found = dict(cls.required)
+        if cls.tag in cls.model_fields and not cls.variant and (word := cls.tag_word()) != cls.default_tag:
+            found.setdefault(cls.tag, word)
+        for key, name in cls.written_keys().items():
+            if (field := cls.model_fields[name]).is_required():
+                found.setdefault(key, _example(field.metadata))
+        return found
+
+    def check_values(self, problems: Problems) -> None:
+        """Add a problem for each combination of values in a file that is invalid.
+
+        Values that are invalid by themselves have been reported. The settings are a draft: ask `problems.valid` for a
+        key before you use the value of a required key.
+        """
 
     def completed(self) -> Self:
         """A copy with the implied values of omitted keys, for a run's record."""
@@ -261,27 +318,60 @@ class Section(BaseModel):
         """Value of a key as written in files; None if it was not given."""
         return getattr(self, self.written_keys()[key])
 
+    def with_values(self, **changes: Any) -> Self:
+        """A copy with other values of some fields, which are not validated."""
+        return self.model_copy(update=changes)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_draft(cls, data: Any, info: ValidationInfo) -> Any:
+        """The data of a file with `MISSING` for required keys that it lacks."""
+        if info.context is not FROM_FILE or not isinstance(data, Mapping):
+            return data
+        keys = {field.alias or name for name, field in cls.model_fields.items() if field.is_required()}
+        return dict.fromkeys(keys - data.keys(), MISSING) | dict(data)
+
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _in_file(cls, value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+        """Let `MISSING` pass as None, and refuse keys that only a program sets."""
+        if info.context is FROM_FILE:
+            if value is MISSING:
+                return None
+            if marks_of(cls)[str(info.field_name)] == SET_BY_PROGRAM:
+                raise PydanticKnownError("extra_forbidden")
+        return handler(value)
+
+
+MISSING = object()
+"""Stands for the value of a missing required key while a draft is validated."""
+
+
+def _example(metadata: Sequence[Any]) -> str:
+    given = next((m.text for m in metadata if isinstance(m, Example)), None)
+    return given or next((m.example for m in metadata if isinstance(m, Quantity)), "…")
+
 
 MADE: dict[str, Any] = {"use_attribute_docstrings": False}
 """For sections made from tables: no source is searched for the keys' meanings, which takes a second."""
 
-S = TypeVar("S", bound=Section)
+S = TypeVar("S", bound=Settings)
 
 
 def _form(value: Any) -> str:
     return "path" if isinstance(value, str) else "inline"
 
 
-def tagged(variants: Mapping[str, type[Section]], *, default: str = "") -> Any:
-    """One of several sections, distinguished by their `tag` key: `{strategy: D3, …}`.
+def tagged(variants: Mapping[str, type[Settings]]) -> Any:
+    """One of several kinds of settings, distinguished by their `tag` key: `{strategy: D3, …}`.
 
     Args:
-        variants: by the value of that key; two or more.
-        default: the variant used if the key is missing; without a default the key is mandatory.
+        variants: by the value of that key; two or more. If it is missing, their `default_tag` is meant.
     """
     if not variants:
         raise RuntimeError("Decant's own entry points are not registered; install it again (pip install -e .)")
-    key = next(iter(variants.values())).tag
+    first = next(iter(variants.values()))
+    key, default = first.tag, first.default_tag
 
     def word(value: Any) -> str | None:
         found = value.get(key, default) if isinstance(value, Mapping) else getattr(value, key, None)
@@ -318,7 +408,9 @@ class SchemaGenerator(GenerateJsonSchema):
     def model_schema(self, schema: Any) -> JsonSchemaValue:
         """The schema with the keys that the section requires."""
         form = super().model_schema(schema)
-        required = getattr(schema["cls"], "required", {})
-        if required:
+        model = schema["cls"]
+        if issubclass(model, Settings) and (required := model.required_keys()):
             form["required"] = list(required)
+        for name in [name for name, mark in marks_of(model).items() if mark == SET_BY_PROGRAM]:
+            form["properties"].pop(name, None)
         return form

@@ -27,7 +27,7 @@ POURER = cylinder("beaker", inner_radius=LIP_RADIUS, inner_height=0.10)
 def _profile(name: str, wall: float, *inner: tuple[float, float]) -> VesselSpec:
     """A vessel of revolution from millimetres."""
     points = tuple((1e-3 * r, 1e-3 * z) for r, z in inner)
-    return VesselSpec(name=name, shape=ProfileShape(inner=points, wall=1e-3 * wall, floor=0.004))
+    return VesselSpec(name=name, shape=ProfileShape(unit="m", inner=points, wall=1e-3 * wall, floor=0.004))
 
 
 TUMBLER = cylinder("tumbler", inner_radius=0.032, inner_height=0.10)

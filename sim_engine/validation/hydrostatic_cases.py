@@ -202,7 +202,7 @@ def straight_cup() -> Vessel:
 
 def conical_cup() -> Vessel:
     """A cup that widens from 25 mm to 45 mm, 410 mL."""
-    shape = ProfileShape(inner=((0.0, 0.0), (0.025, 0.0), (0.045, 0.10)), wall=0.003, floor=0.004)
+    shape = ProfileShape(unit="m", inner=((0.0, 0.0), (0.025, 0.0), (0.045, 0.10)), wall=0.003, floor=0.004)
     return build_vessel(VesselSpec(name="cone", shape=shape))
 
 

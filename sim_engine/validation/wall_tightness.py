@@ -43,6 +43,7 @@ def random_vessel(rng: np.random.Generator, name: str, radius: tuple[float, floa
     top = bottom * float(rng.uniform(1.0, 1.4))
     height = float(rng.uniform(0.06, 0.12))
     shape = ProfileShape(
+        unit="m",
         inner=((0.0, 0.0), (bottom, 0.0), (top, height)),
         wall=float(np.exp(rng.uniform(np.log(1e-3), np.log(4e-3)))),
         floor=float(np.exp(rng.uniform(np.log(1e-3), np.log(4e-3)))),

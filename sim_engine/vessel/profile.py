@@ -42,11 +42,6 @@ def check_profile(shape: ProfileShape) -> Floats:
     inner = np.array(shape.inner, dtype=float).reshape(-1, 2)
     if len(inner) < 2:
         raise VesselError(f"the profile has {len(inner)} point(s); it needs at least the floor's centre and the rim")
-    if not np.all(np.isfinite(inner)) or not np.isfinite([shape.wall, shape.floor]).all():
-        raise VesselError("the profile, wall and floor must be finite numbers")
-    for what, value in (("wall", shape.wall), ("floor", shape.floor)):
-        if value <= 0.0:
-            raise VesselError(f"the {what} is {1e3 * value:g} mm thick; it must be thicker than 0")
     if np.any(inner[:, 0] < -TOLERANCE):
         bad = inner[int(np.argmin(inner[:, 0]))]
         raise VesselError(f"the profile has the negative radius of {_mm(bad)}; radii are distances from the axis")

@@ -12,34 +12,37 @@ import hashlib
 import random
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, SerializeAsAny
+from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny
 
 from sim_engine.errors import DecantError
-from sim_engine.settings.model import BY_CONTENT
-from sim_engine.settings.plugin_registry import PluginError, PluginRegistry
+from sim_engine.settings.model import BY_CONTENT, NOT_IN_FINGERPRINT, Example, Number, Problems, Settings
+from sim_engine.settings.plugin_registry import PluginRegistry
+from sim_engine.settings.quantity import Quantity, parse_quantity
 
 LengthUnit = Literal["m", "cm", "mm", "in"]
+
+Thickness = Annotated[float, Quantity("m", "4 mm", lower=2e-4, upper=0.1)]
+
+Point = Annotated[tuple[Number, Number], Field(description="[r, z]")]
 
 NARROWEST = 2e-4
 """Smallest radius of drawn profiles [m], since a negative radius is impossible."""
 
 
-class Shape(BaseModel):
-    """A source of vessels: a small value that defines a shape and builds a vessel from it.
+class Shape(Settings):
+    """A source of vessels: the settings that define a shape, from which a vessel is built.
 
-    To add one, derive a class from this one and register it in `decant.vessels` under its `kind`. It has an `outline`
-    if it is a surface of revolution, else it has `build`.
+    To add one, derive a class from this one and register it in `decant.vessels` under its `kind`, which is also its key
+    in a vessel's file. It has an `outline` if it is a surface of revolution, else it has `build`.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    kind: str = ""
-    """The source; a literal in each class, and its name in the registry."""
+    kind: ClassVar[str] = ""
+    """The source: its name in the registry."""
 
     def outline(self) -> ProfileShape | None:
-        """Its profile, if it is a surface of revolution; exact distances and quadrature follow from it.
+        """Its profile in metres, if it is a surface of revolution; exact distances and quadrature follow from it.
 
         Raises:
             VesselError: the settings define no vessel; the text states valid ones.
@@ -48,7 +51,7 @@ class Shape(BaseModel):
 
     def content(self) -> bytes:
         """Everything that determines the geometry, for the cache's keys."""
-        return self.model_dump_json().encode()
+        return f"{self.kind} {self.model_dump_json()}".encode()
 
     def build(self, spec: VesselSpec, *, use_cache: bool) -> Any:
         """The `sim_engine.vessel.vessel.Vessel`, for a shape without an outline; see `build_vessel`."""
@@ -58,25 +61,74 @@ class Shape(BaseModel):
 
 
 class ProfileShape(Shape):
-    """Surface of revolution.
+    """A surface of revolution."""
 
-    `inner` runs from the axis at the inner floor to the rim, as (r, z) points [m], z measured from the inner floor's
-    lowest point; the wall is `wall` thick outwards and `floor` thick below.
+    kind: ClassVar[str] = "profile"
 
-    `radius_deviations` describes the uncertainty: each row is an independent mode, the outward displacement of each
-    point for one standard deviation [m]. `height_deviation` is that of the rim's height, all points moving in
-    proportion [m]."""
+    recorded_as_given: ClassVar[bool] = True
 
-    kind: Literal["profile"] = "profile"
-    inner: tuple[tuple[float, float], ...]
-    wall: float
-    floor: float
-    radius_deviations: tuple[tuple[float, ...], ...] = ()
-    height_deviation: float = 0.0
+    unit: Annotated[LengthUnit, Example("mm"), NOT_IN_FINGERPRINT]
+    """Unit of the numbers in `inner`."""
+
+    inner: Annotated[tuple[Point, ...], Example("[[0, 0], [40, 0], [40, 100]]")]
+    """The inner surface as [r, z] points, from the axis at the inner floor to the rim."""
+
+    wall: Thickness
+    """Thickness of the wall, outwards."""
+
+    floor: Thickness
+    """Thickness of the floor, downwards."""
+
+    radius_deviations: tuple[tuple[Number, ...], ...] = ()
+    """Uncertainty of the shape: a row for each independent deviation, with the outward displacement of each point of
+    `inner` at one standard deviation. Predictions of spillage use shapes drawn from it."""
+
+    height_deviation: Annotated[float, Quantity("m", "0.3 mm", lower=0.0, upper=0.02)] = 0.0
+    """Uncertainty of the rim's height, one standard deviation; all points move in proportion."""
+
+    def check_values(self, problems: Problems) -> None:
+        """Check the order of the points, the size, and the lengths of the rows of deviations."""
+        if not problems.valid("unit", "inner"):
+            return
+        points = self.outline().inner
+        if len(points) < 2:
+            problems.add("needs at least two [r, z] points: from the axis at the floor to the rim", "inner")
+            return
+        if points[0] != (0.0, 0.0):
+            problems.add("the first point is the inner floor on the axis and should be [0, 0]", "inner", 0)
+        for i, (point, before) in enumerate(zip(points[1:], points, strict=False), start=1):
+            if point[0] <= 0.0:
+                text = f"r = {self.inner[i][0]:g} should be above 0; only the first point is on the axis"
+                problems.add(text, "inner", i)
+            if point == before:
+                problems.add("is the same point as the one before; remove it", "inner", i)
+        if points[-1][1] <= max(z for _, z in points[:-1]):
+            problems.add("the last point is the rim and should be higher than all others", "inner", len(points) - 1)
+        largest = max(max(point) for point in points)
+        if not 0.005 <= largest <= 1.0:
+            size = f"{largest * 1e3:g} mm"
+            text = f"in {self.unit} the vessel would be {size} large; vessels are 5 mm … 1 m. Is it right?"
+            problems.add(text, "unit")
+        for i, row in enumerate(self.radius_deviations):
+            if len(row) != len(points):
+                text = f"has {len(row)} number(s); should have one for each of the {len(points)} points of 'inner'"
+                problems.add(text, "radius_deviations", i)
+
+    def content(self) -> bytes:
+        """See `Shape.content`."""
+        return f"{self.kind} {self.outline().model_dump_json(exclude={'unit'})}".encode()
 
     def outline(self) -> ProfileShape:
-        """See `Shape.outline`."""
-        return self
+        """See `Shape.outline`: the profile with all numbers in metres."""
+        if self.unit == "m":
+            return self
+        inner = tuple((self._metres(r), self._metres(z)) for r, z in self.inner)
+        scale = self._metres(1)
+        rows = tuple(tuple(scale * x for x in row) for row in self.radius_deviations)
+        return self.with_values(unit="m", inner=inner, radius_deviations=rows)
+
+    def _metres(self, number: float) -> float:
+        return parse_quantity(f"{number} {self.unit}", "m", "40 mm")
 
     @property
     def uncertain(self) -> bool:
@@ -85,16 +137,18 @@ class ProfileShape(Shape):
 
     def drawn(self, rng: random.Random) -> ProfileShape:
         """A shape drawn from the uncertainty, itself certain: one normal number for each mode."""
-        moved = [0.0] * len(self.inner)
-        for row in self.radius_deviations:
+        profile = self.outline()
+        moved = [0.0] * len(profile.inner)
+        for row in profile.radius_deviations:
             by = rng.gauss(0.0, 1.0)
             moved = [m + by * d for m, d in zip(moved, row, strict=True)]
-        stretch = 1.0 + rng.gauss(0.0, 1.0) * self.height_deviation / self.inner[-1][1]
+        stretch = 1.0 + rng.gauss(0.0, 1.0) * self.height_deviation / profile.inner[-1][1]
         # only the floor's centre lies on the axis
         inner = (
-            (max(r + m, NARROWEST) if r > 0.0 else r, z * stretch) for (r, z), m in zip(self.inner, moved, strict=True)
+            (max(r + m, NARROWEST) if r > 0.0 else r, z * stretch)
+            for (r, z), m in zip(profile.inner, moved, strict=True)
         )
-        return ProfileShape(inner=tuple(inner), wall=self.wall, floor=self.floor)
+        return ProfileShape(unit="m", inner=tuple(inner), wall=self.wall, floor=self.floor)
 
     def free_fields(self) -> frozenset[str]:
         """Fields that do not affect any request: the uncertainty, if it is not given."""
@@ -107,7 +161,7 @@ class MeshShape(Shape):
     `up` is the mesh axis that points out of the opening.
     """
 
-    kind: Literal["mesh"] = "mesh"
+    kind: ClassVar[str] = "mesh"
     path: Annotated[Path, BY_CONTENT]
     unit: LengthUnit | None = None
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
@@ -129,10 +183,8 @@ class MeshShape(Shape):
 def _shape(loaded: object, name: str) -> type[Shape]:
     if not (isinstance(loaded, type) and issubclass(loaded, Shape)):
         raise TypeError("should be a class derived from Shape")
-    if loaded.model_fields["kind"].default != name:
-        raise ValueError(
-            f"its field 'kind' should be Literal['{name}'] = '{name}', the name that it is registered under"
-        )
+    if loaded.kind != name:
+        raise ValueError(f"its 'kind' should be '{name}', the name that it is registered under")
     if loaded.outline is Shape.outline and loaded.build is Shape.build:
         raise TypeError(f"its class {loaded.__name__} lacks 'outline' or 'build'")
     return loaded
@@ -142,23 +194,13 @@ VESSELS: PluginRegistry[type[Shape]] = PluginRegistry("decant.vessels", "source 
 """All installed sources of vessels."""
 
 
-def _of_its_kind(value: Any) -> Any:
-    """Convert a written shape, by its kind."""
-    if not isinstance(value, dict):
-        return value
-    try:
-        return VESSELS.get(str(value.get("kind"))).model_validate(value)
-    except PluginError as error:
-        raise ValueError(str(error)) from None
-
-
 class VesselSpec(BaseModel):
     """A vessel by its name and the source of its shape."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
-    shape: Annotated[SerializeAsAny[Shape], BeforeValidator(_of_its_kind)]
+    shape: SerializeAsAny[Shape]
 
     @property
     def uncertain(self) -> bool:
@@ -193,7 +235,7 @@ def cylinder(
     return VesselSpec(
         name=name,
         shape=ProfileShape(
-            inner=((0.0, 0.0), (inner_radius, 0.0), (inner_radius, inner_height)), wall=wall, floor=floor
+            unit="m", inner=((0.0, 0.0), (inner_radius, 0.0), (inner_radius, inner_height)), wall=wall, floor=floor
         ),
     )
 

@@ -157,6 +157,7 @@ class FittedOutline:
         points = [(0.0, 0.0), *zip(at(self.radii), at(self.heights), strict=True)]
         deviations = tuple((0.0, *at(row)) for row in rows)
         return ProfileShape(
+            unit="m",
             inner=tuple(points),
             wall=self.wall,
             floor=self.floor,

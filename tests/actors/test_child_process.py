@@ -19,7 +19,7 @@ import pytest
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ChildProcess, ConnectedProcess, child_environment, run, run_async
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[2]
 PRODUCT = ("decant", "orchestrator", "actors", "sim_engine")

@@ -14,9 +14,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.end_to_end.small import CAMPAIGN, write_campaign
-from tests.local_cluster import LocalCluster
-from tests.patience import PATIENCE
+from tests.support.local_cluster import LocalCluster
+from tests.support.small_campaign import CAMPAIGN, write_campaign
+from tests.support.waiting import PATIENCE
 
 pytestmark = pytest.mark.ray
 
@@ -30,7 +30,7 @@ from actors.laboratory_settings import LaboratorySpec, RaySpec
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PourTask
-from tests.actors import conftest
+from tests.support import fake_simulator
 
 def say(*words):
     print(json.dumps(words), flush=True)
@@ -40,13 +40,13 @@ async def main(address, log):
     action = Action(angular_velocity=60 * DEG, x_offset=0.09, height=0.05, max_angle=100 * DEG, hold_time=0.5)
     spec = LaboratorySpec("far", ray=RaySpec(address))
     heard = []
-    laboratory = open_laboratory(spec, need_bench=False, make=conftest.make_fake(0.5, Path(log)))
-    ray.cloudpickle.register_pickle_by_value(conftest)
+    laboratory = open_laboratory(spec, need_bench=False, make=fake_simulator.make_fake(0.5, Path(log)))
+    ray.cloudpickle.register_pickle_by_value(fake_simulator)
     async with laboratory:
         laboratory.listen(lambda notice: (heard.append(notice.text), say("notice", notice.text)))
         pool = laboratory.simulators
         say("size", pool.size)
-        tasks = [PourTask(conftest.make_scene(), action, SimulationParameters(), seed) for seed in range(24)]
+        tasks = [PourTask(fake_simulator.make_scene(), action, SimulationParameters(), seed) for seed in range(24)]
         results = await asyncio.gather(*(pool.simulate(task) for task in tasks))
         say("seeds", [result.outcome.seed for result in results])
         while not any("is lost" in text for text in heard):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from actors.optimizer.questions import Data, SuggestProblem
 from actors.optimizer.suggest import propose
 from sim_engine.search_space import Axis, Space
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from actors.optimizer.questions import Data, Linear, SearchEffort, SuggestProblem
 from actors.optimizer.suggest import propose
 from sim_engine.search_space import Axis, Space
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 MEANS = ("constant", "zero", "simulated", "scaled")
 axes = st.sampled_from(

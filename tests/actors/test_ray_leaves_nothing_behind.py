@@ -20,7 +20,7 @@ from actors.laboratory_settings import LaboratorySpec
 from actors.runtime import private_ray as ray_private
 from actors.runtime import ray_runtime
 from actors.runtime.child_process import ChildProcess, child_environment
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 pytestmark = pytest.mark.ray
 

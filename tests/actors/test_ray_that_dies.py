@@ -26,7 +26,7 @@ from actors.simulators.shared_pool import WarmSimulators
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
 from sim_engine.scene import PourTask
-from tests.actors.conftest import make_scene
+from tests.support.fake_simulator import make_scene
 from sim_engine.action import Action
 from tests.reliability.formula import Formula
 

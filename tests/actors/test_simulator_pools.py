@@ -22,7 +22,7 @@ from actors.simulators import process_worker as processes
 from actors.simulators.local_worker import InProcessSimulatorPool
 from actors.simulators.pool import RaySimulatorPool
 from actors.simulators.process_worker import ProcessSimulatorPool
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 
 async def until(what, timeout=PATIENCE):

@@ -19,7 +19,7 @@ from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
 from sim_engine.action import DEG
 from sim_engine.outcome import PourOutcome
 from sim_engine.scene import PoseError
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ import psutil
 import pytest
 
 from orchestrator.journal.journal import Entry, Kind
-from tests.end_to_end import small
-from tests.end_to_end.command import (
+from tests.support import small_campaign
+from tests.support.command_process import (
     PATIENCE,
     ROOT,
     Workplace,
@@ -25,7 +25,7 @@ from tests.end_to_end.command import (
     pour_under_way,
     started_after_they_were_finished,
 )
-from tests.local_cluster import LocalCluster
+from tests.support.local_cluster import LocalCluster
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
@@ -34,7 +34,7 @@ RESUME = (*RUN, "--resume")
 CALIBRATION = 40
 """Simulations: enough for a node to be lost among them, and for another one to be of use."""
 
-LONGER = small.CAMPAIGN.replace("  simulations: 6\n", f"  simulations: {CALIBRATION}\n").replace("300", "800")
+LONGER = small_campaign.CAMPAIGN.replace("  simulations: 6\n", f"  simulations: {CALIBRATION}\n").replace("300", "800")
 SLOW_ARM = LONGER.replace("time_scale: 0", "time_scale: 20").replace(f"simulations: {CALIBRATION}", "simulations: 6")
 
 
@@ -54,7 +54,7 @@ def places(cluster: LocalCluster, tmp_path: Path) -> Iterator[Callable[[str, boo
         folder.mkdir()
         if on_cluster:
             campaign = campaign.replace("  simulators: 2\n", f"  ray: {{address: '{cluster.address}'}}\n")
-        small.write_campaign(folder, campaign)
+        small_campaign.write_campaign(folder, campaign)
         made.append(Workplace(folder, cluster.environment if on_cluster else None))
         return made[-1]
 

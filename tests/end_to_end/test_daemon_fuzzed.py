@@ -18,8 +18,8 @@ from schemathesis.specs.openapi.checks import (
 
 from orchestrator.daemon.access_control import Role
 from orchestrator.daemon.http_api import create_app
-from tests.depth import examples
-from tests.end_to_end.daemon_thread import Real
+from tests.support.daemon_thread import Real
+from tests.support.hypothesis_examples import examples
 
 pytestmark = pytest.mark.slow
 

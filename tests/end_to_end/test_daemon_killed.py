@@ -20,10 +20,10 @@ from orchestrator.daemon.access_control import Role, token_of
 from orchestrator.journal.codec import decode_outcome
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Poured
-from tests.end_to_end.command import ROOT, pour_under_way, started_after_they_were_finished
-from tests.end_to_end.small import CAMPAIGN, write_campaign
-from tests.orchestrator.daemon.browsing import browser
-from tests.patience import PATIENCE
+from tests.support.browser import browser
+from tests.support.command_process import ROOT, pour_under_way, started_after_they_were_finished
+from tests.support.small_campaign import CAMPAIGN, write_campaign
+from tests.support.waiting import PATIENCE
 
 pytestmark = pytest.mark.slow
 

@@ -20,9 +20,10 @@ from orchestrator.daemon.access_control import Role, token_of
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.journal.journal import Kind
 from orchestrator.runs.motion_approval import SafetyRecord, write_record
-from tests.end_to_end.command import pour_under_way
 from tests.end_to_end.test_daemon_killed import Laboratory, opened
-from tests.orchestrator import hardware
+from tests.support import hardware_laboratory
+from tests.support.command_process import pour_under_way
+from tests.support.loopback import free_address
 
 pytestmark = [pytest.mark.slow, pytest.mark.realtime]
 
@@ -32,9 +33,9 @@ SPILLED = 37.2e-3
 
 @pytest.fixture
 def controller() -> Iterator[VirtualController]:
-    joints = [radians(q) for q in hardware.HOME]
-    with VirtualController.start("127.82.9.4", "ur10", joints=joints) as started:
-        hardware.install(started)
+    joints = [radians(q) for q in hardware_laboratory.HOME]
+    with VirtualController.start(free_address(), "ur10", joints=joints) as started:
+        hardware_laboratory.install(started)
         yield started
 
 
@@ -47,10 +48,10 @@ def balance() -> Iterator[VirtualSerialBalance]:
 
 @pytest.fixture
 def laboratory(tmp_path: Path, controller: VirtualController, balance: VirtualSerialBalance) -> Iterator[Laboratory]:
-    hardware.write_rig(tmp_path, controller.address)
+    hardware_laboratory.write_rig(tmp_path, controller.address)
     wired = f"balance: {{placement: tray, port: {balance.port}, dialect: kcp, repeatability: 0.1 g, step: 0.1 g}}"
     person = "operator: {answers: person}"
-    hardware.write_laboratory(tmp_path / "rig.yaml", controller.address, f"{wired}\n{person}")
+    hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", controller.address, f"{wired}\n{person}")
     checksum = controller.fault("state")["checksum"]
     record = SafetyRecord(checksum, "2016300123", "ur10", "3.15.8", "2030-01-31", "a person")
     write_record(tmp_path / "rig.yaml", record)

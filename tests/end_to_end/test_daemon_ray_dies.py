@@ -11,11 +11,11 @@ import psutil
 import pytest
 
 from orchestrator.journal.journal import Kind
-from tests.end_to_end.command import pour_under_way, started_after_they_were_finished
-from tests.end_to_end.small import write_campaign
 from tests.end_to_end.test_daemon_killed import SLOW_POURS, Laboratory, opened
-from tests.patience import PATIENCE
 from tests.reliability import strikes
+from tests.support.command_process import pour_under_way, started_after_they_were_finished
+from tests.support.small_campaign import write_campaign
+from tests.support.waiting import PATIENCE
 
 pytestmark = pytest.mark.slow
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from tests.end_to_end.daemon_thread import Real
-from tests.patience import PATIENCE
+from tests.support.daemon_thread import Real
+from tests.support.waiting import PATIENCE
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 
 from actors.runtime.child_process import child_environment
 from tests.end_to_end.test_daemon_killed import opened
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 pytestmark = [
     pytest.mark.slow,

@@ -8,14 +8,14 @@ from pathlib import Path
 
 from orchestrator.journal.journal import Entry, Kind
 from orchestrator.states import State
-from tests.end_to_end import small
-from tests.end_to_end.command import Workplace
+from tests.support.command_process import Workplace
+from tests.support.small_campaign import CAMPAIGN, write_campaign
 
-SHORT = small.CAMPAIGN[: small.CAMPAIGN.index("deployment:")] + "outputs: {directory: runs, rrd: false}\n"
+SHORT = CAMPAIGN[: CAMPAIGN.index("deployment:")] + "outputs: {directory: runs, rrd: false}\n"
 
 
 def test_a_run_interrupted_before_its_report_is_published_by_decant_report(tmp_path: Path) -> None:
-    small.write_campaign(tmp_path, SHORT)
+    write_campaign(tmp_path, SHORT)
     place = Workplace(tmp_path)
 
     def finished_without_summary(entries: list[Entry]) -> bool:

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.end_to_end.command import Workplace
-from tests.end_to_end.small import write_campaign
-from tests.orchestrator.late_viewer import seen, viewer
-from tests.orchestrator.recorded import Contents
-from tests.patience import PATIENCE
+from tests.support.command_process import Workplace
+from tests.support.rerun_recordings import Contents, seen, viewer
+from tests.support.small_campaign import write_campaign
+from tests.support.waiting import PATIENCE
 
 FIRST = ("/cell/receiver/mesh", "/cell/liquid", "/balance/shown", "/learning/calibration/loss/measured", "/status")
 """What is there long before the campaign ends."""

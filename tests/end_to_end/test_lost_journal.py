@@ -23,11 +23,11 @@ from orchestrator.journal.journal import JOURNAL_NAME, Entry, Kind
 from orchestrator.journal.journal_check import JournalDamagedError
 from orchestrator.journal.pour_ledger import LEDGER_NAME, read_ledger
 from orchestrator.runs.run_folder import find_run
-from tests.end_to_end import small
-from tests.end_to_end.command import Workplace, ended, started_after_they_were_finished
-from tests.patience import PATIENCE
+from tests.support import small_campaign
+from tests.support.command_process import Workplace, ended, started_after_they_were_finished
+from tests.support.waiting import PATIENCE
 
-CAMPAIGN = small.CAMPAIGN.replace("directory: runs,", "directory: runs, figures: false, rrd: false,")
+CAMPAIGN = small_campaign.CAMPAIGN.replace("directory: runs,", "directory: runs, figures: false, rrd: false,")
 
 RUN = ("run", "small.yaml", "--in-process")
 RESUME = (*RUN, "--resume", "--run")
@@ -55,7 +55,7 @@ def two_poured(place: Workplace) -> Callable[[list[Entry]], bool]:
 def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a campaign that was killed after its second pour."""
     folder = tmp_path_factory.mktemp("killed")
-    small.write_campaign(folder, CAMPAIGN)
+    small_campaign.write_campaign(folder, CAMPAIGN)
     place = Workplace(folder)
     try:
         process, _ = place.interrupt(two_poured(place), signal.SIGKILL, *RUN)
@@ -162,7 +162,7 @@ def test_a_run_with_a_damaged_journal_is_refused_with_the_pours_that_were_made(
     assert any(problem in text for text in json.loads(checked.stdout)["problems"])
 
     plan = load_campaign(place.folder / "small.yaml")
-    plan = replace(plan, outputs=replace(plan.outputs, directory=run.parent))
+    plan = replace(plan, outputs=plan.outputs.model_copy(update={"directory": str(run.parent)}))
     with pytest.raises(JournalDamagedError, match=re.escape(problem)):
         find_run(plan)  # without a name it is found by its journal, or by its ledger
 

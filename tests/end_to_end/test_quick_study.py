@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.orchestrator.study_files import ROOT, read, written
-from tests.patience import PATIENCE
+from tests.support.study_files import ROOT, read, written
+from tests.support.waiting import PATIENCE
 
 
 @pytest.mark.slow

@@ -13,9 +13,7 @@ import psutil
 import pytest
 
 from orchestrator.journal.journal import Entry, Kind
-from tests.depth import THOROUGH
-from tests.end_to_end import small
-from tests.end_to_end.command import (
+from tests.support.command_process import (
     Workplace,
     ended,
     finished_in,
@@ -23,22 +21,23 @@ from tests.end_to_end.command import (
     pour_under_way,
     started_after_they_were_finished,
 )
-from tests.patience import PATIENCE
+from tests.support.hypothesis_examples import THOROUGH
+from tests.support.small_campaign import CAMPAIGN as SMALL
+from tests.support.small_campaign import write_campaign
+from tests.support.waiting import PATIENCE
 
 pytestmark = [pytest.mark.ray]
 
 RUN = ("run", "small.yaml")
 RESUME = (*RUN, "--resume")
 
-CAMPAIGN = (
-    small.CAMPAIGN if THOROUGH else small.CAMPAIGN.replace("directory: runs,", "directory: runs, figures: false,")
-)
+CAMPAIGN = SMALL if THOROUGH else SMALL.replace("directory: runs,", "directory: runs, figures: false,")
 
 
 @pytest.fixture
 def workplace(tmp_path: Path) -> Iterator[Workplace]:
     place = Workplace(tmp_path)
-    small.write_campaign(tmp_path, CAMPAIGN)
+    write_campaign(tmp_path, CAMPAIGN)
     yield place
     place.close()
 
@@ -56,7 +55,7 @@ class Finished:
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Finished]:
     folder = tmp_path_factory.mktemp("undisturbed")
-    small.write_campaign(folder, CAMPAIGN)
+    write_campaign(folder, CAMPAIGN)
     place = Workplace(folder)
     yield Finished(place)
     place.close()
@@ -138,7 +137,7 @@ def test_killed_in_a_pour_in_calibration_and_in_deployment_it_ends_as_if_undistu
     workplace.interrupt(in_calibration, signal.SIGKILL, *RESUME, "--answer", "repeat")
     workplace.assert_nothing_is_left()
 
-    small.write_campaign(workplace.folder, CAMPAIGN)
+    write_campaign(workplace.folder, CAMPAIGN)
     workplace.interrupt(pouring_into_the_narrow_cup, signal.SIGKILL, *RESUME)
     workplace.assert_nothing_is_left()
 
@@ -153,7 +152,7 @@ def test_killed_in_a_pour_in_calibration_and_in_deployment_it_ends_as_if_undistu
 
 def assert_a_person_is_asked(place: Workplace) -> None:
     """Unless the campaign says that such pours are repeated."""
-    small.write_campaign(place.folder, CAMPAIGN.replace("on_unknown: repeat", "on_unknown: ask"))
+    write_campaign(place.folder, CAMPAIGN.replace("on_unknown: repeat", "on_unknown: ask"))
     before = len(place.entries())
     process = place.start(*RESUME)
     with ended(process):

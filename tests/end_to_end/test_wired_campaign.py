@@ -13,8 +13,8 @@ from ruamel.yaml import YAML
 
 from actors.arm.planned_pour import unpack
 from orchestrator.journal.journal import Entry, Kind
-from tests.end_to_end import small
-from tests.end_to_end.command import Workplace, finished_in, pour_under_way, started_after_they_were_finished
+from tests.support import small_campaign
+from tests.support.command_process import Workplace, finished_in, pour_under_way, started_after_they_were_finished
 
 pytestmark = [pytest.mark.ray]
 
@@ -33,7 +33,7 @@ def write_wired(folder: Path) -> None:
     laboratory["bench"]["pose_error"] = {"x": "1 mm", "tilt": "0.5 deg"}
     yaml.dump(laboratory, folder / "lab.yaml")
 
-    campaign = yaml.load(small.CAMPAIGN)
+    campaign = yaml.load(small_campaign.CAMPAIGN)
     campaign["laboratory"] = "lab.yaml"
     campaign["motion"]["return_velocity"] = "100 deg/s"
     calibration, deployment = campaign["calibration"], campaign["deployment"]
@@ -46,7 +46,7 @@ def write_wired(folder: Path) -> None:
     deployment["actions"]["x_offset"] = ["70 mm", "100 mm"]
     text = StringIO()
     yaml.dump(campaign, text)
-    small.write_campaign(folder, text.getvalue())
+    small_campaign.write_campaign(folder, text.getvalue())
 
 
 @pytest.fixture

@@ -117,7 +117,9 @@ def test_a_run_writes_and_shows_the_same(golden: Golden, tmp_path: Path) -> None
     plan = load_campaign(QUICKSTART, TWIN)
     folder = tmp_path / "quickstart-20300131-1"
     folder.mkdir()
-    plan = replace(plan, outputs=replace(plan.outputs, directory=tmp_path, rrd=False, figures=False))
+    plan = replace(
+        plan, outputs=plan.outputs.model_copy(update={"directory": str(tmp_path), "rrd": False, "figures": False})
+    )
     events: list[Event] = []
     display = ProgressDisplay(plan, quiet=True)
     work = run_campaign(plan, FormulaLaboratory(), folder, watchers=[events.append, display])

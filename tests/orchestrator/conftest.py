@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.orchestrator.good_files import write_good
+from tests.support.campaign_files import write_good
 
 
 @pytest.fixture
@@ -20,6 +20,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture(scope="session")
 def results() -> dict[str, Any]:
     """Results of the real strategies, in a world whose spillage is a formula."""
-    from tests.orchestrator.reported import played_results
+    from tests.support.example_results import played_results
 
     return played_results()

@@ -14,9 +14,9 @@ from orchestrator.runs.events import Event, RequestFinished, StageClosed
 from orchestrator.runs.speculation import SpeculativeExecution
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
 from sim_engine.scene import PourTask
-from tests.orchestrator.scripted import simulate
 from tests.orchestrator.test_stages import Optimizer, campaign
-from tests.orchestrator.toy import ToyBench, ToyLaboratory, ToySimulators, logical_record, run_toy
+from tests.support.scripted_strategy import simulate
+from tests.support.toy_campaign import ToyBench, ToyLaboratory, ToySimulators, logical_record, run_toy
 
 
 def laboratory(*, separate: bool, pour: float = 0.05) -> ToyLaboratory:

@@ -26,8 +26,8 @@ from orchestrator.catalogue.run_registry import VARIABLE, state_directory
 from orchestrator.cli.app import app
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.run_folder import create_run
-from tests.orchestrator.killed import die_at, run
-from tests.orchestrator.toy import ToyLaboratory, ToySimulators, toy_plan
+from tests.support.killed_runs import die_at, run
+from tests.support.toy_campaign import ToyLaboratory, ToySimulators, toy_plan
 
 
 @pytest.fixture

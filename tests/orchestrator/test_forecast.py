@@ -21,8 +21,8 @@ from orchestrator.runs.events import (
 )
 from orchestrator.strategies.strategy import Progress
 from sim_engine.liquids import SimulationParameters
-from tests.orchestrator import watched
-from tests.orchestrator.toy import SCENE, SPACE, toy_plan
+from tests.support import example_run
+from tests.support.toy_campaign import SCENE, SPACE, toy_plan
 
 THETA = SimulationParameters(particles=1000)
 ACTION = SCENE.action(SPACE.decode([0.5, 0.5]))
@@ -53,7 +53,9 @@ class Timeline:
         self.ids += 1
         yield RequestStarted(time=self.now, stage=stage, id=self.ids, request=request)
         self.now += seconds
-        outcome = Simulated(watched.outcome()) if isinstance(request, Simulate) else Failed("pour_failed", "slipped")
+        outcome = (
+            Simulated(example_run.outcome()) if isinstance(request, Simulate) else Failed("pour_failed", "slipped")
+        )
         yield RequestFinished(
             time=self.now, stage=stage, id=self.ids, request=request, outcome=outcome, seconds=seconds
         )
@@ -67,12 +69,12 @@ class Timeline:
         for seconds in simulations:
             yield from self._answered(name, Simulate("cup", ACTION, THETA, 1), seconds)
             done = replace(done, simulations=done.simulations + 1)
-            yield StrategyProgressed(time=self.now, stage=name, progress=done, result=watched.LEARNT)
+            yield StrategyProgressed(time=self.now, stage=name, progress=done, result=example_run.LEARNT)
         for number, seconds in enumerate(pours, start=1):
             yield from self._answered(name, Pour("cup", ACTION, number, 1), seconds)
             done = replace(done, simulations=done.simulations + beside, pours=number)
-            yield StrategyProgressed(time=self.now, stage=name, progress=done, result=watched.LEARNT)
-        yield StageClosed(time=self.now, stage=name, result=watched.LEARNT)
+            yield StrategyProgressed(time=self.now, stage=name, progress=done, result=example_run.LEARNT)
+        yield StageClosed(time=self.now, stage=name, result=example_run.LEARNT)
 
     def campaign(self) -> Iterator[Event]:
         """All four stages."""
@@ -163,12 +165,12 @@ def test_what_an_earlier_run_has_done_is_not_left_any_more() -> None:
 
 
 def test_a_person_s_pour_takes_the_time_that_was_set_for_it_and_a_fast_bench_a_part_of_it() -> None:
-    plan = toy_plan(watched.Path("x"))
+    plan = toy_plan(example_run.Path("x"))
     assert work_of(plan, ["deployment:cup", "no stage of it"]) == {
         "deployment:cup": WorkEstimate(37 + 2 * 3, 3, 2, pour_time=0.0),
         "no stage of it": WorkEstimate(),
     }
-    campaign = watched.campaign()
+    campaign = example_run.campaign()
     assert campaign.deployment is not None
     bench = VirtualBenchSpec(SimulationParameters(particles=4000))
     scene, actions = campaign.deployment.scenes[0], campaign.deployment.actions

@@ -19,11 +19,11 @@ from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.journal.journal_file import JournalError
 from orchestrator.requests import Poured
 from orchestrator.runs.events import Event, LogLine
-from orchestrator.strategies.campaign_plan import OutputPlan
+from orchestrator.strategies.campaign_plan import OutputSettings
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
-from tests.orchestrator.scripted import Script, one_stage, pour, run, states
-from tests.orchestrator.toy import ToyBench, ToyLaboratory, toy_plan
+from tests.support.scripted_strategy import Script, one_stage, pour, run, states
+from tests.support.toy_campaign import ToyBench, ToyLaboratory, toy_plan
 
 SIZE = 60 * MB
 
@@ -143,7 +143,7 @@ def test_no_pour_begins_without_room_for_its_records(disk: Path) -> None:
 
 def test_a_run_says_at_once_which_disk_is_full_and_how_much_it_needs(disk: Path) -> None:
     fill(disk, leave=3 * MB)
-    plan = toy_plan(disk, outputs=OutputPlan(disk / "runs"))
+    plan = toy_plan(disk, outputs=OutputSettings(directory=str(disk / "runs")))
     with pytest.raises(
         RefusalError, match=rf"runs: 3.\d MB are free on its disk, and {TO_BEGIN // MB} MB are needed"
     ) as e:

@@ -23,7 +23,7 @@ from orchestrator.journal.journal_file import FORMAT, Header, JournalError, Jour
 from orchestrator.journal.pour_ledger import BEGUN, LEDGER_NAME, read_ledger
 from orchestrator.states import State
 from orchestrator.study.study_folder import StudyError, opened
-from tests.orchestrator.study_files import small
+from tests.support.study_files import small
 
 HEADER = Header("toy", {"seed": 7, "deployment": {"pours": 3}})
 

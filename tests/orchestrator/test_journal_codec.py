@@ -26,7 +26,7 @@ from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.search_space import Axis, Space
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 # Numbers below 2e-308 are not numbers of a laboratory, and a process in which Taichi has run takes them for 0.
 number = st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False)

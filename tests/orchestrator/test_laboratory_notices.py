@@ -10,8 +10,8 @@ from actors.interfaces import BenchLostError, LaboratoryError, Notice
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.events import LogLine
 from orchestrator.runs.request_executor import RequestExecutorError
-from tests.orchestrator.scripted import Script, one_stage, pour, run, simulate, states
-from tests.orchestrator.toy import ToyBench, ToyLaboratory, ToySimulators
+from tests.support.scripted_strategy import Script, one_stage, pour, run, simulate, states
+from tests.support.toy_campaign import ToyBench, ToyLaboratory, ToySimulators
 
 LOST = BenchLostError("arm: its machine bench-pc (10.0.0.3) was lost during 'execute'")
 

@@ -20,10 +20,9 @@ from orchestrator.live_view.recording_sink import SENDING
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
 from orchestrator.live_view.viewer_server import run_rerun
 from orchestrator.runs.events import LogLine
-from tests.orchestrator import watched
-from tests.orchestrator.late_viewer import seen, viewer
-from tests.orchestrator.recorded import Contents, tabs_as_they_came
-from tests.patience import PATIENCE
+from tests.support import example_run
+from tests.support.rerun_recordings import Contents, seen, tabs_as_they_came, viewer
+from tests.support.waiting import PATIENCE
 
 EXPECTED = (
     ("/cell/receiver/mesh", "Mesh3D:vertex_positions"),
@@ -45,12 +44,12 @@ EXPECTED = (
 
 
 def test_viewer_who_joins_late_sees_all_that_happened(tmp_path: Path) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     with LiveView() as live:
         with urllib.request.urlopen(live.url, timeout=60.0) as page:
             assert b"<html" in page.read().lower()
         monitor = live.watcher_for(plan, tmp_path)
-        for event in watched.events(plan):
+        for event in example_run.events(plan):
             monitor(event)
         with viewer(live.stream, tmp_path / "seen.rrd"):
             contents = seen(
@@ -68,10 +67,10 @@ def test_viewer_who_joins_late_sees_all_that_happened(tmp_path: Path) -> None:
 
 
 def test_who_comes_late_gets_the_newest_first_in_the_arrangement_that_is_shown_now(tmp_path: Path) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     with LiveView() as live:
         monitor = live.watcher_for(plan, tmp_path)
-        told = list(watched.events(plan))[:-1]
+        told = list(example_run.events(plan))[:-1]
         while not monitor.path.stat().st_size:  # what comes while programs are loaded is sent in one piece
             time.sleep(0.1)
         for part in (told[:8], told[8:]):
@@ -91,11 +90,11 @@ def test_who_comes_late_gets_the_newest_first_in_the_arrangement_that_is_shown_n
 
 @pytest.mark.slow
 def test_two_campaigns_are_served_side_by_side(tmp_path: Path) -> None:
-    plan = watched.campaign(pours=1)
+    plan = example_run.campaign(pours=1)
     with LiveView() as live:
         monitors = [live.watcher_for(plan, tmp_path / name) for name in ("first", "second")]
         for monitor in monitors:
-            for event in watched.events(plan):
+            for event in example_run.events(plan):
                 monitor(event)
         with viewer(live.stream, tmp_path / "seen.rrd"):
             seen(tmp_path / "seen.rrd", lambda c: c.rows("/learning/narrow_cup/loss/measured") == 2)
@@ -121,7 +120,7 @@ def test_taken_port_is_refused_where_it_was_asked_for_and_passed_over_otherwise(
         with pytest.raises(LiveError, match=f"port {port} of 127.0.0.1 is taken"):
             LiveView(web_port=port).open()
         with pytest.raises(RefusalError, match=f"port {port} is taken"):
-            live_view(watched.campaign(), live=False, at=f"127.0.0.1:{port}")
+            live_view(example_run.campaign(), live=False, at=f"127.0.0.1:{port}")
     with LiveView() as one, LiveView() as other:
         assert not {*one._ports} & {*other._ports}
 
@@ -136,13 +135,13 @@ def test_address_that_is_not_one_is_refused_with_what_would_be_right() -> None:
 
 @pytest.mark.parametrize("death", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
 def test_server_that_dies_or_hangs_costs_the_recording_nothing(tmp_path: Path, death: signal.Signals) -> None:
-    plan = watched.campaign(pours=1)
+    plan = example_run.campaign(pours=1)
     with LiveView() as live:
         monitor = live.watcher_for(plan, tmp_path)
         monitor(LogLine(level="info", text="before"))
         pid = live.server_pid
         os.kill(pid, death)
-        for event in watched.events(plan):
+        for event in example_run.events(plan):
             monitor(event)
         assert monitor.close(PATIENCE)
         if death == signal.SIGSTOP:
@@ -152,10 +151,10 @@ def test_server_that_dies_or_hangs_costs_the_recording_nothing(tmp_path: Path, d
 
 @pytest.mark.parametrize("death", [signal.SIGKILL, signal.SIGSTOP])
 def test_writer_that_dies_or_hangs_never_holds_up_the_campaign(tmp_path: Path, death: signal.Signals) -> None:
-    plan = watched.campaign(pours=1)
+    plan = example_run.campaign(pours=1)
     monitor = RerunMonitor(tmp_path / "campaign.rrd", plan, capacity=50)
     os.kill(monitor.pid, death)
-    told = list(watched.events(plan))
+    told = list(example_run.events(plan))
     for _ in range(200):
         for event in told:
             monitor(event)
@@ -205,9 +204,9 @@ def test_rerun_sends_no_statistics_and_touches_no_settings_of_the_user(
     before = dict(os.environ)
 
     path = tmp_path / "campaign.rrd"
-    plan = watched.campaign()
+    plan = example_run.campaign()
     monitor = RerunMonitor(path, plan)
-    for event in watched.events(plan):
+    for event in example_run.events(plan):
         monitor(event)
     assert monitor.close(PATIENCE)
     assert run_rerun("rrd", "stats", str(path)).returncode == 0

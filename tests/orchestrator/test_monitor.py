@@ -26,9 +26,9 @@ from orchestrator.runs.events import LogLine, PourProgressed, RequestFinished, R
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import RecordedFrames, SimulatedPour
 from sim_engine.search_space import Axis, Space
-from tests.orchestrator import watched
-from tests.orchestrator.recorded import Contents
-from tests.patience import PATIENCE
+from tests.support import example_run
+from tests.support.rerun_recordings import Contents
+from tests.support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[2]
 
@@ -36,9 +36,9 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Contents:
     path = tmp_path_factory.mktemp("run") / "campaign.rrd"
-    plan = watched.campaign()
+    plan = example_run.campaign()
     monitor = RerunMonitor(path, plan)
-    for event in watched.events(plan):
+    for event in example_run.events(plan):
         monitor(event)
     assert monitor.close(timeout=PATIENCE)
     assert (monitor.failed, monitor.dropped) == (0, 0)
@@ -50,7 +50,7 @@ def test_recording_shows_both_vessels_and_the_particles_of_recorded_simulations(
         assert recorded.values(entity, "Mesh3D:vertex_positions")
     # two simulations of 3 s at 10 Hz
     assert recorded.rows("/simulation/liquid", "sim_time") == 2 * 31
-    assert all(len(row) == watched.PARTICLES for row in recorded.values("/simulation/liquid", "Points3D:positions"))  # type: ignore[arg-type]
+    assert all(len(row) == example_run.PARTICLES for row in recorded.values("/simulation/liquid", "Points3D:positions"))  # type: ignore[arg-type]
     states = {state for row in recorded.values("/simulation/liquid", "Points3D:class_ids") for state in row}  # type: ignore[attr-defined]
     assert states == {0, 2, 3}
 
@@ -90,7 +90,7 @@ def test_surrogates_of_calibration_and_receiver_are_in_the_recording_as_pictures
 
 
 def test_picture_of_a_surrogate_has_axes_units_data_and_the_next_point() -> None:
-    (event,) = watched.three_parameters()
+    (event,) = example_run.three_parameters()
     assert isinstance(event, RequestFinished)
     assert isinstance(event.request, Suggest)
     assert isinstance(event.outcome, Suggested)
@@ -112,7 +112,7 @@ def test_picture_of_a_surrogate_has_axes_units_data_and_the_next_point() -> None
 
 
 def test_what_has_more_than_two_axes_is_cut_through_every_two_of_them() -> None:
-    box = Space((*watched.THETA.axes, Axis("friction", 0.0, 0.5)))
+    box = Space((*example_run.THETA.axes, Axis("friction", 0.0, 0.5)))
     rng = np.random.default_rng(1)
     points = rng.random((20, 3))
     costs = (points[:, 0] - 0.3) ** 2 + points[:, 2]
@@ -132,7 +132,7 @@ def test_what_has_more_than_two_axes_is_cut_through_every_two_of_them() -> None:
 
 
 def test_two_axes_are_one_picture() -> None:
-    problem = SuggestProblem(watched.THETA, Data(((0.2, 0.3), (0.7, 0.3)), (0.2, 0.05)), map_resolution=9)
+    problem = SuggestProblem(example_run.THETA, Data(((0.2, 0.3), (0.7, 0.3)), (0.2, 0.05)), map_resolution=9)
     assert slices(problem, propose(problem)) == ()
 
 
@@ -166,14 +166,14 @@ def test_wall_clock_shows_films_at_their_own_pace(recorded: Contents) -> None:
 
 
 def test_vessels_are_there_on_the_wall_clock_even_if_their_first_film_was_not(tmp_path: Path) -> None:
-    plan = watched.campaign(pours=0)
+    plan = example_run.campaign(pours=0)
     recording = CampaignRecording(tmp_path / "campaign.rrd", plan)
-    request = Simulate("tumbler", watched.ACTION, SimulationParameters(), 1, "calibrate")
+    request = Simulate("tumbler", example_run.ACTION, SimulationParameters(), 1, "calibrate")
     for number, length in enumerate(
         (30.0, 3.0, 3.0), start=1
     ):  # the second would begin 30 s late, the third comes then
-        frames, now = watched.frames(duration=length, rate=1.0), 1e6 + 40.0 * (number == 3)
-        outcome = Simulated(watched.outcome())
+        frames, now = example_run.frames(duration=length, rate=1.0), 1e6 + 40.0 * (number == 3)
+        outcome = Simulated(example_run.outcome())
         recording.handle(
             RequestFinished(time=now, stage="calibration", id=number, request=request, outcome=outcome, frames=frames)
         )
@@ -240,9 +240,9 @@ def test_event_log_tells_decisions_results_and_warnings(recorded: Contents) -> N
 
 
 def test_recording_brings_its_blueprint_and_passes_the_viewers_own_check(tmp_path: Path) -> None:
-    plan = watched.campaign(pours=1)
+    plan = example_run.campaign(pours=1)
     monitor = RerunMonitor(tmp_path / "campaign.rrd", plan)
-    for event in watched.events(plan):
+    for event in example_run.events(plan):
         monitor(event)
     assert monitor.close(timeout=PATIENCE)
     assert Contents(monitor.path).blueprints == 1, "of several the viewer would take any"
@@ -257,7 +257,7 @@ def test_recording_brings_its_blueprint_and_passes_the_viewers_own_check(tmp_pat
 
 
 def test_resumed_run_keeps_the_recording_made_before_the_interruption(tmp_path: Path) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     first = RerunMonitor(tmp_path / "campaign.rrd", plan)
     assert first.close()
     before = first.path.read_bytes()
@@ -270,17 +270,17 @@ def test_resumed_run_keeps_the_recording_made_before_the_interruption(tmp_path: 
 def test_recording_that_cannot_be_written_is_reported_before_the_run(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("a file where a folder is needed")
     with pytest.raises(OSError, match="taken"):
-        RerunMonitor(tmp_path / "taken" / "campaign.rrd", watched.campaign())
-    task, result = watched.simulation()
+        RerunMonitor(tmp_path / "taken" / "campaign.rrd", example_run.campaign())
+    task, result = example_run.simulation()
     (tmp_path / "pour.rrd").mkdir()
     with pytest.raises(OSError, match=r"pour\.rrd"):
         simulation_rrd(tmp_path / "pour.rrd", task, result)
 
 
 def test_an_event_that_cannot_be_drawn_costs_only_itself(tmp_path: Path) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     monitor = RerunMonitor(tmp_path / "campaign.rrd", plan)
-    told = list(watched.events(plan))
+    told = list(example_run.events(plan))
     broken = RecordedFrames(np.array([0.0]), [np.zeros((3, 3))], [np.zeros(3, np.uint8)], np.zeros((1, 3)))
     for event in told:
         if getattr(event, "frames", None) is not None:
@@ -321,7 +321,7 @@ def test_hanging_disk_does_not_keep_the_run_from_ending() -> None:
 
 
 def test_dropped_events_are_said_in_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     monitor = RerunMonitor(tmp_path / "campaign.rrd", plan, capacity=1)
     for number in range(3000):
         monitor(LogLine(level="info", text=f"line {number}"))
@@ -333,14 +333,14 @@ def test_dropped_events_are_said_in_the_recording(tmp_path: Path, monkeypatch: p
 
 
 def test_simulation_recording_thins_particles_to_ten_frames_a_second(tmp_path: Path) -> None:
-    task, result = watched.simulation()
-    dense = SimulatedPour(result.outcome, watched.frames(rate=50.0))
+    task, result = example_run.simulation()
+    dense = SimulatedPour(result.outcome, example_run.frames(rate=50.0))
     contents = Contents(simulation_rrd(tmp_path / "pour.rrd", task, dense))
     assert contents.rows("/simulation/liquid", "sim_time") == 31
     assert contents.blueprints == 1
 
 
 def test_simulation_without_frames_is_refused_with_advice(tmp_path: Path) -> None:
-    task, result = watched.simulation()
+    task, result = example_run.simulation()
     with pytest.raises(ValueError, match="record rate above 0"):
         simulation_rrd(tmp_path / "pour.rrd", task, SimulatedPour(result.outcome))

@@ -11,8 +11,8 @@ from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Poured
 from orchestrator.runs.request_executor import PourNotMadeError, PourUnknownError
 from orchestrator.runs.resume import OperatorNeededError
-from tests.orchestrator.scripted import Script, one_stage, pour, run, states
-from tests.orchestrator.toy import ToyBench, ToyLaboratory, toy_plan
+from tests.support.scripted_strategy import Script, one_stage, pour, run, states
+from tests.support.toy_campaign import ToyBench, ToyLaboratory, toy_plan
 
 NOT_POURED = NotPouredError("the operator did not let the arm move. Nothing was poured")
 UNKNOWN = UnknownPourError("protective stop during tilt. All weighings: pourer_full 512.1 g")

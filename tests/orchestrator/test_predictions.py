@@ -32,11 +32,11 @@ from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
 from sim_engine.outcome import Loss
 from sim_engine.prediction_band import resolution_shift
 from sim_engine.vessel.shapes import VesselSpec
-from tests.orchestrator import watched
-from tests.orchestrator.plans import deployment_plan
-from tests.orchestrator.reported import changed, shown
-from tests.orchestrator.toy import ToyLaboratory, run_toy, toy_plan
-from tests.orchestrator.toys import narrow_cup
+from tests.support import example_run
+from tests.support.example_results import changed, shown
+from tests.support.plans import deployment_plan
+from tests.support.toy_campaign import ToyLaboratory, run_toy, toy_plan
+from tests.support.toy_spillage import narrow_cup
 
 CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"
 ACTION = SCENE.action({"angular_velocity": 1.0, "x_offset": 0.1})
@@ -58,7 +58,7 @@ def repeated(count: int = 5, seed: int = 3, loss: Loss | None = None) -> Repeate
 
 
 def test_the_prediction_is_the_mean_of_fresh_seeds_with_their_deviation() -> None:
-    strategy = repeated(loss=Loss("grams"))
+    strategy = repeated(loss=Loss(name="grams"))
     assert isinstance(strategy, Strategy)
     played = StrategyHarness(narrow_cup).run(strategy)
     assert {(r.action, r.purpose) for r in played.simulations} == {(ACTION, "predict")}
@@ -239,9 +239,9 @@ def test_the_line_of_a_pour_says_both() -> None:
     assert loss_unit(Loss()).prediction(predicted) == "0.80 ± 0.90 %, a pour ± 0.50 %"
     assert loss_unit(Loss()).prediction(replace(predicted, scatter=None)) == "0.80 ± 0.90 %"
     assert loss_unit(Loss()).prediction(replace(predicted, band=(0.0, 0.021))) == "0.80 ± 0.90 %, a pour: 0.00 … 2.10 %"
-    plan = watched.campaign()
+    plan = example_run.campaign()
     tally = ProgressState(plan)
-    for event in watched.events(plan):
+    for event in example_run.events(plan):
         request = getattr(event, "request", None)
         known = isinstance(request, Pour)
         tally(replace(event, request=replace(request, predicted=predicted)) if known else event)  # type: ignore[type-var]
@@ -249,7 +249,7 @@ def test_the_line_of_a_pour_says_both() -> None:
 
 
 def test_the_summary_s_best_expected_loss_has_both(results: dict[str, Any]) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     learnt = results["narrow cup"]
     known = changed(learnt.recommended, predicted_loss=0.02, predicted_deviation=0.01, predicted_scatter=0.03)
     deployed = changed(learnt, recommended=known)

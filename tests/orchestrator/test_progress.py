@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -25,7 +26,7 @@ from orchestrator.runs.events import (
 )
 from orchestrator.strategies.strategy import Progress
 from sim_engine.outcome import PourMeasurement
-from tests.orchestrator import watched
+from tests.support.example_run import LEARNT, campaign, events
 
 
 def console(*, terminal: bool) -> Console:
@@ -37,9 +38,9 @@ def written(display_console: Console) -> str:
 
 
 def test_log_without_terminal_names_stages_pours_and_warnings_in_plain_lines() -> None:
-    plan, plain = watched.campaign(), console(terminal=False)
+    plan, plain = campaign(), console(terminal=False)
     with ProgressDisplay(plan, console=plain) as display:
-        for event in watched.events(plan):
+        for event in events(plan):
             display(event)
     text = written(plain)
     assert "\x1b" not in text
@@ -57,23 +58,21 @@ def test_log_without_terminal_names_stages_pours_and_warnings_in_plain_lines() -
 
 def test_log_without_terminal_has_at_most_one_progress_line_in_two_seconds() -> None:
     now = 0.0
-    plan, plain = watched.campaign(), console(terminal=False)
+    plan, plain = campaign(), console(terminal=False)
     display = ProgressDisplay(plan, console=plain, clock=lambda: now)
     display(StageOpened(stage="calibration", index=1, count=1))
     for step in range(100):
         now = 0.1 * step
-        display(StrategyProgressed(stage="calibration", progress=Progress(step, 100), result=watched.LEARNT))
+        display(StrategyProgressed(stage="calibration", progress=Progress(step, 100), result=LEARNT))
     assert len([line for line in written(plain).splitlines() if "/100" in line]) == 5  # at 0, 2, 4, 6 and 8 s
 
 
 def test_plain_lines_say_how_busy_the_pool_was_not_who_is_idle_at_the_moment_a_result_arrives() -> None:
     now = 0.0
-    plan, plain = watched.campaign(), console(terminal=False)
+    plan, plain = campaign(), console(terminal=False)
     display = ProgressDisplay(plan, console=plain, clock=lambda: now)
-    simulations = [
-        r for r in watched.events(plan) if isinstance(r, RequestFinished) and isinstance(r.request, Simulate)
-    ]
-    display(CampaignOpened(time=0.0, name="x", run_directory=watched.Path("x"), stages=(), mode="none", simulators=2))
+    simulations = [r for r in events(plan) if isinstance(r, RequestFinished) and isinstance(r.request, Simulate)]
+    display(CampaignOpened(time=0.0, name="x", run_directory=Path("x"), stages=(), mode="none", simulators=2))
     display(StageOpened(time=0.0, stage="calibration", index=1, count=1))
     # two simulators: both work from 0 to 6 s, one of them on to 8 s, nobody from there to 10 s
     for key, finished in enumerate(simulations, start=1):
@@ -82,7 +81,7 @@ def test_plain_lines_say_how_busy_the_pool_was_not_who_is_idle_at_the_moment_a_r
         display(replace(finished, time=end, id=key, frames=None))
     for time_now, done in ((10.0, 2), (14.0, 3)):
         now = time_now
-        display(StrategyProgressed(time=now, stage="calibration", progress=Progress(done, 8), result=watched.LEARNT))
+        display(StrategyProgressed(time=now, stage="calibration", progress=Progress(done, 8), result=LEARNT))
     lines = [line for line in written(plain).splitlines() if "/8" in line]
     assert "pool 70 % busy · 2 simulations" in lines[0]
     assert "pool 0 % busy · 2 simulations" in lines[1]
@@ -90,21 +89,21 @@ def test_plain_lines_say_how_busy_the_pool_was_not_who_is_idle_at_the_moment_a_r
 
 def test_simulators_that_work_ahead_while_the_arm_pours_are_not_shown_as_idle() -> None:
     now = 0.0
-    plan, plain = watched.campaign(), console(terminal=False)
+    plan, plain = campaign(), console(terminal=False)
     display = ProgressDisplay(plan, console=plain, clock=lambda: now)
-    display(CampaignOpened(time=0.0, name="x", run_directory=watched.Path("x"), stages=(), mode="none", simulators=2))
+    display(CampaignOpened(time=0.0, name="x", run_directory=Path("x"), stages=(), mode="none", simulators=2))
     display(StageOpened(time=0.0, stage="pours", index=1, count=2))
     display(MadeAhead(time=0.0, running=2, waiting=0))
     display(MadeAhead(time=8.0, running=1, waiting=5))
     now = 10.0
-    display(StrategyProgressed(time=now, stage="pours", progress=Progress(0, 0, 1, 8), result=watched.LEARNT))
+    display(StrategyProgressed(time=now, stage="pours", progress=Progress(0, 0, 1, 8), result=LEARNT))
     assert "pool 90 % busy · 0 simulations · 5 more made ahead" in written(plain)
 
 
 def test_terminal_shows_bars_the_running_pours_checkpoint_and_the_pool() -> None:
-    plan, terminal = watched.campaign(), console(terminal=True)
+    plan, terminal = campaign(), console(terminal=True)
     display = ProgressDisplay(plan, console=terminal)
-    told = list(watched.events(plan))
+    told = list(events(plan))
     running = next(i for i, event in enumerate(told) if isinstance(event, PourProgressed))
     for event in told[: running + 1]:
         display(event)
@@ -121,9 +120,9 @@ def test_terminal_shows_bars_the_running_pours_checkpoint_and_the_pool() -> None
 
 
 def test_display_writes_nothing_to_stdout(capsys: pytest.CaptureFixture[str]) -> None:
-    plan = watched.campaign()
+    plan = campaign()
     with ProgressDisplay(plan) as display:
-        for event in watched.events(plan):
+        for event in events(plan):
             display(event)
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -132,21 +131,26 @@ def test_display_writes_nothing_to_stdout(capsys: pytest.CaptureFixture[str]) ->
 
 def test_text_that_looks_like_markup_is_shown_as_it_is() -> None:
     plain = console(terminal=False)
-    ProgressDisplay(watched.campaign(), console=plain)(LogLine(level="error", text="balance [/dev/ttyUSB0] is silent"))
+    ProgressDisplay(campaign(), console=plain)(LogLine(level="error", text="balance [/dev/ttyUSB0] is silent"))
     assert written(plain).strip() == "balance [/dev/ttyUSB0] is silent"
 
 
 def test_pours_and_simulations_are_told_apart_with_the_time_left_in_all() -> None:
-    plan, plain = watched.campaign(), console(terminal=False)
+    plan, plain = campaign(), console(terminal=False)
     display = ProgressDisplay(plan, console=plain)
     display(
         CampaignOpened(
-            time=0.0, name="x", run_directory=watched.Path("x"), stages=("narrow cup",), mode="virtual", simulators=2
+            time=0.0,
+            name="x",
+            run_directory=Path("x"),
+            stages=("narrow cup",),
+            mode="virtual",
+            simulators=2,
         )
     )
     display(StageOpened(time=0.0, stage="narrow cup", index=1, count=1))
     done = Progress(simulations=14, of_simulations=40, pours=6, of_pours=6)
-    display(StrategyProgressed(time=9.0, stage="narrow cup", progress=done, result=watched.LEARNT))
+    display(StrategyProgressed(time=9.0, stage="narrow cup", progress=done, result=LEARNT))
     (line,) = [line for line in written(plain).splitlines() if "/40" in line]
     assert line.startswith("narrow cup: 6/6 pours · 14/40 simulations")
     assert line.endswith(" left in all")
@@ -156,9 +160,9 @@ def test_pours_and_simulations_are_told_apart_with_the_time_left_in_all() -> Non
 
 
 def test_best_so_far_is_kept_per_receiver_and_ignores_calibration_pours() -> None:
-    plan = watched.campaign()
+    plan = campaign()
     tally = ProgressState(plan)
-    told = list(watched.events(plan))
+    told = list(events(plan))
     for event in told:
         tally(event)
     calibration_pour = next(
@@ -172,10 +176,10 @@ def test_best_so_far_is_kept_per_receiver_and_ignores_calibration_pours() -> Non
 
 
 def test_confirming_pours_are_counted_apart_and_are_no_best_so_far() -> None:
-    plan = watched.campaign()
+    plan = campaign()
     assert plan.deployment is not None
     tally = ProgressState(replace(plan, deployment=replace(plan.deployment, confirm=5)))
-    for event in watched.events(plan):
+    for event in events(plan):
         if isinstance(event, (RequestStarted, RequestFinished)) and isinstance(event.request, Pour):
             tally(replace(event, request=replace(event.request, purpose="confirm")))
     assert (tally.pour_line() or "").startswith("confirming pour 3/5 into narrow  ")
@@ -183,15 +187,15 @@ def test_confirming_pours_are_counted_apart_and_are_no_best_so_far() -> None:
 
 
 def test_failed_pours_and_simulations_are_shown_as_such() -> None:
-    plan = watched.campaign()
+    plan = campaign()
     tally = ProgressState(plan)
-    tally(CampaignOpened(name="x", run_directory=watched.Path("x"), stages=("s",), mode="virtual", simulators=2))
+    tally(CampaignOpened(name="x", run_directory=Path("x"), stages=("s",), mode="virtual", simulators=2))
     simulation: Any = next(
-        e for e in watched.events(plan) if isinstance(e, RequestFinished) and isinstance(e.request, Simulate)
+        e for e in events(plan) if isinstance(e, RequestFinished) and isinstance(e.request, Simulate)
     )
     tally(replace(simulation, outcome=Failed("simulation", "diverged"), frames=None))
     assert "1 failed" in tally.pool_line()
-    for event in watched.events(plan):
+    for event in events(plan):
         if isinstance(event, RequestFinished) and isinstance(event.request, Pour):
             tally(replace(event, outcome=Failed("pour_failed", "the gripper slipped")))
             break
@@ -200,7 +204,7 @@ def test_failed_pours_and_simulations_are_shown_as_such() -> None:
 
 
 def test_display_can_be_left_after_a_failure_and_says_how_the_run_ended() -> None:
-    plan, terminal = watched.campaign(), console(terminal=True)
+    plan, terminal = campaign(), console(terminal=True)
     display = ProgressDisplay(plan, console=terminal)
     display.__enter__()
     display(CampaignClosed(state="failed", results={}))

@@ -17,9 +17,9 @@ from orchestrator.run_errors import RunError
 from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.stage_result import StageResult
-from tests.orchestrator import watched
-from tests.orchestrator.reported import changed
-from tests.orchestrator.toy import run_toy
+from tests.support import example_run
+from tests.support.example_results import changed
+from tests.support.toy_campaign import run_toy
 
 
 def test_results_read_back_as_they_were_bit_for_bit(results: dict[str, Any]) -> None:
@@ -68,7 +68,7 @@ def test_publishing_names_the_recording_and_can_be_done_again(tmp_path: Path, re
 
     recording = tmp_path / "campaign.rrd"
     result = replace(asyncio.run(run_toy(tmp_path / "run")), results=results)
-    published = publish(watched.campaign(), result, recording, 3)
+    published = publish(example_run.campaign(), result, recording, 3)
     assert published.recording == published.summary.recording == recording
     assert published.summary.dropped_events == 3
     assert published.theta is not None
@@ -76,14 +76,14 @@ def test_publishing_names_the_recording_and_can_be_done_again(tmp_path: Path, re
     assert all(path.is_file() for path in published.figures.values())
     summary = (tmp_path / "run" / "summary.json").read_text()
     assert json.loads(summary)["theta"] == results["calibration"].found.theta.model_dump()
-    publish(watched.campaign(), result, recording, 3)
+    publish(example_run.campaign(), result, recording, 3)
     assert (tmp_path / "run" / "summary.json").read_text() == summary
 
 
 def test_kinds_of_installed_strategies_are_in_the_schema_and_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
     from orchestrator.journal import stage_results as module
     from orchestrator.results.run_summary import summary_schema
-    from tests.orchestrator.scripted import Scripted
+    from tests.support.scripted_strategy import Scripted
 
     assert Scripted not in module.kinds()
     settings = type("Settings", (), {"__module__": Scripted.__module__})

@@ -22,11 +22,11 @@ from orchestrator.journal.journal_file import JournalError, JournalLockedError
 from orchestrator.runs.events import Event, RequestFinished, StageClosed
 from orchestrator.runs.resume import ReplayError
 from orchestrator.runs.stages import StageDefinition
-from tests.depth import THOROUGH
-from tests.orchestrator import toy
-from tests.orchestrator.killed import SMALL, finished_times, killed_at, killed_when_last, run
-from tests.orchestrator.toy import ToyLaboratory, ToyStrategy, logical_record, toy_plan, toy_stages
-from tests.patience import PATIENCE
+from tests.support import toy_campaign
+from tests.support.hypothesis_examples import THOROUGH
+from tests.support.killed_runs import SMALL, finished_times, killed_at, killed_when_last, run
+from tests.support.toy_campaign import ToyLaboratory, ToyStrategy, logical_record, toy_plan, toy_stages
+from tests.support.waiting import PATIENCE
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def process(directory: Path, *arguments: str) -> subprocess.Popen[str]:
     # Beside the file stands no package that its imports could find, so the root is named.
     root = Path(__file__).parents[2]
     return subprocess.Popen(
-        [sys.executable, str(Path(toy.__file__)), str(directory), *arguments],
+        [sys.executable, str(Path(toy_campaign.__file__)), str(directory), *arguments],
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": str(root)},
@@ -156,7 +156,7 @@ def test_completion_order_is_replayed_exactly(tmp_path: Path) -> None:
     free = tuple(replace(stage, order="completion") for stage in toy_stages())
     for entries in (40, 120):
         directory = tmp_path / str(entries)
-        laboratory = toy.slow_laboratory(0.01, random.Random(entries))
+        laboratory = toy_campaign.slow_laboratory(0.01, random.Random(entries))
         written: list[Any] = []
 
         def stop(event: Event, directory: Path = directory, limit: int = entries, written: Any = written) -> None:
@@ -169,7 +169,7 @@ def test_completion_order_is_replayed_exactly(tmp_path: Path) -> None:
         with pytest.raises(asyncio.CancelledError):
             run(directory, laboratory, stages=free, watchers=[stop])
         before = logical_record(directory)
-        run(directory, toy.slow_laboratory(0.01), stages=free, resume=True)
+        run(directory, toy_campaign.slow_laboratory(0.01), stages=free, resume=True)
         assert logical_record(directory)[: len(before)] == before
         assert set(finished_times(directory).values()) == {1}
 

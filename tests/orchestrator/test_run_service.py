@@ -21,14 +21,14 @@ from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import JournalDamagedError
 from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService, RunTaskError, task_request
 from orchestrator.runs.events import CampaignOpened, Event
-from tests.end_to_end import small
 from tests.golden.world import FormulaLaboratory
-from tests.orchestrator.daemon.served import HeldLaboratory, held
-from tests.orchestrator.scripted import Script, one_stage, pour, states
-from tests.orchestrator.toy import ToyLaboratory, logical_record, toy_plan
-from tests.patience import PATIENCE
+from tests.support.scripted_strategy import Script, one_stage, pour, states
+from tests.support.small_campaign import CAMPAIGN, write_campaign
+from tests.support.toy_campaign import ToyLaboratory, logical_record, toy_plan
+from tests.support.toy_daemon import HeldLaboratory, held
+from tests.support.waiting import PATIENCE
 
-SHORT = small.CAMPAIGN.replace("outputs: {directory: runs,", "outputs: {directory: runs, rrd: false, figures: false,")
+SHORT = CAMPAIGN.replace("outputs: {directory: runs,", "outputs: {directory: runs, rrd: false, figures: false,")
 
 
 def campaign(folder: Path, *changes: tuple[str, str]) -> decant.CampaignPlan:
@@ -36,7 +36,7 @@ def campaign(folder: Path, *changes: tuple[str, str]) -> decant.CampaignPlan:
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
-    return load_campaign(small.write_campaign(folder, text))
+    return load_campaign(write_campaign(folder, text))
 
 
 def everything_in(folder: Path) -> list[tuple[Path, int]]:

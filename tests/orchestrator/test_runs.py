@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from orchestrator.runs.run_folder import RunNotFoundError, create_run, find_run
-from tests.orchestrator.killed import SMALL, die_at, run
-from tests.orchestrator.toy import run_toy, toy_plan
+from tests.support.killed_runs import SMALL, die_at, run
+from tests.support.toy_campaign import run_toy, toy_plan
 
 
 def test_run_directories_count_up_and_the_newest_unfinished_one_is_resumed(tmp_path: Path) -> None:

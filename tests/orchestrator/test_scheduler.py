@@ -19,8 +19,8 @@ from orchestrator.runs.events import Event, LogLine, PourProgressed, RequestFini
 from orchestrator.runs.request_executor import Deadlines, PourUnknownError, RequestExecutorError
 from orchestrator.runs.stage_scheduler import StrategyError
 from sim_engine.scene import PourTask
-from tests.orchestrator.scripted import Script, one_stage, pour, run, simulate, states
-from tests.orchestrator.toy import (
+from tests.support.scripted_strategy import Script, one_stage, pour, run, simulate, states
+from tests.support.toy_campaign import (
     ToyBench,
     ToyLaboratory,
     ToyOptimizer,

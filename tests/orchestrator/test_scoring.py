@@ -11,7 +11,7 @@ from orchestrator.results.prediction_figures import draw_scored, write_scored
 from orchestrator.results.prediction_scores import ScoredRow, rank_correlation, score, scores
 from sim_engine.action import DEG, Action
 from sim_engine.prediction_band import SampleStatistics, band
-from tests.orchestrator.reported import is_picture
+from tests.support.example_results import is_picture
 
 ACTION = Action(angular_velocity=40 * DEG, x_offset=0.09, height=0.06)
 

@@ -39,9 +39,9 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.shapes import cylinder
-from tests.orchestrator import plans
-from tests.orchestrator.reported import changed, shown
-from tests.orchestrator.toy import SCENE, SPACE, ToyLaboratory, logical_record, run_toy, toy_plan
+from tests.support import plans
+from tests.support.example_results import changed, shown
+from tests.support.toy_campaign import SCENE, SPACE, ToyLaboratory, logical_record, run_toy, toy_plan
 
 NARROW = replace(SCENE, name="narrow", receiver=cylinder("narrow", inner_radius=0.02, inner_height=0.1))
 PARAMETERS = Space((Axis("cohesion", 0.0, 0.1), Axis("friction", 0.0, 0.5)))

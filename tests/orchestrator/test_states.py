@@ -9,8 +9,8 @@ import pytest
 from orchestrator.run_errors import RunError
 from orchestrator.runs.stages import stage_seed
 from orchestrator.states import RESTING, TRANSITIONS, State, TransitionError, check_transition
-from tests.orchestrator.scripted import run, states
-from tests.orchestrator.toy import ToyLaboratory, toy_stages
+from tests.support.scripted_strategy import run, states
+from tests.support.toy_campaign import ToyLaboratory, toy_stages
 
 
 def test_an_undisturbed_run_goes_the_straight_way(tmp_path: Path) -> None:

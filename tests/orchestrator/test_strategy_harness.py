@@ -20,8 +20,8 @@ from orchestrator.strategy_harness import (
     check_strategy,
     replay,
 )
-from tests.orchestrator.plans import deployment_plan
-from tests.orchestrator.toys import narrow_cup
+from tests.support.plans import deployment_plan
+from tests.support.toy_spillage import narrow_cup
 
 CENTRE = SCENE.action(ACTIONS.decode([0.5, 0.5]))
 

@@ -17,9 +17,9 @@ from orchestrator.requests import Failed, Poured
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import Event, RequestFinished
 from orchestrator.runs.resume import LOST, REPEAT, WEIGHED, OperatorNeededError, parse_answer
-from tests.orchestrator import toy
-from tests.orchestrator.killed import SMALL, killed_when_last, run
-from tests.orchestrator.toy import ToyLaboratory, answering, logical_record, run_toy, toy_plan
+from tests.support import toy_campaign
+from tests.support.killed_runs import SMALL, killed_when_last, run
+from tests.support.toy_campaign import ToyLaboratory, answering, logical_record, run_toy, toy_plan
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_matter_is_not_repeated_on_a_real_bench(tmp_path: Path) -> None:
     hardware = {"laboratory": LaboratorySpec("toy", mode="hardware")}
 
     def laboratory() -> ToyLaboratory:
-        return ToyLaboratory(bench=toy.ToyBench(lambda: 60.0, mode="hardware"))
+        return ToyLaboratory(bench=toy_campaign.ToyBench(lambda: 60.0, mode="hardware"))
 
     async def abandon(directory: Path) -> None:
         def watch(event: Event) -> None:

@@ -19,8 +19,8 @@ from orchestrator.runs.events import (
 from orchestrator.runs.stage_scheduler import is_recorded
 from sim_engine.outcome import RecordedFrames
 from sim_engine.scene import PourTask
-from tests.orchestrator.scripted import run
-from tests.orchestrator.toy import ToyLaboratory, logical_record, toy_plan
+from tests.support.scripted_strategy import run
+from tests.support.toy_campaign import ToyLaboratory, logical_record, toy_plan
 
 
 def test_a_watcher_that_raises_is_reported_once_and_changes_nothing(tmp_path: Path) -> None:
@@ -71,7 +71,7 @@ def test_recorded_simulations_bring_frames_and_the_same_outcomes(tmp_path: Path)
         simulated = sorted((e.id, e.frames is not None) for e in done if isinstance(e.request, Simulate))
         assert [number for number, (_, framed) in enumerate(simulated, start=1) if framed] == [1, 2]
     plan = toy_plan(tmp_path)
-    silent = replace(plan, outputs=replace(plan.outputs, record_rate=0.0))
+    silent = replace(plan, outputs=plan.outputs.model_copy(update={"record_rate": 0.0}))
     laboratory = ToyLaboratory()
     run(tmp_path / "silent", laboratory, plan=silent)
     assert all(task.record_rate == 0.0 for task in laboratory.simulators.tasks)

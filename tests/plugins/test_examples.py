@@ -56,7 +56,7 @@ def test_half_a_line_is_no_weight(line: bytes) -> None:
 
 
 def test_a_cone_holds_what_a_cone_holds() -> None:
-    cone = Cone(kind="cone", top="45 mm", bottom="30 mm", height="100 mm")  # type: ignore[arg-type]
+    cone = Cone(top="45 mm", bottom="30 mm", height="100 mm")  # type: ignore[arg-type]
     vessel = build_vessel(VesselSpec(name="cone-1", shape=cone))
     r, s, h = 0.045, 0.03, 0.1
     assert vessel.capacity == pytest.approx(math.pi * h * (r * r + r * s + s * s) / 3.0, rel=1e-6)

@@ -15,9 +15,9 @@ import pytest
 from decant.plugins import DeploymentPlan, Loss, Objectives
 from decant.plugins.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
 from orchestrator.strategies.deployment.objectives import Spillage
-from tests.orchestrator.toys import narrow_cup
 from tests.plugins.decant_example.objective import Gentle
 from tests.plugins.decant_example.strategy import Hypercube, HypercubeSettings
+from tests.support.toy_spillage import narrow_cup
 
 ROOT = Path(__file__).parents[2]
 
@@ -186,8 +186,8 @@ STUDY = """
 import json, sys
 from pathlib import Path
 from orchestrator.study.report.study_page import write_report
-from tests.orchestrator.study_files import read, written
-from tests.orchestrator.toy_study import run_toy_study
+from tests.support.study_files import read, written
+from tests.support.toy_study import run_toy_study
 from orchestrator.study.study_file import load_study
 from orchestrator.config.yaml.yaml_errors import ConfigError
 

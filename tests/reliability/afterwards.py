@@ -8,7 +8,7 @@ from typing import Any
 
 from orchestrator.journal.journal import JOURNAL_NAME, Entry, JournalReader, Kind
 from orchestrator.states import State
-from tests.end_to_end.command import timeless
+from tests.support.command_process import timeless
 
 
 def entries(directory: Path) -> list[Entry]:

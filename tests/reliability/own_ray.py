@@ -10,12 +10,12 @@ from typing import Any
 
 from actors.laboratory import RayLaboratory
 from actors.laboratory_settings import LaboratorySpec
-from tests.orchestrator.toy import ToyLaboratory
 from tests.reliability import strikes
 from tests.reliability.case import CUT, FULL, KILLED, STOPPED, Case, every, first_of_kind
 from tests.reliability.formula import WORK, Formula
 from tests.reliability.program import LoggingBench
 from tests.reliability.rig import Life, Rig
+from tests.support.toy_campaign import ToyLaboratory
 
 
 class RayRig(Rig):

@@ -16,12 +16,12 @@ from actors.laboratory_settings import LaboratorySpec
 from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
 from actors.runtime.remote_object import DeviceLostError, RayDevice
 from actors.simulators.pool import RaySimulatorPool
-from tests.orchestrator.toy import ToyLaboratory
 from tests.reliability import strikes
 from tests.reliability.case import CUT, KILLED, STOPPED, Case, Outcome, every, first_and_last, first_of_kind
 from tests.reliability.formula import WORK, Formula
 from tests.reliability.program import LoggingBench
 from tests.reliability.rig import Life, Rig
+from tests.support.toy_campaign import ToyLaboratory
 
 SIMULATORS = 2
 

@@ -8,9 +8,9 @@ from typing import Any
 
 from actors.optimizer.optimizer_actor import Proposer
 from sim_engine.outcome import PourMeasurement
-from tests.orchestrator.toy import ToyBench, ToyLaboratory
 from tests.reliability.case import AHEAD, BACK, FULL, KILLED, KILLED_AFTER, STOPPED, Case, every
 from tests.reliability.rig import Life, Rig
+from tests.support.toy_campaign import ToyBench, ToyLaboratory
 
 
 class LoggingBench(ToyBench):

@@ -30,8 +30,6 @@ from orchestrator.runs.events import Event, PourProgressed, Watcher
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from tests.end_to_end.small import CAMPAIGN, write_campaign
-from tests.orchestrator.toy import ToyLaboratory
 from tests.reliability import strikes
 from tests.reliability.afterwards import entries, first_difference, kinds, record, state, unknown_pours, weights
 from tests.reliability.case import (
@@ -48,6 +46,8 @@ from tests.reliability.case import (
     points_of,
 )
 from tests.reliability.formula import LOG
+from tests.support.small_campaign import CAMPAIGN, write_campaign
+from tests.support.toy_campaign import ToyLaboratory
 
 PATIENCE = 240.0
 """Longest that one life may take [s]: Ray alone may wait for a simulator for two minutes."""
@@ -229,7 +229,7 @@ class Rig:
 
     async def campaign(self, life: Life, *, resume: bool) -> None:
         """The same, awaited."""
-        plan = replace(self.plan, outputs=replace(self.plan.outputs, directory=life.place))
+        plan = replace(self.plan, outputs=self.plan.outputs.model_copy(update={"directory": str(life.place)}))
         life.directory.mkdir(parents=True, exist_ok=True)
 
         def answer(question: str, options: Sequence[str]) -> str:

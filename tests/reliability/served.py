@@ -22,7 +22,6 @@ from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.daemon.daemon_settings import load_settings
 from orchestrator.daemon.server_process import serve
 from orchestrator.daemon.submissions import pack
-from tests.end_to_end.small import CAMPAIGN, write_campaign
 from tests.reliability import strikes
 from tests.reliability.case import (
     AHEAD,
@@ -39,6 +38,7 @@ from tests.reliability.case import (
 )
 from tests.reliability.formula import LOG, Formula
 from tests.reliability.rig import PATIENCE, Life, Moments, Rig
+from tests.support.small_campaign import CAMPAIGN, write_campaign
 
 TEXT = CAMPAIGN.replace("recorded_simulations: 1", "figures: false, rrd: false").replace(
     "on_unknown: repeat", "on_unknown: ask"

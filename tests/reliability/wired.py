@@ -17,12 +17,12 @@ from actors.bench.virtual_operator import VirtualOperator
 from actors.interfaces import OperatorQuestion, OperatorSpec
 from actors.laboratory import InProcessLaboratory
 from orchestrator.journal.journal import Kind
-from tests.actors.bench.conftest import wired_spec
 from tests.end_to_end.test_wired_campaign import write_wired
 from tests.reliability import strikes
 from tests.reliability.case import CUT, KILLED, STOPPED, Case, Point, every, first_of_kind
 from tests.reliability.formula import Formula
 from tests.reliability.rig import Life, Rig
+from tests.support.wired_bench import wired_spec
 
 PACE = 30.0
 

@@ -17,7 +17,7 @@ from sim_engine.resources import BackendError, cuda_devices, require_backend
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.vessel.shapes import cylinder
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 SCENE = Scene(
     "batch",

@@ -29,7 +29,7 @@ from sim_engine.simulator import (
 )
 from sim_engine.vessel.shapes import cylinder
 from sim_engine.vessel.vessel import build_vessel
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 SCENE = Scene(
     "calm",

@@ -28,7 +28,7 @@ from sim_engine.scene import Pivot, PoseError, SampledMotion, Scene
 from sim_engine.simulator import InvalidSceneError, check_motion
 from sim_engine.vessel.shapes import cylinder
 from sim_engine.vessel.vessel import build_vessel
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 A = build_vessel(cylinder("a", inner_radius=0.04, inner_height=0.1, wall=0.002, floor=0.002))
 B = build_vessel(cylinder("b", inner_radius=0.05, inner_height=0.08, wall=0.002, floor=0.002))

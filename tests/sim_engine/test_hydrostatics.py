@@ -12,19 +12,22 @@ from hypothesis import strategies as st
 from sim_engine.hydrostatics import level, predicted_end_of_flow, retained_volume, tilting_cup_outflow
 from sim_engine.vessel.shapes import ProfileShape, VesselSpec, cylinder
 from sim_engine.vessel.vessel import build_vessel
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 CUP = build_vessel(cylinder("cup", inner_radius=0.04, inner_height=0.1))
 BOTTLE = build_vessel(
     VesselSpec(
         name="bottle",
         shape=ProfileShape(
-            inner=((0.0, 0.0), (0.03, 0.0), (0.03, 0.1), (0.012, 0.11), (0.012, 0.13)), wall=0.002, floor=0.002
+            unit="m",
+            inner=((0.0, 0.0), (0.03, 0.0), (0.03, 0.1), (0.012, 0.11), (0.012, 0.13)),
+            wall=0.002,
+            floor=0.002,
         ),
     )
 )
 CONE = build_vessel(
-    VesselSpec(name="cone", shape=ProfileShape(inner=((0.0, 0.0), (0.05, 0.1)), wall=0.003, floor=0.003))
+    VesselSpec(name="cone", shape=ProfileShape(unit="m", inner=((0.0, 0.0), (0.05, 0.1)), wall=0.003, floor=0.003))
 )
 
 

@@ -95,7 +95,7 @@ def test_mug_retains_what_the_vessel_of_its_profile_retains(mug: Vessel) -> None
         (39, 82),
     ]
     points = tuple((r * 1e-3, z * 1e-3) for r, z in inner)
-    twin = build_vessel(VesselSpec(name="twin", shape=ProfileShape(inner=points, wall=0.003, floor=0.006)))
+    twin = build_vessel(VesselSpec(name="twin", shape=ProfileShape(unit="m", inner=points, wall=0.003, floor=0.006)))
     for tilt in (20, 40, 60, 70, 80, 95):
         kept = retained_volume(mug, math.radians(tilt))
         assert kept == pytest.approx(retained_volume(twin, math.radians(tilt)), abs=0.005 * mug.capacity)
@@ -158,7 +158,7 @@ def test_distance_of_a_mesh_is_the_distance_to_its_nearest_triangle(build: Make)
 
 def test_sign_of_a_mesh_is_that_of_the_same_profile(build: Make) -> None:
     meshed = build(cup())
-    shape = ProfileShape(inner=((0.0, 0.0), (0.03, 0.0), (0.03, 0.06)), wall=0.004, floor=0.004)
+    shape = ProfileShape(unit="m", inner=((0.0, 0.0), (0.03, 0.0), (0.03, 0.06)), wall=0.004, floor=0.004)
     turned = build_vessel(VesselSpec(name="profile", shape=shape))
     points = np.random.default_rng(2).uniform([-0.05, -0.05, -0.01], [0.05, 0.05, 0.08], (4000, 3))
     a, b = meshed.grid.sample(points), turned.grid.sample(points)

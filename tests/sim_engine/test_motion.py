@@ -13,7 +13,7 @@ from sim_engine.motion import PourMotion, plan_motion
 from sim_engine.scene import Pivot, SampledMotion, Scene
 from sim_engine.vessel.shapes import cylinder
 from sim_engine.vessel.vessel import build_vessel
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 CUP = cylinder("cup", inner_radius=0.04, inner_height=0.10)
 GLASS = cylinder("glass", inner_radius=0.045, inner_height=0.09)

@@ -20,7 +20,7 @@ from sim_engine.motion import plan_motion
 from sim_engine.scene import Pivot, SampledMotion, Scene
 from sim_engine.vessel.shapes import ProfileShape, VesselSpec, cylinder
 from sim_engine.vessel.vessel import build_vessel
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 CUP = cylinder("cup", inner_radius=0.04, inner_height=0.1)
 GLASS = cylinder("glass", inner_radius=0.045, inner_height=0.09)
@@ -36,7 +36,7 @@ NUMBERS = ("velocity", "thickness", "reynolds", "weber", "bond")
 def necked(radius: float) -> VesselSpec:
     """A bottle of 60 mm with a neck."""
     inner = ((0.0, 0.0), (0.03, 0.0), (0.03, 0.1), (radius, 0.11), (radius, 0.13))
-    return VesselSpec(name="bottle", shape=ProfileShape(inner=inner, wall=0.002, floor=0.002))
+    return VesselSpec(name="bottle", shape=ProfileShape(unit="m", inner=inner, wall=0.002, floor=0.002))
 
 
 def planned(scene: Scene = SCENE, action: Action = STANDARD, spacing: float = FINE) -> ModelValidity:

@@ -27,7 +27,7 @@ from sim_engine.validation.sensitivity import (
     grid,
     sensitivity,
 )
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 INFOS = {name: info for name, info in SimulationParameters.info().items() if not info.nuisance}
 NOISE = 0.01

@@ -202,7 +202,8 @@ def _exchange(connection: _Rtde, rate: float, seconds: float) -> Exchange:
     if connection.ask(rtde.START) != b"\x01":
         raise OSError("it doesn't begin to send")
     layout = struct.Struct(">B" + "".join(rtde.FORMATS[kind][0] for kind in known.values()))
-    arrivals, package, begin = [], b"", time.monotonic()
+    arrivals: list[float] = []
+    package, begin = b"", time.monotonic()
     while not arrivals or time.monotonic() - begin < seconds:
         kind, payload = connection.next()
         if kind == rtde.DATA_PACKAGE:

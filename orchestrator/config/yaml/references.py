@@ -7,21 +7,21 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from orchestrator.config.laboratory_file import LaboratoryFile, resolve_laboratory
-from orchestrator.config.vessel_file import MESH_SUFFIXES, LiquidFile, VesselFile, resolve_liquid, resolve_vessel
+from orchestrator.config.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
 from sim_engine.errors import shown_path
-from sim_engine.liquids import Liquid
-from sim_engine.settings.model import Section
+from sim_engine.liquids import Liquid, LiquidSettings
+from sim_engine.settings.model import Settings
 from sim_engine.vessel.shapes import VesselSpec
 
-S = TypeVar("S", bound=Section)
+S = TypeVar("S", bound=Settings)
 
 YAML_SUFFIXES = (".yaml", ".yml", ".json")
 
-KINDS: dict[type[Section], str] = {VesselFile: "vessel", LaboratoryFile: "laboratory"}
+KINDS: dict[type[Settings], str] = {VesselFile: "vessel", LaboratoryFile: "laboratory"}
 """Kinds of whole files that their keys identify."""
 
 
@@ -30,7 +30,7 @@ class References:
     """Follows paths from files to files. Problems in any of them are added to the report with their own place."""
 
     report: Report
-    _read: dict[tuple[Path, type[Section]], tuple[Section, Place] | None] = field(default_factory=dict)
+    _read: dict[tuple[Path, type[Settings]], tuple[Settings, Place] | None] = field(default_factory=dict)
     _vessels: dict[tuple[Path, Any], VesselSpec | None] = field(default_factory=dict)
 
     def section(self, value: Any, place: Place, model: type[S]) -> tuple[S, Place] | None:
@@ -96,8 +96,8 @@ class References:
 
     def liquid(self, value: Any, place: Place) -> Liquid | None:
         """A liquid; None after a problem."""
-        found = self.section(value, place, LiquidFile)
-        return None if found is None else resolve_liquid(*found, self.report)
+        found = self.section(value, place, LiquidSettings)
+        return None if found is None or self.report.is_broken_within(found[1]) else found[0].load()
 
     def laboratory(self, value: Any, place: Place) -> Any:
         """A `LaboratorySpec`; None after a problem."""

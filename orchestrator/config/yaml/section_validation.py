@@ -1,33 +1,34 @@
-"""Validates plain data with places into sections, and reports pydantic's errors as problems with their places.
+"""Validates plain data with places into settings, and reports pydantic's errors as problems with their places.
 
-`validate` finds as many problems as possible in one pass. `PlacedProblems` places problems that a strategy finds in its
-settings.
+`validate` finds as many problems as possible in one pass: invalid values, missing keys, and the problems that
+`Settings.check_values` finds between keys. `PlacedProblems` places the latter.
 """
 
 from __future__ import annotations
 
 import copy
 import typing
+from collections.abc import Iterator
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from orchestrator.config.action_ranges import EXAMPLES
+from orchestrator.config.search_ranges import EXAMPLES
 from orchestrator.config.yaml.yaml_source import Loc, Place, Report
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.errors import did_you_mean
-from sim_engine.settings.model import Section
+from sim_engine.settings.model import Problems, Settings
 from sim_engine.settings.quantity import FROM_FILE
 
-S = TypeVar("S", bound=Section)
+S = TypeVar("S", bound=Settings)
 
 
 def validate(model: type[S], place: Place, report: Report) -> S | None:
-    """The section at a place; all problems are added to the report.
+    """The settings at a place; all problems are added to the report.
 
     Invalid parts are removed and the rest is validated again. The result thus has all valid parts, which later checks
-    can use. It is None only if nothing is left.
+    can use. It is None only if nothing is left. After a problem it is a draft: required keys may be None.
     """
     document = place.document
     if place.loc == ():
@@ -59,12 +60,15 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
                     continue
                 unknown = detail["type"] == "extra_forbidden"
                 if (unknown or detail["type"] == "literal_error") and (retired := _retired(model, loc, data)):
-                    report.add(place.at(*loc), retired, key=unknown)
+                    text, renamed = retired
+                    report.add(place.at(*loc), text, key=unknown, renamed=renamed)
+                    if unknown and renamed:  # the key is not reported as missing as well
+                        report.broken.add((place.document.path, place.at(*loc[:-1], renamed[1]).loc))
                 elif unknown and (owners := _owners(model, loc, data)):
                     if loc[:-1] not in guessed:
                         here = _variant(_sections_at(model, loc[:-1], data), _node(data, loc[:-1]))
-                        names = " and ".join(sorted({_tag(owner) for owner in owners}))
-                        text = f"belongs to {names}, not to {' or '.join(map(_tag, here))}; remove it"
+                        names = " and ".join(sorted({owner.tag_word() for owner in owners}))
+                        text = f"belongs to {names}, not to {' or '.join(one.tag_word() for one in here)}; remove it"
                         report.add(place.at(*loc), text, key=True)
                 else:
                     report.add(place.at(*loc), _message(model, detail, loc, data), key=unknown)
@@ -76,56 +80,63 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
                 return None
             continue
         _note_missing(section, place, report)
+        _check_values(section, place, report)
         return section
 
 
-def _guess_variant(variants: set[type[Section]], data: dict[str, Any], place: Place, report: Report) -> None:
+def _guess_variant(variants: set[type[Settings]], data: dict[str, Any], place: Place, report: Report) -> None:
     """Report that the key that selects the variant is missing or wrong; continue with the best-matching variant."""
     key, word = next(iter(variants)).tag, data.get(next(iter(variants)).tag)
-    words = sorted(map(_tag, variants))
+    new = next((s.retired[f"{key}: {word}"].partition(": ")[2] for s in variants if f"{key}: {word}" in s.retired), "")
+    if new:
+        report.add(place.at(key), f"{word!r} is called '{new}' now; write that", renamed=(str(word), new))
+        data[key] = new
+        return
+    words = sorted(section.tag_word() for section in variants)
     if word is None:
-        examples = [section.required[key] for section in variants if key in section.required]
-        text = f"key '{key}' is missing; add for example '{key}: {sorted(examples)[-1]}'"
+        examples = [keys[key] for section in variants if key in (keys := section.required_keys())]
+        text = f"key '{key}' is missing; add for example '{key}: {max(examples)}'"
         report.add(place, text, key=True)
         report.broken.add((place.document.path, place.at(key).loc))
     else:
         expected = " or ".join([", ".join(map(repr, words[:-1])), repr(words[-1])])
         said = next(iter(variants)).unknown_tag(word) if isinstance(word, str) else ""
         report.add(place.at(key), said or _one_of(word, expected))
-    data[key] = max(words, key=lambda w: len(data.keys() & next(v for v in variants if _tag(v) == w).written_keys()))
+    by_word = {section.tag_word(): section for section in variants}
+    data[key] = max(words, key=lambda word: len(data.keys() & by_word[word].written_keys()))
 
 
-def _tag(section: type[Section]) -> str:
-    """The word that selects a variant."""
-    return section.variant or str(section.model_fields[section.tag].default)
-
-
-def _retired(model: type[Section], loc: Loc, data: Any) -> str:
-    """What to write in place of a key or value that earlier versions had; empty where none had it."""
+def _retired(model: type[Settings], loc: Loc, data: Any) -> tuple[str, tuple[str, str] | None] | None:
+    """The message about a key or value that earlier versions had, and its old and new name, if it has a new one."""
     if not loc or _loc_in(data, loc) != loc:
-        return ""
-    key, value = loc[-1], _node(data, loc)
+        return None
+    key, pair = str(loc[-1]), f"{loc[-1]}: {_node(data, loc)}"
     for section in _sections_at(model, loc[:-1], data):
+        if key in section.removed:
+            return section.removed[key], None
         if key in section.retired:
-            return section.retired[str(key)]
-        if text := section.retired.get(f"{key}: {value}"):
-            return f"{value!r} {text}"
-    return ""
+            new = section.retired[key]
+            return f"is called '{new}' now; rename it, or use 'decant migrate'", (key, new)
+        if pair in section.removed:
+            return f"{_node(data, loc)!r} {section.removed[pair]}", None
+        if pair in section.retired:
+            new = section.retired[pair].partition(": ")[2]
+            return f"{_node(data, loc)!r} is called '{new}' now; write that", (str(_node(data, loc)), new)
+    return None
 
 
-def _variant(sections: set[type[Section]], data: Any) -> set[type[Section]]:
+def _variant(sections: set[type[Settings]], data: Any) -> set[type[Settings]]:
     """The sections that the data are meant to be, among those that are possible at their place."""
     if not isinstance(data, dict):
         return sections
     return {
         section
         for section in sections
-        if not section.tag
-        or (_tag(section) == data[section.tag] if section.tag in data else section.tag not in section.required)
+        if not section.tag or section.tag_word() == data.get(section.tag, section.default_tag)
     }
 
 
-def _owners(model: type[Section], loc: Loc, data: Any) -> set[type[Section]]:
+def _owners(model: type[Settings], loc: Loc, data: Any) -> set[type[Settings]]:
     """The variants that have a key which the selected variant lacks."""
     variants = {section for section in _sections_at(model, loc[:-1], data) if section.tag}
     if not variants and len(loc) > 1 and any(section.variant for section in _sections_at(model, loc[:-1], data)):
@@ -179,22 +190,34 @@ def _cut_empty(data: Any, place: Place, report: Report) -> None:
             _cut_empty(value, place.at(i), report)
 
 
-def _note_missing(section: Section, place: Place, report: Report) -> None:
-    for key, example in section.required.items():
+def _note_missing(section: Settings, place: Place, report: Report) -> None:
+    for key, example in section.required_keys().items():
         if section.value(key) is None and not report.is_broken_within(place.at(key)):
             shown = f"{key}: {example}"
             report.add(place, f"key '{key}' is missing; add for example '{shown}'", key=True)
+            report.broken.add((place.document.path, place.at(key).loc))
+    for inner, at in _inside(section, place):
+        _note_missing(inner, at, report)
+
+
+def _check_values(section: Settings, place: Place, report: Report) -> None:
+    """Apply the rules between keys, those of inner settings first."""
+    for inner, at in _inside(section, place):
+        _check_values(inner, at, report)
+    section.check_values(PlacedProblems(place, report))
+
+
+def _inside(section: Settings, place: Place) -> Iterator[tuple[Settings, Place]]:
+    """The settings in other settings that are written in the same file."""
     for key in section.written_keys():
         value = section.value(key)
-        if isinstance(value, Section) and place.at(key).loc in place.document.marks:
-            _note_missing(value, place.at(key), report)
-        elif isinstance(value, (list, tuple)):
-            for i, item in enumerate(value):
-                if isinstance(item, Section):
-                    _note_missing(item, place.at(key, i), report)
+        if isinstance(value, Settings) and place.at(key).loc in place.document.marks:
+            yield value, place.at(key)
+        elif isinstance(value, list | tuple):
+            yield from ((item, place.at(key, i)) for i, item in enumerate(value) if isinstance(item, Settings))
 
 
-def _message(model: type[Section], detail: ErrorDetails, loc: Loc, data: Any) -> str:
+def _message(model: type[Settings], detail: ErrorDetails, loc: Loc, data: Any) -> str:
     context = detail.get("ctx", {})
     value = detail["input"]
     match detail["type"]:
@@ -240,7 +263,7 @@ def _bound(number: float) -> str:
     return f"{number:,}" if isinstance(number, int) and number >= 10_000 else f"{number:g}"
 
 
-def _unknown_key(model: type[Section], loc: Loc, data: Any) -> str:
+def _unknown_key(model: type[Settings], loc: Loc, data: Any) -> str:
     key = str(loc[-1])
     guess = _meant(model, loc, data)
     if guess is not None:
@@ -253,23 +276,23 @@ def _unknown_key(model: type[Section], loc: Loc, data: Any) -> str:
     return f"unknown key; known here: {', '.join(sorted(known))}"
 
 
-def _keys(sections: set[type[Section]]) -> set[str]:
+def _keys(sections: set[type[Settings]]) -> set[str]:
     return {name for section in sections for name in section.written_keys()}
 
 
-def _meant(model: type[Section], loc: Loc, data: Any) -> str | None:
+def _meant(model: type[Settings], loc: Loc, data: Any) -> str | None:
     """The key most similar to a misspelt one: of the selected variant, or of another one."""
     variants = _sections_at(model, loc[:-1], data)
     own = _keys(_variant(variants, _node(data, loc[:-1])))
     return did_you_mean(str(loc[-1]), own) or did_you_mean(str(loc[-1]), _keys(variants))
 
 
-def _sections_at(model: type[Section], loc: Loc, data: Any) -> set[type[Section]]:
+def _sections_at(model: type[Settings], loc: Loc, data: Any) -> set[type[Settings]]:
     """The sections that are possible at a location of the data (several for a union)."""
-    candidates: set[type[Section]] = {model}
+    candidates: set[type[Settings]] = {model}
     for part in loc:
         if not isinstance(part, int):
-            below: set[type[Section]] = set()
+            below: set[type[Settings]] = set()
             for candidate in _variant(candidates, data):
                 if part in candidate.written_keys():
                     below |= sections_in(candidate.model_fields[candidate.written_keys()[part]].annotation)
@@ -278,10 +301,10 @@ def _sections_at(model: type[Section], loc: Loc, data: Any) -> set[type[Section]
     return candidates
 
 
-def sections_in(annotation: Any) -> set[type[Section]]:
+def sections_in(annotation: Any) -> set[type[Settings]]:
     """The sections that a field may hold."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return {annotation} if issubclass(annotation, Section) else set()
+        return {annotation} if issubclass(annotation, Settings) else set()
     return {section for argument in typing.get_args(annotation) for section in sections_in(argument)}
 
 
@@ -309,32 +332,38 @@ def _name(value: Any) -> str:
 
 
 class PlacedProblems:
-    """Problems of a section, placed by its keys; see `orchestrator.strategies.campaign_plan.Complaints`.
+    """See `sim_engine.settings.model.Problems`.
 
     Args:
-        place: place of the section.
-        common: keys of the section that do not belong to the strategy.
+        place: place of the settings.
+        common: keys of the settings that `any` ignores.
     """
 
-    def __init__(self, place: Place, report: Report, common: frozenset[str]) -> None:
+    def __init__(self, place: Place, report: Report, common: frozenset[str] = frozenset()) -> None:
         self._place, self._report, self._common = place, report, common
         self._before = len(report.problems)
 
     def add(self, text: str, *at: str | int, key: bool = False, of: str = "") -> None:
-        """Add a problem, unless one was added at the same place."""
-        where = self._place.at(*at)
-        if (at and self._below(where.loc)) or (of and self._below(self._place.at(of).loc)):
+        """See `Problems.add`."""
+        if (at and self._report.is_broken_within(self._place.at(*at))) or (of and not self.valid(of)):
             return
-        self._report.add(where, text, key=key)
+        self._report.add(self._place.at(*at), text, key=key)
 
     @property
     def any(self) -> bool:
-        """Whether the strategy's settings have problems."""
+        """See `Problems.any`."""
         if len(self._report.problems) > self._before:
             return True
-        start = len(self._place.loc)
-        return any(loc[start] not in self._common for loc in self._below(self._place.loc) if len(loc) > start)
+        path, here, start = self._place.document.path, self._place.loc, len(self._place.loc)
+        return any(
+            where == path and loc[:start] == here and len(loc) > start and loc[start] not in self._common
+            for where, loc in self._report.broken
+        )
 
-    def _below(self, loc: Loc) -> list[Loc]:
-        path = self._place.document.path
-        return [found for where, found in self._report.broken if where == path and found[: len(loc)] == loc]
+    def valid(self, *keys: str) -> bool:
+        """See `Problems.valid`."""
+        return not any(self._report.is_broken_within(self._place.at(key)) for key in keys)
+
+    def within(self, *at: str | int) -> Problems:
+        """See `Problems.within`."""
+        return PlacedProblems(self._place.at(*at), self._report)

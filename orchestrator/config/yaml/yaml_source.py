@@ -129,11 +129,11 @@ class Document:
                 known = (*known, part)
         return known
 
-    def problem(self, loc: Loc, message: str, *, key: bool = False) -> Problem:
+    def problem(self, loc: Loc, message: str, *, key: bool = False, renamed: tuple[str, str] | None = None) -> Problem:
         """A problem at a location. It points at the value if that fits on a line, else (or with `key`) at the key."""
         mark = self.marks[self.known_loc(loc)]
         line, column = mark.value if mark.inline and not key else mark.key
-        return Problem(self.path, line, column, dotted(loc), message, self.line(line))
+        return Problem(self.path, line, column, dotted(loc), message, self.line(line), renamed)
 
     def _plain(self, node: Node, loc: Loc, active: frozenset[int] = frozenset()) -> Any:
         self._nodes += 1
@@ -259,9 +259,9 @@ class Report:
     problems: list[Problem] = field(default_factory=list)
     broken: set[tuple[Path, Loc]] = field(default_factory=set)
 
-    def add(self, place: Place, message: str, *, key: bool = False) -> None:
-        """Add a problem; its place then counts as invalid."""
-        self.problems.append(place.document.problem(place.loc, message, key=key))
+    def add(self, place: Place, message: str, *, key: bool = False, renamed: tuple[str, str] | None = None) -> None:
+        """Add a problem; its place then counts as invalid. `renamed`: see `Problem`."""
+        self.problems.append(place.document.problem(place.loc, message, key=key, renamed=renamed))
         self.broken.add((place.document.path, place.document.known_loc(place.loc)))
 
     def is_broken(self, place: Place) -> bool:

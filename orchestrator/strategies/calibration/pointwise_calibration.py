@@ -154,7 +154,6 @@ def _score(trial: Trial) -> float | None:
 class C1Settings(DesignSettings):
     """C1: a uniform grid, each θ on all training pours."""
 
-    required: ClassVar[dict[str, str]] = {"strategy": "C1"}
     examples: ClassVar[dict[str, str]] = {"grid": "{particles: 5, cohesion: 6}", "per_axis": "10"}
 
     strategy: Literal["C1"] = "C1"
@@ -224,7 +223,6 @@ class UniformGrid(BestOfDesign[C1Settings]):
 class C2Settings(DesignSettings):
     """C2: stratified sampling, each θ on all training pours."""
 
-    required: ClassVar[dict[str, str]] = {"strategy": "C2"}
     examples: ClassVar[dict[str, str]] = {"samples": "18"}
 
     strategy: Literal["C2"] = "C2"
@@ -265,7 +263,6 @@ class StratifiedSampling(BestOfDesign[C2Settings]):
 class C3Settings(DesignSettings):
     """C3: Bayesian optimisation, each θ on all training pours."""
 
-    required: ClassVar[dict[str, str]] = {"strategy": "C3"}
     examples: ClassVar[dict[str, str]] = {"iterations": "59"}
 
     strategy: Literal["C3"] = "C3"

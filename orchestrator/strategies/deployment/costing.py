@@ -23,7 +23,7 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Fractions, Loss, PourMeasurement
 from sim_engine.scene import Scene
 from sim_engine.search_space import Space
-from sim_engine.settings.model import Section
+from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
 
 
@@ -108,10 +108,10 @@ WITHOUT_OUTCOME = 2.0
 """CPU seconds of a simulation while no outcome has any."""
 
 
-class PricesSettings(Section):
+class PricesSettings(Settings):
     """D3 with `per_pour: free`: costs by which simulations are chosen and ended."""
 
-    retired: ClassVar[dict[str, str]] = {
+    removed: ClassVar[dict[str, str]] = {
         "simulation": "was retired; remove it: outcomes say what a simulation costs before anything depends on it"
     }
 

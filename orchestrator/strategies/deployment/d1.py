@@ -39,7 +39,6 @@ larger."""
 class D1Settings(SearchSettings):
     """D1: plan in simulation, then pour once."""
 
-    required: ClassVar[dict[str, str]] = {"strategy": "D1"}
     learns_on_pours: ClassVar[bool] = False
 
     strategy: Literal["D1"] = "D1"

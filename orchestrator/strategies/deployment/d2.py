@@ -15,7 +15,6 @@ from sim_engine.scene import Scene
 class D2Settings(SearchSettings):
     """D2: learn from real pours."""
 
-    required: ClassVar[dict[str, str]] = {"strategy": "D2"}
     simulates: ClassVar[bool] = False
 
     strategy: Literal["D2"] = "D2"

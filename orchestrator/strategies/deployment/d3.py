@@ -50,8 +50,7 @@ if TYPE_CHECKING:
 class D3Settings(SearchSettings):
     """D3: real pours with a simulated prior."""
 
-    required: ClassVar[dict[str, str]] = {"strategy": "D3"}
-    retired: ClassVar[dict[str, str]] = {
+    removed: ClassVar[dict[str, str]] = {
         "trust": (
             "was retired; remove it: 'model: adaptive' weighs the simulator by every pour ('ignorance' says what "
             "follows), 'model: residual' always believes it"

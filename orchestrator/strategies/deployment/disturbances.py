@@ -18,7 +18,7 @@ from orchestrator.strategies.campaign_plan import Draw
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseError
 from sim_engine.search_space import Axis, Space
-from sim_engine.settings.model import Problems, Section
+from sim_engine.settings.model import Problems, Settings
 from sim_engine.settings.quantity import Quantity
 
 ERRORS = ("x", "y", "tilt", "speed_factor", "z")
@@ -47,7 +47,7 @@ Factor = Annotated[float, Quantity("1", "1.02", 0.5, 1.5)]
 Spread = Annotated[float, Quantity("1", "0.01", 0.0, 0.5)]
 
 
-class PoseErrorSection(Section):
+class PoseErrorSection(Settings):
     """How the real placement differs from the intended one."""
 
     x: Offset = 0.0
@@ -66,7 +66,7 @@ class PoseErrorSection(Section):
     """Executed over commanded angular velocity."""
 
 
-class PoseNoiseSection(Section):
+class PoseNoiseSection(Settings):
     """Standard deviations of the same from pour to pour."""
 
     x: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
@@ -85,7 +85,7 @@ class PoseNoiseSection(Section):
     """Standard deviation of executed over commanded angular velocity."""
 
 
-class RiskSettings(Section):
+class RiskSettings(Settings):
     """Plan for errors of execution and uncertain θ, instead of one pour that is executed exactly."""
 
     measure: Literal["expected", "cvar"] = "expected"

@@ -13,7 +13,7 @@ from orchestrator.strategies.deployment.real_pours import PourTrial
 from orchestrator.strategies.stage_result import ResultPart
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.search_space import Axis, Space
-from sim_engine.settings.model import Section
+from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
 
 Otherwise = Literal["ask", "go on", "stop"]
@@ -29,7 +29,7 @@ WORDS = ((0.05, "is borne out"), (DOUBT, "is borne out so far"), (0.7, "is in do
 """The words for a simulator whose ignorance is below each of these; above all of them it is wrong here."""
 
 
-class DiscrepancyPolicySettings(Section):
+class DiscrepancyPolicySettings(Settings):
     """D3 with `model: adaptive`: what follows when the simulator seems to say nothing of this bench."""
 
     limit: Annotated[float, Quantity("1", "90 %", 0.1, 1.0)] = 0.9
@@ -40,7 +40,7 @@ class DiscrepancyPolicySettings(Section):
     question."""
 
 
-class RiskLimitSettings(Section):
+class RiskLimitSettings(Settings):
     """D3 with `model: adaptive`: what no pour may lose, once one has kept it."""
 
     loss: Annotated[float, Quantity("1", "10 %", 1e-3, 1.0)] = 0.1
@@ -54,7 +54,7 @@ class RiskLimitSettings(Section):
     deployment ends; ask: the campaign pauses with a question."""
 
 
-class StopSettings(Section):
+class StopSettings(Settings):
     """D3 with `model: adaptive`: when no further pour is worth it."""
 
     gain_below: Annotated[float, Quantity("1", "0.2 %", 1e-5, 1.0)] = 0.002

@@ -19,7 +19,7 @@ from sim_engine.motion import turn
 from sim_engine.outcome import Fractions
 from sim_engine.scene import Scene
 from sim_engine.search_space import Space
-from sim_engine.settings.model import Section
+from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ STOPS = ("max_angle", "hold_time")
 """Dimensions of an action that can end a pour before the pourer is empty."""
 
 
-class Objective(Section):
+class Objective(Settings):
     """One objective of a pour: dimensionless, and about 1 for a bad pour.
 
     A derived class defines one objective: its settings, its equation and its worst value. It is registered as an entry

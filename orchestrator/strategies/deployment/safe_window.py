@@ -15,7 +15,7 @@ from typing import Annotated, ClassVar, Literal
 from actors.optimizer.questions import Point
 from orchestrator.strategies.stage_result import ResultPart, displayed_action
 from sim_engine.search_space import Space
-from sim_engine.settings.model import Section
+from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
 
 PLACES = 40
@@ -28,7 +28,7 @@ Way = Literal["low", "high"]
 _WAYS: tuple[Way, Way] = ("low", "high")
 
 
-class WindowSettings(Section):
+class WindowSettings(Settings):
     """Find the permitted deviation from the planned action in each dimension, within a tolerated loss."""
 
     required: ClassVar[dict[str, str]] = {"tolerance": "2 %"}

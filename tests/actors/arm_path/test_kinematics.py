@@ -10,9 +10,8 @@ from hypothesis.extra.numpy import arrays
 
 from actors.arm.planning.kinematics import MODELS, beyond_reach, forward, inverse, link_points, posture, singularities
 from actors.emulators.ur_controller.robot_kinematics import Kinematics
-from tests.depth import examples
-
-from .cell import SPEC, turned
+from tests.support.hypothesis_examples import examples
+from tests.support.planning_cell import SPEC, turned
 
 MODEL = MODELS["ur10e"]
 joints = arrays(float, 6, elements=st.floats(-3.1, 3.1))

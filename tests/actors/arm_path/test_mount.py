@@ -15,8 +15,7 @@ from actors.arm.planning.path_checks import check_limits
 from actors.arm.planning.pour_planner import plan_path
 from actors.interfaces import InvalidActionError
 from sim_engine.action import DEG
-
-from .cell import SPEC, motion, vessel
+from tests.support.planning_cell import SPEC, motion, vessel
 
 MOUNTS = {"wall": Mount(tilt=90 * DEG), "ceiling": Mount(tilt=180 * DEG, turn=30 * DEG), "tilt": Mount(tilt=-35 * DEG)}
 RECEIVERS = {"wall": (0.2, 0.75, 0.3), "ceiling": (0.2, 0.75, -0.8), "tilt": (0.75, 0.1, 0.1)}

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from actors.arm.planning.trajectory import STEEPEST, followable, pour_times, trapezoid
 from sim_engine.action import DEG
 from sim_engine.motion import Phase, PourMotion, Segment
-from tests.depth import examples
-
-from .cell import ACTION, motion
+from tests.support.hypothesis_examples import examples
+from tests.support.planning_cell import ACTION, motion
 
 STEP = ACTION.with_values(angular_acceleration=None, angular_velocity=100 * DEG)
 

@@ -27,9 +27,8 @@ from sim_engine.collision import clearance, first_contact, rotations
 from sim_engine.motion import plan_motion
 from sim_engine.scene import Pivot
 from sim_engine.vessel.vessel import build_vessel
-from tests.depth import examples
-
-from .cell import ACTION, CONFIGS, LIMITS, SPEC, limited, motion, turned, vessel, waiting_at
+from tests.support.hypothesis_examples import examples
+from tests.support.planning_cell import ACTION, CONFIGS, LIMITS, SPEC, limited, motion, turned, vessel, waiting_at
 
 actions = st.builds(
     lambda speed, angle, acceleration, hold, back, x, y, height: ACTION.with_values(

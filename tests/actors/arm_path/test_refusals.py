@@ -15,8 +15,7 @@ from actors.arm.planning.pour_planner import plan_path
 from actors.interfaces import InvalidActionError
 from sim_engine.action import DEG, Action
 from sim_engine.scene import Pivot
-
-from .cell import ACTION, LIMITS, SPEC, limited, motion, placed, vessel, waiting_at
+from tests.support.planning_cell import ACTION, LIMITS, SPEC, limited, motion, placed, vessel, waiting_at
 
 
 def refusal(spec: UrArmSpec = SPEC, action: Action = ACTION, pivot: Pivot | None = None) -> str:

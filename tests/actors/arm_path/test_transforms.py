@@ -15,9 +15,8 @@ from actors.arm.planning.kinematics import MODELS, inverse
 from actors.arm.planning.pour_planner import plan_path
 from sim_engine.action import DEG
 from sim_engine.collision import rotations
-from tests.depth import examples
-
-from .cell import SPEC, motion, placed, turned, vessel
+from tests.support.hypothesis_examples import examples
+from tests.support.planning_cell import SPEC, motion, placed, turned, vessel
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from actors.arm.planning.collision_geometry import hull
 from actors.arm.planning.frames import about, between, from_vector, to_quaternions
-from tests.depth import examples
-
-from .cell import vessel
+from tests.support.hypothesis_examples import examples
+from tests.support.planning_cell import vessel
 
 vectors = st.tuples(*[st.floats(-7.0, 7.0)] * 3)
 

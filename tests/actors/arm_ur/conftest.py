@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import os
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -15,18 +13,11 @@ from actors.arm.planned_pour import PourPath
 from actors.arm.ur.ur_driver import UrArm
 from actors.contract_tests import contract_calls
 from actors.emulators.ur_controller import VirtualController
-from tests.patience import PATIENCE
-
-from .pours import HOME, START, pour_path, settings
+from tests.support.loopback import free_address
+from tests.support.ur_pours import HOME, START, pour_path, settings
+from tests.support.waiting import PATIENCE
 
 SCALE = 10.0
-_numbers = itertools.count(2)
-
-
-def next_address() -> str:
-    """A loopback address that no other test, and no other test process, uses."""
-    pid, number = os.getpid(), next(_numbers)
-    return f"127.{160 + pid % 64}.{pid // 64 % 256}.{number}"
 
 
 class Call(contract_calls.Call):
@@ -120,7 +111,7 @@ class Makers:
         scale = changes.pop("time_scale", SCALE)
         options: dict[str, Any] = {"model": changes.pop("there", "ur10e"), "time_scale": scale, "joints": HOME}
         options["frequency"] = changes.pop("frequency", 125.0)
-        controller = VirtualController.start(address=next_address(), **options)
+        controller = VirtualController.start(address=free_address(), **options)
         arm = UrArm(settings(controller.address, time_scale=scale, **changes))
         rig = Rig(controller, arm, path or pour_path())
         self._made.append(rig)

@@ -18,15 +18,15 @@ from actors.arm.ur.ur_driver import UrArm
 from actors.contract_tests.arm_contract import ArmBench, ArmContract
 from actors.emulators.ur_controller import VirtualController
 from sim_engine.action import DEG
+from tests.support.loopback import free_address
 
-from .conftest import next_address
 from .test_planned import ACTION, SPEC, motion, vessels
 
 
 def bench_of(cls: type[UrArm]) -> Iterator[ArmBench]:
     """An arm and its controller, whose true joints are the witness."""
     path = plan_path(motion(ACTION.with_values(angular_velocity=25 * DEG)), SPEC, *vessels())
-    with VirtualController.start(next_address(), SPEC.model, SPEC.time_scale, 125.0, joints=SPEC.home) as controller:
+    with VirtualController.start(free_address(), SPEC.model, SPEC.time_scale, 125.0, joints=SPEC.home) as controller:
 
         def true_poses(since: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
             kept = controller.fault("history", since=max(since + 1e-6, 0.0))

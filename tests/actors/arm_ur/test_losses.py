@@ -27,10 +27,11 @@ from actors.arm.ur.urscript_writer import path_program
 from actors.arm.ur.worker_messages import MotionSettings
 from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import child_environment
-from tests.patience import PATIENCE
+from tests.support.loopback import free_address
+from tests.support.ur_pours import START, pour_path, settings
+from tests.support.waiting import PATIENCE
 
-from .conftest import Call, Rig, next_address
-from .pours import START, pour_path, settings
+from .conftest import Call, Rig
 
 Make = Callable[..., Rig]
 LONG_TILT = pour_path(angle=math.radians(80.0), speed=math.radians(15.0), hold=20.0)
@@ -119,12 +120,12 @@ def test_after_a_reboot_in_mid_pour_tool_and_payload_are_set_again(make_rig: Mak
 @pytest.mark.realtime
 def test_nobody_there_is_told_with_what_to_look_at() -> None:
     with pytest.raises(ArmLostError, match=r"no robot at 127\..*RTDE.*Is the controller on"):
-        UrArm(settings(next_address())).connect()
+        UrArm(settings(free_address())).connect()
 
 
 @pytest.mark.realtime
 def test_a_controller_that_accepts_and_says_nothing_does_not_hang_the_driver() -> None:
-    address = next_address()
+    address = free_address()
     with contextlib.ExitStack() as stack:
         for port in (30004, 29999, 30001):
             server = stack.enter_context(socket.create_server((address, port)))
@@ -328,7 +329,7 @@ def _upload(rig: Rig, statements: str) -> None:
     ],
 )
 def test_what_is_no_path_is_refused_before_it_reaches_the_robot(times: Any, joints: Any) -> None:
-    arm = UrArm(settings("127.0.0.99"))
+    arm = UrArm(settings(free_address()))
     arm.release()
     with pytest.raises(ArmRefusedError, match="path"):
         arm.move_to_start(replace(pour_path(), approach=JointPath(np.array(times), joints)))

@@ -19,9 +19,8 @@ from actors.arm.ur.motion_segments import jog_path, leans, rejoin, upright_way, 
 from actors.arm.ur.primary_interface import PrimaryError, split
 from actors.arm.ur.urscript_writer import path_program, thinned
 from actors.arm.ur.worker_messages import MotionSettings
-from tests.depth import examples
-
-from .pours import HOME, START, pour_path, settings, smooth
+from tests.support.hypothesis_examples import examples
+from tests.support.ur_pours import HOME, START, pour_path, settings, smooth
 
 NO_TOOL = MotionSettings((0.0,) * 6, 0.0, (0.0,) * 3)
 POUR = pour_path()

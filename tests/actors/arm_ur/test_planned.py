@@ -23,8 +23,9 @@ from sim_engine.motion import PourMotion, plan_motion
 from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import cylinder
 from sim_engine.vessel.vessel import Vessel, build_vessel
+from tests.support.loopback import free_address
 
-from .conftest import Call, Rig, next_address
+from .conftest import Call, Rig
 
 SPEC = UrArmSpec(
     model="ur10e",
@@ -65,7 +66,7 @@ def planned() -> Callable[..., Rig]:
 
     def make(action: Action) -> Rig:
         path = plan_path(motion(action), SPEC, *vessels())
-        controller = VirtualController.start(next_address(), "ur10e", SPEC.time_scale, 125.0, joints=SPEC.home)
+        controller = VirtualController.start(free_address(), "ur10e", SPEC.time_scale, 125.0, joints=SPEC.home)
         made.append(Rig(controller, UrArm(replace(SPEC, address=controller.address)), path))
         made[-1].arm.connect()
         return made[-1]

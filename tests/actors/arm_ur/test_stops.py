@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from actors.arm.arm_interface import ArmNotReleasedError, ArmRefusedError, ArmStoppedError
+from tests.support.ur_pours import HOME, START, pour_path
 
 from .conftest import Call, Rig
-from .pours import HOME, START, pour_path
 
 Make = Callable[..., Rig]
 DEG = math.radians(1.0)

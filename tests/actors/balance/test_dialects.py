@@ -15,7 +15,7 @@ from actors.balance.dialects.kern_swt import KERN_SWT, KernSwt
 from actors.balance.dialects.mt_sics import MT_SICS
 from actors.balance.dialects.sbi import SBI, Sbi
 from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingReply, ReadingStatus
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 SPEAKERS: tuple[Dialect, ...] = (*dialects().values(), KernSwt(short=True), Sbi(identified=True))
 

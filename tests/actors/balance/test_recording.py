@@ -15,7 +15,7 @@ from actors.balance.record_line import main
 from actors.balance.serial_balance import SerialBalance
 from actors.emulators.serial_balance.balance_process import RecordedBalance
 from actors.runtime.child_process import child_environment
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 from .conftest import spec_for
 

@@ -14,7 +14,7 @@ from actors.balance.balance_interface import BalanceError, NotStableError, OutOf
 from actors.balance.balance_settings import SettlingRule
 from actors.balance.serial_balance import SerialBalance
 from actors.runtime.remote_object import LocalDevice, RayDevice
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 from .conftest import spec_for
 

@@ -9,7 +9,7 @@ import pytest
 
 from actors.balance.balance_interface import BalanceError, NoConnectionError
 from actors.balance.balance_settings import SettlingRule
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 from .conftest import SOON
 

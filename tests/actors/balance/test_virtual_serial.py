@@ -20,7 +20,7 @@ from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.serial_balance.emulated_balance import Emulation
 from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import child_environment
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 from .conftest import spec_for
 

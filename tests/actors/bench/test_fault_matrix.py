@@ -24,9 +24,8 @@ from actors.bench.virtual_operator import VirtualOperator
 from actors.interfaces import LaboratoryError, NotPouredError, OperatorSpec, UnknownPourError
 from sim_engine.action import DEG
 from sim_engine.outcome import PourMeasurement
-from tests.patience import PATIENCE
-
-from .conftest import ACTION, SCENE, Stage, wired_spec
+from tests.support.waiting import PATIENCE
+from tests.support.wired_bench import ACTION, SCENE, Stage, wired_spec
 
 PACE = 15.0
 """Bench seconds per second."""

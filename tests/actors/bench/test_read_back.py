@@ -13,8 +13,7 @@ from actors.bench.virtual_bench import slipped
 from actors.interfaces import UnknownPourError
 from sim_engine.action import DEG
 from sim_engine.scene import SampledMotion
-
-from .conftest import ACTION, reach, wired_spec
+from tests.support.wired_bench import ACTION, reach, wired_spec
 
 PACE = 10.0
 

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -15,24 +14,24 @@ from actors.runtime.child_process import child_environment
 PACE = 15.0
 
 PROGRAM = f"""
-import asyncio, runpy, sys
-here = runpy.run_path({str(Path(__file__).with_name("conftest.py"))!r})
+import asyncio
 from actors.laboratory import InProcessLaboratory
 from actors.interfaces import LaboratoryError
+from tests.support.wired_bench import ACTION, SCENE, Trickle, wired_spec
 
 def look(progress):
     if progress.checkpoint == "tilt" and (progress.tilt or 0.0) > 0.1:
         print("tilts", flush=True)
 
 async def play():
-    spec = here["wired_spec"](pace={PACE}, hurried=True)
-    async with InProcessLaboratory(spec, here["Trickle"], need_bench=True) as laboratory:
-        slowly = here["ACTION"].with_values(angular_velocity=0.4, return_velocity=0.4)
+    spec = wired_spec(pace={PACE}, hurried=True)
+    async with InProcessLaboratory(spec, Trickle, need_bench=True) as laboratory:
+        slowly = ACTION.with_values(angular_velocity=0.4, return_velocity=0.4)
         for seed in (5, 6):
-            action = slowly if seed == 5 else here["ACTION"]
+            action = slowly if seed == 5 else ACTION
             try:
                 watch = look if seed == 5 else None
-                measured = await laboratory.bench.pour(here["SCENE"], action, seed=seed, progress=watch)
+                measured = await laboratory.bench.pour(SCENE, action, seed=seed, progress=watch)
                 print("outcome", measured, flush=True)
             except LaboratoryError as error:
                 print("outcome", type(error).__name__, error, flush=True)

@@ -15,8 +15,7 @@ from actors.balance.weighing_plan import Placement
 from actors.bench.device_emulators import History
 from actors.interfaces import InvalidActionError, NotPouredError, OperatorSpec, PourProgress
 from sim_engine.outcome import PourMeasurement
-
-from .conftest import ACTION, SCENE, Stage, opened_stage, reach, wired_spec
+from tests.support.wired_bench import ACTION, SCENE, Stage, opened_stage, reach, wired_spec
 
 DEFAULT = (Placement.TRAY, Placement.RECEIVER, Placement.MANUAL)
 

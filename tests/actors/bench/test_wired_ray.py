@@ -13,8 +13,7 @@ import pytest
 
 from actors.interfaces import Notice, UnknownPourError
 from actors.laboratory import RayLaboratory
-
-from .conftest import ACTION, SCENE, Trickle, reach, wired_spec
+from tests.support.wired_bench import ACTION, SCENE, Trickle, reach, wired_spec
 
 pytestmark = [pytest.mark.ray]
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-import os
 import subprocess
 import sys
 import threading
@@ -20,15 +18,9 @@ from actors.emulators.ur_controller.controller import Controller, RuntimeState
 from actors.emulators.ur_controller.robot import UR10E
 from actors.emulators.ur_controller.servers.primary_messages import ControllerMessage
 from actors.runtime.child_process import child_environment
+from tests.support.loopback import free_address
 
 CLIENTS = Path(__file__).with_name("clients")
-_numbers = itertools.count(2)
-
-
-def next_address() -> str:
-    """A loopback address that no other test, and no other test process, uses."""
-    pid, number = os.getpid(), next(_numbers)
-    return f"127.{64 + pid % 64}.{pid // 64 % 256}.{number}"
 
 
 class Bench:
@@ -153,7 +145,7 @@ def observe(scenario: str, address: str, **arguments: Any) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def shared() -> Iterator[VirtualController]:
     """One controller for all tests of a module, four times as fast as time."""
-    with VirtualController.start(address=next_address(), time_scale=4.0) as controller:
+    with VirtualController.start(address=free_address(), time_scale=4.0) as controller:
         yield controller
 
 
@@ -163,7 +155,7 @@ def fresh() -> Iterator[Callable[..., VirtualController]]:
     started: list[VirtualController] = []
 
     def start(**options: Any) -> VirtualController:
-        started.append(VirtualController.start(**{"address": next_address(), "time_scale": 4.0, **options}))
+        started.append(VirtualController.start(**{"address": free_address(), "time_scale": 4.0, **options}))
         return started[-1]
 
     yield start

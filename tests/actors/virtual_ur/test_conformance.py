@@ -19,8 +19,9 @@ from actors.emulators.ur_controller import VirtualController
 from actors.emulators.ur_controller.poses import compose, pose_of, transform_of
 from actors.emulators.ur_controller.robot import MODELS
 from actors.emulators.ur_controller.robot_kinematics import Kinematics
+from tests.support.loopback import free_address
 
-from .conftest import next_address, observe
+from .conftest import observe
 
 Seen = Callable[[str], dict[str, Any]]
 
@@ -59,7 +60,7 @@ def robots() -> Iterator[dict[str, Robot]]:
         found = {}
         for model in MODELS:
             controller = stack.enter_context(
-                VirtualController.start(address=next_address(), model=model, time_scale=SCALE)
+                VirtualController.start(address=free_address(), model=model, time_scale=SCALE)
             )
             controller.fault("inputs", digital={"3": True, "4": False}, analog=[3.3])
             queue = ThreadPoolExecutor(1)
@@ -338,7 +339,7 @@ def test_two_robots_side_by_side_keep_out_of_each_other_s_way(robots: dict[str, 
 @pytest.mark.realtime
 @pytest.mark.parametrize(("model_name", "rate"), [("ur10e", 500), ("ur10", 125)])
 def test_in_real_time_the_clock_is_right_and_packages_come_at_the_controller_s_rate(model_name: str, rate: int) -> None:
-    with VirtualController.start(address=next_address(), model=model_name) as controller:
+    with VirtualController.start(address=free_address(), model=model_name) as controller:
         seen = observe("receiving", controller.address, seconds=1.5, frequency=rate)
         timing = controller.fault("state")["timing"]
     assert seen["clock"] == pytest.approx(1.0, abs=0.2)

@@ -13,7 +13,7 @@ from actors.emulators.ur_controller.controller import RuntimeState
 from actors.emulators.ur_controller.robot import HOME
 from actors.emulators.ur_controller.rtde_fields import OutputRecipe, output_fields
 from actors.emulators.ur_controller.safety_system import SafetyConfiguration, SafetyMode, SafetyPlane
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 from .conftest import Bench
 

@@ -21,10 +21,9 @@ from hypothesis import strategies as st
 from actors.emulators.ur_controller import VirtualController, VirtualControllerError
 from actors.emulators.ur_controller import control_clock as host
 from actors.runtime.child_process import child_environment
-from tests.depth import examples
-from tests.patience import PATIENCE
-
-from .conftest import next_address
+from tests.support.hypothesis_examples import examples
+from tests.support.loopback import free_address
+from tests.support.waiting import PATIENCE
 
 PORTS = (30001, 30002, 30003, 30004, 30011, 30012, 29999)
 
@@ -52,7 +51,7 @@ def greeting(address: str) -> bytes:
 
 @pytest.mark.realtime
 def test_it_is_ready_when_it_says_so_and_gone_when_it_is_closed() -> None:
-    controller = VirtualController.start(address=next_address())
+    controller = VirtualController.start(address=free_address())
     assert greeting(controller.address).startswith(b"Connected: Universal Robots Dashboard Server")
     assert controller.alive
     controller.close()
@@ -65,7 +64,7 @@ def test_it_is_ready_when_it_says_so_and_gone_when_it_is_closed() -> None:
 @pytest.mark.realtime
 def test_the_arm_begins_where_it_is_told_to() -> None:
     joints = [0.1, -1.2, 1.3, -1.4, -1.5, 1.6]
-    with VirtualController.start(address=next_address(), joints=joints, state="idle") as controller:
+    with VirtualController.start(address=free_address(), joints=joints, state="idle") as controller:
         state = controller.fault("state")
     assert state["joints"] == pytest.approx(joints)
     assert state["robot_mode"] == "IDLE"
@@ -93,7 +92,7 @@ def test_an_address_that_is_taken_is_told(shared: VirtualController) -> None:
 )
 def test_settings_that_make_no_sense_are_told(options: dict[str, object], says: str) -> None:
     with pytest.raises(VirtualControllerError, match=says):
-        VirtualController.start(**{"address": next_address(), **options})  # type: ignore[arg-type]
+        VirtualController.start(**{"address": free_address(), **options})  # type: ignore[arg-type]
 
 
 PARENT = """
@@ -112,7 +111,7 @@ time.sleep(60)
 @pytest.mark.realtime
 @pytest.mark.parametrize("how", ["plain", "fork"])
 def test_it_dies_with_a_parent_that_is_killed(how: str) -> None:
-    address = next_address()
+    address = free_address()
     parent = subprocess.Popen(
         [sys.executable, "-c", PARENT, address, how],
         stdout=subprocess.PIPE,

@@ -16,7 +16,7 @@ from actors.emulators.ur_controller.urscript import program
 from actors.emulators.ur_controller.urscript.lexer import KEYWORDS, ScriptError, Splitter
 from actors.emulators.ur_controller.urscript.program import Command, Program, Steps, waiting
 from actors.emulators.ur_controller.urscript.translator import translate
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 from .conftest import Bench
 

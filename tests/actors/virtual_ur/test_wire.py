@@ -19,7 +19,7 @@ from actors.emulators.ur_controller.servers.connections import MOST_UNSENT, Conn
 from actors.emulators.ur_controller.servers.dashboard_server import DashboardConnection, DashboardServer
 from actors.emulators.ur_controller.servers.primary_server import PrimaryConnection, PrimaryServer
 from actors.emulators.ur_controller.servers.rtde_server import RtdeConnection, RtdeServer
-from tests.depth import examples
+from tests.support.hypothesis_examples import examples
 
 
 class _Socket:

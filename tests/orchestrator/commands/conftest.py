@@ -7,7 +7,7 @@ from typing import NoReturn
 
 import pytest
 
-from tests.orchestrator.commands.typed import write_inputs
+from tests.support.cli_inputs import write_inputs
 
 
 @pytest.fixture(scope="session")

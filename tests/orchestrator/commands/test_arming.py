@@ -24,23 +24,24 @@ from orchestrator.runs.motion_approval import (
     write_record,
 )
 from orchestrator.runs.stages import stages_of
-from tests.orchestrator import hardware
-from tests.orchestrator.terminal import Terminal
-
-ADDRESS = "127.82.3.2"
+from tests.support import hardware_laboratory
+from tests.support.loopback import free_address
+from tests.support.terminal import Terminal
 
 
 @pytest.fixture(scope="module")
 def controller() -> Iterator[VirtualController]:
-    with VirtualController.start(ADDRESS, "ur10", joints=[radians(q) for q in hardware.HOME]) as started:
-        hardware.install(started)
+    with VirtualController.start(
+        free_address(), "ur10", joints=[radians(q) for q in hardware_laboratory.HOME]
+    ) as started:
+        hardware_laboratory.install(started)
         yield started
 
 
 @pytest.fixture
 def campaign(tmp_path: Path, controller: VirtualController) -> Path:
     """A campaign on hardware whose safety settings were accepted."""
-    path = hardware.write_rig(tmp_path, controller.address)
+    path = hardware_laboratory.write_rig(tmp_path, controller.address)
     accept(tmp_path, controller.fault("state")["checksum"])
     return path
 
@@ -103,7 +104,7 @@ def test_the_record_that_counts_is_that_of_the_laboratory_in_use(campaign: Path)
 def test_a_wrong_name_moves_nothing(campaign: Path, controller: VirtualController) -> None:
     before = joints(controller)
     with Terminal("jog", str(campaign.with_name("rig.yaml")), "--arm", cwd=str(campaign.parent)) as terminal:
-        terminal.expect("HARDWARE: laboratory rig, UR10 at 127.82.3.2")
+        terminal.expect(f"HARDWARE: laboratory rig, UR10 at {controller.address}")
         terminal.expect("> ")
         terminal.type("yes")
         assert terminal.end() == 2
@@ -160,11 +161,11 @@ def test_envelope_covers_the_actions_of_the_campaign_and_grows_with_them(campaig
         assert pour_count(plan, stages) == 3
         return envelope(plan.laboratory.arm, campaign_pours(plan, stages))
 
-    low = worst(hardware.CAMPAIGN)
+    low = worst(hardware_laboratory.CAMPAIGN)
     assert low.worst.tilt_speed == pytest.approx(radians(90.0), rel=1e-3)  # of the return
     assert low.worst.tilt == pytest.approx(radians(110.0), abs=1e-3)
     assert not low.refused
-    high = worst(hardware.CAMPAIGN.replace("height: 60 mm", "height: 200 mm"))
+    high = worst(hardware_laboratory.CAMPAIGN.replace("height: 60 mm", "height: 200 mm"))
     assert low.worst.high[2] + 0.05 < high.worst.high[2] < low.worst.high[2] + 0.15
 
 

@@ -20,8 +20,8 @@ from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import Problem
 from orchestrator.progress.console_progress import ProgressDisplay
 from orchestrator.runs.events import LogLine
-from tests.end_to_end import small
-from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, VESSEL, report, write, write_good
+from tests.support import small_campaign
+from tests.support.campaign_files import CAMPAIGN, DEPLOYED, VESSEL, report, write, write_good
 
 
 @pytest.fixture(autouse=True)
@@ -51,7 +51,7 @@ class SeenError(Exception):
 @pytest.fixture
 def campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A good campaign in the working directory, and another laboratory that is called 'other'."""
-    small.write_campaign(tmp_path)
+    small_campaign.write_campaign(tmp_path)
     write(tmp_path, "other.yaml", "name: other\nbench: {liquid: {particles: 400}, time_scale: 0}\nin_process: true\n")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -95,11 +95,11 @@ def test_verbs_that_need_a_laboratory_take_another_one(
 
 
 def test_quiet_leaves_notes_out_and_nothing_else(campaign: Path) -> None:
-    write(campaign, "far.yaml", small.CAMPAIGN.replace("[60 mm, 100 mm]", "[200 mm, 300 mm]"))
+    write(campaign, "far.yaml", small_campaign.CAMPAIGN.replace("[60 mm, 100 mm]", "[200 mm, 300 mm]"))
     loud, quiet = invoke("validate far.yaml"), invoke("validate --quiet far.yaml")
     assert loud.stderr.startswith("warning: far.yaml:27:64: ")
     assert (quiet.stderr, quiet.stdout) == ("", loud.stdout)
-    write(campaign, "bad.yaml", small.CAMPAIGN.replace("pours: 2", "pour: 2"))
+    write(campaign, "bad.yaml", small_campaign.CAMPAIGN.replace("pours: 2", "pour: 2"))
     assert "did you mean 'pours'?" in invoke("validate -q bad.yaml").stderr
     assert invoke("validate far.yaml").stderr == loud.stderr, "the next command is as loud as before"
 

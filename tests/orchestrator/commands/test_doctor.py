@@ -28,10 +28,10 @@ from actors.emulators.ur_controller.safety_system import SafetyConfiguration
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.runs.motion_approval import SafetyRecordError, accepted_checksum, read_record, record_path
-from tests.orchestrator import hardware
+from tests.support import hardware_laboratory
+from tests.support.loopback import free_address
 
-ADDRESS = "127.81.3.2"
-JOINTS = [radians(q) for q in hardware.HOME]
+JOINTS = [radians(q) for q in hardware_laboratory.HOME]
 
 
 @pytest.fixture(autouse=True)
@@ -42,8 +42,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def controller() -> Iterator[VirtualController]:
-    with VirtualController.start(ADDRESS, "ur10", joints=JOINTS) as started:
-        hardware.install(started)
+    with VirtualController.start(free_address(), "ur10", joints=JOINTS) as started:
+        hardware_laboratory.install(started)
         yield started
 
 
@@ -56,7 +56,7 @@ def balance() -> Iterator[VirtualSerialBalance]:
 
 @pytest.fixture
 def laboratory(tmp_path: Path, controller: VirtualController) -> Path:
-    return hardware.write_laboratory(tmp_path / "rig.yaml", controller.address)
+    return hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", controller.address)
 
 
 def doctor(path: Path, *options: str) -> Result:
@@ -84,7 +84,7 @@ def when_not_overloaded(path: Path, *options: str) -> Result:
 def test_a_bench_that_is_ready_has_its_settings_accepted_once_and_is_told_so(
     tmp_path: Path, controller: VirtualController, balance: VirtualSerialBalance
 ) -> None:
-    path = hardware.write_laboratory(
+    path = hardware_laboratory.write_laboratory(
         tmp_path / "rig.yaml", controller.address, f"balance: {{placement: tray, port: {balance.port}}}"
     )
     before = controller.fault("state")
@@ -131,19 +131,20 @@ def test_a_bench_of_numbers_and_a_bad_file_are_refused_with_exit_code_2(tmp_path
 
 @pytest.mark.realtime
 def test_nobody_at_the_address(tmp_path: Path) -> None:
-    path = hardware.write_laboratory(tmp_path / "rig.yaml", "127.81.3.9")  # loopback: every port refuses
+    path = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", free_address())  # loopback: every port refuses
     network = checked(path)["network"]
     assert network["state"] == "fail"
     assert "closed" in network["found"]
     assert "Services" in network["advice"]
-    path = hardware.write_laboratory(tmp_path / "rig.yaml", "no-such-robot.invalid")
+    path = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", "no-such-robot.invalid")
     assert "stands for no machine" in checked(path)["address"]["found"]
 
 
 @pytest.mark.realtime
 def test_one_closed_port_is_named_with_what_it_is_for(tmp_path: Path) -> None:
-    servers = [socket.create_server(("127.81.3.8", port)) for port in (30001, 30003, 30004)]
-    path = hardware.write_laboratory(tmp_path / "rig.yaml", "127.81.3.8")
+    address = free_address()
+    servers = [socket.create_server((address, port)) for port in (30001, 30003, 30004)]
+    path = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", address)
     try:
         table = checked(path)
     finally:
@@ -169,8 +170,8 @@ def test_one_closed_port_is_named_with_what_it_is_for(tmp_path: Path) -> None:
 def test_a_controller_that_was_started_otherwise(
     tmp_path: Path, model: str, options: dict[str, Any], name: str, found: str, advice: str
 ) -> None:
-    with VirtualController.start("127.81.3.4", model, **options) as started:
-        path = hardware.write_laboratory(tmp_path / "rig.yaml", started.address)
+    with VirtualController.start(free_address(), model, **options) as started:
+        path = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", started.address)
         line = checked(path)[name]
     assert line["state"] == ("warn" if name == "position" else "fail")
     assert found in line["found"]
@@ -179,8 +180,8 @@ def test_a_controller_that_was_started_otherwise(
 
 @pytest.mark.realtime
 def test_stops_are_named_and_never_unlocked(tmp_path: Path) -> None:
-    with VirtualController.start("127.81.3.5", "ur10", joints=JOINTS) as started:
-        path = hardware.write_laboratory(tmp_path / "rig.yaml", started.address)
+    with VirtualController.start(free_address(), "ur10", joints=JOINTS) as started:
+        path = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", started.address)
         started.fault("protective_stop", reason="a test")
         line = checked(path)["safety"]
         assert (line["state"], line["found"]) == ("fail", "protective stop")
@@ -201,9 +202,9 @@ def test_stops_are_named_and_never_unlocked(tmp_path: Path) -> None:
 def test_doctor_fails_for_the_reason_for_which_the_driver_refuses(
     tmp_path: Path, fault: str, arguments: dict[str, Any], line: str, why: str
 ) -> None:
-    with VirtualController.start("127.81.3.6", "ur10", joints=JOINTS) as started:
-        hardware.install(started)
-        path = hardware.write_laboratory(tmp_path / "rig.yaml", started.address)
+    with VirtualController.start(free_address(), "ur10", joints=JOINTS) as started:
+        hardware_laboratory.install(started)
+        path = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", started.address)
         ready = checked(path)["motion"]
         assert (ready["state"], ready["found"]) == ("ok", "the arm is ready to move")
         started.fault(fault, **arguments)
@@ -226,8 +227,8 @@ def test_doctor_fails_for_the_reason_for_which_the_driver_refuses(
 @pytest.mark.realtime
 def test_joints_are_numbered_from_1_everywhere(tmp_path: Path) -> None:
     away = [*JOINTS[:4], JOINTS[4] + 0.3, JOINTS[5]]
-    with VirtualController.start("127.81.3.7", "ur10", joints=away) as started:
-        path = hardware.write_laboratory(tmp_path / "rig.yaml", started.address)
+    with VirtualController.start(free_address(), "ur10", joints=away) as started:
+        path = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", started.address)
         assert "joint 5 (wrist 2) is 17.2 deg away" in checked(path)["position"]["found"]
     assert joints_violation(9.0) == f"joint 5 (wrist 2) is at {degrees(9.0):.1f} deg, outside -363 … 363 deg"
 
@@ -279,11 +280,11 @@ finally:
 
 @pytest.mark.realtime
 def test_another_tool_or_payload_than_the_file_s(laboratory: Path, controller: VirtualController) -> None:
-    hardware.install(controller, tool=0.12, payload=0.3)
+    hardware_laboratory.install(controller, tool=0.12, payload=0.3)
     try:
         table = checked(laboratory)
     finally:
-        hardware.install(controller)
+        hardware_laboratory.install(controller)
     assert table["tool"]["state"] == table["payload"]["state"] == "fail"
     assert "50.0 mm" in table["tool"]["found"]
     assert "0.30 kg on the controller, 1.60 kg in the file" in table["payload"]["found"]
@@ -329,18 +330,18 @@ def test_a_spoilt_record_is_an_error_and_not_a_missing_one(laboratory: Path, con
 def test_balance_that_is_unplugged_or_silent_is_told_with_what_to_do(
     tmp_path: Path, controller: VirtualController, balance: VirtualSerialBalance
 ) -> None:
-    missing = hardware.write_laboratory(
+    missing = hardware_laboratory.write_laboratory(
         tmp_path / "a.yaml", controller.address, "balance: {placement: tray, port: /dev/serial/by-id/nothing}"
     )
     assert "isn't there" in checked(missing)["balance port"]["found"]
     for port, says in (("/dev/null", "not a serial port"), (tmp_path, "a folder"), (missing, "a file")):
-        wrong = hardware.write_laboratory(
+        wrong = hardware_laboratory.write_laboratory(
             tmp_path / "c.yaml", controller.address, f"balance: {{placement: tray, port: {port}}}"
         )
         checks = checked(wrong)
         assert (checks["balance port"]["state"], "balance" in checks) == ("fail", False)
         assert says in checks["balance port"]["found"]
-    present = hardware.write_laboratory(
+    present = hardware_laboratory.write_laboratory(
         tmp_path / "b.yaml", controller.address, f"balance: {{placement: tray, port: {balance.port}, dialect: kcp}}"
     )
     balance.unplug()

@@ -13,7 +13,7 @@ from orchestrator.cli.app import app
 from orchestrator.cli.command_options import Answer
 from orchestrator.runs.resume import LOST, REPEAT
 from orchestrator.strategies.deployment.model_monitoring import OPTIONS
-from tests.orchestrator.commands.typed import ROOT, invoke, write_inputs
+from tests.support.cli_inputs import ROOT, invoke, write_inputs
 
 HELP = {
     "": ["decant run configs/campaigns/quickstart.yaml", "2 bad input", "130 interrupted"],

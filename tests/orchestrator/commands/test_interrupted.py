@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from orchestrator.cli.foreground_run import file_trouble, given_up_pours, interruption
-from tests.orchestrator.scripted import Script, one_stage, pour, states
-from tests.orchestrator.toy import ToyBench, ToyLaboratory, run_toy, toy_plan
+from tests.support.scripted_strategy import Script, one_stage, pour, states
+from tests.support.toy_campaign import ToyBench, ToyLaboratory, run_toy, toy_plan
 
 
 def interrupted(directory: Path, times: int) -> None:

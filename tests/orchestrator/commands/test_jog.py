@@ -17,8 +17,9 @@ from actors.interfaces import LaboratoryError
 from orchestrator.cli.motion_control import JogError, Jogging, JogStep, parse_step, steps_home
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.runs.motion_approval import SafetyRecord, write_record
-from tests.orchestrator import hardware
-from tests.orchestrator.terminal import Terminal
+from tests.support import hardware_laboratory
+from tests.support.loopback import free_address
+from tests.support.terminal import Terminal
 
 LABORATORY = Path("configs/laboratories/virtual.yaml")
 
@@ -121,9 +122,9 @@ def test_home_from_home_is_no_step() -> None:
 
 @pytest.mark.realtime
 def test_arm_of_hardware_moves_by_what_was_typed_and_ctrl_c_stops_it(tmp_path: Path) -> None:
-    start = [radians(q) for q in hardware.HOME]
-    with VirtualController.start("127.83.3.2", "ur10", joints=start) as controller:
-        laboratory = hardware.write_laboratory(tmp_path / "rig.yaml", controller.address)
+    start = [radians(q) for q in hardware_laboratory.HOME]
+    with VirtualController.start(free_address(), "ur10", joints=start) as controller:
+        laboratory = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", controller.address)
         write_record(laboratory, SafetyRecord(controller.fault("state")["checksum"], "2016300123", "", "", "", ""))
         with Terminal("jog", str(laboratory), "--arm", cwd=str(tmp_path)) as terminal:
             terminal.expect("> ")

@@ -20,7 +20,7 @@ from orchestrator.results.figure_style import INK
 from sim_engine import solver_fingerprint as sources
 from sim_engine.validation import cases as suite
 from sim_engine.validation.case_result import CaseResult, Figure, Measurement, Series, reported, within
-from tests.orchestrator.reported import strays
+from tests.support.example_results import strays
 
 ROOT = Path(__file__).parents[3]
 runner = CliRunner()

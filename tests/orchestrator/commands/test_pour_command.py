@@ -27,19 +27,20 @@ from orchestrator.runs.stages import scenes_of
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.action import Action
-from tests.end_to_end import small
-from tests.orchestrator import hardware
-from tests.orchestrator.terminal import Terminal
-from tests.orchestrator.toy import ToyBench, ToyLaboratory
-from tests.patience import PATIENCE
+from tests.support import hardware_laboratory, small_campaign
+from tests.support.loopback import free_address
+from tests.support.terminal import Terminal
+from tests.support.toy_campaign import ToyBench, ToyLaboratory
+from tests.support.waiting import PATIENCE
 
-ADDRESS = "127.84.3.2"
 ACTION = ("--set", "angular_velocity=30", "--set", "x_offset=80")
 
 
 @pytest.fixture
 def controller() -> Iterator[VirtualController]:
-    with VirtualController.start(ADDRESS, "ur10", joints=[radians(q) for q in hardware.HOME]) as started:
+    with VirtualController.start(
+        free_address(), "ur10", joints=[radians(q) for q in hardware_laboratory.HOME]
+    ) as started:
         yield started
 
 
@@ -48,7 +49,7 @@ def decant(*arguments: str) -> Result:
 
 
 def test_dry_run_tells_and_draws_the_whole_path_and_connects_to_nobody(tmp_path: Path) -> None:
-    campaign = hardware.write_rig(tmp_path, "127.84.3.9")  # nobody is there
+    campaign = hardware_laboratory.write_rig(tmp_path, free_address())  # nobody is there
     png = tmp_path / "path.png"
     result = decant("pour", str(campaign), *ACTION, "--dry-run", "--png", str(png))
     assert result.exit_code == 0, result.output
@@ -65,7 +66,7 @@ def test_dry_run_tells_and_draws_the_whole_path_and_connects_to_nobody(tmp_path:
 
 @pytest.mark.realtime
 def test_dry_run_can_look_where_the_arm_stands(tmp_path: Path, controller: VirtualController) -> None:
-    campaign = hardware.write_rig(tmp_path, controller.address)
+    campaign = hardware_laboratory.write_rig(tmp_path, controller.address)
     before = controller.fault("state")
     at_home = decant("pour", str(campaign), *ACTION, "--dry-run", "--connect", "--json")
     assert json.loads(at_home.stdout)["at_home"] is True
@@ -73,7 +74,9 @@ def test_dry_run_can_look_where_the_arm_stands(tmp_path: Path, controller: Virtu
     assert after["joints"] == before["joints"]
     assert after["program"] == before["program"]
     assert (
-        decant("pour", str(hardware.write_rig(tmp_path, "127.84.3.9")), *ACTION, "--dry-run", "--connect").exit_code
+        decant(
+            "pour", str(hardware_laboratory.write_rig(tmp_path, free_address())), *ACTION, "--dry-run", "--connect"
+        ).exit_code
         == 1
     )
 
@@ -93,7 +96,7 @@ def test_dry_run_can_look_where_the_arm_stands(tmp_path: Path, controller: Virtu
 def test_pours_that_can_t_be_are_refused_before_anything_is_reached(
     tmp_path: Path, options: list[str], said: str
 ) -> None:
-    result = decant("pour", str(hardware.write_rig(tmp_path, "127.84.3.9")), *options)
+    result = decant("pour", str(hardware_laboratory.write_rig(tmp_path, free_address())), *options)
     assert result.exit_code == 2
     assert said in result.stderr
     assert not (tmp_path / "runs").exists()
@@ -104,7 +107,7 @@ def test_pours_that_can_t_be_are_refused_before_anything_is_reached(
 def test_empty_cycle_on_hardware_asks_counts_down_goes_slowly_and_leaves_a_record(
     tmp_path: Path, controller: VirtualController
 ) -> None:
-    campaign = hardware.write_rig(tmp_path, controller.address)
+    campaign = hardware_laboratory.write_rig(tmp_path, controller.address)
     checksum = controller.fault("state")["checksum"]
     write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
     arguments = ("pour", str(campaign), "--set", "angular_velocity=60", "--set", "x_offset=80")
@@ -126,12 +129,12 @@ def test_empty_cycle_on_hardware_asks_counts_down_goes_slowly_and_leaves_a_recor
     fastest = np.abs(np.diff(joints, axis=0) / np.diff(times)[:, None]).max()
     assert degrees(fastest) < 50.0  # 90 deg/s of the return, halved
     assert np.ptp(joints[:, 5]) > radians(60.0) or np.ptp(joints, axis=0).max() > radians(60.0)
-    assert joints[-1] == pytest.approx([radians(q) for q in hardware.HOME], abs=1e-2)
+    assert joints[-1] == pytest.approx([radians(q) for q in hardware_laboratory.HOME], abs=1e-2)
 
 
 @pytest.mark.realtime
 def test_empty_cycle_that_is_not_confirmed_moves_nothing(tmp_path: Path, controller: VirtualController) -> None:
-    campaign = hardware.write_rig(tmp_path, controller.address)
+    campaign = hardware_laboratory.write_rig(tmp_path, controller.address)
     checksum = controller.fault("state")["checksum"]
     write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
     before = controller.fault("state")["joints"]
@@ -167,7 +170,7 @@ def test_pour_whose_outcome_is_unknown_doesn_t_promise_to_be_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: Callable[..., object], code: int
 ) -> None:
     monkeypatch.setattr("orchestrator.runs.run_engine.run_campaign", ends)
-    result = decant("pour", str(small.write_campaign(tmp_path)), *small.GOOD_ACTION, "--in-process")
+    result = decant("pour", str(small_campaign.write_campaign(tmp_path)), *small_campaign.GOOD_ACTION, "--in-process")
     assert result.exit_code == code, result.stderr
     run = next((tmp_path / "runs").iterdir())
     assert f"this pour is not resumed; what was weighed of it is in {run}" in result.stderr
@@ -203,7 +206,7 @@ def answered(terminal: Terminal, before_start: Callable[[], object] = lambda: No
 def test_whole_pour_on_hardware_is_asked_for_confirmed_made_and_weighed(
     tmp_path: Path, controller: VirtualController
 ) -> None:
-    campaign = hardware.write_rig(tmp_path, controller.address)
+    campaign = hardware_laboratory.write_rig(tmp_path, controller.address)
     checksum = controller.fault("state")["checksum"]
     write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
     action = ("--set", "angular_velocity=60", "--set", "x_offset=80")
@@ -226,7 +229,7 @@ def test_whole_pour_on_hardware_is_asked_for_confirmed_made_and_weighed(
 def test_protective_stop_in_a_pour_is_mended_by_consent_weighed_and_left_for_a_person_to_judge(
     tmp_path: Path, controller: VirtualController
 ) -> None:
-    campaign = hardware.write_rig(tmp_path, controller.address)
+    campaign = hardware_laboratory.write_rig(tmp_path, controller.address)
     checksum = controller.fault("state")["checksum"]
     write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
     action = ("--set", "angular_velocity=30", "--set", "x_offset=80")
@@ -238,14 +241,14 @@ def test_protective_stop_in_a_pour_is_mended_by_consent_weighed_and_left_for_a_p
     assert [("made ready" in c, "upright" in c) for c in consents[1:]] == [(True, False), (False, True)]
     assert "protective stop during tilt" in terminal.screen
     joints = controller.fault("state")["joints"]
-    assert joints == pytest.approx([radians(q) for q in hardware.HOME], abs=1e-2)
+    assert joints == pytest.approx([radians(q) for q in hardware_laboratory.HOME], abs=1e-2)
 
 
 @pytest.mark.slow
 def test_terminal_that_is_closed_in_a_pour_leaves_the_arm_at_home_and_the_pour_unknown(
     tmp_path: Path, controller: VirtualController
 ) -> None:
-    campaign = hardware.write_rig(tmp_path, controller.address)
+    campaign = hardware_laboratory.write_rig(tmp_path, controller.address)
     checksum = controller.fault("state")["checksum"]
     write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
     terminal = Terminal("pour", str(campaign), *ACTION, "--in-process", "--arm", cwd=str(tmp_path))
@@ -262,7 +265,9 @@ def test_terminal_that_is_closed_in_a_pour_leaves_the_arm_at_home_and_the_pour_u
         assert terminal.process.wait(90) != 0
     finally:
         terminal.__exit__(None, None, None)
-    assert controller.fault("state")["joints"] == pytest.approx([radians(q) for q in hardware.HOME], abs=1e-2)
+    assert controller.fault("state")["joints"] == pytest.approx(
+        [radians(q) for q in hardware_laboratory.HOME], abs=1e-2
+    )
     with JournalReader(next((tmp_path / "runs").glob("*/journal.sqlite"))) as journal:
         assert journal.state() is State.UNKNOWN
 

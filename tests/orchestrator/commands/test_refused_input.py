@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.orchestrator.commands.typed import SIMULATE, process, refused
+from tests.support.cli_inputs import SIMULATE, process, refused
 
 # command line: what stderr has to say; where it begins, for files with lines
 BAD: dict[str, str] = {

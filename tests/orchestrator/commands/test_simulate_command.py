@@ -13,8 +13,8 @@ import pytest
 
 from orchestrator.cli.simulate_command import told
 from sim_engine.prediction_band import spreads
-from tests.orchestrator import watched
-from tests.orchestrator.commands.typed import SIMULATE, invoke, process
+from tests.support import example_run
+from tests.support.cli_inputs import SIMULATE, invoke, process
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_a_table_of_weighed_pours_is_predicted_and_scored(inputs: Path) -> None:
 
 
 def test_one_seed_has_no_spread_and_says_so() -> None:
-    several = [watched.outcome(spilled=s) for s in (0.05, 0.07)]
+    several = [example_run.outcome(spilled=s) for s in (0.05, 0.07)]
     assert "received 92.0 ± 1.4 %  spilled 6.0 ± 1.4 %" in told(several, spreads(several))
     alone = told(several[:1], spreads(several[:1]))
     assert "±" not in alone

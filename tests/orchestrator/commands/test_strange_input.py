@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.orchestrator.commands.typed import ROOT, invoke
+from tests.support.cli_inputs import ROOT, invoke
 
 QUICKSTART, STUDY, VIRTUAL = "campaigns/quickstart.yaml", "studies/quick.yaml", "laboratories/virtual.yaml"
 

@@ -20,7 +20,7 @@ from actors.interfaces import LaboratoryError, Notice, OperatorQuestion, Operato
 from orchestrator.cli.terminal_operator import TerminalOperator
 from orchestrator.progress.console_progress import ProgressDisplay
 from orchestrator.runs.events import LogLine
-from tests.orchestrator import watched
+from tests.support import example_run
 
 DONE = OperatorQuestion("Put the full pourer into the gripper.", "done")
 WEIGHT = OperatorQuestion("Weigh the pourer on the other balance.", "weight")
@@ -217,7 +217,7 @@ def test_without_a_terminal_nobody_is_asked(tmp_path: Path) -> None:
 
 def test_why_the_arm_was_stopped_stands_on_the_screen_once_and_in_the_recording(keyboard: Keyboard) -> None:
     why = "protective stop, joint 3"
-    display = ProgressDisplay(watched.campaign(), console=Console(file=keyboard.screen, width=150))
+    display = ProgressDisplay(example_run.campaign(), console=Console(file=keyboard.screen, width=150))
     shown: list[LogLine] = []
 
     def hear(notice: Notice) -> None:
@@ -240,7 +240,7 @@ def test_why_the_arm_was_stopped_stands_on_the_screen_once_and_in_the_recording(
 
 
 def test_progress_makes_room_for_a_question_and_goes_on_after_it() -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     console = Console(file=io.StringIO(), force_terminal=True, width=150, highlight=False)
 
     def written() -> str:

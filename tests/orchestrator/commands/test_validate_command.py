@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.orchestrator.commands.typed import RECORDED, ROOT, invoke, process
+from tests.support.cli_inputs import RECORDED, ROOT, invoke, process
 
 
 def test_all_that_is_wrong_with_several_files_is_told_at_once(folder: Path) -> None:

@@ -18,7 +18,7 @@ from orchestrator.cli.vessel_tables import read_photograph
 from orchestrator.config.file_loading import load_vessel
 from sim_engine.vessel.profile import volume
 from sim_engine.vessel.vessel import build_vessel
-from tests.measured import FOCAL, Bench
+from tests.support.measured_vessel import FOCAL, Bench
 
 VESSELS = Path("configs/vessels")
 
@@ -161,7 +161,7 @@ def test_the_file_says_how_far_the_shape_may_be_off(tmp_path: Path, door: Door) 
     made(tmp_path, door(bench("cone"), tmp_path))
     told = float((tmp_path / "made.yaml").read_text().partition("±")[2].split()[0])
     found = load_vessel(tmp_path / "made.yaml")
-    capacities = [volume(np.array(found.drawn(seed).shape.inner)) for seed in range(200)]  # type: ignore[attr-defined]
+    capacities = [volume(np.array(found.drawn(seed).shape.outline().inner)) for seed in range(200)]  # type: ignore[attr-defined]
     assert 1e6 * np.std(capacities) == pytest.approx(told, rel=0.25)
 
 

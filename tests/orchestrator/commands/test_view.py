@@ -24,20 +24,19 @@ from orchestrator.live_view.repeated_pour import NoSuchPourError, find_pour, tas
 from orchestrator.live_view.run_recording import CampaignRecording
 from orchestrator.requests import Pour, Poured
 from sim_engine.outcome import PourMeasurement
-from tests.orchestrator import watched
-from tests.orchestrator.late_viewer import seen, viewer
-from tests.orchestrator.recorded import Contents
-from tests.patience import PATIENCE
+from tests.support import example_run
+from tests.support.rerun_recordings import Contents, seen, viewer
+from tests.support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    plan = watched.campaign(pours=1)
+    plan = example_run.campaign(pours=1)
     path = tmp_path_factory.mktemp("run") / "campaign.rrd"
     written = CampaignRecording(path, plan)
-    for event in watched.events(plan):
+    for event in example_run.events(plan):
         written.handle(event)
     written.close()
     return path
@@ -46,7 +45,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _journal(run: Path, notes: dict[str, object] | None = None) -> None:
     with Journal.create(run / JOURNAL_NAME, Header("narrow-cup", {})) as journal:
         for key, stage in ((1, "pours"), (2, "deployment:narrow cup")):
-            pour = Pour("narrow cup", watched.ACTION, 1, 70 + key)
+            pour = Pour("narrow cup", example_run.ACTION, 1, 70 + key)
             journal.append(Kind.REQUESTED, {"id": key, "request": encode_request(pour)}, stage=stage)
             measured = PourMeasurement(0.199, 0.01 * key, 0.001, dict(notes or {}))
             outcome = encode_outcome(Poured(measured))
@@ -91,7 +90,7 @@ def test_pour_is_simulated_again_as_the_arm_moved_with_the_load_that_was_weighed
     assert isinstance(arm, UrArmSpec)
     joints = np.array(arm.home) + np.linspace(0.0, 0.4, 50)[:, None] * np.array([0, 0, 0, 0, 0, 1.0])
     _journal(tmp_path, {"executed": pack(ExecutedPath(np.arange(50) * 0.1, joints, True))})
-    plan = replace(watched.campaign(), laboratory=LaboratorySpec("virtual", arm=arm))
+    plan = replace(example_run.campaign(), laboratory=LaboratorySpec("virtual", arm=arm))
     (tmp_path / "theta.json").write_text('{"theta": {"particles": 700, "cohesion": 0.03}}')
     pour = find_pour(tmp_path, 1)
     assert pour.stage == "deployment:narrow cup", "the last stage with such a pour"
@@ -106,9 +105,9 @@ def test_pour_is_simulated_again_as_the_arm_moved_with_the_load_that_was_weighed
 
 def test_pour_of_an_arm_of_numbers_is_simulated_by_its_action(tmp_path: Path) -> None:
     _journal(tmp_path)
-    task = task_of(watched.campaign(), tmp_path, find_pour(tmp_path, 1))
+    task = task_of(example_run.campaign(), tmp_path, find_pour(tmp_path, 1))
     assert task.motion is None
-    assert task.action == watched.ACTION
+    assert task.action == example_run.ACTION
     assert task.record_rate > 10.0
 
 

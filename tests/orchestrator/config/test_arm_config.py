@@ -14,11 +14,11 @@ from orchestrator.config.arm_file import CellSection, UrArmSection, resolve_arm
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
-from sim_engine.settings.model import Section
-from tests.orchestrator.good_files import written_out
+from sim_engine.settings.model import Settings
+from tests.support.campaign_files import written_out
 
 
-class Laboratory(Section):
+class Laboratory(Settings):
     arm: UrArmSection | None = None
     """As in a laboratory's file."""
 
@@ -161,7 +161,7 @@ def test_all_mistakes_come_at_once():
 
 def test_keys_are_typed_in_the_sections_that_say_them():
     # every key has a sentence for the editor's tooltip
-    def sentences(model: type[Section]) -> list[str | None]:
+    def sentences(model: type[Settings]) -> list[str | None]:
         return [field.description for field in model.model_fields.values()]
 
     assert all(sentences(UrArmSection))

@@ -11,7 +11,7 @@ from orchestrator.config.action_assignments import AssignmentError, set_action
 from orchestrator.config.campaign_checks import check_campaign
 from orchestrator.config.file_loading import load_campaign, load_laboratory, load_parameters, load_vessel
 from orchestrator.config.yaml.yaml_errors import ConfigError
-from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, LABORATORY, VESSEL, write
+from tests.support.campaign_files import CAMPAIGN, DEPLOYED, LABORATORY, VESSEL, write
 
 BAD_VESSELS = {
     "no shape": ("name: cup\n", "vessel.yaml:1:1: has no shape; add 'profile:'"),

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from orchestrator.config.file_loading import load_campaign
-from tests.orchestrator.good_files import CAMPAIGN, CSV, DEPLOYED, RECORDED, report, write
+from tests.support.campaign_files import CAMPAIGN, CSV, DEPLOYED, RECORDED, report, write
 
 
 def test_the_good_inputs_that_the_table_spoils_are_good(folder: Path) -> None:

@@ -14,7 +14,7 @@ from orchestrator.config.balance_file import SerialSection, SettlingSection, Vir
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
-from tests.orchestrator.good_files import written_out
+from tests.support.campaign_files import written_out
 
 
 def load(text: str, mode: str = "hardware") -> BalanceSpec:

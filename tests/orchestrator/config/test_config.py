@@ -169,7 +169,7 @@ def test_a_tilde_in_a_path_is_the_home_directory(tmp_path: Path, monkeypatch: py
     text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../../runs", "~/runs")
     (tmp_path / "campaign.yaml").write_text(text.replace("../", "~/configs/"), encoding="utf-8")
     plan = load_campaign(Path("campaign.yaml"))
-    assert plan.outputs.directory == home / "runs"
+    assert plan.outputs.folder == home / "runs"
     assert plan.laboratory_source == home / "configs" / "laboratories" / "virtual.yaml"
     create_run(plan)
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith("~")] == []
@@ -295,7 +295,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     assert deployment is not None
     assert bench is not None
     assert (plan.name, plan.seed, plan.parallel_simulations, plan.on_unknown) == ("everything", 41, 5, "repeat")
-    assert dataclasses.astuple(plan.outputs) == (tmp_path / "here", False, False, 4.0, 2)
+    assert tuple(plan.outputs.model_dump().values()) == (str(tmp_path / "here"), False, False, 4.0, 2)
     lab = plan.laboratory
     assert (lab.name, lab.simulators, lab.in_process, lab.object_store_mb) == ("odd", 3, True, 300)
     assert lab.ray == RaySpec("head.local:6379", "left_bench")

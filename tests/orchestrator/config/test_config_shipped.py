@@ -26,7 +26,7 @@ from orchestrator.config.json_schema import (
 from orchestrator.config.yaml.yaml_source import Document
 from sim_engine.action import DEG, Action
 from sim_engine.vessel.shapes import MeshShape
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 CAMPAIGNS = sorted((CONFIGS / "campaigns").glob("*.yaml"))
@@ -145,7 +145,7 @@ def test_hidden_liquid_of_the_bench_is_nowhere_in_what_calibration_gets() -> Non
 def test_paths_resolve_against_the_file_that_names_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     plan = load_campaign(CONFIGS / "campaigns" / "quickstart.yaml")
-    assert plan.outputs.directory == CONFIGS.parent / "runs"
+    assert plan.outputs.folder == CONFIGS.parent / "runs"
     mug = load_vessel(CONFIGS / "vessels" / "mug.yaml")
     assert isinstance(mug.shape, MeshShape)
     assert mug.shape.path == CONFIGS / "vessels" / "meshes" / "mug.stl"

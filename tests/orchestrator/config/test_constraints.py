@@ -27,8 +27,8 @@ from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
 from sim_engine.settings.quantity import QuantityError
-from tests.orchestrator.good_files import DEPLOYED, report, write
-from tests.orchestrator.plans import calibration_plan, deployment_plan
+from tests.support.campaign_files import DEPLOYED, report, write
+from tests.support.plans import calibration_plan, deployment_plan
 
 SPACE = Space(
     (

@@ -13,7 +13,7 @@ from orchestrator.config.file_loading import load_campaign, load_vessel
 from orchestrator.config.yaml.file_access import SIZE_LIMIT
 from orchestrator.config.yaml.yaml_errors import PROBLEMS_SHOWN, ConfigError, Problem
 from orchestrator.config.yaml.yaml_source import Document
-from tests.orchestrator.good_files import CAMPAIGN, CSV, RECORDED, report, write
+from tests.support.campaign_files import CAMPAIGN, CSV, RECORDED, report, write
 
 CPU_SECONDS = 3.0
 """What refusing may take, for any of them: a few times what it takes."""

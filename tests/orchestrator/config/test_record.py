@@ -27,10 +27,10 @@ from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.study.study_campaigns import campaign_of
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_plan import cells_of
-from sim_engine.settings.model import Section
+from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
-from tests.depth import examples
-from tests.orchestrator import plans
+from tests.support import plans
+from tests.support.hypothesis_examples import examples
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 SHIPPED = sorted((CONFIGS / "campaigns").glob("*.yaml"))
@@ -106,7 +106,7 @@ def value_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> st.SearchStrate
         return st.one_of([value_of(part) for part in inner if part is not type(None)])
     if origin is Literal:
         return st.sampled_from(inner)
-    if isinstance(annotation, type) and issubclass(annotation, Section):
+    if isinstance(annotation, type) and issubclass(annotation, Settings):
         return section_of(annotation)
     if annotation is int:
         flat = [deep for m in metadata for deep in getattr(m, "metadata", [m])]
@@ -118,17 +118,17 @@ def value_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> st.SearchStrate
     raise AssertionError(f"settings of type {annotation} are not generated: teach this function to write one")
 
 
-def section_of(model: type[Section], without: frozenset[str] = frozenset()) -> st.SearchStrategy[dict[str, Any]]:
+def section_of(model: type[Settings], without: frozenset[str] = frozenset()) -> st.SearchStrategy[dict[str, Any]]:
     """A section with any of its keys, and all that must be there."""
     needed, free = {}, {}
     for key, name in model.written_keys().items():
         if name not in without:
             info = model.model_fields[name]
-            (needed if key in model.required else free)[key] = value_of(info.annotation, tuple(info.metadata))
+            (needed if key in model.required_keys() else free)[key] = value_of(info.annotation, tuple(info.metadata))
     return st.fixed_dictionaries(needed, optional=free)
 
 
-def strategy_of(variants: Mapping[str, type[Section]], common: type[Section]) -> st.SearchStrategy[dict[str, Any]]:
+def strategy_of(variants: Mapping[str, type[Settings]], common: type[Settings]) -> st.SearchStrategy[dict[str, Any]]:
     """The own keys of one of the strategies that are installed."""
 
     def of(name: str) -> st.SearchStrategy[dict[str, Any]]:

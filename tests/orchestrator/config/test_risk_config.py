@@ -20,7 +20,7 @@ from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.strategies.deployment.d1 import D1Settings
 from sim_engine.action import DEG
 from sim_engine.scene import PoseError
-from tests.orchestrator import plans
+from tests.support import plans
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 

@@ -9,7 +9,7 @@ import pytest
 from orchestrator.config.campaign_checks import check_campaign
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import Problem
-from tests.orchestrator.good_files import CAMPAIGN, RECORDED, write
+from tests.support.campaign_files import CAMPAIGN, RECORDED, write
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 QUICKSTART = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")

@@ -18,7 +18,7 @@ from orchestrator.config.laboratory_file import LaboratoryFile
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from tests.orchestrator.good_files import written_out
+from tests.support.campaign_files import written_out
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 VIRTUAL = (CONFIGS / "laboratories" / "virtual.yaml").read_text(encoding="utf-8")

@@ -28,8 +28,8 @@ from orchestrator.daemon.access_control import (
     TooManyFailuresError,
 )
 from orchestrator.daemon.submissions import SubmissionBundleError, unpack
-from tests.orchestrator.daemon.browsing import on_port
-from tests.orchestrator.daemon.served import Served, held, run, serving
+from tests.support.browser import on_port
+from tests.support.toy_daemon import Served, held, run, serving
 
 LOOKING = (
     *("/status", "/campaigns", "/campaigns/x", "/questions", "/rigs", "/events", "/metrics", "/campaigns/x/report"),

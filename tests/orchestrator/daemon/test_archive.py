@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 from orchestrator.catalogue.run_registry import VARIABLE, use_state_directory
 from orchestrator.cli.app import app
 from orchestrator.daemon.access_control import Role
-from tests.end_to_end.daemon_thread import Real
-from tests.orchestrator.daemon.served import Served, run, serving
 from tests.orchestrator.test_catalogue import made
+from tests.support.daemon_thread import Real
+from tests.support.toy_daemon import Served, run, serving
 
 
 @pytest.fixture(autouse=True)

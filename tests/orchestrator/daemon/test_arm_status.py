@@ -9,21 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.support.waiting import PATIENCE
 
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import DeviceCheck
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.daemon.daemon_settings import Rig
-from tests.orchestrator import hardware
-from tests.orchestrator.daemon.served import Served, held, run, serving
-from tests.patience import PATIENCE
-
-
-def hardware_rig(folder: Path, address: str, model: str = "ur10") -> Rig:
-    """A rig whose arm is reached by address, as hardware is."""
-    path = hardware.write_laboratory(folder / "rig.yaml", address)
-    path.write_text(path.read_text().replace("model: ur10", f"model: {model}"))
-    return Rig("rig", path, load_laboratory(path))
+from tests.support.hardware_laboratory import hardware_rig
+from tests.support.toy_daemon import Served, held, run, serving
 
 
 async def arm_of(served: Served, rig: str, state: str) -> dict[str, Any]:

@@ -23,11 +23,11 @@ from orchestrator.catalogue.run_registry import VARIABLE
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.daemon.access_control import Role, token_of
 from orchestrator.daemon.daemon_settings import Rig
-from tests.orchestrator.daemon.browsing import OnPort, browser, on_port
-from tests.orchestrator.daemon.served import HeldBench, HeldLaboratory
-from tests.orchestrator.daemon.test_arm_status import hardware_rig
-from tests.orchestrator.toy import ToyOptimizer, ToySimulators
-from tests.patience import PATIENCE
+from tests.support.browser import OnPort, browser, on_port
+from tests.support.hardware_laboratory import hardware_rig
+from tests.support.toy_campaign import ToyOptimizer, ToySimulators
+from tests.support.toy_daemon import HeldBench, HeldLaboratory
+from tests.support.waiting import PATIENCE
 
 pytest.importorskip("playwright")
 

@@ -9,7 +9,7 @@ import pytest
 
 from actors.interfaces import OperatorQuestion
 from orchestrator.daemon.access_control import Role
-from tests.orchestrator.daemon.served import HeldLaboratory, run, serving
+from tests.support.toy_daemon import HeldLaboratory, run, serving
 
 REFILL = OperatorQuestion("Refill the beaker to 100 g.", "done", about="refill", details={"load": 100.0})
 WEIGH = OperatorQuestion(
@@ -29,7 +29,7 @@ def asking(question: OperatorQuestion) -> Callable[[], HeldLaboratory]:
 @pytest.fixture
 def with_person(tmp_path: Path) -> Path:
     """A campaign on a bench beside which somebody stands."""
-    from tests.orchestrator.daemon.served import CAMPAIGN, write_campaign
+    from tests.support.toy_daemon import CAMPAIGN, write_campaign
 
     text = CAMPAIGN.replace("pours: 3", "pours: 2").replace(
         "  bench: {liquid: {particles: 400}, time_scale: 0}\n",

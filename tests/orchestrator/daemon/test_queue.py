@@ -19,8 +19,8 @@ from orchestrator.daemon.run_readout import Pours
 from orchestrator.daemon.submissions import Submission, SubmissionError, pack, prepare, run_request
 from orchestrator.run_service import RunRequest
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from tests.end_to_end.small import NARROW, write_campaign
-from tests.orchestrator.daemon.served import CAMPAIGN, HeldLaboratory, campaign_in, held, run, serving
+from tests.support.small_campaign import NARROW, write_campaign
+from tests.support.toy_daemon import CAMPAIGN, HeldLaboratory, campaign_in, held, run, serving
 
 
 def test_submitted_campaigns_run_to_their_end_one_after_the_other(tmp_path: Path) -> None:

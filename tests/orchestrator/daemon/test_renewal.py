@@ -13,7 +13,7 @@ import pytest
 from actors.simulators.shared_pool import WarmSimulators
 from orchestrator.daemon import server_process, supervisor
 from orchestrator.daemon.server_process import MOST, RENEWED, DaemonRestart, RayWatch
-from tests.orchestrator.daemon.served import held, run, serving
+from tests.support.toy_daemon import held, run, serving
 
 
 def test_a_pour_is_finished_before_and_its_campaign_goes_on_after(

@@ -10,7 +10,7 @@ import pytest
 from orchestrator.daemon import rig_worker as lane
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.daemon.run_readout import prune_recordings
-from tests.orchestrator.daemon.served import run, serving
+from tests.support.toy_daemon import run, serving
 
 
 def test_without_room_nothing_is_begun_and_it_is_said_until_there_is_room(

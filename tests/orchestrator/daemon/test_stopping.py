@@ -11,7 +11,7 @@ import pytest
 
 from orchestrator.daemon.access_control import Role
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from tests.orchestrator.daemon.served import HeldLaboratory, held, run, serving
+from tests.support.toy_daemon import HeldLaboratory, held, run, serving
 
 
 def entries(folder: Path, found: dict[str, Any]) -> list[Any]:

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.daemon.submissions import Files, Submission, SubmissionError, pack, prepare
-from tests.depth import examples
-from tests.end_to_end.small import write_campaign
+from tests.support.hypothesis_examples import examples
+from tests.support.small_campaign import write_campaign
 
 pytestmark = [pytest.mark.slow, pytest.mark.hypothesis]
 

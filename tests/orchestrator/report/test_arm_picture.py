@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
 from orchestrator.results import figure_style as style
-from tests.orchestrator.reported import strays
+from tests.support.example_results import strays
 
 QUICKSTART = Path(__file__).parents[3] / "configs" / "campaigns" / "quickstart.yaml"
 

@@ -12,17 +12,17 @@ from orchestrator.results.pour_figures import _moments, place, section, simulati
 from sim_engine.motion import plan_motion
 from sim_engine.outcome import SimulatedPour
 from sim_engine.vessel.vessel import build_vessel
-from tests.orchestrator import watched
-from tests.orchestrator.reported import is_picture
+from tests.support import example_run
+from tests.support.example_results import is_picture
 
 
 def test_simulated_pour_is_drawn_with_its_vessels_and_particles(tmp_path: Path) -> None:
-    task, result = watched.simulation()
+    task, result = example_run.simulation()
     assert is_picture(simulation_png(tmp_path / "pour.png", task, result))
 
 
 def test_pour_that_keeps_everything_in_the_pourer_is_drawn(tmp_path: Path) -> None:
-    task, result = watched.simulation()
+    task, result = example_run.simulation()
     frames = result.frames
     assert frames is not None
     for states in frames.states:
@@ -41,13 +41,13 @@ def test_snapshots_show_the_flow_from_its_beginning_to_its_end() -> None:
 
 
 def test_simulation_without_frames_is_refused_with_advice(tmp_path: Path) -> None:
-    task, result = watched.simulation()
+    task, result = example_run.simulation()
     with pytest.raises(ValueError, match="record rate above 0"):
         simulation_png(tmp_path / "pour.png", task, SimulatedPour(result.outcome))
 
 
 def test_section_of_a_cup_is_its_wall_cut_open() -> None:
-    vessel = build_vessel(watched.BEAKER)
+    vessel = build_vessel(example_run.BEAKER)
     loops = section(vessel.solid_vertices, vessel.solid_faces)
     assert len(loops) == 1
     x, z = loops[0].T
@@ -57,14 +57,14 @@ def test_section_of_a_cup_is_its_wall_cut_open() -> None:
 
 
 def test_section_of_an_open_mesh_is_refused() -> None:
-    vessel = build_vessel(watched.BEAKER)
+    vessel = build_vessel(example_run.BEAKER)
     with pytest.raises(ValueError, match="loose end"):
         section(vessel.solid_vertices, vessel.solid_faces[: len(vessel.solid_faces) // 2])
 
 
 def test_drawn_vessel_turns_the_way_the_motion_turns_it() -> None:
-    pourer, receiver = build_vessel(watched.BEAKER), build_vessel(watched.NARROW.receiver)
-    motion = plan_motion(watched.NARROW, watched.ACTION, pourer, receiver)
+    pourer, receiver = build_vessel(example_run.BEAKER), build_vessel(example_run.NARROW.receiver)
+    motion = plan_motion(example_run.NARROW, example_run.ACTION, pourer, receiver)
     poses = motion.sample(np.linspace(0.0, motion.duration, 9))
     lip = pourer.lip_point(0.0)
     for pose in poses:

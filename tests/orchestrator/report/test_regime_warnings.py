@@ -26,9 +26,8 @@ from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.action import DEG
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
-from tests.end_to_end import small
-from tests.orchestrator import watched
-from tests.orchestrator.reported import changed, shown
+from tests.support import example_run, small_campaign
+from tests.support.example_results import changed, shown
 
 CAMPAIGNS = Path(__file__).parents[3] / "configs" / "campaigns"
 SLOW = Space((Axis("angular_velocity", 5 * DEG, 10 * DEG), Axis("max_angle", 70 * DEG, 75 * DEG)))
@@ -37,10 +36,10 @@ QUICK = Space((Axis("angular_velocity", 80 * DEG, 120 * DEG), Axis("max_angle", 
 
 def deploying(actions: Space, **changes: float) -> CampaignPlan:
     """A campaign without calibration, in one scene, with many particles."""
-    plan = watched.campaign()
+    plan = example_run.campaign()
     assert plan.deployment is not None
-    liquid = watched.NARROW.liquid.model_copy(update=changes)
-    scene = replace(watched.NARROW, liquid=liquid, fixed={"height": 0.05, "x_offset": 0.09})
+    liquid = example_run.NARROW.liquid.model_copy(update=changes)
+    scene = replace(example_run.NARROW, liquid=liquid, fixed={"height": 0.05, "x_offset": 0.09})
     deployment = replace(plan.deployment, scenes=(scene,), actions=actions)
     parameters = plan.parameters.model_copy(update={"particles": 20_000})
     return replace(plan, calibration=None, deployment=deployment, parameters=parameters)
@@ -100,7 +99,7 @@ def test_the_recommended_action_is_judged_with_the_calibrated_number_of_particle
 
 
 def test_the_summary_has_them_for_people_and_for_programs(results: dict[str, Any]) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     spaces = campaign_warnings(deploying(SLOW))
     deployed = {"narrow cup": results["narrow cup"]}
     best = {"narrow cup": [one.worst for one in spaces["narrow cup"]]}
@@ -114,13 +113,13 @@ def test_the_summary_has_them_for_people_and_for_programs(results: dict[str, Any
 
 
 def test_numbers_are_told_with_digits_that_mean_something() -> None:
-    scene = watched.NARROW
-    found = regimes_of(scene, watched.ACTION, 2_000)
+    scene = example_run.NARROW
+    found = regimes_of(scene, example_run.ACTION, 2_000)
     assert found.lip is not None
     line = numbers_line(found)
     assert f"We {found.lip.weber.smallest:.2g} … {found.lip.weber.largest:.2g}" in line
     assert "e+" not in line
-    nothing = regimes_of(scene, watched.ACTION.with_values(max_angle=10 * DEG), 2_000)
+    nothing = regimes_of(scene, example_run.ACTION.with_values(max_angle=10 * DEG), 2_000)
     assert numbers_line(nothing) == "nothing leaves the pourer, as far as hydrostatics tells"
 
 
@@ -135,8 +134,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def closed(*args: object, **kwargs: object) -> NoReturn:
         raise OSError(28, "No space left on device", "campaign.rrd")
 
-    slow = small.CAMPAIGN.replace("[60 deg/s, 180 deg/s], x_offset", "[5 deg/s, 10 deg/s], x_offset")
-    small.write_campaign(tmp_path, slow.replace("max_angle: 115 deg", "max_angle: 60 deg"))
+    slow = small_campaign.CAMPAIGN.replace("[60 deg/s, 180 deg/s], x_offset", "[5 deg/s, 10 deg/s], x_offset")
+    small_campaign.write_campaign(tmp_path, slow.replace("max_angle: 115 deg", "max_angle: 60 deg"))
     monkeypatch.setattr(laboratory, "open_laboratory", closed)
     monkeypatch.chdir(tmp_path)
     return tmp_path

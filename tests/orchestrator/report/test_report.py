@@ -31,12 +31,12 @@ from orchestrator.results.surrogate_figures import SurrogatePicture, draw_poster
 from sim_engine.action import DEG, Action
 from sim_engine.outcome import Loss
 from sim_engine.search_space import Axis, Space
-from tests.orchestrator import watched
-from tests.orchestrator.reported import changed, is_picture, shown, strays
+from tests.support import example_run
+from tests.support.example_results import changed, is_picture, shown, strays
 
 
 def test_run_gets_every_figure_that_its_results_allow(results: dict[str, Any], tmp_path: Path) -> None:
-    drawn = draw_figures(tmp_path / "figures", watched.campaign(), results)
+    drawn = draw_figures(tmp_path / "figures", example_run.campaign(), results)
     assert set(drawn) == {
         "discrepancy map",
         "test discrepancy",
@@ -48,8 +48,8 @@ def test_run_gets_every_figure_that_its_results_allow(results: dict[str, Any], t
 
 
 def test_unfinished_run_gets_the_figures_it_can(results: dict[str, Any], tmp_path: Path) -> None:
-    assert draw_figures(tmp_path, watched.campaign(), {}) == {}
-    only_pours = draw_figures(tmp_path, watched.campaign(), {"narrow cup": results["narrow cup"]})
+    assert draw_figures(tmp_path, example_run.campaign(), {}) == {}
+    only_pours = draw_figures(tmp_path, example_run.campaign(), {"narrow cup": results["narrow cup"]})
     assert set(only_pours) == {"spillage against pours", "loss map narrow"}
 
 
@@ -57,7 +57,7 @@ def test_a_figure_that_fails_does_not_take_the_others_with_it(
     results: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "spillage.png").mkdir()
-    drawn = draw_figures(tmp_path, watched.campaign(), results)
+    drawn = draw_figures(tmp_path, example_run.campaign(), results)
     assert "spillage against pours" not in drawn
     assert len(drawn) == 4
     assert "figure 'spillage against pours' was not drawn" in caplog.text
@@ -65,7 +65,7 @@ def test_a_figure_that_fails_does_not_take_the_others_with_it(
 
 def test_discrepancy_map_shows_every_useful_trial_and_theta_in_percent(results: dict[str, Any]) -> None:
     result = results["calibration"]
-    picture = calibration_picture(watched.campaign(), result)
+    picture = calibration_picture(example_run.campaign(), result)
     assert picture is not None
     assert picture.best == result.found.theta.model_dump()
     assert list(picture.costs) == [100 * t.discrepancy for t in result.trials if t.discrepancy is not None]
@@ -75,9 +75,9 @@ def test_discrepancy_map_shows_every_useful_trial_and_theta_in_percent(results: 
 
 def in_three_axes(results: dict[str, Any]) -> tuple[Any, Any]:
     """A plan that searches friction too, and what its calibration gave: a map over particles and cohesion."""
-    plan = watched.campaign()
+    plan = example_run.campaign()
     assert plan.calibration is not None
-    box = Space((*watched.THETA.axes, Axis("friction", 0.0, 0.5)))
+    box = Space((*example_run.THETA.axes, Axis("friction", 0.0, 0.5)))
     result: Any = results["calibration"]
     trials = [changed(trial, theta={**trial.theta, "friction": 0.1}) for trial in result.trials]
     axes = {"particles": result.found.map.axes["particles"], "friction": np.linspace(0.0, 0.5, 30).tolist()}
@@ -122,7 +122,7 @@ def test_three_parameters_get_their_trials_against_each_of_them_as_well(
 def test_expected_losses_below_zero_are_shown_as_zero_and_stored_as_they_are(
     results: dict[str, Any],
 ) -> None:
-    plan, learnt = watched.campaign(), results["narrow cup"]
+    plan, learnt = example_run.campaign(), results["narrow cup"]
     deployed = changed(
         learnt,
         recommended=changed(learnt.recommended, predicted_loss=-0.013, predicted_deviation=0.014),
@@ -145,7 +145,7 @@ def test_expected_losses_below_zero_are_shown_as_zero_and_stored_as_they_are(
 
 
 def test_receivers_are_called_by_their_own_name_unless_two_share_it(results: dict[str, Any], tmp_path: Path) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     assert plan.deployment is not None
     deployed = {"narrow cup": results["narrow cup"]}
     assert draw_figures(tmp_path, plan, deployed)["loss map narrow"].name == "loss-map-narrow.png"
@@ -153,13 +153,13 @@ def test_receivers_are_called_by_their_own_name_unless_two_share_it(results: dic
     text = shown(summary_table(plan, summarise(plan, deployed)))
     assert "narrow " in text
     assert "narrow cup" not in text
-    low = replace(watched.NARROW, name="low", fixed={"height": 0.02})
-    twins = replace(plan, deployment=replace(plan.deployment, scenes=(watched.NARROW, low)))
+    low = replace(example_run.NARROW, name="low", fixed={"height": 0.02})
+    twins = replace(plan, deployment=replace(plan.deployment, scenes=(example_run.NARROW, low)))
     assert pour_series(twins, deployed, loss_unit(Loss()))[0].receiver == "narrow cup (D3)"
 
 
 def test_loss_map_numbers_its_pours_as_the_log_does(results: dict[str, Any]) -> None:
-    picture = deployment_picture(watched.campaign(), results["narrow cup"])
+    picture = deployment_picture(example_run.campaign(), results["narrow cup"])
     assert picture is not None
     assert picture.numbers == [1, 2, 3, 4]
     assert picture.best == results["narrow cup"].recommended.action_si
@@ -186,13 +186,13 @@ def test_maps_can_be_drawn_for_any_number_of_axes(tmp_path: Path) -> None:
 
 def test_flat_surrogate_is_drawn_too(tmp_path: Path) -> None:
     flat = np.full((5, 5), 2.0)
-    picture = SurrogatePicture("θ", "|Δ| [%]", watched.THETA, [], [], mean=flat, deviation=flat)
+    picture = SurrogatePicture("θ", "|Δ| [%]", example_run.THETA, [], [], mean=flat, deviation=flat)
     assert is_picture(draw_surrogate(tmp_path / "flat.png", picture))
 
 
 def test_nothing_to_draw_is_said_not_drawn(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="neither a surrogate nor a single observation"):
-        draw_surrogate(tmp_path / "a.png", SurrogatePicture("θ", "|Δ| [%]", watched.THETA, [], []))
+        draw_surrogate(tmp_path / "a.png", SurrogatePicture("θ", "|Δ| [%]", example_run.THETA, [], []))
     with pytest.raises(ValueError, match="no pours"):
         draw_spillage(tmp_path / "b.png", [], cost="loss [%]", title="")
     with pytest.raises(ValueError, match="no set of pours"):
@@ -241,8 +241,8 @@ def test_quantities_are_shown_in_the_units_that_people_type() -> None:
 
 def test_losses_are_shown_in_their_own_unit() -> None:
     assert loss_unit(Loss()).text(0.0123, 0.005) == "1.23 ± 0.50 %"
-    assert loss_unit(Loss("grams")).text(2.46) == "2.46 g"
-    assert loss_unit(Loss("particles")).text(17.0) == "17 particles"
+    assert loss_unit(Loss(name="grams")).text(2.46) == "2.46 g"
+    assert loss_unit(Loss(name="particles")).text(17.0) == "17 particles"
     assert "0.5 × retained" in loss_unit(Loss(retained_weight=0.5)).label
 
 
@@ -256,7 +256,7 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 def at_the_edges(**changes: Any) -> SurrogatePicture:
     """Observations and the best in the corners of the box."""
     corners = [{"particles": n, "cohesion": c} for n in (500.0, 4000.0) for c in (0.0, 0.1)]
-    picture = SurrogatePicture("corners", "loss [%]", watched.THETA, corners, [1.0, 2.0, 3.0, 4.0], best=corners[3])
+    picture = SurrogatePicture("corners", "loss [%]", example_run.THETA, corners, [1.0, 2.0, 3.0, 4.0], best=corners[3])
     return replace(picture, **changes)
 
 
@@ -290,7 +290,7 @@ def test_simulations_stand_beside_the_pours_of_a_loss_map(
     results: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     deployed, drawn = results["narrow cup"], kept(monkeypatch)
-    picture = deployment_picture(watched.campaign(), deployed)
+    picture = deployment_picture(example_run.campaign(), deployed)
     assert picture is not None
     assert len(picture.simulated) == deployed.simulations - deployed.simulations_lost
     draw_surrogate(Path("map.png"), picture)
@@ -325,7 +325,7 @@ def test_the_posterior_has_axes_with_plain_numbers_and_nothing_is_cut(
 ) -> None:
     drawn, result = kept(monkeypatch), results["calibration"]
     theta = {**result.found.theta.model_dump(), "particles": 4000.0, "cohesion": 0.0}
-    draw_posterior(Path("posterior.png"), result.found.posterior, watched.THETA, theta)
+    draw_posterior(Path("posterior.png"), result.found.posterior, example_run.THETA, theta)
     drawn[0].draw_without_rendering()
     said = [text.get_text() for text in drawn[0].findobj(Text)]
     assert not [text for text in said if "10^" in text]

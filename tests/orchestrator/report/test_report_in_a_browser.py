@@ -13,9 +13,9 @@ from orchestrator.config.file_loading import load_campaign
 from orchestrator.results.publishing import publish
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.run_folder import create_run
-from tests.end_to_end.small import write_campaign
-from tests.orchestrator.daemon.browsing import browser
 from tests.orchestrator.report.test_run_report import laboratory
+from tests.support.browser import browser
+from tests.support.small_campaign import write_campaign
 
 pytest.importorskip("playwright")
 

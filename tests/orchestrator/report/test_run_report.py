@@ -29,8 +29,8 @@ from orchestrator.run_errors import RunError
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.run_folder import create_run
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from tests.end_to_end.small import CAMPAIGN, write_campaign
-from tests.orchestrator.toy import ToyBench, ToyLaboratory
+from tests.support.small_campaign import CAMPAIGN, write_campaign
+from tests.support.toy_campaign import ToyBench, ToyLaboratory
 
 SCRIPT = "<script>alert(1)</script>"
 

@@ -19,14 +19,14 @@ from orchestrator.strategies.deployment.model_monitoring import Belief, Believed
 from orchestrator.strategies.deployment.real_pours import Foretold
 from orchestrator.strategies.repeated_simulation import Foreseen
 from sim_engine.prediction_band import SampleStatistics
-from tests.orchestrator import watched
-from tests.orchestrator.reported import changed, shown
+from tests.support import example_run
+from tests.support.example_results import changed, shown
 
 BUSY = PoolUse(pool_busy=0.974, pool_useful=0.41, arm_longest_wait_s=0.061, arm_mean_wait_s=0.03)
 
 
 def test_summary_tells_theta_discrepancies_losses_actions_and_files(results: dict[str, Any], tmp_path: Path) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     results = {**results, "evaluation": changed(results["evaluation"], mean_predictor={"test": 0.1234})}
     figures = {"spillage against pours": tmp_path / "spillage.png"}
     summary = summarise(
@@ -58,7 +58,7 @@ def test_summary_tells_theta_discrepancies_losses_actions_and_files(results: dic
 def test_summary_file_has_what_was_summarised_and_the_results_read_back(
     results: dict[str, Any], tmp_path: Path
 ) -> None:
-    summary = summarise(watched.campaign(), results)
+    summary = summarise(example_run.campaign(), results)
     path = write_summary(tmp_path / "run", summary)
     assert path.name == "summary.json"
     written = json.loads(path.read_text(encoding="utf-8"))
@@ -68,7 +68,7 @@ def test_summary_file_has_what_was_summarised_and_the_results_read_back(
 
 
 def test_summary_file_is_what_its_schema_says(results: dict[str, Any], tmp_path: Path) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     warning = NotSimulated(kind="wetting", share=0.1, text="", action_si={"x_offset": 0.1}, hit=1, tried=5)
     summary = summarise(plan, results, totals=Totals(occupancy={"narrow cup": BUSY}))
     written = json.loads(write_summary(tmp_path, changed(summary, not_covered={"cup": (warning,)})).read_text())
@@ -88,7 +88,7 @@ def test_summary_warns_of_an_untrustworthy_simulator_failed_pours_and_dropped_ev
     for index, why in ((1, "pour_failed: the gripper slipped"), (2, "pour_unknown: declared lost by the operator")):
         pours[index] = changed(pours[index], status="failed", reason=why)
     poured = changed(results["narrow cup"], failed_pours=2, trust=trust, pours=tuple(pours))
-    plan = watched.campaign()
+    plan = example_run.campaign()
     text = shown(summary_table(plan, summarise(plan, {"narrow cup": poured}, dropped_events=12)))
     assert "the simulator may not fit this vessel" in text
     assert (
@@ -112,7 +112,7 @@ def test_what_pours_say_of_the_simulator_is_known_where_it_is_borne_out_and_open
         alarm=False,
         text="the simulator is as it is",
     )
-    plan = watched.campaign()
+    plan = example_run.campaign()
     poured = changed(results["narrow cup"], trust=trust)
     (said,) = advice(plan, summarise(plan, {"narrow cup": poured}))
     assert ("The simulator is as it is." in said.sentences) == known
@@ -120,7 +120,7 @@ def test_what_pours_say_of_the_simulator_is_known_where_it_is_borne_out_and_open
 
 
 def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(results: dict[str, Any]) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     assert plan.deployment is not None
     liquid = plan.deployment.scenes[0].liquid
     deployed = results["narrow cup"]
@@ -147,7 +147,7 @@ def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(re
 
 
 def test_planning_alone_shows_no_columns_about_pours_and_no_empty_table(results: dict[str, Any]) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     planned = changed(results["narrow cup"], strategy="D1", pours=())
     text = shown(summary_table(plan, summarise(plan, {"narrow cup": planned})))
     assert "best expected" in text
@@ -164,7 +164,7 @@ def test_table_in_a_log_file_breaks_neither_paths_nor_rows(
     results: dict[str, Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "60")
-    plan = watched.campaign()
+    plan = example_run.campaign()
     recording = Path("/laboratory") / "a-folder-with-a-rather-long-name" / ("x" * 120) / "campaign.rrd"
     summary = summarise(plan, {"narrow cup": results["narrow cup"]}, recording=recording)
     print_summary(plan, summary)
@@ -175,7 +175,7 @@ def test_table_in_a_log_file_breaks_neither_paths_nor_rows(
 
 
 def test_summary_tells_how_busy_the_pool_was_and_whether_the_arm_waited(results: dict[str, Any]) -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     summary = summarise(plan, results, totals=Totals(occupancy={"deployment:narrow": BUSY}))
     assert summary.occupancy["deployment:narrow"] == BUSY
     text = " ".join(shown(summary_table(plan, summary)).split())
@@ -184,7 +184,7 @@ def test_summary_tells_how_busy_the_pool_was_and_whether_the_arm_waited(results:
 
 
 def test_run_that_was_stopped_at_once_has_a_summary_too() -> None:
-    plan = watched.campaign()
+    plan = example_run.campaign()
     summary = summarise(plan, {})
     assert (summary.theta, summary.receivers) == (None, {})
     assert "narrow-cup" in shown(summary_table(plan, summary))

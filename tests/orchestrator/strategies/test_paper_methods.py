@@ -30,10 +30,10 @@ from orchestrator.study.report.study_tables import tables
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import finished_results, read_result
 from orchestrator.study.study_plan import StudyPlan, cells_of
-from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, report, write
-from tests.orchestrator.study_files import read, written
-from tests.orchestrator.toy_study import TOYS
-from tests.orchestrator.toys import calibration_spill, narrow_cup, narrow_cup_biased, weighed
+from tests.support.campaign_files import CAMPAIGN, DEPLOYED, report, write
+from tests.support.study_files import read, written
+from tests.support.toy_spillage import calibration_spill, narrow_cup, narrow_cup_biased, weighed
+from tests.support.toy_study import TOYS
 
 
 def campaign(folder: Path, keys: str) -> CampaignPlan:

@@ -38,12 +38,12 @@ from orchestrator.strategy_harness import CALIBRATION_ACTIONS, SCENE, THETA, Str
 from sim_engine.outcome import Loss, PourMeasurement
 from sim_engine.scene import PoseError
 from sim_engine.search_space import Axis, Space
-from tests.depth import examples
-from tests.orchestrator import plans
-from tests.orchestrator.plans import calibration_plan, deployment_plan
-from tests.orchestrator.toy import SCENE as TOY
-from tests.orchestrator.toy import SPACE, ToyLaboratory, logical_record, run_toy, slow_laboratory, toy_plan
-from tests.orchestrator.toys import calibration_spill, narrow_cup, weighed
+from tests.support import plans
+from tests.support.hypothesis_examples import examples
+from tests.support.plans import calibration_plan, deployment_plan
+from tests.support.toy_campaign import SCENE as TOY
+from tests.support.toy_campaign import SPACE, ToyLaboratory, logical_record, run_toy, slow_laboratory, toy_plan
+from tests.support.toy_spillage import calibration_spill, narrow_cup, weighed
 
 CALIBRATIONS: dict[str, tuple[Any, dict[str, Any]]] = {
     "C1": (UniformGrid, {"grid": {"particles": 2, "cohesion": 3}}),

@@ -44,12 +44,12 @@ from orchestrator.study.study_plan import StudyPlan, cells_of, study_fingerprint
 from orchestrator.study.study_strategies import FinalPour
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement
-from tests.actors.conftest import make_fake
-from tests.orchestrator import toy_study
-from tests.orchestrator.study_files import ROOT, read, small, without, written
-from tests.orchestrator.toy import logical_record
-from tests.orchestrator.toy_study import PAUSE, TOYS, run_toy_study
-from tests.patience import PATIENCE
+from tests.support import toy_study
+from tests.support.fake_simulator import make_fake
+from tests.support.study_files import ROOT, read, small, without, written
+from tests.support.toy_campaign import logical_record
+from tests.support.toy_study import PAUSE, TOYS, run_toy_study
+from tests.support.waiting import PATIENCE
 
 
 def comparable(study: StudyPlan) -> dict[str, Any]:

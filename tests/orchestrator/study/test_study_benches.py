@@ -21,8 +21,8 @@ from orchestrator.study.study_folder import finished_results
 from orchestrator.study.study_plan import StudyPlan, cells_of
 from sim_engine.scene import PourTask
 from sim_engine.simulator import InvalidSceneError, PourSimulator
-from tests.orchestrator.study_files import STUDIES, read, written
-from tests.orchestrator.toy_study import run_toy_study
+from tests.support.study_files import STUDIES, read, written
+from tests.support.toy_study import run_toy_study
 
 LEVELS = ("bench1", "bench2")
 

@@ -20,8 +20,8 @@ from orchestrator.study.study_campaigns import campaign_of
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_plan import cells_of
 from sim_engine.vessel.vessel import build_vessel
-from tests.orchestrator import plans
-from tests.orchestrator.study_files import ROOT, STUDIES, read, small, without, written
+from tests.support import plans
+from tests.support.study_files import ROOT, STUDIES, read, small, without, written
 
 
 def test_the_paper_study_has_the_repetitions_that_it_promises() -> None:

@@ -31,8 +31,8 @@ from orchestrator.study.study_folder import CellResult, code_now, run_folder, to
 from orchestrator.study.study_plan import StudyCell, StudyPlan, cells_of
 from orchestrator.study.study_strategies import FinalPoured
 from sim_engine.liquids import SimulationParameters
-from tests.orchestrator.reported import strays
-from tests.orchestrator.study_files import read, written
+from tests.support.example_results import strays
+from tests.support.study_files import read, written
 
 FIGURES = ("3b", "3c", "4", "5a", "5b", "6", "7", "final")
 

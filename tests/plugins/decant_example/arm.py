@@ -77,8 +77,6 @@ class StandSpec(ArmSpec):
 class StandSection(ArmSettings):
     """A stand whose motor turns the pourer."""
 
-    required: ClassVar[dict[str, str]] = {"kind": "stand"}
-
     kind: Literal["stand"] = "stand"
     """A stand with a motor."""
 

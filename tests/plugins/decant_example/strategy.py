@@ -21,7 +21,6 @@ from decant.plugins import (
 class HypercubeSettings(DeploymentSettings):
     """Hypercube: pour everywhere once, then use what was best."""
 
-    required: ClassVar[dict[str, str]] = {"strategy": "hypercube"}
     simulates: ClassVar[bool] = False
 
     strategy: Literal["hypercube"] = "hypercube"

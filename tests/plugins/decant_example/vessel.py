@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
-from decant.plugins import ProfileShape, Quantity, Settings, Shape, VesselError
+from decant.plugins import ProfileShape, Quantity, Shape, VesselError
 
 Length = Annotated[float, Quantity("m", "40 mm", 5e-3, 0.5)]
 
 
-class Cone(Shape, Settings):
+class Cone(Shape):
     """A cone that opens upwards, cut off at its floor."""
 
-    required: ClassVar[dict[str, str]] = {"top": "40 mm"}
+    kind: ClassVar[str] = "cone"
 
-    kind: Literal["cone"] = "cone"
-    """The key that it has in a vessel's file."""
-
-    top: Length | None = None
+    top: Length
     """Inner radius at the rim."""
 
     bottom: Length = 0.02
@@ -31,11 +28,10 @@ class Cone(Shape, Settings):
 
     def outline(self) -> ProfileShape:
         """See `Shape.outline`."""
-        assert self.top is not None, "a required key"
         if self.top < self.bottom:
             raise VesselError(
                 f"a cone opens upwards; its top ({1e3 * self.top:g} mm) should be wider than its bottom "
                 f"({1e3 * self.bottom:g} mm)"
             )
         inner = ((0.0, 0.0), (self.bottom, 0.0), (self.top, self.height))
-        return ProfileShape(inner=inner, wall=self.wall, floor=self.wall)
+        return ProfileShape(unit="m", inner=inner, wall=self.wall, floor=self.wall)

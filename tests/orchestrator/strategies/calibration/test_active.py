@@ -21,8 +21,8 @@ from orchestrator.strategy_harness import ACTIONS, SCENE, StrategyHarness, repla
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
-from tests.orchestrator.plans import calibration_plan, deployment_plan
 from tests.orchestrator.strategies.calibration.test_nuisances import SEARCHED, TRUTH, spilled, written
+from tests.support.plans import calibration_plan, deployment_plan
 
 NARROW = replace(SCENE, name="deployment-narrow", fixed={"height": 0.07})
 

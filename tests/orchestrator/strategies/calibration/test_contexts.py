@@ -21,8 +21,8 @@ from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.shapes import cylinder
-from tests.orchestrator.plans import calibration_plan
 from tests.orchestrator.strategies.calibration.test_nuisances import written
+from tests.support.plans import calibration_plan
 
 WIDE = replace(SCENE, name="calibration-wide", receiver=cylinder("wide", inner_radius=0.05, inner_height=0.1))
 THIRD = replace(SCENE, name="calibration-third")

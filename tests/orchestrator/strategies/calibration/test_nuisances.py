@@ -19,7 +19,7 @@ from orchestrator.strategy_harness import SCENE, StrategyHarness
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
-from tests.orchestrator.plans import calibration_plan
+from tests.support.plans import calibration_plan
 
 ACTIONS = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0.08, 0.15)))
 SEARCHED = Space((Axis("receiver_x", -0.015, 0.015), Axis("speed_factor", 0.9, 1.1)))

@@ -32,9 +32,9 @@ from sim_engine.action import DEG
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 from sim_engine.search_space import Axis, Space
-from tests.orchestrator.plans import calibration_plan
-from tests.orchestrator.reported import is_picture
-from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed
+from tests.support.example_results import is_picture
+from tests.support.plans import calibration_plan
+from tests.support.toy_spillage import TRUE_THETA, calibration_spill, weighed
 
 TIED = Space((Axis("cohesion", 0.0, 0.1), Axis("friction", 0.0, 0.5)))
 

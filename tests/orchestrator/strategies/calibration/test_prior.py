@@ -19,9 +19,9 @@ from orchestrator.strategies.campaign_plan import CalibrationPlan, NormalPrior
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, StrategyHarness
 from sim_engine.action import DEG
 from sim_engine.search_space import Axis, Space
-from tests.orchestrator.good_files import CAMPAIGN, DEPLOYED, report, write
-from tests.orchestrator.plans import calibration_plan
-from tests.orchestrator.toys import calibration_spill, weighed
+from tests.support.campaign_files import CAMPAIGN, DEPLOYED, report, write
+from tests.support.plans import calibration_plan
+from tests.support.toy_spillage import calibration_spill, weighed
 
 SLOW = NormalPrior("angular_velocity", 30 * DEG, 10 * DEG)
 """A prior on 15 … 120 deg/s: a deviation and a half above the lowest."""

@@ -26,8 +26,8 @@ from orchestrator.strategies.campaign_plan import MeasuredPour
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness, outcome_of, replay
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
-from tests.orchestrator.plans import calibration_plan, unit
-from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed
+from tests.support.plans import calibration_plan, unit
+from tests.support.toy_spillage import TRUE_THETA, calibration_spill, weighed
 
 
 class Quiet:

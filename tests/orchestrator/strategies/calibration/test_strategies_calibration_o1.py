@@ -14,8 +14,8 @@ from orchestrator.strategies.calibration.pointwise_calibration import (
 from orchestrator.strategies.calibration.pour_design import DesignedPours
 from orchestrator.strategies.strategy import Progress
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness, outcome_of
-from tests.orchestrator.plans import calibration_plan
-from tests.orchestrator.toys import TRUE_THETA, calibration_spill, weighed
+from tests.support.plans import calibration_plan
+from tests.support.toy_spillage import TRUE_THETA, calibration_spill, weighed
 
 STRATEGIES = {"C1": UniformGrid, "C2": StratifiedSampling, "C3": BayesianCalibration}
 BUDGETS = {"C1": {"grid": {"particles": 4, "cohesion": 4}}, "C2": {"samples": 18}, "C3": {"iterations": 16}}

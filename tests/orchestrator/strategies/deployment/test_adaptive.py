@@ -28,13 +28,13 @@ from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 from sim_engine.search_space import Axis, Space
-from tests.orchestrator import plans
-from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.test_stages import laboratory
-from tests.orchestrator.toy import SCENE as TOY_SCENE
-from tests.orchestrator.toy import SPACE as TOY_SPACE
-from tests.orchestrator.toy import ToyLaboratory, answering, run_toy, toy_plan
-from tests.orchestrator.toys import narrow_cup, narrow_cup_biased
+from tests.support import plans
+from tests.support.plans import deployment_plan
+from tests.support.toy_campaign import SCENE as TOY_SCENE
+from tests.support.toy_campaign import SPACE as TOY_SPACE
+from tests.support.toy_campaign import ToyLaboratory, answering, run_toy, toy_plan
+from tests.support.toy_spillage import narrow_cup, narrow_cup_biased
 
 
 def upside_down(action: Any, theta: Any, rng: Any) -> float:

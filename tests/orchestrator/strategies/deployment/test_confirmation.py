@@ -11,7 +11,7 @@ from orchestrator.strategies.deployment.deployment_result import Recommended
 from orchestrator.strategies.strategy import Progress
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import Loss, PourMeasurement
-from tests.orchestrator.toy import SCENE, SPACE, THETA
+from tests.support.toy_campaign import SCENE, SPACE, THETA
 
 COSTING = Costing(Loss(), SCENE, THETA)
 RECOMMENDED = Recommended(

@@ -20,8 +20,8 @@ from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.vessel.vessel import build_vessel
-from tests.orchestrator.plans import deployment_plan, unit
-from tests.orchestrator.toys import narrow_cup
+from tests.support.plans import deployment_plan, unit
+from tests.support.toy_spillage import narrow_cup
 
 STRATEGIES: dict[str, Any] = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
 NEAREST = 0.122

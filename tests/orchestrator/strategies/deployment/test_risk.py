@@ -23,9 +23,9 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 from sim_engine.scene import PoseError
 from sim_engine.search_space import Axis, Space
-from tests.orchestrator import plans
-from tests.orchestrator.plans import deployment_plan
-from tests.orchestrator.toys import quiet_valleys, two_valleys
+from tests.support import plans
+from tests.support.plans import deployment_plan
+from tests.support.toy_spillage import quiet_valleys, two_valleys
 
 ERRORS = PoseError(x=8e-3, speed_factor=0.03)
 
@@ -238,7 +238,7 @@ def test_a_prediction_bears_the_errors_and_counts_cups_that_touch_as_the_worst()
 
 
 def test_a_simulation_that_was_asked_for_with_an_error_is_made_with_it() -> None:
-    from tests.orchestrator.toy import ToySimulators
+    from tests.support.toy_campaign import ToySimulators
 
     async def run() -> Any:
         import asyncio

@@ -25,8 +25,8 @@ from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.strategy import Progress
 from orchestrator.strategy_harness import THETA, StrategyHarness
 from sim_engine.action import DEG
-from tests.orchestrator.toy import ToyLaboratory, run_toy
-from tests.orchestrator.toys import narrow_cup
+from tests.support.toy_campaign import ToyLaboratory, run_toy
+from tests.support.toy_spillage import narrow_cup
 
 CONFIGS = Path(__file__).parents[4] / "configs"
 

@@ -14,8 +14,8 @@ from orchestrator.strategies.deployment.deployment_base import MAX_REFUSED
 from orchestrator.strategies.strategy import Strategy
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, replay
 from sim_engine.outcome import Loss, PourMeasurement
-from tests.orchestrator.plans import deployment_plan
-from tests.orchestrator.toys import narrow_cup, narrow_cup_biased
+from tests.support.plans import deployment_plan
+from tests.support.toy_spillage import narrow_cup, narrow_cup_biased
 
 STRATEGIES = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
 
@@ -104,7 +104,7 @@ def test_d1_averages_its_simulations_of_an_action():
 
 
 def test_d1_predicts_the_spillage_of_its_action_whatever_it_minimised():
-    strategy = make("D1", pours=0, loss=Loss("grams"))
+    strategy = make("D1", pours=0, loss=Loss(name="grams"))
     told = StrategyHarness(lambda *pour: 0.1 + 0.5 * narrow_cup(*pour)).run(strategy).told
     result = strategy.result()
     chosen = SCENE.action(result.recommended.action_si)
@@ -226,7 +226,7 @@ def test_a_simulator_that_is_wrong_raises_the_alarm_and_a_right_one_does_not():
 
 @pytest.mark.parametrize(
     ("loss", "worst"),
-    [(Loss(), 1.0), (Loss(retained_weight=3.0), 3.0), (Loss("normalised"), 1.0), (Loss("grams"), 200.0)],
+    [(Loss(), 1.0), (Loss(retained_weight=3.0), 3.0), (Loss(name="normalised"), 1.0), (Loss(name="grams"), 200.0)],
 )
 def test_the_worst_loss_is_as_bad_as_spilling_or_keeping_everything(loss, worst):
     costing = Costing(loss, SCENE, THETA)

@@ -28,8 +28,8 @@ from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, normalised_spillage
 from sim_engine.search_space import Axis, Space
-from tests.orchestrator.plans import calibration_plan, deployment_plan
 from tests.orchestrator.strategies.test_strategies_properties import Shuffled
+from tests.support.plans import calibration_plan, deployment_plan
 
 ACTIONS = (
     Axis("angular_velocity", 15 * DEG, 120 * DEG, "log"),

@@ -22,12 +22,12 @@ from orchestrator.strategies.deployment.costing import Prices, PricesSettings
 from orchestrator.strategies.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
 from orchestrator.strategies.deployment.model_monitoring import DiscrepancyPolicySettings
 from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
-from tests.orchestrator.killed import die_at, finished_times
-from tests.orchestrator.plans import deployment_plan
 from tests.orchestrator.test_stages import campaign, laboratory
-from tests.orchestrator.toy import SCENE as TOY_SCENE
-from tests.orchestrator.toy import logical_record, run_toy
-from tests.orchestrator.toys import narrow_cup, narrow_cup_biased
+from tests.support.killed_runs import die_at, finished_times
+from tests.support.plans import deployment_plan
+from tests.support.toy_campaign import SCENE as TOY_SCENE
+from tests.support.toy_campaign import logical_record, run_toy
+from tests.support.toy_spillage import narrow_cup, narrow_cup_biased
 
 
 def free(seed: int = 0, prices: PricesSettings | None = None, **changes: Any) -> FreeHybrid:

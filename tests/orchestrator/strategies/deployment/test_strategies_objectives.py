@@ -37,8 +37,8 @@ from sim_engine.motion import plan_motion
 from sim_engine.outcome import Fractions, Loss, PourMeasurement
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.vessel import build_vessel
-from tests.orchestrator.plans import deployment_plan
-from tests.orchestrator.toy import toy_plan
+from tests.support.plans import deployment_plan
+from tests.support.toy_campaign import toy_plan
 
 STRATEGIES = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
 ACTIONS = Space(

@@ -22,12 +22,12 @@ from orchestrator.strategies.deployment.safe_window import ROUNDS, SafeWindow
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, executed
 from sim_engine.outcome import Loss
 from sim_engine.scene import PoseError
-from tests.orchestrator import plans, toy
-from tests.orchestrator.killed import die_at
-from tests.orchestrator.plans import deployment_plan
-from tests.orchestrator.reported import changed, is_picture
-from tests.orchestrator.toy import ToyLaboratory, logical_record, toy_plan
-from tests.orchestrator.toys import quiet_valleys, two_valleys
+from tests.support import plans, toy_campaign
+from tests.support.example_results import changed, is_picture
+from tests.support.killed_runs import die_at
+from tests.support.plans import deployment_plan
+from tests.support.toy_campaign import ToyLaboratory, logical_record, toy_plan
+from tests.support.toy_spillage import quiet_valleys, two_valleys
 
 ERRORS = PoseError(x=8e-3, speed_factor=0.03)
 CENTRE = (0.5, 0.7)
@@ -178,7 +178,7 @@ def test_the_window_is_told_and_drawn(tmp_path: Path) -> None:
     assert is_picture(draw_figures(tmp_path, plan, {"deployment:cup": mapless})["safe window cup"])
 
 
-class ProposingOptimizer(toy.ToyOptimizer):
+class ProposingOptimizer(toy_campaign.ToyOptimizer):
     """The real optimiser, without an actor."""
 
     async def suggest(self, problem: SuggestProblem) -> Suggestion:
@@ -190,8 +190,8 @@ def run_risk(directory: Path, *, resume: bool = False) -> Any:
     risk = plans.risk("cvar", 0.8, ERRORS)
     deployment = plans.deployment(
         "D1",
-        scenes=(toy.SCENE,),
-        actions=toy.SPACE,
+        scenes=(toy_campaign.SCENE,),
+        actions=toy_campaign.SPACE,
         loss=Loss(),
         pours=1,
         iterations=4,
@@ -200,7 +200,7 @@ def run_risk(directory: Path, *, resume: bool = False) -> Any:
     )
     plan = toy_plan(directory, deployment=deployment, on_unknown="repeat")
     laboratory = ToyLaboratory(optimizer=ProposingOptimizer())
-    return asyncio.run(toy.run_toy(directory, laboratory, plan=plan, stages=None, resume=resume))
+    return asyncio.run(toy_campaign.run_toy(directory, laboratory, plan=plan, stages=None, resume=resume))
 
 
 def test_killed_on_the_way_it_makes_the_requests_it_would_have_made(tmp_path: Path) -> None:

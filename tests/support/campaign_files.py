@@ -9,12 +9,12 @@ from textwrap import dedent
 import pytest
 
 from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.run_snapshot import as_file
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
-from orchestrator.config.yaml.yaml_writer import as_file
-from sim_engine.settings.model import Section
+from sim_engine.settings.model import Settings
 
 CAMPAIGN = """\
 name: test
@@ -90,7 +90,7 @@ def report(path: Path) -> str:
     return str(caught.value)
 
 
-def written_out(model: type[Section], text: str) -> str:
+def written_out(model: type[Settings], text: str) -> str:
     """A section of a text as a run's record has it."""
     report = Report()
     place = Place(Document.parse(dedent(text), Path("written.yaml").resolve()))

@@ -19,7 +19,7 @@ from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.stage_result import StageResult
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
-from tests.orchestrator import watched
+from tests.support import example_run
 
 
 def spilled(action: Action, parameters: SimulationParameters) -> float:
@@ -30,21 +30,21 @@ def spilled(action: Action, parameters: SimulationParameters) -> float:
 
 def played_results() -> dict[str, StageResult]:
     """Results of the real strategies, in a world whose spillage is a formula."""
-    plan = watched.campaign(pours=4)
+    plan = example_run.campaign(pours=4)
     assert plan.calibration is not None
     assert plan.deployment is not None
     rng = np.random.default_rng(3)
     pours = []
     for number in range(8):
-        values = watched.ACTIONS.draw(rng)
+        values = example_run.ACTIONS.draw(rng)
         action = Action(height=0.05, **values)
         split = "test" if number >= 6 else "train"
         pours.append(MeasuredPour(action, spilled(action, SimulationParameters()), 0.98, split))
-    calibrated = watched.played(ContinuousBayesianCalibration(_with_height(plan.calibration), pours, 1), spilled)
+    calibrated = example_run.played(ContinuousBayesianCalibration(_with_height(plan.calibration), pours, 1), spilled)
     thetas = {"calibrated": calibrated.found.theta}
-    thetas |= random_parameters(watched.THETA, {}, 3, 2)
-    evaluated = watched.played(Evaluation(thetas, [ScoredPour("tumbler", pour) for pour in pours], 3), spilled)
-    poured = watched.played(Hybrid(plan.deployment, watched.NARROW, SimulationParameters(), 4), spilled)
+    thetas |= random_parameters(example_run.THETA, {}, 3, 2)
+    evaluated = example_run.played(Evaluation(thetas, [ScoredPour("tumbler", pour) for pour in pours], 3), spilled)
+    poured = example_run.played(Hybrid(plan.deployment, example_run.NARROW, SimulationParameters(), 4), spilled)
     return {"calibration": calibrated, "evaluation": evaluated, "narrow cup": poured}
 
 

@@ -1,13 +1,20 @@
-"""What is in a recording."""
+"""Reads what a Rerun recording contains, and records what a live view sends to a viewer without a screen."""
 
 from __future__ import annotations
 
+import contextlib
 import re
+import subprocess
+import time
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pyarrow as pa
 
-from orchestrator.live_view.viewer_server import run_rerun
+from actors.runtime.child_process import child_environment
+from orchestrator.live_view.viewer_server import environment, rerun_program, run_rerun
+from tests.support.waiting import PATIENCE
 
 
 class Contents:
@@ -58,3 +65,32 @@ def tabs_as_they_came(path: Path) -> list[str]:
         turned[found]
         for found in re.findall(r'BlueprintActivationCommand\(StoreId\(Blueprint, "[^"]*", "([^"]*)"', said)
     ]
+
+
+@contextlib.contextmanager
+def viewer(stream: str, kept: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Connected while the context lasts; writes to `kept`."""
+    process = subprocess.Popen(
+        [rerun_program(), "--save", str(kept), "--connect", stream, "--port", "auto"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=child_environment(environment()),
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def seen(kept: Path, enough: Callable[[Contents], bool]) -> Contents:
+    """What a viewer has been sent, once it is enough."""
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        time.sleep(0.3)
+        with contextlib.suppress(Exception), warnings.catch_warnings():  # half-written
+            warnings.simplefilter("ignore")
+            contents = Contents(kept)
+            if enough(contents):
+                return contents
+    raise AssertionError(f"not enough came to the viewer within {PATIENCE:g} s")

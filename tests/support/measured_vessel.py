@@ -34,7 +34,7 @@ class Bench:
 
     def __post_init__(self) -> None:
         assert isinstance(self.spec.shape, ProfileShape)
-        self.shape = self.spec.shape
+        self.shape = self.spec.shape.outline()
         self.inner = np.array(self.shape.inner)
         self.vessel = build_vessel(self.spec)
         self.rng = np.random.default_rng(self.seed)

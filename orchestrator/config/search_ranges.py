@@ -1,7 +1,11 @@
-"""File sections for motions, action spaces and execution errors, derived from the declarations in `sim_engine.action`.
+"""Values and ranges of action dimensions and simulation parameters, as sections of files.
 
-- `RangeSection` and `ActionRangeSection`: bounds of a searched quantity, with scale and prior.
+The sections are derived from the declarations in `sim_engine.action` and `sim_engine.liquids`.
+
+- `RangeSection`: bounds and scale of a searched quantity. `ActionRangeSection` adds a prior, `ParameterRangeSection` a
+  measured value.
 - `MotionBase`: values of the motion that are not searched; `ActionsBase`: searched dimensions and their constraints.
+- `ParametersBase`: simulation parameters, each with a value or a range.
 """
 
 from __future__ import annotations
@@ -14,10 +18,10 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 from orchestrator.strategies.campaign_plan import NormalPrior
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
-from sim_engine.liquids import SimulationParameters
+from sim_engine.liquids import ParameterInfo, SimulationParameters
 from sim_engine.scene import Pivot
 from sim_engine.search_space import Axis, Scale, Space
-from sim_engine.settings.model import MADE, Section, Text
+from sim_engine.settings.model import MADE, Settings, Text
 from sim_engine.settings.quantity import Quantity
 
 EXAMPLES = {
@@ -39,7 +43,7 @@ EXAMPLES = {
 """A valid value of every action dimension and simulation parameter, for messages and schemas."""
 
 
-class RangeSection(Section):
+class RangeSection(Settings):
     """Bounds of a searched quantity: `[lowest, highest]`, or with a scale `{range: [...], scale: log}`."""
 
     required: ClassVar[dict[str, str]] = {"range": "[lowest, highest]"}
@@ -83,26 +87,24 @@ class RangeSection(Section):
         return Axis(name, float(self.range[0]), float(self.range[1]), self.scale, integer)
 
 
-def range_model(
-    name: str, quantity: Quantity, base: type[RangeSection] = RangeSection, **further: Any
-) -> type[RangeSection]:
-    """A range of one quantity; `further` are additional fields."""
+def _section(
+    name: str, base: type[Settings], types: Mapping[str, Any], meanings: Mapping[str, str] | None = None
+) -> Any:
+    """A section with optional keys of these types; keys that `base` declares keep their descriptions."""
+    described = {key: info.description for key, info in base.model_fields.items()} | dict(meanings or {})
+    fields: Any = {
+        key: (kind | None, Field(default=None, description=described[key] or None)) for key, kind in types.items()
+    }
+    return create_model(name, __base__=base, __doc__=base.__doc__, __cls_kwargs__=MADE, **fields)
+
+
+def _range(quantity: Quantity) -> Any:
     end = Annotated[float, quantity]
-    fields: Any = {"range": (tuple[end, end] | None, Field(default=None, description="[lowest, highest]")), **further}
-    model: type[RangeSection] = create_model(
-        f"{title(name)}Range", __base__=base, __doc__=base.__doc__, __cls_kwargs__=MADE, **fields
-    )
-    return model
+    return tuple[end, end]
 
 
-def title(name: str) -> str:
-    """Name of the models of a quantity."""
+def _title(name: str) -> str:
     return name.title().replace("_", "")
-
-
-def described(section: type[Section], field: str) -> str | None:
-    """Description of a section's field."""
-    return section.model_fields[field].description
 
 
 DEVIATIONS = {"rad/s": "20 deg/s", "rad": "10 deg", "rad/s^2": "200 deg/s^2", "s": "0.5 s", "m": "15 mm"}
@@ -120,7 +122,7 @@ def dimension_quantity(dimension: Dimension, *, words: bool = False) -> Quantity
     )
 
 
-class PriorSection(Section):
+class PriorSection(Settings):
     """Prior of a searched dimension: a normal distribution, truncated at the ends of the range."""
 
     mean: Any = None
@@ -144,23 +146,17 @@ class ActionRangeSection(RangeSection):
         return NormalPrior(name, float(prior.mean), float(prior.deviation))
 
 
-def _action_range_model(dimension: Dimension) -> type[RangeSection]:
-    name, quantity = dimension.name, dimension_quantity(dimension)
+def _action_range(dimension: Dimension) -> Any:
+    title, quantity = _title(dimension.name), dimension_quantity(dimension)
     width = dimension.upper - dimension.lower
     spread = Quantity(dimension.unit, DEVIATIONS[dimension.unit], 0.0, width, positive=True)
-    fields: Any = {
-        key: (Annotated[float, number] | None, Field(default=None, description=described(PriorSection, key)))
-        for key, number in (("mean", quantity), ("deviation", spread))
-    }
-    prior: Any = create_model(
-        f"{title(name)}Prior", __base__=PriorSection, __doc__=PriorSection.__doc__, __cls_kwargs__=MADE, **fields
-    )
+    moments = {"mean": Annotated[float, quantity], "deviation": Annotated[float, spread]}
+    prior = _section(f"{title}Prior", PriorSection, moments)
     prior.required = {"mean": quantity.example, "deviation": spread.example}
-    field = (prior | None, Field(default=None, description=described(ActionRangeSection, "prior")))
-    return range_model(name, quantity, ActionRangeSection, prior=field)
+    return _section(f"{title}Range", ActionRangeSection, {"range": _range(quantity), "prior": prior})
 
 
-class PivotPoint(Section):
+class PivotPoint(Settings):
     """A horizontal line in the frame of the upright pourer."""
 
     required: ClassVar[dict[str, str]] = {"x": "0 mm", "z": "50 mm"}
@@ -176,7 +172,7 @@ def _pivot_form(value: Any) -> str:
     return "word" if isinstance(value, str) else "point"
 
 
-class MotionBase(Section):
+class MotionBase(Settings):
     """Values of the motion that are not searched."""
 
     pivot: (
@@ -208,21 +204,7 @@ class MotionBase(Section):
         return Pivot("point", self.pivot.x, self.pivot.z)
 
 
-def _motion_model() -> type[MotionBase]:
-    fields: Any = {
-        name: (
-            Annotated[float | str, dimension_quantity(dimension, words=True)] | None,
-            Field(default=None, description=dimension.meaning),
-        )
-        for name, dimension in ACTION_DIMENSIONS.items()
-    }
-    model: type[MotionBase] = create_model(
-        "Motion", __base__=MotionBase, __doc__=MotionBase.__doc__, __cls_kwargs__=MADE, **fields
-    )
-    return model
-
-
-class ActionsBase(Section):
+class ActionsBase(Settings):
     """Searched dimensions of the motion, each with its range; any subset."""
 
     constraints: list[Text] | None = None
@@ -244,19 +226,124 @@ class ActionsBase(Section):
         return tuple(normal for normal in normals if normal is not None)
 
 
-def _actions_model() -> type[ActionsBase]:
-    fields: Any = {
-        name: (
-            _action_range_model(dimension) | None,
-            Field(default=None, description=dimension.meaning),
-        )
-        for name, dimension in ACTION_DIMENSIONS.items()
+_MEANINGS = {name: dimension.meaning for name, dimension in ACTION_DIMENSIONS.items()}
+
+Motion: Any = _section(
+    "Motion",
+    MotionBase,
+    {name: Annotated[float | str, dimension_quantity(one, words=True)] for name, one in ACTION_DIMENSIONS.items()},
+    _MEANINGS,
+)
+Actions: Any = _section(
+    "Actions", ActionsBase, {name: _action_range(dimension) for name, dimension in ACTION_DIMENSIONS.items()}, _MEANINGS
+)
+
+SEARCHED_TOLERANCES = 3.0
+"""The default range of a measured value, in standard deviations to both sides."""
+
+
+def parameter_quantity(name: str) -> Quantity:
+    """Annotation of a simulation parameter."""
+    info = SimulationParameters.info()[name]
+    return Quantity(info.unit, EXAMPLES[name], info.lower, info.upper, whole=info.integer)
+
+
+class ParameterRangeSection(RangeSection):
+    """A searched parameter: `[lowest, highest]` for a uniform prior, or `{measured: …, tolerance: …}` for a normal
+    prior, which an additional range truncates."""
+
+    required: ClassVar[dict[str, str]] = {}
+
+    measured: Any = None
+    """C4: measured or known value."""
+
+    tolerance: Any = None
+    """C4: standard deviation of the measured value; without a range, three of them to both sides are searched."""
+
+    info: ClassVar[ParameterInfo]
+
+    def searched(self) -> Axis | None:
+        """The searched axis; None after a problem."""
+        info = self.info
+        if self.range is not None:
+            return self.axis(info.name, integer=info.integer)
+        if self.measured is None or self.tolerance is None:
+            return None
+        low, high = (self.measured + sign * SEARCHED_TOLERANCES * self.tolerance for sign in (-1.0, 1.0))
+        return Axis(info.name, max(low, info.lower), min(high, info.upper), self.scale, info.integer)
+
+    def normal(self) -> NormalPrior | None:
+        """The prior; None if it is uniform, or after a problem."""
+        if self.measured is None or self.tolerance is None:
+            return None
+        return NormalPrior(self.info.name, float(self.measured), float(self.tolerance))
+
+
+def _parameter_range(info: ParameterInfo) -> Any:
+    quantity = parameter_quantity(info.name)
+    typical = (info.tolerance or (info.upper - info.lower) / 20.0) / info.factor
+    example = f"{typical:.2g}" + ("" if info.shown == "1" else f" {info.shown}")
+    spread = Quantity(info.unit, example, 0.0, info.upper - info.lower, positive=True)
+    types = {
+        "range": _range(quantity),
+        "measured": Annotated[float, quantity],
+        "tolerance": Annotated[float, spread],
     }
-    model: type[ActionsBase] = create_model(
-        "Actions", __base__=ActionsBase, __doc__=ActionsBase.__doc__, __cls_kwargs__=MADE, **fields
-    )
+    model = _section(f"{_title(info.name)}Range", ParameterRangeSection, types)
+    model.info = info
     return model
 
 
-Motion = _motion_model()
-Actions = _actions_model()
+def _parameter_form(value: Any) -> str:
+    return "searched" if isinstance(value, (list, Mapping)) else "fixed"
+
+
+class ParametersBase(Settings):
+    """Parameters: a value fixes one; a range, or a measured value with a tolerance, makes calibration search it."""
+
+    def fixed(self) -> dict[str, float]:
+        """Parameters with a value, SI."""
+        return {name: float(v) for name in self.written_keys() if isinstance(v := self.value(name), (int, float))}
+
+    def ranges(self) -> dict[str, ParameterRangeSection]:
+        """Searched parameters."""
+        given = {name: self.value(name) for name in self.written_keys()}
+        return {name: section for name, section in given.items() if isinstance(section, ParameterRangeSection)}
+
+    def searched(self) -> dict[str, Axis]:
+        """Axes of the searched parameters."""
+        axes = {name: section.searched() for name, section in self.ranges().items()}
+        return {name: axis for name, axis in axes.items() if axis is not None}
+
+    def priors(self) -> tuple[NormalPrior, ...]:
+        """Searched parameters with a prior that is not uniform."""
+        found = (section.normal() for section in self.ranges().values())
+        return tuple(prior for prior in found if prior is not None)
+
+    def completed(self) -> Self:
+        """A copy with the defaults of parameters that are not given."""
+        given = {name: value for name in self.written_keys() if (value := self.value(name)) is not None}
+        return self.model_copy(update=SimulationParameters().model_dump() | given)
+
+    def in_force(self) -> dict[str, float]:
+        """Values in SI: fixed values; for a range, the measured value or the default, clipped to the range."""
+        default = SimulationParameters().model_dump() | {prior.name: prior.mean for prior in self.priors()}
+        return self.fixed() | {n: min(max(default[n], axis.lower), axis.upper) for n, axis in self.searched().items()}
+
+
+def _parameter(info: ParameterInfo) -> Any:
+    return Annotated[
+        Annotated[float, parameter_quantity(info.name), Tag("fixed")]
+        | Annotated[_parameter_range(info), Tag("searched")],
+        Discriminator(_parameter_form),
+    ]
+
+
+_PARAMETERS = SimulationParameters.info()
+
+Parameters: Any = _section(
+    "Parameters",
+    ParametersBase,
+    {name: _parameter(info) for name, info in _PARAMETERS.items()},
+    {name: info.meaning for name, info in _PARAMETERS.items()},
+)

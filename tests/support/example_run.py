@@ -41,7 +41,7 @@ from orchestrator.runs.events import (
     StageOpened,
     StrategyProgressed,
 )
-from orchestrator.strategies.campaign_plan import CampaignPlan, OutputPlan
+from orchestrator.strategies.campaign_plan import CampaignPlan, OutputSettings
 from orchestrator.strategies.repeated_simulation import Foreseen
 from orchestrator.strategies.strategy import Progress, Strategy
 from sim_engine.action import DEG, Action
@@ -50,7 +50,7 @@ from sim_engine.outcome import Loss, PourMeasurement, PourOutcome, RecordedFrame
 from sim_engine.scene import PourTask, Scene
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.shapes import cylinder
-from tests.orchestrator import plans
+from tests.support import plans
 
 BEAKER = cylinder("beaker", inner_radius=0.035, inner_height=0.09)
 TUMBLER = Scene("tumbler", BEAKER, cylinder("tumbler", inner_radius=0.05, inner_height=0.09), Liquid(mass=0.2))
@@ -92,7 +92,7 @@ def campaign(*, pours: int = 3) -> CampaignPlan:
         SimulationParameters(),
         calibration,
         deployment,
-        OutputPlan(Path("runs")),
+        OutputSettings(),
     )
 
 

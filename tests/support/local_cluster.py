@@ -21,7 +21,7 @@ import psutil
 
 from actors.runtime.child_process import child_environment
 from actors.runtime.ray_cleanup import MARK, cluster_processes, end_cluster
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 NOT_OURS = ("ray::IDLE", "ray::DashboardAgent", "ray::RuntimeEnvAgent")
 """Titles of Ray's own processes and of workers that wait for work."""

@@ -19,7 +19,7 @@ import psutil
 
 from orchestrator.journal.journal import JOURNAL_NAME, Entry, JournalReader, Kind
 from orchestrator.journal.journal_file import JournalError
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[2]
 

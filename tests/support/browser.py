@@ -18,9 +18,9 @@ import uvicorn
 
 from orchestrator.daemon.access_control import Role, Tokens
 from orchestrator.daemon.http_api import serve_app
-from tests.end_to_end.small import write_campaign
-from tests.orchestrator.daemon.served import CAMPAIGN, Make, Served, held, serving
-from tests.patience import PATIENCE
+from tests.support.small_campaign import write_campaign
+from tests.support.toy_daemon import CAMPAIGN, Make, Served, held, serving
+from tests.support.waiting import PATIENCE
 
 T = TypeVar("T")
 

@@ -37,7 +37,7 @@ from orchestrator.requests import (
 )
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import StageDefinition
-from orchestrator.strategies.campaign_plan import CampaignPlan, OutputPlan
+from orchestrator.strategies.campaign_plan import CampaignPlan, OutputSettings
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Progress
 from sim_engine.action import DEG
@@ -46,7 +46,7 @@ from sim_engine.outcome import Loss, PourMeasurement, PourOutcome, SimulatedPour
 from sim_engine.scene import PourTask, Scene
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.shapes import cylinder
-from tests.orchestrator import plans
+from tests.support import plans
 
 SPACE = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0.08, 0.15)))
 SCENE = Scene(
@@ -69,7 +69,7 @@ def toy_plan(directory: Path, **changes: Any) -> CampaignPlan:
         "parameters": THETA,
         "calibration": None,
         "deployment": deployment,
-        "outputs": OutputPlan(directory, record_rate=10.0, recorded_simulations=2),
+        "outputs": OutputSettings(directory=str(directory), record_rate=10.0, recorded_simulations=2),
         "parallel_simulations": 2,
     }
     return CampaignPlan(**(values | changes))

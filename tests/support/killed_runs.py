@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.journal.journal import JOURNAL_NAME, Journal, JournalReader, Kind
-from tests.orchestrator.toy import ToyLaboratory, run_toy, toy_plan, toy_stages
+from tests.support.toy_campaign import ToyLaboratory, run_toy, toy_plan, toy_stages
 
 SMALL = toy_stages(simulations=3, pours=2, beside=2)
 

@@ -14,8 +14,8 @@ import trimesh
 from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
-from tests.end_to_end import small
-from tests.patience import PATIENCE
+from tests.support import small_campaign
+from tests.support.waiting import PATIENCE
 
 CSV = """\
 angular_velocity_deg_s,max_angle_deg,poured_g,spilled_g,retained_g,split
@@ -24,21 +24,21 @@ angular_velocity_deg_s,max_angle_deg,poured_g,spilled_g,retained_g,split
 120,110,100,9,0,test
 """
 
-RECORDED = small.CAMPAIGN.replace("{count: 3, holdout: 1}", "{from: pours.csv}")
+RECORDED = small_campaign.CAMPAIGN.replace("{count: 3, holdout: 1}", "{from: pours.csv}")
 
 SIMULATE = "simulate small.yaml --set angular_velocity=100 --set x_offset=70"
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 
 
 def write_inputs(folder: Path) -> None:
     """The good campaign, and everything that is wrong in one way."""
-    small.write_campaign(folder)
+    small_campaign.write_campaign(folder)
 
     def write(name: str, text: str | bytes) -> None:
         (folder / name).write_bytes(text.encode() if isinstance(text, str) else text)
 
-    def spoil(name: str, old: str, new: str, text: str = small.CAMPAIGN) -> None:
+    def spoil(name: str, old: str, new: str, text: str = small_campaign.CAMPAIGN) -> None:
         assert old in text
         write(name, text.replace(old, new, 1))
 
@@ -56,10 +56,10 @@ def write_inputs(folder: Path) -> None:
     spoil("close.yaml", "[60 mm, 100 mm]", "[10 mm, 12 mm]")
     spoil("unwritable.yaml", "directory: runs", "directory: beaker.yaml/runs")
     spoil("passwd.yaml", "directory: runs", "directory: /etc/passwd")
-    start, end = small.CAMPAIGN.index("calibration:"), small.CAMPAIGN.index("deployment:")
-    uncalibrated = small.CAMPAIGN[:start] + small.CAMPAIGN[end:]
+    start, end = small_campaign.CAMPAIGN.index("calibration:"), small_campaign.CAMPAIGN.index("deployment:")
+    uncalibrated = small_campaign.CAMPAIGN[:start] + small_campaign.CAMPAIGN[end:]
     spoil("plan-only.yaml", "[0 N/m, 0.1 N/m]", "0.05 N/m", uncalibrated)
-    write("calibrate-only.yaml", small.CAMPAIGN[:end])
+    write("calibrate-only.yaml", small_campaign.CAMPAIGN[:end])
 
     solid = trimesh.creation.box((60, 60, 80))
     solid.export(folder / "solid.stl")

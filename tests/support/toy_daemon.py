@@ -22,9 +22,9 @@ from orchestrator.daemon.submissions import pack
 from orchestrator.daemon.supervisor import Supervisor
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
-from tests.end_to_end.small import write_campaign
-from tests.orchestrator.toy import ToyBench, ToyLaboratory, ToyOptimizer, ToySimulators
-from tests.patience import PATIENCE
+from tests.support.small_campaign import write_campaign
+from tests.support.toy_campaign import ToyBench, ToyLaboratory, ToyOptimizer, ToySimulators
+from tests.support.waiting import PATIENCE
 
 CAMPAIGN = """\
 name: cup

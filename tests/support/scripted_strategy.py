@@ -12,7 +12,7 @@ from orchestrator.runs.stages import StageDefinition
 from orchestrator.states import State, check_transition
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Progress
-from tests.orchestrator.toy import SCENE, SPACE, THETA, ToyLaboratory, run_toy
+from tests.support.toy_campaign import SCENE, SPACE, THETA, ToyLaboratory, run_toy
 
 
 def run(directory: Path, laboratory: ToyLaboratory | None = None, **arguments: Any) -> Any:

@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 
 from actors.emulators.ur_controller.controller_process import VirtualController
+from orchestrator.config.file_loading import load_laboratory
+from orchestrator.daemon.daemon_settings import Rig
 
 HOME = (-14.0, -91.0, -115.0, -154.0, -104.0, 0.0)
 """[deg]"""
@@ -71,10 +73,17 @@ outputs: {directory: runs, rrd: false}
 
 def write_rig(folder: Path, address: str) -> Path:
     """A campaign of pours on hardware, with its laboratory and vessels; returns the campaign's file."""
-    from tests.end_to_end import small
+    from tests.support import small_campaign
 
-    path = small.write_campaign(folder)
+    path = small_campaign.write_campaign(folder)
     write_laboratory(folder / "rig.yaml", address)
     path = folder / "rigged.yaml"
     path.write_text(CAMPAIGN, encoding="utf-8")
     return path
+
+
+def hardware_rig(folder: Path, address: str, model: str = "ur10") -> Rig:
+    """A rig whose arm is reached by address, as hardware is."""
+    path = write_laboratory(folder / "rig.yaml", address)
+    path.write_text(path.read_text().replace("model: ur10", f"model: {model}"))
+    return Rig("rig", path, load_laboratory(path))

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from types import TracebackType
 
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 
 class Terminal:

@@ -23,7 +23,7 @@ from sim_engine.vessel.vessel import Vessel, build_vessel
 
 FloatArray = NDArray[np.float64]
 
-CONFIGS = Path(__file__).parents[3] / "configs"
+CONFIGS = Path(__file__).parents[2] / "configs"
 
 LIMITS = ArmLimits(
     box_low=(0.25, -0.6, 0.0), box_high=(1.0, 0.4, 0.9), joint_speed=170 * DEG, tilt_speed=155 * DEG, clearance=3e-3

@@ -15,7 +15,7 @@ from orchestrator.daemon.daemon_client import Client
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.daemon.http_api import serve_app
 from orchestrator.daemon.supervisor import Supervisor
-from tests.patience import PATIENCE
+from tests.support.waiting import PATIENCE
 
 
 class Real:

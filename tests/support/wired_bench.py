@@ -1,0 +1,229 @@
+"""A wired bench in this process: real wires, a cheap liquid that follows what the arm executed, a scripted operator."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from actors.balance.balance_settings import SerialBalanceSpec
+from actors.balance.weighing_plan import Placement
+from actors.bench.bench_factory import PouringBench
+from actors.bench.device_emulators import DeviceEmulators
+from actors.bench.virtual_bench import FollowedBench, VirtualBench
+from actors.bench.virtual_operator import BenchContents, VirtualOperator
+from actors.interfaces import Notice, OperatorQuestion, OperatorSpec
+from actors.laboratory import InProcessLaboratory
+from actors.laboratory_settings import LaboratorySpec
+from orchestrator.config.file_loading import load_laboratory
+from sim_engine.action import DEG, Action
+from sim_engine.liquids import Liquid
+from sim_engine.outcome import PourOutcome, SimulatedPour
+from sim_engine.scene import PourTask, Scene
+from sim_engine.vessel.shapes import cylinder
+from tests.support.waiting import PATIENCE
+
+LABORATORIES = Path(__file__).parents[2] / "configs" / "laboratories"
+
+PACE = 30.0
+"""Bench seconds per second in these tests, unless they say otherwise."""
+
+FULL_TILT = 100 * DEG
+
+
+class Trickle:
+    """A liquid of one rule: a pourer tilted to `FULL_TILT` is empty, one less tilted keeps what it can; a twentieth of
+    what leaves it misses the receiver."""
+
+    def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
+        assert task.motion is not None, "the wired bench simulates what was executed"
+        tilt = float(np.max(task.motion.tilt(task.motion.times)))
+        poured = min(max((tilt - 30 * DEG) / (FULL_TILT - 30 * DEG), 0.0), 1.0)
+        outcome = PourOutcome(
+            received=0.95 * poured,
+            spilled=0.05 * poured,
+            retained=1.0 - poured,
+            in_flight=0.0,
+            escaped=0.0,
+            particles=100,
+            spacing=4e-3,
+            density_error=0.01,
+            simulated_time=task.motion.duration,
+            steps=100,
+            cpu_s=0.1,
+            seed=task.seed,
+            curve_times=(0.0, 1.0),
+            curve_poured=(0.0, poured),
+            curve_spilled=(0.0, 0.05 * poured),
+        )
+        return SimulatedPour(outcome)
+
+    def close(self) -> None:
+        pass
+
+
+SCENE = Scene(
+    name="tumbler",
+    pourer=cylinder("beaker", inner_radius=0.035, inner_height=0.1),
+    receiver=cylinder("tumbler", inner_radius=0.04, inner_height=0.1),
+    liquid=Liquid(mass=0.2),
+)
+
+ACTION = Action(
+    angular_velocity=60 * DEG,
+    x_offset=0.1,
+    height=0.1,
+    max_angle=90 * DEG,
+    hold_time=0.8,
+    return_velocity=60 * DEG,
+    angular_acceleration=600 * DEG,
+)
+
+
+@dataclass
+class Stage:
+    """A laboratory that is open, and everything that was said in it."""
+
+    laboratory: InProcessLaboratory
+    bench: PouringBench = field(init=False)
+    site: DeviceEmulators = field(init=False)
+    operator: VirtualOperator = field(init=False)
+    things: BenchContents = field(init=False)
+    notices: list[Notice] = field(default_factory=list)
+    before: dict[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
+    """Done before the next question about something is answered."""
+    answered_at: dict[str, float] = field(default_factory=dict)
+    """Controller time at which the last question about something was answered [s]."""
+    unsafe: list[str] = field(default_factory=list)
+    """Questions that invited hands in while a program ran or a joint moved."""
+
+    clock: float = 0.0
+    earlier: float = 0.0
+
+    def attend(self) -> None:
+        """Stand beside the operator, and look at the controller whenever it is asked something."""
+        opened = self.laboratory.opened
+        assert opened is not None
+        assert opened.stand_ins is not None
+        assert isinstance(opened.bench.nature, VirtualBench)
+        assert isinstance(opened.operator, VirtualOperator)
+        self.bench, self.site, self.operator = opened.bench, opened.stand_ins, opened.operator
+        self.things = opened.bench.nature.things
+        ask = self.operator.ask
+
+        async def attended(question: OperatorQuestion) -> str:
+            state = await self._seen()
+            if question.hands and (state["runtime_state"] != "STOPPED" or max(map(abs, state["speeds"])) > 1e-3):
+                self.unsafe.append(question.about)
+            if (hook := self.before.pop(question.about, None)) is not None:
+                await hook()
+            answer = await ask(question)
+            self.answered_at[question.about] = await self.now()
+            return answer
+
+        self.operator.ask = attended  # type: ignore[method-assign]
+
+    async def _seen(self) -> dict[str, Any]:
+        """What the controller knows of itself; an arm without one never runs a program."""
+        if not isinstance(self.bench.nature, FollowedBench):
+            return {"runtime_state": "STOPPED", "speeds": [0.0], "time": 0.0}
+        return await self.site.fault("state")
+
+    @property
+    def heard(self) -> list[str]:
+        """What the operator was asked about, in order."""
+        return [question.about for question in self.operator.heard]
+
+    def said(self, level: str) -> str:
+        return "\n".join(notice.text for notice in self.notices if notice.level == level)
+
+    async def pour(self, action: Action = ACTION, **changes: Any) -> Any:
+        return await self.bench.pour(SCENE, action, seed=5, **changes)
+
+    async def moved(self, since: float) -> float:
+        """How far any joint has moved since a controller time [rad]."""
+        history = await self.site.history(since)
+        joints = np.array(history.joints)
+        return 0.0 if len(joints) < 2 else float(np.max(np.ptp(joints, axis=0)))
+
+    async def now(self) -> float:
+        """The controller's time [s]; it goes on counting when the controller's clock begins anew."""
+        return self.unwrapped(float((await self._seen())["time"]))
+
+    def unwrapped(self, clock: float) -> float:
+        if clock < self.clock:
+            self.earlier += self.clock
+        self.clock = clock
+        return clock + self.earlier
+
+
+def wired_spec(
+    placement: Placement = Placement.TRAY,
+    pace: float = PACE,
+    operator: OperatorSpec | None = None,
+    *,
+    hurried: bool = False,
+) -> LaboratorySpec:
+    """The shipped virtual laboratory with an exact balance; `hurried` saves time where that changes nothing."""
+    spec = load_laboratory(LABORATORIES / "virtual.yaml")
+    assert spec.arm is not None
+    assert spec.balance is not None
+    device = spec.balance.device
+    assert isinstance(device, SerialBalanceSpec)
+    assert device.virtual is not None
+    assert spec.bench is not None
+    rule = replace(device.settling, deadline=10.0)
+    arm = replace(spec.arm, time_scale=pace)
+    if hurried:
+        rule = replace(rule, readings=2, span=0.2)
+        arm = replace(arm, announcement=1.0, untilt_speed=60 * DEG, approach_speed=90 * DEG)
+    virtual = replace(device.virtual, noise=0.0, drift=0.0, settling_time=0.5)
+    device = replace(device, time_scale=pace, answer_time=0.3, reconnect_time=1.0, settling=rule, virtual=virtual)
+    manual = placement is Placement.MANUAL
+    return replace(
+        spec,
+        in_process=True,
+        arm=arm,
+        balance=replace(
+            spec.balance,
+            placement=placement,
+            device=None if manual else device,
+        ),
+        bench=replace(spec.bench, time_scale=pace),
+        operator=operator or OperatorSpec(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
+    )
+
+
+OpenStage = Callable[..., contextlib.AbstractAsyncContextManager[Stage]]
+
+
+@contextlib.asynccontextmanager
+async def opened_stage(
+    spec: LaboratorySpec | None = None,
+    *,
+    answers: Mapping[str, Sequence[str]] | None = None,
+    late: Mapping[str, float] | None = None,
+    **changes: Any,
+) -> AsyncIterator[Stage]:
+    """A wired bench around the cheap liquid, with an operator that does as it is told."""
+    laboratory = InProcessLaboratory(spec or wired_spec(**changes), Trickle, need_bench=True)
+    stage = Stage(laboratory)
+    laboratory.listen(stage.notices.append)
+    async with laboratory:
+        stage.attend()
+        stage.operator.script(answers or {}, late or {})
+        yield stage
+
+
+async def reach(seen: list[Any], checkpoint: str, patience: float = PATIENCE) -> None:
+    """Wait until a pour's progress has come to a checkpoint."""
+    end = time.monotonic() + patience
+    while not seen or seen[-1].checkpoint != checkpoint:
+        assert time.monotonic() < end, f"never reached {checkpoint}; was at {seen[-1:]}"
+        await asyncio.sleep(0.01)
