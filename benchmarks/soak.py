@@ -139,7 +139,7 @@ def one(client: Client, kind: str, sent: tuple[str, Files]) -> str:
     """Have a campaign run to its end, whatever is done to it on the way; the state that it ends in."""
     last = client.get("/status")["last_event"]
     verb = "plan" if kind == "plan" else "run"
-    key = client.post("/campaigns", {"text": sent[0], "files": sent[1], "verb": verb})["id"]
+    key = client.post("/campaigns", {"text": sent[0], "files": sent[1], "task": verb})["id"]
     done = False
     for told in client.events(last, key):
         match told.type:

@@ -97,8 +97,8 @@ def run(
     is written if the campaign has `outputs: {rrd: true}` and Rerun is installed.
 
     Raises:
-        ValueError: the vessels or motions can't be used, draws of θ are missing, or the laboratory is hardware, which
-            the command line arms (`RunError` or `InvalidArgumentError`, both a `DecantError`).
+        ValueError: the vessels or motions can't be used, draws of θ are missing, or the laboratory is hardware, whose
+            motion the command line enables (`RunError` or `InvalidArgumentError`, both a `DecantError`).
         LaboratoryError: the laboratory can't be opened.
         RunError: the run can't begin, go on or end; the text says what is kept, and what to do.
     """
@@ -221,8 +221,8 @@ def _checked(request: RunRequest, watch: Sequence[Watch], in_process: bool) -> R
     campaign, service = request.campaign, RunService()
     if campaign.laboratory.mode == "hardware":
         raise InvalidArgumentError(
-            f"laboratory {campaign.laboratory.name} is hardware, which is armed from the command line alone: "
-            f"decant run {campaign.source} --arm"
+            f"laboratory {campaign.laboratory.name} is hardware, whose motion is enabled from the command line alone: "
+            f"decant run {campaign.source} --enable-motion"
         )
     report = service.check(request)
     report.require()

@@ -25,10 +25,11 @@ from orchestrator.cli import (
     vessel_command,
     view_command,
 )
-from orchestrator.cli.command_options import command, examples
+from orchestrator.cli.command_options import Command, Commands, command, examples
 
 app = typer.Typer(
     name="decant",
+    cls=Commands,
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
@@ -70,7 +71,8 @@ def _add(work: Callable[..., None], *shown: str, name: str | None = None, panel:
         name: name of the command; None: that of the function.
         panel: heading in the list of commands.
     """
-    app.command(name or work.__name__, epilog=examples(*shown), rich_help_panel=panel)(command(work))
+    register = app.command(name or work.__name__, cls=Command, epilog=examples(*shown), rich_help_panel=panel)
+    register(command(work))
 
 
 _add(
@@ -113,13 +115,13 @@ _add(
 _add(
     robot_commands.jog,
     "decant jog configs/laboratories/virtual.yaml         # practise without a robot",
-    "decant jog configs/laboratories/ur10-kern.yaml --arm",
+    "decant jog configs/laboratories/ur10-kern.yaml --enable-motion",
 )
 _add(
     pour_command.pour,
     "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --dry-run --png path.png",
-    "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --empty --slow 0.2 --arm",
-    "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --arm",
+    "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --empty --slow 0.2 --enable-motion",
+    "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --enable-motion",
 )
 _add(
     report_command.report,
@@ -154,7 +156,7 @@ _add(
     queue_commands.submit,
     "decant submit configs/campaigns/quickstart.yaml",
     "decant submit my.yaml --rig left --priority 5",
-    "decant submit my.yaml --verb plan --parameters theta.json --receiver configs/vessels/bowl.yaml",
+    "decant submit my.yaml --task plan --parameters theta.json --receiver configs/vessels/bowl.yaml",
     panel=_DAEMON,
 )
 _add(queue_commands.list_campaigns, "decant list", "decant list --json", name="list", panel=_DAEMON)
@@ -178,7 +180,7 @@ _add(
     "decant answer 8 weighed 3.2 0.4",
     panel=_DAEMON,
 )
-_add(queue_commands.arm, "decant arm narrow-1b2c3d", panel=_DAEMON)
+_add(queue_commands.enable, "decant enable narrow-1b2c3d", panel=_DAEMON)
 _add(queue_commands.move, "decant move narrow-1b2c3d --first", panel=_DAEMON)
 _add(queue_commands.shutdown, "decant shutdown", panel=_DAEMON)
 _add(

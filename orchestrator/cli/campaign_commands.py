@@ -12,8 +12,8 @@ import typer
 
 from orchestrator.cli.command_options import (
     Answer,
-    Arm,
     Campaign,
+    EnableMotion,
     InProcess,
     Json,
     Live,
@@ -59,7 +59,7 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
         run_id: RunId = None,
         answer: Answer = None,
         in_process: InProcess = False,
-        arm: Arm = False,
+        enable_motion: EnableMotion = False,
         live: Live = False,
         live_at: LiveAt = None,
         laboratory: OtherLaboratory = None,
@@ -74,7 +74,7 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
             read_campaign,
             run_in_front_of_people,
         )
-        from orchestrator.cli.motion_control import arm_campaign
+        from orchestrator.cli.motion_control import enable_campaign_motion
         from orchestrator.cli.view_command import live_view
         from orchestrator.results.run_summary import summary_json
         from orchestrator.run_service import RunResources, RunTaskError, task_request
@@ -85,7 +85,7 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
         check_campaign_can_run(request)
         if answer is not None and not resume:
             raise RefusalError(f"--answer {answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT)
-        checksum = arm_campaign(plan, request.stages, armed=arm, verb=task)
+        checksum = enable_campaign_motion(plan, request.stages, enabled=enable_motion, task=task)
         if request.pours:
             check_somebody_is_there(plan.laboratory)
         resources = RunResources(in_process=in_process, approved_checksum=checksum or "")
@@ -94,7 +94,7 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
         directory = run_directory(plan, resume=resume, run_id=run_id)
         flag = "" if laboratory is None else f" --laboratory {laboratory}"
         flag += "" if seed is None else f" --seed {seed}"
-        flag += " --arm" if plan.laboratory.mode == "hardware" else ""
+        flag += " --enable-motion" if plan.laboratory.mode == "hardware" else ""
         again = f"decant {task} {campaign} --resume --run {directory.name}{flag}"
         result, published = run_in_front_of_people(
             dataclasses.replace(request, folder=directory, resume="yes" if resume else "no"),

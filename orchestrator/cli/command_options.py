@@ -1,16 +1,18 @@
-"""Arguments and options that several commands share.
+"""Arguments and options that several commands share, and the classes of the application's commands.
 
-`command` turns a function with such parameters into a command of the application.
+`command` turns a function with such parameters into a command. `Commands` and `Command` refuse names that earlier
+versions used, and give the new name (`RETIRED`).
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from orchestrator.cli.console import BAD_INPUT, INTERRUPTED, RefusalError, fail, hush
 
@@ -63,10 +65,10 @@ SceneName = Annotated[
     str | None,
     typer.Option("--scene", help="'calibration', 'transfer' or a receiver's name; default: the first receiver."),
 ]
-Arm = Annotated[
+EnableMotion = Annotated[
     bool,
     typer.Option(
-        "--arm",
+        "--enable-motion",
         help="Enable motion of the hardware for this run only: shows what will move, requires the laboratory's name.",
     ),
 ]
@@ -96,6 +98,37 @@ Parameters = Annotated[
 Receiver = Annotated[
     Path | None, typer.Option(help="Vessel file (YAML) instead of the campaign's receiver.", show_default=False)
 ]
+
+
+RETIRED = {"arm": "enable", "--arm": "--enable-motion", "--verb": "--task"}
+"""Commands and options of earlier versions, with their new names."""
+
+
+class Commands(TyperGroup):
+    """The group of all commands."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Refuse a retired command."""
+        if args and args[0] not in self.commands:
+            _refuse_retired(args[:1])
+        return super().parse_args(ctx, args)
+
+
+class Command(TyperCommand):
+    """One command."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Refuse retired options."""
+        known = {name for parameter in self.params for name in parameter.opts}
+        options = (arg.partition("=")[0] for arg in args[: args.index("--") if "--" in args else len(args)])
+        _refuse_retired(option for option in options if option.startswith("--") and option not in known)
+        return super().parse_args(ctx, args)
+
+
+def _refuse_retired(names: Iterable[str]) -> None:
+    for name in names:
+        if name in RETIRED:
+            fail(RefusalError(f"{name}: is called {RETIRED[name]} now", BAD_INPUT))
 
 
 def examples(*commands: str) -> str:

@@ -49,14 +49,16 @@ _HELP = """\
   quit"""
 
 
-def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed: bool, verb: str) -> str | None:
+def enable_campaign_motion(
+    plan: CampaignPlan, stages: Sequence[StageDefinition], *, enabled: bool, task: str
+) -> str | None:
     """Check the approval of motion before a campaign: hardware needs the flag, a safety record, and a typed name.
 
     Args:
         plan: campaign with its laboratory.
         stages: stages to run.
-        armed: whether `--arm` was given.
-        verb: name of the command, for messages.
+        enabled: whether `--enable-motion` was given.
+        task: name of the command, for messages.
 
     Returns:
         The checksum of the accepted safety settings; None without hardware.
@@ -70,12 +72,13 @@ def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed
     if not any(stage.pours for stage in stages):
         return None
     if laboratory.mode != "hardware":
-        if armed:
+        if enabled:
             mention(
-                f"note: --arm has nothing to arm: laboratory {laboratory.name} is {laboratory.mode}, and moves nothing"
+                f"note: --enable-motion has no effect: laboratory {laboratory.name} is {laboratory.mode}, and moves "
+                "nothing"
             )
         return None
-    require_flag(laboratory, armed=armed, again=f"decant {verb} {plan.source.name} --arm")
+    require_flag(laboratory, enabled=enabled, again=f"decant {task} {plan.source.name} --enable-motion")
     assert laboratory.arm is not None
     with Refused(SafetyRecordError):
         checksum = required_checksum(plan)
@@ -90,16 +93,16 @@ def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed
     return checksum
 
 
-def require_flag(laboratory: LaboratorySpec, *, armed: bool, again: str) -> None:
-    """Refuse to move hardware without `--arm`.
+def require_flag(laboratory: LaboratorySpec, *, enabled: bool, again: str) -> None:
+    """Refuse to move hardware without `--enable-motion`.
 
     Raises:
         RefusalError: exit code 2.
     """
-    if laboratory.mode == "hardware" and not armed:
+    if laboratory.mode == "hardware" and not enabled:
         raise RefusalError(
             f"laboratory {laboratory.name} is hardware: an arm would move. Try it without moving first "
-            f"('decant doctor', 'decant pour --dry-run'); then arm this one run: {again}",
+            f"('decant doctor', 'decant pour --dry-run'); then enable motion for this one run: {again}",
             BAD_INPUT,
         )
 
@@ -111,7 +114,7 @@ def announce(laboratory: str, arm: str, lines: Sequence[str], lasting: str = "")
         say(f"  {line}")
     say(
         "\nA software stop is not a safety function: keep the emergency stop within reach, and everybody out of the "
-        f"box.\nType the laboratory's name ({laboratory}) to arm it{lasting}; anything else ends here."
+        f"box.\nType the laboratory's name ({laboratory}) to enable its motion{lasting}; anything else ends here."
     )
 
 
@@ -124,8 +127,8 @@ def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
     assert laboratory.arm is not None
     if not sys.stdin.isatty():
         raise RefusalError(
-            f"laboratory {laboratory.name} is hardware, and is armed by somebody who reads what it will do and types "
-            "its name: that needs a terminal, with nothing piped into it",
+            f"laboratory {laboratory.name} is hardware: an operator enables its motion, who reads what it will do and "
+            "types its name. That needs a terminal, with nothing piped into it",
             BAD_INPUT,
         )
     announce(laboratory.name, laboratory.arm.title, lines, " for this run")
@@ -133,8 +136,8 @@ def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
     print("> ", end="", file=sys.stderr, flush=True)
     typed = sys.stdin.readline()
     if typed.strip() != laboratory.name:
-        raise RefusalError(f"not armed: '{typed.strip()}' was typed; nothing has moved", BAD_INPUT)
-    say(f"armed, for this run only: {laboratory.name}")
+        raise RefusalError(f"motion is not enabled: '{typed.strip()}' was typed; nothing has moved", BAD_INPUT)
+    say(f"motion is enabled, for this run only: {laboratory.name}")
 
 
 @contextlib.contextmanager

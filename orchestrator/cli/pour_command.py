@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import (
-    Arm,
     Assignments,
     Campaign,
+    EnableMotion,
     InProcess,
     Json,
     OtherLaboratory,
@@ -55,7 +55,7 @@ def pour(
     slow: Annotated[float, typer.Option(min=0.05, max=1.0, help="With --empty: fraction of the planned speed.")] = 1.0,
     laboratory: OtherLaboratory = None,
     in_process: InProcess = False,
-    arm: Arm = False,
+    enable_motion: EnableMotion = False,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -81,7 +81,7 @@ def pour(
         _dry_run(chosen, connect=connect, as_json=as_json)
         return
     again = f"decant pour {campaign}" + ("" if laboratory is None else f" --laboratory {laboratory}")
-    require_flag(bench, armed=arm, again=f"{again} … --arm")
+    require_flag(bench, enabled=enable_motion, again=f"{again} … --enable-motion")
     if empty:
         assert chosen.path is not None
         pour_empty(chosen.plan, chosen.action, chosen.path.slowed(slow), slow=slow, as_json=as_json)

@@ -115,7 +115,7 @@ def connected_client(url: str | None, state: Path | None) -> Iterator[Client]:
 
 def submit(
     campaign: Campaign,
-    verb: Annotated[str, typer.Option("--verb", help="Task: run, calibrate or plan.")] = "run",
+    task: Annotated[str, typer.Option(help="Task: run, calibrate or plan.")] = "run",
     rig: Annotated[str, typer.Option(help="Rig to run on, if several match.", show_default=False)] = "",
     priority: Annotated[int, typer.Option(help="Higher priorities run first.")] = 0,
     laboratory: OtherLaboratory = None,
@@ -124,7 +124,7 @@ def submit(
     receiver: Receiver = None,
     iterations: Annotated[
         int | None,
-        typer.Option(min=1, help="With --verb plan: simulations instead of the campaign's.", show_default=False),
+        typer.Option(min=1, help="With --task plan: simulations instead of the campaign's.", show_default=False),
     ] = None,
     url: Url = None,
     state: State = None,
@@ -138,23 +138,23 @@ def submit(
     if (parameters, receiver, iterations) != (None, None, None):
         from orchestrator.cli.campaign_commands import planning_plan
 
-        if verb != "plan":
-            raise RefusalError("--parameters, --receiver and --iterations go with --verb plan", BAD_INPUT)
+        if task != "plan":
+            raise RefusalError("--parameters, --receiver and --iterations go with --task plan", BAD_INPUT)
         plan = planning_plan(plan, parameters, receiver, iterations)
     try:
         packed, files = pack(plan, parameters)
     except OSError as error:
         raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
     with connected_client(url, state) as client:
-        body = {"text": packed, "files": files, "verb": verb, "rig": rig, "priority": priority}
+        body = {"text": packed, "files": files, "task": task, "rig": rig, "priority": priority}
         found = client.post("/campaigns", body)
     if as_json:
         print_json(found)
         return
     print(found["id"])
     mention(f"queued for {found['rig']}; follow it with: decant logs -f {found['id']}")
-    if found["needs_arming"]:
-        say(f"hardware: it waits until somebody has armed it: decant arm {found['id']}")
+    if found["needs_enabling"]:
+        say(f"hardware: it waits until its motion is enabled: decant enable {found['id']}")
 
 
 def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) -> None:
@@ -188,8 +188,8 @@ def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) 
 
 def _standing(one: dict[str, Any]) -> str:
     progress = one["progress"]
-    if one["needs_arming"]:
-        return f"waits for: decant arm {one['id']}"
+    if one["needs_enabling"]:
+        return f"waits for: decant enable {one['id']}"
     if progress is None:
         return str(one["reason"]).split("\n", maxsplit=1)[0][:100]
     parts = [f"{progress['stage']} ({progress['stage_index']}/{progress['stage_count']})"] if progress["stage"] else []
@@ -208,7 +208,7 @@ def show(key: CampaignId, url: Url = None, state: State = None, as_json: Json = 
     if as_json:
         print_json(found)
         return
-    print(f"{found['id']}: {found['state']}  ({found['verb']} on {found['rig']}, {found['mode']})")
+    print(f"{found['id']}: {found['state']}  ({found['task']} on {found['rig']}, {found['mode']})")
     for name in ("reason", "run", "live"):
         if found[name]:
             print(f"  {name:10s} {found[name]}")
@@ -221,8 +221,8 @@ def show(key: CampaignId, url: Url = None, state: State = None, as_json: Json = 
         told += f" ({pour['loss']})" if pour["state"] == "weighed" else ""
         predicted = f"  predicted {pour['predicted']}" if pour["predicted"] else ""
         print(f"  pour {pour['number']:<3d} into {pour['receiver']}  {pour['action']}{predicted}  → {told}")
-    for deed in found["deeds"]:
-        print(f"  {_clock(deed['t'])}  {deed['by']}: {deed['what']} {deed['detail']}".rstrip())
+    for entry in found["audit"]:
+        print(f"  {_clock(entry['t'])}  {entry['by']}: {entry['what']} {entry['detail']}".rstrip())
 
 
 def logs(
@@ -271,7 +271,7 @@ def _line(event: dict[str, Any]) -> str | None:
             question = event["question"]
             said = f" → {question['answer']} ({question['by']})" if question["answer"] else ""
             text = f"question {question['id']}: {question['text']}{said}"
-        case "Deed":
+        case "AuditEntry":
             text = f"{event['by']}: {event['what']} {event['detail']}".rstrip()
         case _:
             text = " ".join([kind, *(str(event[k]) for k in ("text", "rig", "state") if event.get(k))])
@@ -325,7 +325,7 @@ def _change(key: str | None, what: str, url: str | None, state: Path | None) -> 
     if key is None:
         print("queue paused" if found["queue_paused"] else "queue goes on")
     else:
-        print(f"{found['id']}: {found['state']}, wanted: {found['wish']}")
+        print(f"{found['id']}: {found['state']}, wanted: {found['desired_state']}")
 
 
 def abort(
@@ -352,7 +352,7 @@ def abort(
     with connected_client(url, state) as client:
         if key is not None:
             found = client.post(f"/campaigns/{key}/abort")
-            print(f"{found['id']}: {found['state']}, wanted: {found['wish']}")
+            print(f"{found['id']}: {found['state']}, wanted: {found['desired_state']}")
             return
         client.post("/emergency-stop/clear" if clear else "/emergency-stop", {"rig": rig or ""})
     of = f" of {rig}" if rig else ""
@@ -399,22 +399,23 @@ def _print_question(question: dict[str, Any]) -> None:
     print(f"  decant answer {question['id']} …   ({wanted})")
 
 
-def arm(key: CampaignId, url: Url = None, state: State = None) -> None:
+def enable(key: CampaignId, url: Url = None, state: State = None) -> None:
     """Enable motion for the coming part of a run: shows what will move, and requires the laboratory's name."""
     from orchestrator.cli.motion_control import announce
 
     if not sys.stdin.isatty():
         raise RefusalError(
-            "hardware is armed by somebody who reads what it will do and types its name: that needs a terminal",
+            "motion of hardware is enabled by an operator, who reads what it will do and types its name: that needs "
+            "a terminal",
             BAD_INPUT,
         )
     with connected_client(url, state) as client:
         say("planning paths from all over the actions …")
-        moves = client.get(f"/campaigns/{key}/arming")
+        moves = client.get(f"/campaigns/{key}/motion")
         announce(moves["laboratory"], moves["arm"], moves["lines"])
         print("> ", end="", file=sys.stderr, flush=True)
-        found = client.post(f"/campaigns/{key}/arm", {"laboratory": sys.stdin.readline().strip()})
-    say(f"armed for the coming part of its run: {found['id']}")
+        found = client.post(f"/campaigns/{key}/enable", {"laboratory": sys.stdin.readline().strip()})
+    say(f"motion is enabled for the coming part of the run: {found['id']}")
 
 
 def move(

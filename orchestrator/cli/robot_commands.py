@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Arm, Json, Laboratory
+from orchestrator.cli.command_options import EnableMotion, Json, Laboratory
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, say
 
 if TYPE_CHECKING:
@@ -185,7 +185,7 @@ def _accept(path: Path, look: ArmDiagnostics) -> SafetyRecord:
     return record
 
 
-def jog(laboratory: Laboratory, arm: Arm = False) -> None:
+def jog(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
     """Move the arm by small, slow steps that are typed one by one, or bring it home.
 
     'j5 +2' turns joint 5 by 2 deg, 'z -5' moves the tool by 5 mm, 'home' goes home. The first step along an axis is
@@ -199,7 +199,7 @@ def jog(laboratory: Laboratory, arm: Arm = False) -> None:
     spec = read_laboratory(laboratory)
     if spec.arm is None:
         raise without_arm(laboratory, spec, "steps are typed for an arm that a driver moves")
-    require_flag(spec, armed=arm, again=f"decant jog {laboratory} --arm")
+    require_flag(spec, enabled=enable_motion, again=f"decant jog {laboratory} --enable-motion")
     if not sys.stdin.isatty():
         raise RefusalError("jogging is typed at a terminal, step by step, with nothing piped into it", BAD_INPUT)
     with Refused(SafetyRecordError):

@@ -138,8 +138,8 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
     if daemon.progress(item) is None:  # the process was killed, so the journal ends in the middle of the pour
         for pour in pours:
             pour["state"] = "unknown" if pour["state"] == "under way" else pour["state"]
-    deeds = daemon.store.deeds(item.id)
-    return CampaignDetailOut.model_validate({**table, "pours_made": pours, "summary": summary, "deeds": deeds})
+    audit = daemon.store.audit(item.id)
+    return CampaignDetailOut.model_validate({**table, "pours_made": pours, "summary": summary, "audit": audit})
 
 
 @router.get(
@@ -240,7 +240,7 @@ def campaign_out(request: Request, daemon: Supervisor, item: QueueItem) -> Campa
     return CampaignOut.model_validate(
         {
             **table,
-            "needs_arming": item.mode == "hardware" and not item.armed and waits,
+            "needs_enabling": item.mode == "hardware" and not item.motion_enabled and waits,
             "progress": daemon.progress(item),
             "report": run is not None and (run / REPORT).is_file(),
             "live": request.app.state.live(item.id) if daemon.progress(item) is not None else None,

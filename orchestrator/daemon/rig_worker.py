@@ -67,7 +67,7 @@ def run_request(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunReque
     given = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
     # A daemon never repeats a pour by itself: whoever is there is asked, whatever the campaign says.
     plan = replace(plan, on_unknown="ask", outputs=plan.outputs.model_copy(update={"directory": str(settings.runs)}))
-    request = task_request(plan, item.verb, given=given)  # type: ignore[arg-type]  # written by us
+    request = task_request(plan, item.task, given=given)  # type: ignore[arg-type]  # written by us
     if item.run is None:
         return request
     return replace(request, folder=settings.runs / item.run, resume="if begun")
@@ -113,7 +113,7 @@ class Running:
         """Run until it rests.
 
         Args:
-            checksum: of the safety settings that were accepted, where hardware was armed.
+            checksum: of the safety settings that were accepted, where motion of hardware is enabled.
 
         Raises:
             asyncio.CancelledError: it was paused, stopped, aborted.
@@ -399,14 +399,16 @@ class Lane:
         if self.latched or self._daemon.stopping or self._common.warm.lost:
             return None
         store = self._common.store
-        mine = [one for one in store.items([*AT_REST]) if one.rig == self.rig.name and one.wish == DesiredState.RUN]
+        mine = [
+            one for one in store.items([*AT_REST]) if one.rig == self.rig.name and one.desired_state == DesiredState.RUN
+        ]
         begun = sorted(
             (one for one in mine if one.run is not None and one.state not in ENDED), key=lambda one: one.begun or 0.0
         )
         queued = [one for one in mine if one.state == "queued"]
         if self._daemon.queue_paused:
             queued = []
-        found = next((one for one in (*begun, *queued) if one.mode != "hardware" or one.armed), None)
+        found = next((one for one in (*begun, *queued) if one.mode != "hardware" or one.motion_enabled), None)
         return found if found is not None and self._has_room() else None
 
     def _has_room(self) -> bool:
@@ -422,12 +424,12 @@ class Lane:
     async def _run(self, running: Running) -> None:
         store, feed, item = self._common.store, self._common.feed, running.item
         self._show_arm(None)
-        store.change(item.id, state="preparing", reason="", begun=item.begun or time.time(), armed=False)
+        store.change(item.id, state="preparing", reason="", begun=item.begun or time.time(), motion_enabled=False)
         feed.tell("CampaignLeased", {"rig": self.rig.name}, item.id)
         if self._daemon.suspect and not any(one.running for one in self._daemon.lanes.values() if one is not self):
             self._daemon.suspect = False
             await self._common.warm.close()
-        state, reason, wish = "failed", "", DesiredState.PAUSE
+        state, reason, desired = "failed", "", DesiredState.PAUSE
         result: CampaignResult | None = None
         try:
             result = await running.run(self._checksum(item))
@@ -436,11 +438,11 @@ class Lane:
             task = asyncio.current_task()
             if task is not None and task.cancelling():
                 raise
-            state, reason, wish = self._ended_by_people(item)
+            state, reason, desired = self._ended_by_people(item)
         except OperatorNeededError as error:
-            state, reason, wish = "paused", str(error), self._kept_wish(item)
+            state, reason, desired = "paused", str(error), self._kept_desired_state(item)
         except PourUnknownError as error:
-            state, reason, wish = "unknown", str(error), self._kept_wish(item)
+            state, reason, desired = "unknown", str(error), self._kept_desired_state(item)
         except (RunError, LaboratoryError, ConfigError, OSError) as error:
             needs_person = getattr(error, "exit_code", 1) == 3
             self._daemon.suspect |= isinstance(error, LaboratoryError | RequestExecutorError)
@@ -449,9 +451,9 @@ class Lane:
             state, reason = "failed", f"{type(error).__name__}: {error}"
             _log.exception("campaign %s failed", item.id)
         if state in ("failed", "paused") and (lost := self._common.warm.lost):
-            # No fault of the campaign's, and nobody's wish: it goes on when there is a Ray again.
-            state, reason, wish = "paused", f"Ray had lost its {lost}", self._kept_wish(item)
-        await self._leave(running, state, reason, wish)
+            # No fault of the campaign's, and no operator's: it continues when there is a Ray again.
+            state, reason, desired = "paused", f"Ray had lost its {lost}", self._kept_desired_state(item)
+        await self._leave(running, state, reason, desired)
         if result is None and state != "finished":
             _log.warning("campaign %s: %s: %s", item.id, state, reason, extra={"campaign": item.id})
 
@@ -462,21 +464,21 @@ class Lane:
 
         return accepted_checksum(self.rig.source) or ""
 
-    def _kept_wish(self, item: QueueItem) -> DesiredState:
+    def _kept_desired_state(self, item: QueueItem) -> DesiredState:
         """Somebody has to answer before it goes on: it goes on to ask, unless people want something else of it."""
         found = self._common.store.item(item.id)
-        return DesiredState.RUN if found is None else DesiredState(found.wish)
+        return DesiredState.RUN if found is None else DesiredState(found.desired_state)
 
     def _ended_by_people(self, item: QueueItem) -> tuple[str, str, DesiredState]:
         found = self._common.store.item(item.id)
-        wish = DesiredState.PAUSE if found is None else DesiredState(found.wish)
+        desired = DesiredState.PAUSE if found is None else DesiredState(found.desired_state)
         state = "unknown" if found is not None and found.state == "unknown" else "paused"
         reason = found.reason if found is not None else ""
-        return state, reason, wish
+        return state, reason, desired
 
-    async def _leave(self, running: Running, state: str, reason: str, wish: DesiredState) -> None:
+    async def _leave(self, running: Running, state: str, reason: str, desired: DesiredState) -> None:
         store, key = self._common.store, running.item.id
-        if wish is DesiredState.STOP and state != "finished":
+        if desired is DesiredState.STOP and state != "finished":
             state = STOPPED
             try:
                 await running.tidy()
@@ -484,7 +486,7 @@ class Lane:
                 reason = f"what came of it could not be published: {error}"
                 _log.exception("campaign %s: not published", key)
         ended = time.time() if state in ENDED else None
-        store.change(key, state=state, reason=reason, wish=str(wish), ended=ended)
+        store.change(key, state=state, reason=reason, desired_state=str(desired), ended=ended)
         self.running = None  # whoever hears that it rests may have it go on
         self._common.feed.tell("CampaignRests", {"state": state, "reason": reason, "rig": self.rig.name}, key)
         with contextlib.suppress(OSError):

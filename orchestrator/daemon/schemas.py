@@ -30,7 +30,7 @@ class SubmissionIn(_In):
     path: str = Field(default="", max_length=1000)
     """Instead of `text` and `files`: a file in one of the folders that the daemon's settings list as roots."""
 
-    verb: Literal["run", "calibrate", "plan"] = "run"
+    task: Literal["run", "calibrate", "plan"] = "run"
     rig: str = Field(default="", max_length=60)
     """Rig to run on; '' selects the matching one."""
 
@@ -54,7 +54,7 @@ class MoveIn(_In):
     priority: int | None = Field(default=None, ge=-1000, le=1000)
 
 
-class ArmIn(_In):
+class EnableIn(_In):
     """Enables motion in the coming part of a run."""
 
     laboratory: str = Field(max_length=80)
@@ -114,7 +114,7 @@ class CampaignOut(_Out):
 
     id: str
     name: str
-    verb: str
+    task: str
     rig: str
     mode: str
     """'virtual', 'hardware', or 'none' if nothing is poured."""
@@ -125,8 +125,8 @@ class CampaignOut(_Out):
     stopped, withdrawn.
     """
 
-    wish: str
-    """Desired state: run, pause, stop, abort."""
+    desired_state: str
+    """run, pause, stop or abort."""
 
     reason: str
     by: str
@@ -136,9 +136,9 @@ class CampaignOut(_Out):
     run: str | None
     """Name of its run's folder."""
 
-    armed: bool
-    needs_arming: bool
-    """The campaign uses hardware and waits for `decant arm` to enable motion."""
+    motion_enabled: bool
+    needs_enabling: bool
+    """The campaign uses hardware and waits for `decant enable` to enable motion."""
 
     progress: ProgressOut | None
     """Progress while the campaign runs."""
@@ -182,7 +182,7 @@ class CampaignDetailOut(CampaignOut):
     summary: dict[str, Any] | None
     """`summary.json` of its run, after publication."""
 
-    deeds: list[dict[str, Any]]
+    audit: list[dict[str, Any]]
     """Audit entries of the campaign, newest first."""
 
 

@@ -23,7 +23,7 @@ from actors.interfaces import LaboratoryError
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.file_access import confined, out_of_bounds, resolved
 from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
-from orchestrator.daemon.daemon_settings import ANY_RIG, DESK, DaemonSettings, Rig
+from orchestrator.daemon.daemon_settings import ANY_RIG, NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import DesiredState, QueueItem
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_file import whole_copy
@@ -162,7 +162,7 @@ def run_request(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunReque
     theta = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
     # A daemon never repeats a pour by itself: it asks the operator, whatever the campaign says.
     plan = replace(plan, on_unknown="ask", outputs=plan.outputs.model_copy(update={"directory": str(settings.runs)}))
-    request = task_request(plan, item.verb, given=theta)  # type: ignore[arg-type]  # written by us
+    request = task_request(plan, item.task, given=theta)  # type: ignore[arg-type]  # written by us
     if item.run is None:
         return request
     return replace(request, folder=settings.runs / item.run, resume="if begun")
@@ -185,7 +185,7 @@ class Submission:
     text: str = ""
     files: Files | None = None
     path: str = ""
-    verb: str = "run"
+    task: str = "run"
     rig: str = ""
     priority: int = 0
 
@@ -240,7 +240,7 @@ def _prepared(settings: DaemonSettings, submission: Submission, key: str, by: st
     draft = QueueItem(
         key,
         plan.name,
-        submission.verb,
+        submission.task,
         "",
         "none",
         submission.priority,
@@ -257,7 +257,7 @@ def _prepared(settings: DaemonSettings, submission: Submission, key: str, by: st
     service = RunService()
     service.check(work).require()
     service.check_laboratory(work, RunResources())
-    mode = "none" if rig.name == DESK else work.campaign.laboratory.mode
+    mode = "none" if rig.name == NO_RIG else work.campaign.laboratory.mode
     item = replace(draft, id=f"{plan.name[:40]}-{key}", rig=rig.name, mode=mode)
     folder.rename(settings.snapshots / item.id)
     return item
@@ -284,13 +284,13 @@ def _rig(settings: DaemonSettings, wanted: str, work: RunRequest) -> Rig:
     names = [rig.name for rig in settings.rigs]
     spec = work.campaign.laboratory
     if wanted:
-        if wanted not in (*names, DESK):
+        if wanted not in (*names, NO_RIG):
             raise SubmissionError(f"there is no rig '{wanted}'; there are {', '.join(names)}")
-        if wanted == DESK and work.pours:
-            raise SubmissionError(f"'{DESK}' is for campaigns that pour nothing; name one of {', '.join(names)}")
+        if wanted == NO_RIG and work.pours:
+            raise SubmissionError(f"'{NO_RIG}' is for campaigns that pour nothing; name one of {', '.join(names)}")
         return settings.rig(wanted)
     if not work.pours:
-        return Rig(DESK)
+        return Rig(NO_RIG)
     if settings.rigs[0].source is None:
         if spec.mode != "virtual":
             raise SubmissionError(

@@ -19,7 +19,7 @@ from typing import Any
 from actors.interfaces import LaboratoryError
 from actors.simulators.shared_pool import WarmSimulators
 from orchestrator.catalogue.run_registry import make_state_directory
-from orchestrator.daemon.daemon_settings import DESK, DaemonSettings, Rig
+from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, WITHDRAWN, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.notifications import Counts
@@ -64,7 +64,7 @@ class Supervisor:
         self.asking = Asking(self.store, self.feed.tell)
         self.warm = WarmSimulators(settings.simulators, in_process=settings.in_process, tell=self._warn)
         self._common = Common(settings, self.store, self.feed, self.asking, self.warm, live)
-        self.lanes: dict[str, Lane] = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(DESK))}
+        self.lanes: dict[str, Lane] = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(NO_RIG))}
         self.problems: dict[str, str] = {}
         self.words: dict[str, Counts] = {}
         self.pours = Pours()
@@ -266,21 +266,21 @@ class Supervisor:
         """Stop a campaign: finish the pour and publish the results so far."""
         return self._end(key, by, DesiredState.STOP)
 
-    def _end(self, key: str, by: str, wish: DesiredState) -> QueueItem:
+    def _end(self, key: str, by: str, desired: DesiredState) -> QueueItem:
         item = self.item(key)
         running = self._running(item)
         if running is None and item.state in ENDED:
             raise RequestRefusedError(f"{item.id} is {item.state} already")
         if running is not None:
             running.pause()
-        self.store.change(item.id, wish=str(wish))
-        self.note(by, str(wish), item.id)
+        self.store.change(item.id, desired_state=str(desired))
+        self.note(by, str(desired), item.id)
         if running is None:
             if item.state == "queued":
                 self.store.change(
-                    item.id, state=WITHDRAWN if wish is DesiredState.STOP else "paused", reason=f"by {by}"
+                    item.id, state=WITHDRAWN if desired is DesiredState.STOP else "paused", reason=f"by {by}"
                 )
-            elif wish is DesiredState.STOP:
+            elif desired is DesiredState.STOP:
                 self.store.change(item.id, state=STOPPED, ended=time.time(), reason=f"by {by}")
         self.wake()
         return self.item(item.id)
@@ -293,7 +293,7 @@ class Supervisor:
             raise RequestRefusedError(f"{item.id} is {item.state}: nothing of it moves")
         stopping = asyncio.create_task(running.abort())
         await asyncio.sleep(0)
-        self.store.change(item.id, wish=str(DesiredState.ABORT))
+        self.store.change(item.id, desired_state=str(DesiredState.ABORT))
         self.note(by, "abort", item.id)
         await stopping
         return self.item(item.id)
@@ -307,12 +307,12 @@ class Supervisor:
         item = self.item(key)
         self.refuse_new_work(item.rig)
         if item.state in (STOPPED, WITHDRAWN) and item.run is None:
-            self.store.change(item.id, state="queued", wish=str(DesiredState.RUN), reason="")
+            self.store.change(item.id, state="queued", desired_state=str(DesiredState.RUN), reason="")
         elif self._running(item) is not None or item.state in ("queued", "finished"):
             raise RequestRefusedError(f"{item.id} is {item.state}; only what rests can be resumed")
         else:
             state = "queued" if item.run is None else "paused" if item.state == STOPPED else item.state
-            self.store.change(item.id, state=state, wish=str(DesiredState.RUN), ended=None)
+            self.store.change(item.id, state=state, desired_state=str(DesiredState.RUN), ended=None)
         self.note(by, "resume", item.id)
         self.wake()
         return self.item(item.id)
@@ -348,7 +348,7 @@ class Supervisor:
             self.store.set_flag(flag, {"by": by, "time": time.time(), "reason": reason})
             for worker in lanes:
                 if worker.running is not None:
-                    self.store.change(worker.running.item.id, wish=str(DesiredState.ABORT))
+                    self.store.change(worker.running.item.id, desired_state=str(DesiredState.ABORT))
             where = f"rig {rig}" if rig else ""
             self.note(by, "emergency stop", detail=": ".join(filter(None, (where, reason))))
         await asyncio.gather(*stops, return_exceptions=True)
@@ -388,7 +388,7 @@ class Supervisor:
     def note(self, by: str, what: str, campaign: str = "", detail: str = "") -> None:
         """Store, publish and log an audit entry."""
         self.store.note(by, what, campaign, detail)
-        self.feed.tell("Deed", {"by": by, "what": what, "detail": detail}, campaign)
+        self.feed.tell("AuditEntry", {"by": by, "what": what, "detail": detail}, campaign)
         _log.info("%s: %s %s", by, what, campaign, extra={"by": by, "what": what, "campaign": campaign})
 
     def problem(self, key: str, text: str | None) -> None:

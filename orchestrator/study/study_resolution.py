@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from sim_engine.settings.model import Settings
 
 HARDWARE = (
-    "laboratory '{}' is hardware. An arm moves only for one run, after '--arm' and with a person beside it; the cells "
-    "of a study run one after the other in processes of their own, where nobody is asked. Pour there with 'decant "
-    "run', and name a virtual laboratory here"
+    "laboratory '{}' is hardware. An arm moves only for one run, after '--enable-motion' and with a person beside it; "
+    "the cells of a study run one after the other in processes of their own, where nobody is asked. Pour there with "
+    "'decant run', and name a virtual laboratory here"
 )
 
 BUDGETS = (

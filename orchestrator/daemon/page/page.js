@@ -221,10 +221,10 @@ async function stop(rig) {
   if (!done) alarm(`${what} was not confirmed: ${PHYSICAL}.`);
 }
 
-const of = (item, verb) => call(`campaigns/${encodeURIComponent(item.id)}/${verb}`, undefined, { method: "POST" });
+const of = (item, command) => call(`campaigns/${encodeURIComponent(item.id)}/${command}`, undefined, { method: "POST" });
 const acts = {
   answer: async (question, text) => { await call(`questions/${question.id}/answer`, { answer: text }); soon(0); },
-  end: (item, verb) => doing(`${verb} ${item.name}`, () => of(item, verb)),
+  end: (item, command) => doing(`${command} ${item.name}`, () => of(item, command)),
   resume: (item) => doing(`go on with ${item.name}`, () => of(item, "resume")),
   earlier: (item, other) => doing("move", () => call(`campaigns/${encodeURIComponent(item.id)}/move`, { before: other.id })),
   hold: (hold) => doing(hold ? "hold the queue" : "let the queue go on",

@@ -96,7 +96,7 @@ export function rigCard(rig, campaign, acts) {
     armStatus(rig.arm),
     idle ? el("p", { class: "quiet" }, "Nothing runs here.") : [
       el("p", { class: "what" }, el("b", {}, campaign.name), ` ${stateText(campaign.state)}`,
-        campaign.wish !== "run" ? ` (asked to ${campaign.wish})` : ""),
+        campaign.desired_state !== "run" ? ` (asked to ${campaign.desired_state})` : ""),
       progress ? [
         el("p", {}, progress.stage ? `${progress.stage} (stage ${progress.stage_index} of ${progress.stage_count})` : "",
           progress.seconds_left ? `, about ${lasting(progress.seconds_left)} left` : ""),
@@ -199,7 +199,7 @@ export function queueList(items, paused, acts) {
     el("p", {}, paused ? el("b", {}, "The queue is held: nothing begins. ") : "", items.length ? "" : "Nothing waits. ",
       button("hold", paused ? "Let it go on" : "Hold the queue", () => acts.hold(!paused), "plain")),
     items.length ? el("ol", {}, items.map((item, index) => el("li", {}, el("span", {}, el("b", {}, item.name), " ",
-      modeBadge(item.mode), ` for ${item.rig}`, item.needs_arming ? ", waits for `decant arm`" : ""),
+      modeBadge(item.mode), ` for ${item.rig}`, item.needs_enabling ? ", waits for `decant enable`" : ""),
     index ? button(`up ${item.id}`, "Earlier", () => acts.earlier(item, items[index - 1]), "plain") : null,
     button(`drop ${item.id}`, "Take out", () => acts.end(item, "stop"), "plain danger")))) : null,
   ];

@@ -42,7 +42,7 @@ DOING = (
     "/campaigns/x/stop",
     "/campaigns/x/abort",
     "/campaigns/x/move",
-    "/campaigns/x/arm",
+    "/campaigns/x/enable",
     "/questions/1/answer",
     "/queue/pause",
     "/queue/resume",

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.support.waiting import PATIENCE
 
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import DeviceCheck
@@ -17,6 +16,7 @@ from orchestrator.config.file_loading import load_laboratory
 from orchestrator.daemon.daemon_settings import Rig
 from tests.support.hardware_laboratory import hardware_rig
 from tests.support.toy_daemon import Served, held, run, serving
+from tests.support.waiting import PATIENCE
 
 
 async def arm_of(served: Served, rig: str, state: str) -> dict[str, Any]:
@@ -131,6 +131,6 @@ def test_a_rig_without_hardware_has_no_arm_status(tmp_path: Path) -> None:
         async with serving(tmp_path, rigs=(Rig("rig", path, load_laboratory(path)),), arm_interval=0.0) as served:
             for _ in range(20):
                 await asyncio.sleep(0)
-            assert {one["name"]: one["arm"] for one in await served.get("/rigs")} == {"rig": None, "desk": None}
+            assert {one["name"]: one["arm"] for one in await served.get("/rigs")} == {"rig": None, "none": None}
 
     run(work())

@@ -308,7 +308,7 @@ def test_the_queue_is_held_reordered_and_emptied(page: Any, tmp_path: Path) -> N
         page.get_by_role("button", name="Take out").first.click()
         wait_until(page, lambda: queued(lab) == [second])
         page.get_by_role("button", name="Pause", exact=True).click()
-        wait_until(page, lambda: lab.do(lab.served.get("/campaigns"))[0]["wish"] == "pause")
+        wait_until(page, lambda: lab.do(lab.served.get("/campaigns"))[0]["desired_state"] == "pause")
 
 
 def test_pours_stand_with_what_was_expected_and_what_was_spilled(page: Any, tmp_path: Path) -> None:

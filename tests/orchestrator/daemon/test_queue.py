@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from orchestrator.cli.app import app
 from orchestrator.cli.queue_commands import submit
 from orchestrator.config.file_loading import load_campaign, load_laboratory
-from orchestrator.daemon.daemon_settings import DESK, DaemonSettings, Rig
+from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import QueueItem
 from orchestrator.daemon.run_readout import Pours
 from orchestrator.daemon.submissions import Submission, SubmissionError, pack, prepare, run_request
@@ -137,7 +137,7 @@ def test_two_campaigns_never_hold_the_same_rig_and_two_rigs_pour_at_once(tmp_pat
             await served.until(keys[0], "running")
             assert (await served.get(f"/campaigns/{keys[1]}"))["state"] == "queued"
             holders = {rig["name"]: rig["campaign"] for rig in await served.get("/rigs")}
-            assert holders == {"left": keys[0], "right": keys[2], "desk": None}
+            assert holders == {"left": keys[0], "right": keys[2], "none": None}
             assert len(served.laboratories) == 2
             for one in served.laboratories:
                 one.bench.go.set()
@@ -176,7 +176,7 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
     class Told:
         def post(self, path: str, body: Any) -> dict[str, Any]:
             sent.update(body)
-            return {"id": "x", "rig": "desk", "needs_arming": False}
+            return {"id": "x", "rig": "none", "needs_enabling": False}
 
     monkeypatch.setattr(
         "orchestrator.cli.queue_commands.connected_client", lambda url, state: contextlib.nullcontext(Told())
@@ -184,15 +184,15 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
     arguments = ["submit", str(campaign_in(tmp_path)), "--parameters", str(theta), "--receiver", str(bowl)]
     refused = CliRunner().invoke(app, arguments)
     assert refused.exit_code == 2
-    assert "--verb plan" in refused.stderr
+    assert "--task plan" in refused.stderr
     assert not sent
-    assert CliRunner().invoke(app, [*arguments, "--verb", "plan"]).exit_code == 0
+    assert CliRunner().invoke(app, [*arguments, "--task", "plan"]).exit_code == 0
 
     async def work() -> None:
         async with serving(tmp_path) as served:
             key = (await served.post("/campaigns", sent))["id"]
             found = await served.until(key, "finished")
-            plan = run_request(served.daemon.settings, served.daemon.item(key), Rig(DESK)).campaign
+            plan = run_request(served.daemon.settings, served.daemon.item(key), Rig(NO_RIG)).campaign
             assert plan.parameters.friction == 0.21
             assert found["name"] == plan.name == "cup-plan"
             assert [scene.receiver.name for scene in plan.deployment.scenes] == ["bowl"]  # type: ignore[union-attr]
@@ -221,7 +221,7 @@ def test_a_campaign_without_the_draws_of_theta_that_it_bears_is_refused_when_it_
     text, files = pack(with_risk(tmp_path))
     for verb, said in (("run", "this campaign has no calibration"), ("plan", "needs --parameters")):
         with pytest.raises(SubmissionError, match=said):
-            prepare(settings, Submission(text=text, files=files, verb=verb), "00000a", "somebody")
+            prepare(settings, Submission(text=text, files=files, task=verb), "00000a", "somebody")
     assert not any(settings.snapshots.iterdir())
 
 
@@ -235,7 +235,7 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
     class Client:
         def post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
             sent.append(body)
-            return {"id": "risky-1", "rig": "none", "needs_arming": False}
+            return {"id": "risky-1", "rig": "none", "needs_enabling": False}
 
     @contextlib.contextmanager
     def connected(url: Any, state: Any) -> Any:
@@ -243,10 +243,10 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orchestrator.cli.queue_commands.connected_client", connected)
-        submit(with_risk(tmp_path).source, verb="plan", parameters=theta, as_json=True)
+        submit(with_risk(tmp_path).source, task="plan", parameters=theta, as_json=True)
     (body,) = sent
     settings = DaemonSettings(tmp_path / "state", in_process=True)
-    submission = Submission(text=body["text"], files=body["files"], verb="plan")
+    submission = Submission(text=body["text"], files=body["files"], task="plan")
     item = prepare(settings, submission, "00000a", "somebody")
     planned = run_request(settings, item, settings.rig(item.rig)).campaign
     assert planned.parameters.friction == 0.2
