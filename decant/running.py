@@ -35,7 +35,7 @@ from orchestrator.run_service import (
     read_theta,
     task_request,
 )
-from orchestrator.runs.events import Watcher as Watch
+from orchestrator.runs.events import Subscriber as Watch
 from orchestrator.runs.run_folder import create_run
 from orchestrator.runs.stages import POSTERIOR_DRAWS, posterior_draws
 from orchestrator.shipped import shipped, starting_set

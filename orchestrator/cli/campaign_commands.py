@@ -27,7 +27,7 @@ from orchestrator.cli.command_options import (
     Seed,
     Thetas,
 )
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, print_json
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_note
 
 if TYPE_CHECKING:
     from orchestrator.journal.run_record import CampaignResult
@@ -104,7 +104,7 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
             live=view,
         )
         if published.theta is not None:
-            mention(f"the parameters to use are in {published.theta}; give them with --parameters")
+            print_note(f"the parameters to use are in {published.theta}; give them with --parameters")
         if as_json and task == "calibrate":
             print_json(calibration_json(result, published))
         elif as_json:
@@ -213,7 +213,7 @@ def plan(
     check_laboratory_answers(request, resources)
     directory = run_directory(chosen, resume=False, run_id=None)
     if parameters is None:
-        mention(
+        print_note(
             f"note: no --parameters given; planning with the campaign's ({json.dumps(chosen.parameters.model_dump())})"
         )
     run_result, published = run_in_front_of_people(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orchestrator.catalogue.catalogue_index import ACTION_COLUMNS, POURS
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, mention, print_json, say
+from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, print_json, print_message, print_note
 from orchestrator.results.console_view import print_table
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def list_runs(conditions: Mapping[str, Any], *, daemon: bool = False, as_json: b
         print_json({"runs": found})
         return
     if not found:
-        mention("no run; `decant runs add FOLDER` enters runs that the catalogue doesn't know")
+        print_note("no run; `decant runs add FOLDER` enters runs that the catalogue doesn't know")
         return
     rows = [
         {
@@ -178,7 +178,7 @@ def list_pours(conditions: Mapping[str, Any], *, daemon: bool = False, as_json: 
     elif found:
         print_pours(found)
     else:
-        mention("no pour that this holds for")
+        print_note("no pour that this holds for")
 
 
 def show(name: str, *, daemon: bool = False, as_json: bool) -> None:
@@ -302,7 +302,7 @@ def export(
     if as_json:
         print_json(found)
         return
-    mention(f"{found['runs']} runs, {found['pours']} pours")
+    print_note(f"{found['runs']} runs, {found['pours']} pours")
     print("\n".join(found["files"]))
 
 
@@ -366,17 +366,17 @@ def _catalogue(*, anew: bool = False, before: Any = None) -> Iterator[Catalogue]
 
         def progress(number: int, count: int) -> None:
             if time.monotonic() - begin > 2.0 and (number % 20 == 0 or number == count):
-                mention(f"reading runs: {number} of {count}")
+                print_note(f"reading runs: {number} of {count}")
 
         with Catalogue(state) as catalogue:
             if catalogue.warning:
-                say(f"note: {catalogue.warning}")
+                print_message(f"note: {catalogue.warning}")
             looked = catalogue.refresh(progress, anew=anew)
             yield catalogue
     for problem in looked.problems:
-        say(f"note: {problem}")
+        print_message(f"note: {problem}")
     if looked.missing:
-        mention(
+        print_note(
             f"note: {looked.missing} known run{'s are' if looked.missing > 1 else ' is'} not where it was; what was "
             "last known of it is shown (`decant runs add` after a move, `decant runs rebuild` forgets it)"
         )

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from orchestrator.cli.console import BAD_INPUT, INTERRUPTED, RefusalError, fail, hush
+from orchestrator.cli.console import BAD_INPUT, INTERRUPTED, RefusalError, fail, set_quiet
 
 Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
@@ -38,7 +38,7 @@ Quiet = Annotated[
     typer.Option(
         "--quiet",
         "-q",
-        callback=hush,
+        callback=set_quiet,
         help="Print only results, questions, warnings and errors: no progress, no notes.",
     ),
 ]

@@ -17,7 +17,15 @@ from typing import Annotated
 import typer
 
 from orchestrator.cli.command_options import Json, Quiet
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, WaitingIndicator, mention, print_json, say
+from orchestrator.cli.console import (
+    BAD_INPUT,
+    FAILED,
+    RefusalError,
+    WaitingIndicator,
+    print_json,
+    print_message,
+    print_note,
+)
 
 
 def validate(
@@ -41,7 +49,7 @@ def validate(
             problems = [f"{path}: {error}"]
         if problems:
             bad += 1
-            say("\n".join(problems))
+            print_message("\n".join(problems))
         else:
             print(f"{path}: ok ({note})", flush=True)
     if bad:
@@ -79,7 +87,7 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             warned: list[str] = []
             problems = check_campaign(plan, warn=lambda problem: warned.append(f"warning: {problem}"), doing=doing)
             for text in dict.fromkeys(warned):
-                mention(text)
+                print_note(text)
             return f"campaign, seed {plan.seed}", [str(problem) for problem in problems]
 
 
@@ -113,7 +121,7 @@ def migrate(
             kind = kind_of(Document.read(resolved(path)).data)
             result = migrate_file(path, load_daemon if kind is None else kinds[kind])
         except (ConfigError, OSError) as error:
-            say(str(error))
+            print_message(str(error))
             left += 1
             continue
         for line, old, new in result.renamed:
@@ -122,7 +130,7 @@ def migrate(
             print(f"{path}: nothing to rename")
         if result.problems:
             left += 1
-            say("\n".join(map(str, result.problems)))
+            print_message("\n".join(map(str, result.problems)))
     if left:
         raise RefusalError(f"{left} of {len(files)} file(s) have problems that can't be solved by renaming", BAD_INPUT)
 

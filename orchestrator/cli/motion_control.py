@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from actors.arm.arm_interface import NotAcceptedError
 from actors.interfaces import LaboratoryError
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, say
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_message, print_note
 from orchestrator.runs.motion_approval import SafetyRecordError, required_checksum
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def enable_campaign_motion(
         return None
     if laboratory.mode != "hardware":
         if enabled:
-            mention(
+            print_note(
                 f"note: --enable-motion has no effect: laboratory {laboratory.name} is {laboratory.mode}, and moves "
                 "nothing"
             )
@@ -82,7 +82,7 @@ def enable_campaign_motion(
     assert laboratory.arm is not None
     with Refused(SafetyRecordError):
         checksum = required_checksum(plan)
-    mention(f"planning paths from all over the actions of {plan.name} …")
+    print_note(f"planning paths from all over the actions of {plan.name} …")
     found = envelope(laboratory.arm, campaign_pours(plan, stages))
     if not found.reports:
         raise RefusalError(
@@ -109,10 +109,10 @@ def require_flag(laboratory: LaboratorySpec, *, enabled: bool, again: str) -> No
 
 def announce(laboratory: str, arm: str, lines: Sequence[str], lasting: str = "") -> None:
     """Print what hardware will do, before the laboratory's name is typed."""
-    say(f"\nHARDWARE: laboratory {laboratory}, {arm}. This will move:\n")
+    print_message(f"\nHARDWARE: laboratory {laboratory}, {arm}. This will move:\n")
     for line in lines:
-        say(f"  {line}")
-    say(
+        print_message(f"  {line}")
+    print_message(
         "\nA software stop is not a safety function: keep the emergency stop within reach, and everybody out of the "
         f"box.\nType the laboratory's name ({laboratory}) to enable its motion{lasting}; anything else ends here."
     )
@@ -137,7 +137,7 @@ def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
     typed = sys.stdin.readline()
     if typed.strip() != laboratory.name:
         raise RefusalError(f"motion is not enabled: '{typed.strip()}' was typed; nothing has moved", BAD_INPUT)
-    say(f"motion is enabled, for this run only: {laboratory.name}")
+    print_message(f"motion is enabled, for this run only: {laboratory.name}")
 
 
 @contextlib.contextmanager
@@ -185,7 +185,7 @@ def stoppable(arm: Arm, motion: Callable[[], T]) -> T:
         try:
             thread.join(0.1)
         except KeyboardInterrupt:
-            say("\nstopping the arm …")
+            print_message("\nstopping the arm …")
             arm.stop()
     if failure:
         raise failure[0]
@@ -272,7 +272,7 @@ class Jogging:
         tell: prints a line.
     """
 
-    def __init__(self, arm: Arm, read: Callable[[str], str], tell: Callable[[str], None] = say) -> None:
+    def __init__(self, arm: Arm, read: Callable[[str], str], tell: Callable[[str], None] = print_message) -> None:
         self._arm, self._read, self._print = arm, read, tell
         self._known: set[tuple[str, bool]] = set()
 
@@ -383,19 +383,19 @@ class EmptyCycle:
         return executed
 
     def _moving(self, name: str, motion: Callable[[], Any]) -> Any:
-        say(f"{name} …")
+        print_message(f"{name} …")
         return stoppable(self._arm, motion)
 
     def _upright(self, error: LaboratoryError) -> None:
         """After a stop with the pourer tilted: upright and home, if somebody says so."""
-        say(str(error))
+        print_message(str(error))
         if not self._ask:
             return
         if not _yes("Find the cause and mend it. Shall the arm bring the pourer upright, slowly, and go home?"):
             return
         with contextlib.suppress(LaboratoryError):
             self._arm.release()
-            say(f"ready again: {self._arm.recover() or 'nothing had to be done'}")
+            print_message(f"ready again: {self._arm.recover() or 'nothing had to be done'}")
         self._released()
         self._moving("upright", self._arm.untilt)
         self._released()
@@ -409,12 +409,12 @@ class EmptyCycle:
     def _released(self) -> None:
         left = self._announcement
         while left > 0.0:
-            say(f"the arm moves in {left:.0f} s; Ctrl-C stops it" if left >= 0.5 else "the arm moves")
+            print_message(f"the arm moves in {left:.0f} s; Ctrl-C stops it" if left >= 0.5 else "the arm moves")
             time.sleep(min(left, 1.0))
             left -= 1.0
         self._arm.release()
 
 
 def _yes(text: str) -> bool:
-    say(f"\n{text}")
+    print_message(f"\n{text}")
     return typed_line("type 'yes' to go on > ").strip().lower() == "yes"

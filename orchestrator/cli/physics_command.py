@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import Json
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, print_json, say, stdout_for_results
+from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, print_json, print_message, stdout_for_results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -107,7 +107,7 @@ def physics(
     simulator = PourSimulator()
     try:
         for case in chosen:
-            say(f"{case.name}: {case.title} …")
+            print_message(f"{case.name}: {case.title} …")
             image = None
             # a bar is shown only after the first report of progress, which short cases don't make
             with stdout_for_results(), Progress(console=Console(stderr=True), transient=True) as bars:
@@ -127,7 +127,7 @@ def physics(
         theta = describe(PLAIN)
         order = [case.name for case in CASES]
         page = write_page(write, together, order, fingerprint=fingerprint, theta=theta)
-        say(f"page: {page}")
+        print_message(f"page: {page}")
     rows = [(record["title"], m) for record in records.values() for m in record["measurements"]]
     if as_json:
         print_json({"solver": fingerprint, "full": full, "cases": records})
@@ -139,7 +139,7 @@ def physics(
     failed = sum(not m["passed"] for m in judged)
     if failed:
         raise RefusalError(f"{failed} of {len(judged)} criteria are not met", FAILED)
-    say(f"all {len(judged)} criteria are met" if judged else "nothing was judged")
+    print_message(f"all {len(judged)} criteria are met" if judged else "nothing was judged")
 
 
 def _chosen(names: list[str]) -> list[Case]:

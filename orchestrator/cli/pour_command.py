@@ -24,7 +24,7 @@ from orchestrator.cli.command_options import (
     Quiet,
     SceneName,
 )
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, mention, print_json, say
+from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message, print_note
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Executed, PathReport, PlannedPour
@@ -170,7 +170,7 @@ def _draw(chosen: Chosen, png: Path) -> None:
         title=f"{chosen.scene.pourer.name} into {chosen.scene.receiver.name}, laboratory {chosen.plan.laboratory.name}",
         note=chosen.action.display(),
     )
-    mention(f"picture: {drawn}")
+    print_note(f"picture: {drawn}")
 
 
 def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
@@ -179,7 +179,7 @@ def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
     planned, laboratory = chosen.path, chosen.plan.laboratory
     assert planned is not None
     assert laboratory.arm is not None
-    mention(f"{chosen.scene.name}: {chosen.action.display()}; laboratory {laboratory.name}, {laboratory.mode}")
+    print_note(f"{chosen.scene.name}: {chosen.action.display()}; laboratory {laboratory.name}, {laboratory.mode}")
     home = _stands_at_home(chosen) if connect else None
     if as_json:
         print_json(
@@ -194,7 +194,7 @@ def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
     else:
         for line in [*report_lines(planned.report), *_way_lines(planned)]:
             print(line)
-    say("nothing was moved")
+    print_message("nothing was moved")
 
 
 def _way_lines(planned: PlannedPour) -> list[str]:
@@ -218,7 +218,7 @@ def _stands_at_home(chosen: Chosen) -> bool:
     with Refused(LaboratoryError, code=FAILED), reached(chosen.plan.laboratory) as ready:
         assert ready.arm is not None
         check = ready.arm.look().at_home()
-    say(f"the arm stands {check.found}" + (f" → {check.advice}" if check.advice else ""))
+    print_message(f"the arm stands {check.found}" + (f" → {check.advice}" if check.advice else ""))
     return check.state == "ok"
 
 
@@ -322,7 +322,7 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
     if hardware:
         confirm(laboratory, lines)
     else:
-        say(f"laboratory {laboratory.name}, virtual: nothing moves but numbers\n" + "\n".join(lines))
+        print_message(f"laboratory {laboratory.name}, virtual: nothing moves but numbers\n" + "\n".join(lines))
     try:
         directory = create_run(dataclasses.replace(plan, name=f"{plan.name}-empty"))
         with reached(laboratory) as ready:
@@ -352,7 +352,7 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
         print_json({"run": str(directory), **record})
     else:
         print(_told(executed))
-    say(f"record: {directory / RECORD}")
+    print_message(f"record: {directory / RECORD}")
 
 
 def _told(executed: Executed) -> str:

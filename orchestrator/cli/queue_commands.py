@@ -23,7 +23,7 @@ from orchestrator.cli.command_options import (
     Receiver,
     Seed,
 )
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, print_json, say
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message, print_note
 
 if TYPE_CHECKING:
     from orchestrator.daemon.daemon_client import Client
@@ -80,7 +80,7 @@ def serve(
         )
         server_process.log_lines()
         text = f"state in {chosen.state}. 'decant submit CAMPAIGN' queues one"
-        server_process.serve(chosen, lambda url: say(f"serving {url}; {text}"))
+        server_process.serve(chosen, lambda url: print_message(f"serving {url}; {text}"))
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
     except RunError as error:
@@ -152,9 +152,9 @@ def submit(
         print_json(found)
         return
     print(found["id"])
-    mention(f"queued for {found['rig']}; follow it with: decant logs -f {found['id']}")
+    print_note(f"queued for {found['rig']}; follow it with: decant logs -f {found['id']}")
     if found["needs_enabling"]:
-        say(f"hardware: it waits until its motion is enabled: decant enable {found['id']}")
+        print_message(f"hardware: it waits until its motion is enabled: decant enable {found['id']}")
 
 
 def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) -> None:
@@ -168,14 +168,16 @@ def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) 
     stops = [("", status["emergency"]), *((f" of {rig['name']}", rig["emergency"]) for rig in status["rigs"])]
     for of, stop in stops:
         if stop:
-            say(f"EMERGENCY STOP{of} by {stop['by']}, {_clock(stop['time'])}: {stop['reason'] or 'no reason given'}")
+            print_message(
+                f"EMERGENCY STOP{of} by {stop['by']}, {_clock(stop['time'])}: {stop['reason'] or 'no reason given'}"
+            )
     for problem in status["problems"]:
-        say(f"problem: {problem}")
+        print_message(f"problem: {problem}")
     for rig in status["rigs"]:
         if (arm := rig["arm"]) and arm["state"] != "ok":
-            say(f"arm of {rig['name']}: {arm['text']}" + (f" → {arm['advice']}" if arm["advice"] else ""))
+            print_message(f"arm of {rig['name']}: {arm['text']}" + (f" → {arm['advice']}" if arm["advice"] else ""))
     if status["queue_paused"]:
-        say("the queue is paused: decant resume")
+        print_message("the queue is paused: decant resume")
     rows = [("CAMPAIGN", "STATE", "RIG", "SUBMITTED", "")]
     for one in campaigns:
         rows.append((one["id"], one["state"], one["rig"], _clock(one["created"]), _standing(one)))
@@ -246,7 +248,7 @@ def logs(
             return
 
 
-_PASSING = ("PourProgressed", "StrategyProgressed", "MadeAhead", "RequestStarted", "StageClosed")
+_PASSING = ("PourProgressed", "StrategyProgressed", "SpeculationProgressed", "RequestStarted", "StageClosed")
 
 
 def _line(event: dict[str, Any]) -> str | None:
@@ -376,7 +378,7 @@ def answer(
             for one in questions:
                 _print_question(one)
             if not questions:
-                say("no question is open")
+                print_message("no question is open")
             return
         if not text:
             raise RefusalError(
@@ -410,12 +412,12 @@ def enable(key: CampaignId, url: Url = None, state: State = None) -> None:
             BAD_INPUT,
         )
     with connected_client(url, state) as client:
-        say("planning paths from all over the actions …")
+        print_message("planning paths from all over the actions …")
         moves = client.get(f"/campaigns/{key}/motion")
         announce(moves["laboratory"], moves["arm"], moves["lines"])
         print("> ", end="", file=sys.stderr, flush=True)
         found = client.post(f"/campaigns/{key}/enable", {"laboratory": sys.stdin.readline().strip()})
-    say(f"motion is enabled for the coming part of the run: {found['id']}")
+    print_message(f"motion is enabled for the coming part of the run: {found['id']}")
 
 
 def move(

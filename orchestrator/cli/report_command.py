@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from orchestrator.cli.command_options import Json, Quiet
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, print_json, say
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message, print_note
 
 RUNS = Path("runs")
 """Folder in which names without a folder are searched."""
@@ -51,7 +51,7 @@ def report(
         page, figures = _of_study(folder), []
     else:
         raise RefusalError(_nothing_there(folder), BAD_INPUT)
-    mention(f"report  {page}")
+    print_note(f"report  {page}")
     if as_json:
         print_json({"report": page, "figures": figures})
 
@@ -83,7 +83,7 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
 
     check = check_journal(folder / JOURNAL_NAME)
     for problem in check.problems:
-        say(f"warning: {problem}")
+        print_message(f"warning: {problem}")
     try:
         try:
             plan = recorded_campaign(folder / RESOLVED)
@@ -93,11 +93,11 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
             reason = f"Its campaign or its results can't be read: {error}"
             if missing := missing_plugins(read_versions(folder)):
                 reason = f"Not installed here: {'; '.join(missing)}. Install what is missing for the whole report."
-            say(f"warning: the report is reduced to what the journal has. {reason}")
+            print_message(f"warning: the report is reduced to what the journal has. {reason}")
             return write_reduced_report(output or folder / REPORT_NAME, folder, reason), []
-        mention("drawing the figures …")
+        print_note("drawing the figures …")
         if publish_if_missing(plan, result):
-            mention("summary.json and theta.json were missing, and are written now")
+            print_note("summary.json and theta.json were missing, and are written now")
         page, figures = report_on(plan, result, output, formats)
     except RunError as error:
         raise RefusalError(str(error)) from None

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from orchestrator.cli.command_options import EnableMotion, Json, Laboratory
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, say
+from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message
 
 if TYPE_CHECKING:
     from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
@@ -63,7 +63,7 @@ def doctor(
             "looked at are an arm (whether it answers, its safety settings, tool and payload) and a balance",
         )
     virtual = spec.mode != "hardware"
-    say(
+    print_message(
         f"laboratory {spec.name}, {spec.mode}"
         + (": no robot, no balance; both are started for this" if virtual else "")
     )
@@ -92,7 +92,7 @@ def doctor(
         print_table(checks)
     if failed:
         raise RefusalError(f"{len(failed)} of {len(checks)} checks fail; nothing should move before they are mended")
-    say("ready" if all(check.state == "ok" for check in checks) else "ready, with warnings")
+    print_message("ready" if all(check.state == "ok" for check in checks) else "ready, with warnings")
 
 
 def _packages(spec: LaboratorySpec) -> list[DeviceCheck]:
@@ -178,7 +178,7 @@ def _accept(path: Path, look: ArmDiagnostics) -> SafetyRecord:
         written = write_record(path, record)
     except OSError as error:
         raise RefusalError(f"{record_path(path)}: can't be written: {error.strerror}", BAD_INPUT) from None
-    say(
+    print_message(
         f"safety checksum {record.checksum} of robot {record.serial} is accepted by {record.accepted_by}: {written}\n"
         "Compare it with the teach pendant, have a second person read the safety settings, and commit the file."
     )
@@ -207,9 +207,11 @@ def jog(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
     if spec.mode == "hardware":
         confirm(spec, ["steps          one at a time, as typed: at most 10 deg at 5 deg/s, or 50 mm at 20 mm/s"])
     else:
-        say(f"laboratory {spec.name}, virtual: nothing moves but numbers")
+        print_message(f"laboratory {spec.name}, virtual: nothing moves but numbers")
     with Refused(LaboratoryError, code=FAILED), reached(spec) as ready:
         assert ready.arm is not None
         with connected(dataclasses.replace(ready, arm=ready.arm.announced(ANNOUNCEMENT)), accepted) as (driver, facts):
-            say(f"{facts.model} {facts.serial}, {spec.mode}; nothing moves before a step is typed and confirmed")
+            print_message(
+                f"{facts.model} {facts.serial}, {spec.mode}; nothing moves before a step is typed and confirmed"
+            )
             Jogging(driver, typed_line).run()

@@ -30,8 +30,8 @@ from orchestrator.cli.console import (
     FAILED,
     RefusalError,
     Refused,
-    mention,
     print_json,
+    print_note,
     stdout_for_results,
     waiting_for,
 )
@@ -193,7 +193,7 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
             }
         )
     else:
-        mention(f"{scene.name}: {action.display()}")
+        print_note(f"{scene.name}: {action.display()}")
         amount = "" if delivered is None else f"{1e3 * delivered:.1f} g, {scene.liquid.millilitres(delivered):.1f} mL"
         print(told(outcomes, over_seeds, amount))
         if where is not None:
@@ -265,11 +265,11 @@ def _regimes(task: PourTask) -> ModelValidity | None:
     try:
         found = regimes_of(task.scene, task.action, task.parameters.particles)
     except (ValueError, OSError) as error:
-        mention(f"note: whether something is not simulated could not be worked out: {error}")
+        print_note(f"note: whether something is not simulated could not be worked out: {error}")
         return None
-    mention(f"{numbers_line(found)} (Reynolds, Weber and Bond numbers)")
+    print_note(f"{numbers_line(found)} (Reynolds, Weber and Bond numbers)")
     for one in found.not_covered:
-        mention(f"not simulated, {one.kind}: {one.text}")
+        print_note(f"not simulated, {one.kind}: {one.text}")
     return found
 
 
@@ -296,11 +296,11 @@ def _show(task: PourTask, pour: SimulatedPour, options: SimulateOptions) -> None
     if options.rrd is not None:
         from orchestrator.live_view.simulation_view import simulation_rrd
 
-        mention(f"recording: {simulation_rrd(options.rrd, task, pour)} (open it with: rerun {options.rrd})")
+        print_note(f"recording: {simulation_rrd(options.rrd, task, pour)} (open it with: rerun {options.rrd})")
     if options.png is not None:
         from orchestrator.results.pour_figures import simulation_png
 
-        mention(f"picture: {simulation_png(options.png, task, pour)}")
+        print_note(f"picture: {simulation_png(options.png, task, pour)}")
 
 
 def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
@@ -323,7 +323,7 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     tasks = [known.tasks(scene, pour.action, options.seed, options.seeds) for pour in pours]
     _check(simulator, table, source, [some if scene.uncertain else some[:1] for some in tasks])
     said = known.said(scene)
-    mention(f"{scene.name}: {len(pours)} pours, {len(tasks[0])} simulations each, {said}")
+    print_note(f"{scene.name}: {len(pours)} pours, {len(tasks[0])} simulations each, {said}")
     outcomes = _simulated(simulator, tasks)
     rows = [
         _row(row.line, pour, some, known.discrepancy)
@@ -334,12 +334,12 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     if options.csv is not None:
         from orchestrator.results.prediction_figures import write_scored
 
-        mention(f"table: {write_scored(options.csv, rows, dimensions)}")
+        print_note(f"table: {write_scored(options.csv, rows, dimensions)}")
     if options.png is not None:
         from orchestrator.results.prediction_figures import draw_scored
 
         title = f"{scene.pourer.name} into {scene.receiver.name}, {len(rows)} weighed pours"
-        mention(f"picture: {draw_scored(options.png, rows, title=title, note=said)}")
+        print_note(f"picture: {draw_scored(options.png, rows, title=title, note=said)}")
     if options.as_json:
         print_json(
             {
@@ -360,7 +360,7 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
             print(f"{split}: {one.text()}")
     lost = sum(row.lost for row in rows)
     if lost:
-        mention(f"{lost} of {sum(map(len, outcomes))} simulations could not be used, and are left out")
+        print_note(f"{lost} of {sum(map(len, outcomes))} simulations could not be used, and are left out")
     if all(row.predicted is None for row in rows):
         raise RefusalError("no simulation could be used", FAILED)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import Json, Quiet
-from orchestrator.cli.console import INTERRUPTED, RefusalError, Refused, mention, print_json
+from orchestrator.cli.console import INTERRUPTED, RefusalError, Refused, print_json, print_note
 
 if TYPE_CHECKING:
     from orchestrator.study.study_plan import StudyCell, StudyPlan
@@ -131,8 +131,8 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> CellStatus:
     cells = cells_of(plan)
     finished = finished_results(folder, cells)
     if len(finished) < len(cells) and (text := warning(finished)) is not None:
-        mention(text)
-    mention(f"study {folder}, {jobs} at a time")
+        print_note(text)
+    print_note(f"study {folder}, {jobs} at a time")
     columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[left]}")]
     try:
         with Progress(*columns, console=Console(stderr=True)) as bar, _ending_like_ctrl_c():
@@ -172,5 +172,5 @@ def _report(plan: StudyPlan, folder: Path) -> Path:
     from orchestrator.study.report.study_page import write_report
 
     page = write_report(plan, folder)
-    mention(f"figures, tables and a page: {page}")
+    print_note(f"figures, tables and a page: {page}")
     return page

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import typer
 
 from orchestrator.cli.command_options import Json, Quiet
-from orchestrator.cli.console import BAD_INPUT, RefusalError, mention, print_json, say, waiting_for
+from orchestrator.cli.console import BAD_INPUT, RefusalError, print_json, print_message, print_note, waiting_for
 
 if TYPE_CHECKING:
     from sim_engine.vessel.shapes import LengthUnit
@@ -121,10 +121,10 @@ def vessel(
     except OSError as error:
         raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
     for note in found.notes:
-        mention(f"note: {note}")
+        print_note(f"note: {note}")
     for doubt in found.doubts:
-        say(f"warning: {doubt}")
-    mention(f"{out} holds {1e6 * found.capacity:.0f} ± {1e6 * found.deviation:.1f} mL; its picture: {found.picture}")
+        print_message(f"warning: {doubt}")
+    print_note(f"{out} holds {1e6 * found.capacity:.0f} ± {1e6 * found.deviation:.1f} mL; its picture: {found.picture}")
     if as_json:
         print_json(
             {

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from orchestrator.cli.command_options import LiveAt, Quiet
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, say
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_message, print_note
 
 if TYPE_CHECKING:
     from orchestrator.live_view.live_server import LiveView
@@ -72,7 +72,7 @@ def view(
         else:
             shown = _recording_of(recordings[0])
         if output is not None:
-            mention(f"recording  {shown}")
+            print_note(f"recording  {shown}")
             return
         _serve(shown, at)
 
@@ -90,7 +90,7 @@ def _serve(shown: Path, at: str | None) -> None:
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with LiveView(address=address, web_port=port, shown=(shown,)) as live:
-            say(f"{live.url}\nCtrl-C ends it.")
+            print_message(f"{live.url}\nCtrl-C ends it.")
             while not stopped and live.alive:
                 time.sleep(0.2)
             if not stopped:
@@ -122,7 +122,7 @@ def _again(what: Path, number: int, particles: int | None, stage: str | None, pa
     with contextlib.closing(simulator), waiting_for(lambda: f"simulating, {time.monotonic() - begin:.0f} s so far"):
         result = simulator.simulate(task)
     said = f"{1e3 * task.scene.liquid.mass * result.outcome.spilled:.1f} g spilled in this simulation"
-    mention(f"{pour.title}; {said}, {result.outcome.particles} particles")
+    print_note(f"{pour.title}; {said}, {result.outcome.particles} particles")
     return simulation_rrd(path, task, result, pour.title)
 
 

@@ -76,7 +76,7 @@ async def rigs(daemon: Daemon, person: Viewer) -> list[RigOut]:
 def rigs_out(daemon: Supervisor) -> list[RigOut]:
     """Convert the rigs to their response models."""
     found = []
-    for name, worker in daemon.lanes.items():
+    for name, worker in daemon.workers.items():
         running = worker.running
         checkpoint = "" if running is None else running.checkpoint
         campaign = None if running is None else running.item.id
@@ -262,11 +262,13 @@ class _Collector:
             campaigns.add_metric([state], count)
         yield campaigns
         busy = GaugeMetricFamily("decant_rig_busy", "Whether a campaign has the rig.", labels=["rig"])
-        for name, worker in daemon.lanes.items():
+        for name, worker in daemon.workers.items():
             busy.add_metric([name], float(worker.running is not None))
         yield busy
-        words = GaugeMetricFamily("decant_words", "Messages to people elsewhere.", labels=["receiver", "outcome"])
-        for receiver, counts in daemon.words.items():
+        words = GaugeMetricFamily(
+            "decant_notifications", "Notifications sent to receivers.", labels=["receiver", "outcome"]
+        )
+        for receiver, counts in daemon.notification_counts.items():
             for outcome, count in asdict(counts).items():
                 words.add_metric([receiver, outcome], count)
         yield words

@@ -254,7 +254,7 @@ async def _serve_with(
         loop.add_signal_handler(number, ending)
     serving = asyncio.create_task(server.serve([listening]))
     notifying = None if notifier is None else asyncio.create_task(pass_on(daemon.feed.read(), notifier))
-    daemon.words = {} if notifier is None else notifier.counts
+    daemon.notification_counts = {} if notifier is None else notifier.counts
     url = _url(settings, listening)
     settings.address.write_text(url + "\n", encoding="utf-8")
     watch = RayWatch(daemon, restart, ending.asked.is_set)

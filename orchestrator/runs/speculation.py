@@ -60,7 +60,7 @@ class SpeculativeExecution:
         self.made = 0
         self.used = 0
 
-    def foresee(self, request: Simulate) -> None:
+    def predict(self, request: Simulate) -> None:
         """Queue a simulation that runs as soon as a simulator is idle."""
         if request in self._known or request in self._running or request in self._waiting:
             return
@@ -70,7 +70,7 @@ class SpeculativeExecution:
 
     async def outcome(self, request: Simulate) -> Outcome | None:
         """Outcome of a speculative simulation, once it is finished; it stays stored. None: it has no outcome."""
-        self.foresee(request)
+        self.predict(request)
         if request in self._known:
             return self._known[request]
         if request not in self._running and request not in self._waiting:
@@ -190,7 +190,7 @@ class RequestForecast:
         results: results of the earlier stages.
         seed: seed of the campaign.
         capacity: logical slots for simulations.
-        ahead: runs the predicted simulations.
+        speculation: runs the predicted simulations.
         suggest: queries the optimiser.
     """
 
@@ -198,7 +198,7 @@ class RequestForecast:
     results: Results
     seed: int
     capacity: int
-    ahead: SpeculativeExecution
+    speculation: SpeculativeExecution
     suggest: Callable[[Suggest], Awaitable[Outcome]]
 
     async def run(self) -> None:
@@ -250,7 +250,7 @@ class RequestForecast:
             requests = strategy.ask(Slots(slots, 0))
             for request in requests:
                 if isinstance(request, Simulate) and request.parameters not in unknown:
-                    self.ahead.foresee(request)
+                    self.speculation.predict(request)
             questions = [request for request in requests if isinstance(request, Suggest)]
             if not questions and slots == MANY:
                 return
@@ -269,7 +269,7 @@ class RequestForecast:
             open_ += asked
             for request in asked:
                 if isinstance(request, Simulate):
-                    self.ahead.foresee(request)
+                    self.speculation.predict(request)
             if not open_:
                 return
             request = min(open_, key=lambda request: isinstance(request, Simulate))
@@ -277,7 +277,7 @@ class RequestForecast:
             if isinstance(request, Suggest):
                 strategy.tell(request, await self.suggest(request))
             elif isinstance(request, Simulate):
-                outcome = await self.ahead.outcome(request)
+                outcome = await self.speculation.outcome(request)
                 if outcome is None:
                     return
                 strategy.tell(request, outcome)

@@ -122,7 +122,7 @@ def test_a_run_writes_and_shows_the_same(golden: Golden, tmp_path: Path) -> None
     )
     events: list[Event] = []
     display = ProgressDisplay(plan, quiet=True)
-    work = run_campaign(plan, FormulaLaboratory(), folder, watchers=[events.append, display])
+    work = run_campaign(plan, FormulaLaboratory(), folder, subscribers=[events.append, display])
     result = replace(asyncio.run(work), seconds=12.0)
 
     passing = [

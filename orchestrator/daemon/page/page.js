@@ -2,7 +2,7 @@
 
 import { Refused, call, knownToken, listen, reach, saveReport, useToken } from "./talk.js";
 import {
-  button, cellLine, clock, draw, el, endedList, formerRuns, modeBadge, poursTable, questionCard, queueList, rigCard, stopCard,
+  button, cellLine, clock, draw, el, endedList, previousRuns, modeBadge, poursTable, questionCard, queueList, rigCard, stopCard,
 } from "./show.js";
 
 const $ = (id) => document.getElementById(id);
@@ -230,7 +230,7 @@ const acts = {
   hold: (hold) => doing(hold ? "hold the queue" : "let the queue go on",
     () => call(`queue/${hold ? "pause" : "resume"}`, undefined, { method: "POST" })),
   report: (id) => doing("report", () => saveReport(id)),
-  formerReport: (run) => doing(`report of ${run.run}`, () => saveReport(run.run, "runs")),
+  previousReport: (run) => doing(`report of ${run.run}`, () => saveReport(run.run, "runs")),
   note: async (run) => {
     const text = prompt(`What is to be remembered of ${run.run}?`)?.trim();
     if (!text) return;
@@ -248,13 +248,13 @@ const acts = {
   clear: (rig) => doing(rig ? `clear the stop of ${rig}` : "clear the emergency stop", () => call("emergency-stop/clear", { rig })),
 };
 
-/** Former runs that have all the words. */
+/** Previous runs that have all the words. */
 async function find() {
   const query = new URLSearchParams([["limit", 8], ...$("words").value.split(/\s+/).filter(Boolean).map((word) => ["words", word])]);
   await doing("look for runs", async () => {
     const runs = await call(`runs?${query}`, undefined, { timeout: 60000 });
-    draw(body("former"), runs, (found) => formerRuns(found, acts));
-    body("former").hidden = false;
+    draw(body("previous"), runs, (found) => previousRuns(found, acts));
+    body("previous").hidden = false;
   });
 }
 

@@ -216,7 +216,7 @@ export function endedList(items, acts) {
 }
 
 /** Runs that were found, the newest first: what was poured, how well, what people said of it. */
-export function formerRuns(runs, acts) {
+export function previousRuns(runs, acts) {
   if (!runs.length) return el("p", { class: "quiet" }, "No run has all of this.");
   const best = (run) => Object.entries(run.recommended).map(([into, found]) =>
     `${into} ${found.best_loss === null ? "—" : percent(found.best_loss)}`).join(", ") || "—";
@@ -225,7 +225,7 @@ export function formerRuns(runs, acts) {
       ` of ${run.liquid.join(", ")}, best: ${best(run)}`, run.tags.map((tag) => [" ", el("b", { class: "badge" }, tag)]),
       run.notes.map((note) => el("p", { class: "quiet" }, note))),
     button(`note ${run.run}`, "Note", () => acts.note(run), "plain"),
-    button(`former ${run.run}`, "Save report", () => acts.formerReport(run), "plain"))));
+    button(`previous ${run.run}`, "Save report", () => acts.previousReport(run), "plain"))));
 }
 
 const day = (seconds) => new Date(1000 * seconds).toLocaleDateString([], { year: "numeric", month: "short", day: "numeric" });

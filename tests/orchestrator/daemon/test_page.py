@@ -261,7 +261,7 @@ def test_an_arm_that_did_not_confirm_its_stop_is_not_missed(page: Any, tmp_path:
         page.get_by_text("Nothing runs here.").wait_for()
         wait_until(page, lambda: lab.served.daemon.feed.readers > 0)
         lab.loop.call_soon_threadsafe(
-            lab.served.daemon.feed.tell, "LogLine", {"level": "error", "text": text, "stage": ""}
+            lab.served.daemon.feed.publish, "LogLine", {"level": "error", "text": text, "stage": ""}
         )
         page.get_by_role("alert").get_by_text(text).wait_for()
         assert page.evaluate(LEGIBLE) == []
@@ -356,7 +356,7 @@ def test_news_that_never_pause_hide_nothing(page: Any, tmp_path: Path) -> None:
         async def chatter() -> None:
             key = await lab.served.submit()
             while lab.sockets:
-                lab.served.daemon.feed.tell("PourProgressed", {"number": 1}, key, kept=False)
+                lab.served.daemon.feed.publish("PourProgressed", {"number": 1}, key, kept=False)
                 await asyncio.sleep(0.1)
 
         asyncio.run_coroutine_threadsafe(chatter(), lab.loop)
@@ -420,10 +420,10 @@ def test_nothing_but_the_operator_scrolls_the_page(page: Any, tmp_path: Path) ->
     with on_port(tmp_path, asking(**REFILL)) as lab:
         page.goto(lab.address())
         page.get_by_text("Nothing runs here.").wait_for()
-        page.get_by_role("heading", name="Former runs").scroll_into_view_if_needed()
+        page.get_by_role("heading", name="Previous runs").scroll_into_view_if_needed()
         page.evaluate("scrollTo(0, document.documentElement.scrollHeight)")
         assert page.evaluate("scrollY") > 0
-        where = "document.querySelector('#former-head').getBoundingClientRect().top"
+        where = "document.querySelector('#previous-head').getBoundingClientRect().top"
         before = page.evaluate(where)
         asked(lab)
         page.get_by_role("button", name="1 question").wait_for()
@@ -526,7 +526,7 @@ def test_a_screen_reader_finds_its_way(page: Any, tmp_path: Path) -> None:
         page.get_by_role("button", name="Done").wait_for()
         for role in ("banner", "main"):
             assert page.get_by_role(role).count() == 1
-        for name in ("Questions", "Now", "Last pours", "Queue", "At rest", "Former runs", "Stop"):
+        for name in ("Questions", "Now", "Last pours", "Queue", "At rest", "Previous runs", "Stop"):
             assert page.get_by_role("region", name=name, exact=True).count() == 1
         assert page.get_by_role("article", name="Fill the pourer").count() == 1
         assert page.evaluate("document.documentElement.lang") == "en"
@@ -543,7 +543,7 @@ def test_former_runs_are_found_and_what_is_noted_of_them_is_found_again(
         page.goto(lab.address(Role.OPERATOR))
         page.get_by_label("Vessel, liquid, tag, any words").fill("narrow water")
         page.get_by_role("button", name="Find").click()
-        found = page.locator("#former li")
+        found = page.locator("#previous li")
         found.get_by_text(run).wait_for()
         assert page.evaluate(LEGIBLE) == []
         assert page.evaluate("document.documentElement.scrollWidth") <= 390

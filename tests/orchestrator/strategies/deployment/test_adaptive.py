@@ -323,7 +323,7 @@ def test_an_answer_is_replayed_exactly(tmp_path: Path) -> None:
         plan = asking(directory)
         task = asyncio.create_task(
             run_toy(directory, wrong_laboratory(), plan=plan, stages=None, resume=True,
-                    ask_operator=answering("go on"), watchers=[watch])
+                    ask_operator=answering("go on"), subscribers=[watch])
         )  # fmt: skip
         with pytest.raises(asyncio.CancelledError):
             await task
