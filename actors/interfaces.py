@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.questions import Suggestion, SuggestionQuery
 from sim_engine.errors import DecantError
 from sim_engine.outcome import PourMeasurement, RecordedFrames, SimulatedPour
 from sim_engine.scene import PourTask, Scene
@@ -143,8 +143,8 @@ class Bench(Protocol):
 class Optimizer(Protocol):
     """Proposes points. It is stateless: after a worker's death the same request may be made again."""
 
-    async def suggest(self, problem: SuggestProblem) -> Suggestion:
-        """Compute the suggestion for a `SuggestProblem`."""
+    async def suggest(self, query: SuggestionQuery) -> Suggestion:
+        """Compute the suggestion for a `SuggestionQuery`."""
         ...
 
 

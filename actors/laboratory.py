@@ -11,11 +11,11 @@ import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 from actors.balance.balance_settings import SerialBalanceSpec
 from actors.bench.bench_factory import MakeDevice, OpenBench, needs_person, open_bench
-from actors.bench.device_emulators import BenchEmulators
+from actors.bench.virtual_bench import BenchEmulators
 from actors.interfaces import (
     Bench,
     BenchLostError,
@@ -28,16 +28,14 @@ from actors.interfaces import (
 )
 from actors.laboratory_settings import LaboratorySpec, simulator_count
 from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
-from actors.runtime.ray_runtime import watch_ray
+from actors.runtime.ray_cluster import JoinedCluster, check_cluster, versions
+from actors.runtime.ray_runtime import forget_ray_logs, open_ray, ray_lost, stop_ray, watch_ray
 from actors.runtime.remote_object import Device, LocalDevice, RayDevice
-from actors.simulators.local_worker import InProcessSimulatorPool
-from actors.simulators.pool import RaySimulatorPool
-from actors.simulators.process_worker import ProcessSimulatorPool
-from actors.simulators.simulation_task import Simulator, pour_simulator
+from actors.simulators.job_runner import Simulator, give_back, pour_simulator
+from actors.simulators.local_worker import process_pool, thread_pool
+from actors.simulators.pool import PoolShare, WorkerPool
+from actors.simulators.ray_worker import ray_pool
 from sim_engine.resources import EXTRAS, PACKAGES, installed
-
-if TYPE_CHECKING:
-    from actors.runtime.ray_cluster import JoinedCluster
 
 
 def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = False) -> None:
@@ -64,8 +62,6 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = Fa
             "'decant[lab]', or run with --in-process, one simulation after the other"
         )
     if spec.ray is not None and not spec.in_process:
-        from actors.runtime.cluster_check import check_cluster
-
         check_cluster(spec.ray, need_bench=need_bench)
 
 
@@ -75,9 +71,9 @@ def check_bench_packages(spec: LaboratorySpec) -> None:
     Raises:
         LaboratoryError: some are not; the text names them and their extra.
     """
-    if spec.arm is None or (spec.arm.stand_in == "" and spec.arm.missing() is None and spec.balance is None):
+    if spec.arm is None or (spec.arm.emulator == "" and spec.arm.missing() is None and spec.balance is None):
         return
-    needed = ["psutil"] if spec.mode == "virtual" and spec.arm.stand_in else []
+    needed = ["psutil"] if spec.mode == "virtual" and spec.arm.emulator else []
     if spec.balance is not None and isinstance(spec.balance.device, SerialBalanceSpec):
         needed.append("serial")
     missing = [module for module in needed if not installed(module)]
@@ -101,16 +97,16 @@ def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
         yield spec
         return
     assert spec.arm is not None
-    stand_ins = BenchEmulators(spec.arm, None if spec.balance is None else spec.balance.device)
+    emulators = BenchEmulators(spec.arm, None if spec.balance is None else spec.balance.device)
     try:
-        where = stand_ins.found()
-        stand_ins.install()
+        where = emulators.found()
+        emulators.install()
         balance = spec.balance
         if balance is not None:
             balance = replace(balance, device=where.balance)
         yield replace(spec, arm=where.arm, balance=balance)
     finally:
-        stand_ins.close()
+        emulators.close()
 
 
 def _without_ray(spec: LaboratorySpec, *, need_bench: bool, brief: bool) -> bool:
@@ -124,7 +120,7 @@ def open_laboratory(
     brief: bool = False,
     make: Callable[[], Simulator] = pour_simulator,
     operator: Operator | None = None,
-    kept: ClosablePool | None = None,
+    kept: SimulatorPool | None = None,
     optimizer: Optimizer | None = None,
 ) -> Laboratory:
     """Create a laboratory, to be entered with `async with`; nothing starts before that.
@@ -136,8 +132,8 @@ def open_laboratory(
             private Ray. Ignored if a bench is needed or a cluster is named.
         make: creates simulators in their processes.
         operator: answers questions, if a person does.
-        kept: simulators to use instead of its own (`actors.simulators.shared_pool`); they stay open. Not on a
-        cluster, whose nodes change.
+        kept: simulators to use instead of its own (`WarmSimulators.share`); they stay open. Not on a
+            cluster, whose nodes change.
         optimizer: an optimiser to use instead of its own; it is stateless.
 
     Raises:
@@ -161,14 +157,6 @@ def open_laboratory(
     return kind(spec, make, need_bench=need_bench, operator=operator, kept=kept, optimizer=optimizer)
 
 
-class ClosablePool(SimulatorPool, Protocol):
-    """A pool that can be closed."""
-
-    async def close(self) -> None:
-        """End its simulators."""
-        ...
-
-
 class _OpenLaboratory:
     """Common part of both kinds of laboratory.
 
@@ -187,18 +175,15 @@ class _OpenLaboratory:
         *,
         need_bench: bool = False,
         operator: Operator | None = None,
-        kept: ClosablePool | None = None,
+        kept: SimulatorPool | None = None,
         optimizer: Optimizer | None = None,
     ) -> None:
-        self._spec, self._make, self._operator, self._kept = spec, make, operator, kept
-        self._kept_optimizer = optimizer
+        self._spec, self._make, self._operator = spec, make, operator
+        self._pool, self._optimizer = kept, optimizer
         self._needs_bench = need_bench and spec.pours
-        self._pool: ClosablePool | None = None
-        self._apart: ClosablePool | None = None
+        self._own_pools: list[WorkerPool] = []
         self._devices: list[Device] = []
         self._opened: OpenBench | None = None
-        self._optimizer: Optimizer | None = None
-        self._bench: Bench | None = None
         self._bench_problem: str | None = None
         self._notices: list[Notice] = []
         self._subscriber: Callable[[Notice], None] = self._notices.append
@@ -228,7 +213,7 @@ class _OpenLaboratory:
         """
         if self._bench_problem is not None:
             raise BenchLostError(self._bench_problem)
-        return self._bench
+        return None if self._opened is None else self._opened.bench
 
     @property
     def optimizer(self) -> Optimizer:
@@ -253,25 +238,27 @@ class _OpenLaboratory:
         """The parts of the open bench; None if there is no bench."""
         return self._opened
 
-    def _own_optimizer(self, proposer: Device) -> Optimizer:
+    def _open_pool(self, pool: WorkerPool) -> WorkerPool:
+        self._own_pools.append(pool)
+        pool.open()
+        return pool
+
+    def _open_optimizer(self, proposer: Device) -> Optimizer:
         self._devices.append(proposer)
         return DeviceOptimizer(proposer)
 
     async def _open_bench(self, make: MakeDevice, liquid: SimulatorPool | None) -> None:
         self._opened = await open_bench(self._spec, make, liquid, self._operator, self._report)
         self._devices += self._opened.devices
-        self._bench = self._opened.bench
 
     async def _close_all(self) -> None:
         opened, self._opened = self._opened, None
         if opened is not None:
             await opened.close()
-        pools = [pool for pool in (self._pool, self._apart) if pool is not None and pool is not self._kept]
-        await asyncio.gather(
-            *(pool.close() for pool in pools), *(device.close() for device in self._devices), return_exceptions=True
-        )
-        self._pool = self._apart = self._optimizer = self._bench = None
-        self._devices = []
+        open_now: list[WorkerPool | Device] = [*self._own_pools, *self._devices]
+        await asyncio.gather(*(each.close() for each in open_now), return_exceptions=True)
+        self._pool = self._optimizer = None
+        self._own_pools, self._devices = [], []
 
 
 def _local(name: str, cls: type[Any], *args: Any) -> Device:
@@ -292,11 +279,11 @@ class InProcessLaboratory(_OpenLaboratory):
         self._processes = processes
 
     async def __aenter__(self) -> InProcessLaboratory:
-        if self._kept is None and self._processes:
-            self._pool = ProcessSimulatorPool(self._processes, make=self._make)
-        else:
-            self._pool = self._kept or InProcessSimulatorPool(make=self._make)
-        self._optimizer = self._kept_optimizer or self._own_optimizer(LocalDevice("optimiser", Proposer))
+        if self._pool is None:
+            processes = self._processes
+            self._pool = self._open_pool(process_pool(processes, self._make) if processes else thread_pool(self._make))
+        if self._optimizer is None:
+            self._optimizer = self._open_optimizer(LocalDevice("optimiser", Proposer))
         try:
             if self._needs_bench:
                 await self._open_bench(_local, self._pool)
@@ -316,26 +303,13 @@ class RayLaboratory(_OpenLaboratory):
     """
 
     _cluster: JoinedCluster | None = None
-    _liquid: RaySimulatorPool | None = None
+    _liquid: WorkerPool | None = None
     _monitoring: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> RayLaboratory:
-        from actors.runtime.ray_runtime import keep_signals, start_ray
-
-        starting = asyncio.ensure_future(asyncio.to_thread(start_ray, self._spec))
-        try:
-            await asyncio.shield(starting)
-        except asyncio.CancelledError:
-            # The start cannot be interrupted, and must not continue after its caller has ended.
-            await asyncio.wait({starting})
-            if starting.exception() is None:
-                await self._stop_ray()
-            raise
-        keep_signals()
+        await open_ray(self._spec)
         try:
             if self._spec.ray is not None:
-                from actors.runtime.ray_cluster import JoinedCluster
-
                 self._cluster = JoinedCluster(self._spec.ray, self._report, self._lose_bench, self._lose_all)
                 await self._cluster.open(need_bench=self._needs_bench)
             else:
@@ -348,29 +322,29 @@ class RayLaboratory(_OpenLaboratory):
 
     async def _open_all(self) -> None:
         here = None if self._cluster is None else self._cluster.here
-        self._pool = self._kept or self._open_pool()
-        self._optimizer = self._kept_optimizer or self._own_optimizer(
-            RayDevice("optimiser", Proposer, node=here, looked_after=True)
-        )
+        self._pool = self._pool or self._open_pool(self._ray_pool())
+        if self._optimizer is None:
+            optimizer = RayDevice("optimiser", Proposer, node=here, looked_after=True)
+            self._optimizer = self._open_optimizer(optimizer)
         if not self._needs_bench:
             return
         node = None if self._cluster is None else self._cluster.bench
         if self._spec.bench is not None:
-            self._apart = self._liquid = self._open_liquid()
-
+            # The hidden liquid's simulator, on the arm's machine. It reserves no core: the pool's size is the
+            # campaign's choice, and a pour must never wait for it.
+            placement = None if node is None else node.options
+            self._liquid = self._open_pool(ray_pool(1, self._make, cpus=0.0, placement=placement))
         await self._open_bench(partial(RayDevice, node=node), self._liquid)
 
-    def _open_pool(self) -> RaySimulatorPool:
-        from actors.runtime.cluster_nodes import versions
-
+    def _ray_pool(self) -> WorkerPool:
         def tell(text: str) -> None:
             self._report(Notice("warning", text))
 
         if self._cluster is None:
-            return RaySimulatorPool(simulator_count(self._spec), make=self._make, tell=tell)
-        pool = RaySimulatorPool(
+            return ray_pool(simulator_count(self._spec), self._make, tell=tell)
+        pool = ray_pool(
             self._spec.simulators or self._cluster.cpus,
-            make=self._make,
+            self._make,
             placement={"scheduling_strategy": "SPREAD"},
             expected=versions(),
             tell=tell,
@@ -378,13 +352,6 @@ class RayLaboratory(_OpenLaboratory):
         if not self._spec.simulators:
             self._cluster.grown = pool.grow
         return pool
-
-    def _open_liquid(self) -> RaySimulatorPool:
-        """The hidden liquid's simulator, on the arm's machine.
-
-        It reserves no core: the pool's size is the campaign's choice, and a pour must never wait for it."""
-        node = None if self._cluster is None else self._cluster.bench
-        return RaySimulatorPool(1, make=self._make, cpus=0.0, placement=None if node is None else node.options)
 
     def _lose_bench(self, reason: str) -> None:
         """Handle the loss of the bench's machine.
@@ -398,8 +365,9 @@ class RayLaboratory(_OpenLaboratory):
     def _lose_all(self, reason: str) -> None:
         """Handle the loss of Ray on this machine, which ends all of its actors."""
         self._lose_bench(reason)
-        if isinstance(self._pool, RaySimulatorPool):
-            self._pool.abandon(LaboratoryError(reason))
+        for pool in self._own_pools:
+            if pool is not self._liquid:
+                pool.abandon(LaboratoryError(reason))
         for device in self._devices:
             if isinstance(device, RayDevice):
                 device.abandon(reason)
@@ -416,9 +384,97 @@ class RayLaboratory(_OpenLaboratory):
             if self._cluster is not None:
                 await self._cluster.close()
         finally:  # also if closing was interrupted, since Ray counts its users
-            await self._stop_ray()
+            await asyncio.to_thread(stop_ray)
 
-    async def _stop_ray(self) -> None:
-        from actors.runtime.ray_runtime import stop_ray
 
-        await asyncio.to_thread(stop_ray)
+class WarmSimulators:
+    """Simulators and an optimiser that are opened once and shared fairly by all laboratories of this process.
+
+    Processes and compiled kernels are ready before they are needed.
+
+    Args:
+        simulators: size of the pool; 0: one per core.
+        in_process: one simulator in this process, without Ray.
+        make: creates simulators in their processes.
+        tell: called with a message about losses.
+    """
+
+    def __init__(
+        self,
+        simulators: int = 0,
+        *,
+        in_process: bool = False,
+        make: Callable[[], Simulator] = pour_simulator,
+        tell: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self._spec = LaboratorySpec("shared", simulators=simulators, in_process=in_process)
+        self._make, self._report = make, tell
+        self._laboratory: Laboratory | None = None
+        self._opening = asyncio.Lock()
+
+    @property
+    def ready(self) -> bool:
+        """Whether the pool is open."""
+        return self._laboratory is not None
+
+    @property
+    def size(self) -> int:
+        """Number of simulators; 0 before the pool is open."""
+        return 0 if self._laboratory is None else self._laboratory.simulators.size
+
+    async def open(self) -> None:
+        """Start the simulators, unless they are already started.
+
+        Raises:
+            LaboratoryError: Ray does not start.
+        """
+        async with self._opening:
+            if self._laboratory is None:
+                kind = InProcessLaboratory if self._spec.in_process else RayLaboratory
+                laboratory = kind(self._spec, self._make)
+                laboratory.listen(self._hear)
+                self._laboratory = await laboratory.__aenter__()
+
+    def _hear(self, notice: Notice) -> None:
+        if notice.level == "warning":
+            self._report(notice.text)
+
+    def share(self) -> PoolShare:
+        """Return a share for one laboratory, for as long as the laboratory is open.
+
+        Raises:
+            LaboratoryError: the pool is not open.
+        """
+        if self._laboratory is None:
+            raise LaboratoryError("the simulators are not up yet")
+        pool = self._laboratory.simulators
+        assert isinstance(pool, WorkerPool)
+        return pool.share()
+
+    def optimizer(self) -> Optimizer:
+        """Return the shared optimiser, which stays open, too. It handles one request after another.
+
+        Raises:
+            LaboratoryError: the pool is not open.
+        """
+        if self._laboratory is None:
+            raise LaboratoryError("the optimiser is not up yet")
+        return self._laboratory.optimizer
+
+    @property
+    def lost(self) -> str:
+        """The lost part of Ray, which makes the simulators unusable; empty while nothing is lost."""
+        return "" if self._laboratory is None or self._spec.in_process else ray_lost()
+
+    async def tidy(self) -> None:
+        """Release logs and memory left by laboratories that are closed."""
+        await asyncio.to_thread(give_back)
+        if self._laboratory is not None and not self._spec.in_process:
+            await asyncio.to_thread(forget_ray_logs)
+
+    async def close(self) -> None:
+        """End the simulators. May be called twice."""
+        async with self._opening:
+            laboratory, self._laboratory = self._laboratory, None
+            if laboratory is not None:
+                await laboratory.__aexit__()

@@ -50,6 +50,7 @@ from orchestrator.runs.stages import (
     scenes_of,
     stage_seed,
 )
+from orchestrator.strategies.calibration.action_prior import Contexts
 from orchestrator.strategies.calibration.calibration_scores import (
     DRAWS,
     Evaluation,
@@ -57,7 +58,6 @@ from orchestrator.strategies.calibration.calibration_scores import (
     mean_predictor_discrepancy,
     regression_discrepancy,
 )
-from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, MeasuredPour, RecordedPour
 from orchestrator.strategies.strategy import Strategy
 from sim_engine.errors import InvalidSceneError
@@ -159,7 +159,7 @@ class Answers:
         from actors.optimizer.suggest import propose
 
         if isinstance(request, Suggest):
-            return Suggested(propose(request.problem))
+            return Suggested(propose(request.query))
         assert isinstance(request, Simulate)
         task = PourTask(self._scenes[request.scene], request.action, request.parameters, request.seed)
         try:

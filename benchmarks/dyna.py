@@ -36,7 +36,7 @@ from skipping_clock import SkippingLoop, run
 
 from actors.interfaces import ProgressCallback
 from actors.laboratory_settings import LaboratorySpec
-from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
 from orchestrator.results.pool_occupancy import RESTS, Occupancy
 from orchestrator.runs.events import DecisionMade, Event
@@ -137,10 +137,10 @@ class Bench:
         self.occupancy.pour_finished(self._clock.time())
         return PourMeasurement(scene.liquid.mass, scene.liquid.mass * min(max(cost + noise, 0.0), 1.0), 0.0)
 
-    async def suggest(self, problem: SuggestProblem) -> Suggestion:
+    async def suggest(self, query: SuggestionQuery) -> Suggestion:
         """The real optimiser; in a laboratory it is a process of its own."""
         begun = time.thread_time()
-        suggestion = propose(problem)
+        suggestion = propose(query)
         seconds = time.thread_time() - begun
         self.answers.append(seconds)
         await self._clock.spend(seconds, seconds)

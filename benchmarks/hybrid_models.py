@@ -20,7 +20,7 @@ import numpy as np
 from machine import describe, pin, say, show
 from optimiser_problems import BY_NAME, Floats, Instance
 
-from actors.optimizer.questions import Data, Point, SuggestProblem
+from actors.optimizer.questions import Data, MinimumQuery, Point, PourQuery, SpaceFillingQuery
 from actors.optimizer.suggest import propose
 from sim_engine.search_space import Axis, Space
 
@@ -49,18 +49,18 @@ def simulations(name: str, world: Instance, count: int) -> Data:
         cost = WORLDS[name](world, np.array(point), sign) + SCATTER * float(rng.standard_normal())
         return data.added(point, cost)
 
-    start = SuggestProblem(SPACE, data, acquisition="sobol", count=5, seed=world.seed)
+    start = SpaceFillingQuery(SPACE, data.points, count=5, seed=world.seed)
     for point in propose(start).points:
         data = simulate(point)
     while len(data) < count:
-        data = simulate(propose(SuggestProblem(SPACE, data, seed=100 * world.seed + len(data))).points[0])
+        data = simulate(propose(MinimumQuery(SPACE, data, seed=100 * world.seed + len(data))).points[0])
     return data
 
 
 def campaign(model: str, world: Instance, simulated: Data, pours: int) -> dict[str, float]:
     """The pours, and what they come to without noise."""
     informed = model != "constant"
-    question = SuggestProblem(SPACE, Data(), mean=model, simulated=simulated if informed else Data())  # type: ignore[arg-type]
+    query = PourQuery(SPACE, Data(), simulated=simulated) if informed else MinimumQuery(SPACE, Data())
     visited = []
     data = Data()
     for number in range(pours):
@@ -68,20 +68,20 @@ def campaign(model: str, world: Instance, simulated: Data, pours: int) -> dict[s
             point: Point = tuple(map(float, world.initial[number]))
         else:
             acquisition: Any = "lcb" if number or not informed else "posterior_minimum"
-            asked = replace(question, data=data, seed=1000 * world.seed + number, acquisition=acquisition)
+            asked = replace(query, data=data, seed=1000 * world.seed + number, acquisition=acquisition)
             point = propose(asked).points[0]
         visited.append(world.true(np.array(point)))
         data = data.added(point, world.observe(np.array(point), number))
-    best = propose(replace(question, data=data, count=0)).best_point
+    best = propose(replace(query, data=data, count=0)).best_point
     return {"reported": world.true(np.array(best)), "third": min(visited[:3]), "mean": float(np.mean(visited))}
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    models = ["simulated", "scaled", "constant"]
+    models = ["residual", "constant"]
     parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=list(WORLDS))
-    parser.add_argument("--models", nargs="+", choices=models, default=models[:2])
+    parser.add_argument("--models", nargs="+", choices=models, default=models)
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--simulations", type=int, default=37)
     parser.add_argument("--pours", type=int, default=15)

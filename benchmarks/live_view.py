@@ -32,7 +32,7 @@ import numpy as np
 import psutil
 
 from actors.interfaces import PourProgress
-from actors.optimizer.questions import Data, SuggestProblem
+from actors.optimizer.questions import Data, MinimumQuery
 from actors.optimizer.suggest import propose
 from actors.runtime.child_process import child_environment
 from orchestrator.config.file_loading import load_campaign
@@ -301,7 +301,7 @@ def _events(plan: CampaignPlan) -> Callable[[int], list[Event]]:
 
     space = plan.deployment.actions
     weighed = Data(tuple(map(tuple, rng.random((12, space.dimension)))), tuple(rng.random(12)))
-    question = Suggest(SuggestProblem(space, weighed, map_resolution=25))
+    question = Suggest(MinimumQuery(space, weighed, map_resolution=25))
     answer = propose(question.problem)
 
     def at(tick: int) -> list[Event]:

@@ -33,7 +33,8 @@ from machine import describe, pin, say, show, single_threaded
 from optimiser_problems import BY_NAME, PROBLEMS, Instance
 from optimiser_rivals import RIVALS, luckiest, play
 
-from actors.optimizer.questions import Data, MeanName, NoiseName, SuggestProblem
+from actors.optimizer.feasible_region import Region
+from actors.optimizer.questions import Data, MeanName, MinimumQuery, NoiseName, SpaceFillingQuery, SuggestionQuery
 from actors.optimizer.suggest import propose
 from actors.runtime.child_process import child_environment
 from sim_engine.resources import cache_directory
@@ -101,19 +102,22 @@ def ours(name: str, world: Instance) -> dict[str, Any]:
         for i, c in enumerate(world.problem.coordinates)
     ]
     space = Space(tuple(axes))
-    blind = {"random search": "random", "Sobol": "sobol"}.get(name)
 
-    def problem(points: list[Any], costs: list[float], **changes: Any) -> SuggestProblem:
-        data = Data(tuple(tuple(map(float, point)) for point in points), tuple(costs))
-        return SuggestProblem(space, data, seed=1000 * world.seed + len(points), **changes)
+    def query(points: list[Any], costs: list[float]) -> SuggestionQuery:
+        seed, tried = 1000 * world.seed + len(points), tuple(tuple(map(float, point)) for point in points)
+        if name == "Sobol":
+            return SpaceFillingQuery(space, tried, seed=seed)
+        return MinimumQuery(space, Data(tried, tuple(costs)), seed=seed)
 
     def ask(points: list[Any], costs: list[float]) -> Any:
-        return np.array(propose(problem(points, costs, acquisition=blind or "lcb")).points[0])
+        if name == "random search":
+            return Region(space, ()).draw(1, np.random.default_rng(1000 * world.seed + len(points)), even=False)[0]
+        return np.array(propose(query(points, costs)).points[0])
 
     def report(points: list[Any], costs: list[float]) -> Any:
-        if blind:
+        if name in ("random search", "Sobol"):
             return luckiest(points, costs)
-        return np.array(propose(problem(points, costs, count=0)).best_point)
+        return np.array(propose(query(points, costs)).best_point)
 
     return play(world, ask, report)
 
@@ -217,7 +221,7 @@ def speed() -> list[dict[str, Any]]:
             ("scaled", "constant"),
         )
         for mean, noise in models:
-            question = SuggestProblem(space, everything, noise=noise)
+            question = MinimumQuery(space, everything, noise=noise)
             if mean != "constant":
                 question = replace(question, data=pours, simulated=simulations, mean=mean)
             fit = min(propose(replace(question, count=0)).seconds for _ in range(5))

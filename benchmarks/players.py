@@ -50,7 +50,7 @@ def play(strategy: Strategy, answer: Callable[[Request], Outcome], *, pours_last
         if pours_last:
             waiting.sort(key=lambda one: isinstance(one, Pour))
         request = waiting.pop(0)
-        outcome = Suggested(propose(request.problem)) if isinstance(request, Suggest) else answer(request)
+        outcome = Suggested(propose(request.query)) if isinstance(request, Suggest) else answer(request)
         strategy.tell(request, outcome)
 
 

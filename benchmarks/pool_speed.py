@@ -30,7 +30,7 @@ from standard_pour import check_particles, short_task, standard_task
 
 from actors.laboratory import RayLaboratory
 from actors.laboratory_settings import LaboratorySpec
-from actors.simulators.pool import RaySimulatorPool
+from actors.simulators.pool import WorkerPool
 from sim_engine.outcome import PourOutcome, SimulatedPour
 from sim_engine.scene import PourTask
 
@@ -126,7 +126,7 @@ def plain_worker() -> None:
     simulator.close()
 
 
-async def pour_in_pool(pool: RaySimulatorPool, particles: int, pours: int) -> Block:
+async def pour_in_pool(pool: WorkerPool, particles: int, pours: int) -> Block:
     """Make so many pours, all queued at once."""
     workers, others = await _processes(pool)
     before = [_cpu(workers), _cpu(others) + time.process_time()]
@@ -144,7 +144,7 @@ async def pour_in_pool(pool: RaySimulatorPool, particles: int, pours: int) -> Bl
     return Block(wall, after[0] - before[0], after[1] - before[1], 1.0 - idle / stretch, idle / full)
 
 
-async def _processes(pool: RaySimulatorPool) -> tuple[list[psutil.Process], list[psutil.Process]]:
+async def _processes(pool: WorkerPool) -> tuple[list[psutil.Process], list[psutil.Process]]:
     """The pool's members, and what else Ray runs."""
     members = [psutil.Process(pid) for pid in await pool.pids()]
     others = []
@@ -169,7 +169,7 @@ async def throughput(options: argparse.Namespace) -> dict[str, Any]:
     plain = Plain(options.workers)
     spec = LaboratorySpec("benchmark", simulators=options.workers)
     async with RayLaboratory(spec) as laboratory:
-        pool = cast(RaySimulatorPool, laboratory.simulators)
+        pool = cast(WorkerPool, laboratory.simulators)
         await pour_in_pool(pool, TINY, 2 * options.workers)
         rounds: list[tuple[Block, Block]] = []
         for number in range(options.rounds):
@@ -213,7 +213,7 @@ async def nothing(options: argparse.Namespace) -> dict[str, Any]:
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
     spec = LaboratorySpec("benchmark", simulators=options.workers)
     async with RayLaboratory(spec, make=Nothing) as laboratory:
-        pool = cast(RaySimulatorPool, laboratory.simulators)
+        pool = cast(WorkerPool, laboratory.simulators)
         await pour_in_pool(pool, TINY, 10 * options.workers)
         many = await pour_in_pool(pool, TINY, 1000)
         latencies = []
@@ -238,7 +238,7 @@ async def first_answer(particles: int, begun: float) -> dict[str, float]:
     marks = {"program": time.monotonic()}
     async with RayLaboratory(LaboratorySpec("benchmark", simulators=1)) as laboratory:
         marks["ray"] = time.monotonic()
-        pool = cast(RaySimulatorPool, laboratory.simulators)
+        pool = cast(WorkerPool, laboratory.simulators)
         await pool.pids()
         marks["process"] = time.monotonic()
         await pool.simulate(standard_task(particles, 1))

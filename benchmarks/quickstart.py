@@ -26,6 +26,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -34,8 +35,9 @@ from machine import ROOT, run_self, say
 from players import interval
 
 from actors.optimizer.questions import ModelDiscrepancy
-from actors.simulators.local_worker import InProcessSimulatorPool
-from actors.simulators.simulation_task import Simulator, pour_simulator
+from actors.simulators.job_runner import Simulator, pour_simulator
+from actors.simulators.local_worker import ThreadWorker
+from actors.simulators.pool import WorkerPool
 from orchestrator.journal.codec import digest, from_json, to_json
 from orchestrator.strategies.deployment import d3
 from sim_engine.outcome import PourOutcome, SimulatedPour
@@ -48,10 +50,10 @@ CAMPAIGN = ROOT / "configs" / "campaigns" / "quickstart.yaml"
 
 
 def _with_lookahead() -> None:
-    def mismatch(*args: Any, **changes: Any) -> ModelDiscrepancy:
-        return ModelDiscrepancy(*args, **{**changes, "looks_ahead": True})
+    def discrepancy(*args: Any, **changes: Any) -> ModelDiscrepancy:
+        return ModelDiscrepancy(*args, **{**changes, "lookahead": True})
 
-    vars(d3).update(Mismatch=mismatch)
+    vars(d3).update(ModelDiscrepancy=discrepancy)
 
 
 ARMS: dict[str, Callable[[], None]] = {
@@ -60,11 +62,11 @@ ARMS: dict[str, Callable[[], None]] = {
 }
 
 
-class KeptPours(InProcessSimulatorPool):
+class KeptPours(WorkerPool):
     """A pool that answers from a file what it has simulated before; the file's name tells the solver."""
 
     def __init__(self, file: Path, *, make: Callable[[], Simulator] = pour_simulator) -> None:
-        super().__init__(make=make)
+        super().__init__(1, partial(ThreadWorker, make), separate=False)
         self._file, self._known = file, dict[str, Any]()
         self.simulated = 0
         if file.exists():

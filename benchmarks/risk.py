@@ -59,7 +59,7 @@ class Bench:
     def answer(self, request: Request) -> Outcome:
         """What comes of a question or a simulation."""
         if isinstance(request, Suggest):
-            suggestion = propose(request.problem)
+            suggestion = propose(request.query)
             self.seconds += suggestion.seconds
             return Suggested(suggestion)
         assert isinstance(request, Simulate)

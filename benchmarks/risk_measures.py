@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 from scipy.stats import qmc
 
-from actors.optimizer.questions import Data, SuggestProblem
+from actors.optimizer.questions import Data, MinimumQuery, RegressionQuery, RiskQuery
 from actors.optimizer.risk_measures import conditional_value_at_risk, tail_weights
 from actors.optimizer.suggest import propose
 from orchestrator.requests import Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
@@ -83,8 +83,11 @@ class RawMeasure(RobustPlanning):
             data = data.added(trial.point, conditional_value_at_risk(losses, self._risk.tail))
         return data
 
-    def _model(self, *, everything: bool = False, **changes: Any) -> SuggestProblem:
-        return OneShotPlanning._model(self, everything=everything, **changes)
+    def _search(self, *, everything: bool = False, **parts: Any) -> MinimumQuery | RiskQuery:
+        return OneShotPlanning._search(self, everything=everything, **parts)
+
+    def _regression(self, **parts: Any) -> RegressionQuery | RiskQuery:
+        return OneShotPlanning._regression(self, **parts)
 
 
 WAYS: dict[str, tuple[type[OneShotPlanning], int]] = {
@@ -99,7 +102,7 @@ WAYS: dict[str, tuple[type[OneShotPlanning], int]] = {
 def answer(request: Request, toy: Callable[..., Floats]) -> Outcome:
     """What comes of a request; simulations scatter by 1 % of the load and 5 % of the loss."""
     if isinstance(request, Suggest):
-        return Suggested(propose(request.problem))
+        return Suggested(propose(request.query))
     assert isinstance(request, Simulate)
     error, rng = request.pose_error or PoseError(), np.random.default_rng(request.seed)
     executed = {

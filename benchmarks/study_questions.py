@@ -18,10 +18,20 @@ from machine import ROOT
 
 from orchestrator.cli.study_command import read_study
 from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED
-from orchestrator.study.report.cell_results import LEVEL, RANDOM, Gathered, Key, gather, mean, running_least
-from orchestrator.study.report.statistics import Estimate, estimate, tests_of
 from orchestrator.study.study_folder import finished_results
 from orchestrator.study.study_plan import cells_of
+from orchestrator.study.study_statistics import (
+    LEVEL,
+    RANDOM,
+    Estimate,
+    Gathered,
+    Key,
+    estimate,
+    gather,
+    mean,
+    running_least,
+    tests_of,
+)
 
 PAGE = ROOT / "docs" / "results.md"
 BEGIN, END = "<!-- measured: hidden benches -->\n", "<!-- end of measured -->"

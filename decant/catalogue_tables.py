@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Unpack
 
-from orchestrator.catalogue import queries as search
-from orchestrator.catalogue.catalogue_index import TABLES, Catalogue
-from orchestrator.catalogue.query_conditions import Conditions, PourConditions
+from orchestrator.catalogue.catalogue import Catalogue
+from orchestrator.catalogue.queries import Conditions, PourConditions
+from orchestrator.catalogue.run_reading import TABLES
 from orchestrator.journal.run_record import Row
 from sim_engine.resources import require
 
@@ -31,7 +30,8 @@ def find_runs(*words: str, **conditions: Unpack[Conditions]) -> pd.DataFrame:
         ValueError: a date or the mode is invalid.
         RunError: the catalogue cannot be read.
     """
-    return _table("run", search.find_runs, search.searching(words=words, **conditions))
+    with _catalogue() as catalogue:
+        return _table("run", catalogue.runs({**conditions, "words": words}))
 
 
 def find_pours(*words: str, **conditions: Unpack[PourConditions]) -> pd.DataFrame:
@@ -47,20 +47,20 @@ def find_pours(*words: str, **conditions: Unpack[PourConditions]) -> pd.DataFram
     Raises:
         ValueError, RunError: see `find_runs`.
     """
-    run = conditions.pop("run", None)
-    asked = search.searching(words=words, run=None if run is None else str(run), **conditions)
-    return _table("pour", search.find_pours, asked)
+    with _catalogue() as catalogue:
+        return _table("pour", catalogue.pours({**conditions, "words": words}))
 
 
-def _table(
-    name: str, find: Callable[[Catalogue, search.CatalogueQuery], list[Row]], asked: search.CatalogueQuery
-) -> pd.DataFrame:
+def _catalogue() -> Catalogue:
     require("pandas", "A table")
+    catalogue = Catalogue()
+    catalogue.refresh()
+    return catalogue
+
+
+def _table(name: str, rows: list[Row]) -> pd.DataFrame:
     import pandas as pd
 
-    with Catalogue() as catalogue:
-        catalogue.refresh()
-        rows = find(catalogue, asked)
     table = pd.DataFrame(rows, columns=[column.name for column in TABLES[name]])
     for column in TABLES[name]:
         if column.type == "time":

@@ -16,7 +16,7 @@ from typing import Any
 from PIL import Image
 
 from orchestrator.results.html_report import REPORT_NAME
-from orchestrator.study.report.study_page import PAGE, REPORT
+from orchestrator.study.study_page import PAGE, REPORT
 
 DOCS = Path(__file__).parent
 

@@ -18,7 +18,7 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from orchestrator.catalogue.catalogue_index import TABLES as CATALOGUE
+from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.cli.physics_command import kept_records
 from orchestrator.config import arm_file as arm_sections
 from orchestrator.config import arm_file as cell
@@ -88,9 +88,9 @@ SECTIONS: dict[str, type[Settings]] = {
     "balance": laboratory.BalanceSection,
     "pose-error": pose.PoseErrorSection,
     "study": study.StudyFile,
-    "level": study.LevelSection,
-    "compared-calibrations": study.CalibrationsSection,
-    "compared-deployments": study.DeploymentsSection,
+    "level": study.LevelSettings,
+    "compared-calibrations": study.CalibrationsSettings,
+    "compared-deployments": study.DeploymentsSettings,
     "daemon": daemon.DaemonFile,
     "listen": daemon.ListenSection,
     "tls": daemon.TlsSection,
@@ -136,12 +136,12 @@ OF_SECTIONS = {
     "VesselFile": "[vessel](#vessels) or the path of its file",
     "LaboratoryFile": "[laboratory](#laboratories) or the path of its file",
     "LiquidSettings": "[liquid](#liquid) or the path of its file",
-    "LevelSection": "[level](#studies)",
+    "LevelSettings": "[level](#studies)",
     **{
         model.__name__: f"`{{{', '.join(model.written_keys())}}}`, [each](#studies) a mapping"
-        for model in (study.CalibrationsSection, study.DeploymentsSection)
+        for model in (study.CalibrationsSettings, study.DeploymentsSettings)
     },
-    **{f"{name}ArmSection": "[mapping](#studies)" for name in STRATEGIES.names},
+    **{f"{name}ArmSettings": "[mapping](#studies)" for name in STRATEGIES.names},
     **{model.__name__: "[calibration](#calibration)" for model in campaign.CALIBRATIONS.values()},
     **{model.__name__: "[deployment](#deployment)" for model in campaign.DEPLOYMENTS.values()},
 }
@@ -341,8 +341,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "calibration-strategies": partial(variants, campaign.CALIBRATIONS, campaign.CalibrationSection),
     "deployment-strategies": partial(variants, campaign.DEPLOYMENTS, campaign.DeploymentSection),
     "objectives": partial(variants, OBJECTIVES.all, Objective),
-    "compared-calibration": partial(variants, _arms(study.CalibrationsSection), Settings),
-    "compared-deployment": partial(variants, _arms(study.DeploymentsSection), Settings),
+    "compared-calibration": partial(variants, _arms(study.CalibrationsSettings), Settings),
+    "compared-deployment": partial(variants, _arms(study.DeploymentsSettings), Settings),
 }
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import Literal
 
-from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.questions import Suggestion, SuggestionQuery
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
@@ -96,7 +96,7 @@ class Pour:
 class Suggest:
     """Query the optimiser actor for points. Its answer is recorded and replayed, never recomputed."""
 
-    problem: SuggestProblem
+    query: SuggestionQuery
     purpose: str = "suggest"
 
 

@@ -40,7 +40,7 @@ from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
 if TYPE_CHECKING:
-    from actors.laboratory import ClosablePool
+    from actors.interfaces import SimulatorPool
     from orchestrator.config.yaml.yaml_errors import Problem
     from orchestrator.live_view.rerun_subscriber import RerunMonitor
     from orchestrator.results.publishing import Published
@@ -113,7 +113,7 @@ class RunResources:
 
     in_process: bool = False
     brief: bool = False
-    simulators: ClosablePool | None = None
+    simulators: SimulatorPool | None = None
     optimizer: Optimizer | None = None
     operator: Operator | None = None
     ask_operator: AskOperator | None = None

@@ -164,7 +164,7 @@ class StrategyHarness:
 
     def _outcome(self, request: Request) -> Outcome:
         if isinstance(request, Suggest):
-            return Suggested(replace(propose(request.problem), seconds=0.0))
+            return Suggested(replace(propose(request.query), seconds=0.0))
         if isinstance(request, Ask):
             raise AssertionError(
                 f"the harness has no operator for {request!r}; answer it with StrategyHarness(answer=…)"

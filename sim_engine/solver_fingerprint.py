@@ -1,4 +1,8 @@
-"""Fingerprint of the solver's sources: results of the same sources belong together."""
+"""Digests of sources: results of the same sources belong together.
+
+- `solver_fingerprint` covers the solver's code, without comments and layout. Records of validation carry it.
+- `folder_digest` covers the files of a folder. A study's cells carry it, and nodes of a cluster compare it.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +25,16 @@ def solver_fingerprint(root: Path = ROOT) -> str:
     for name, tree in sorted(_modules(root).items()):
         digest.update(f"{name}\n{ast.dump(tree)}\n".encode())
     return digest.hexdigest()[:16]
+
+
+def folder_digest(folder: Path) -> str:
+    """Digest of a folder's Python sources, in 12 digits; any change of a file changes it."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*.py")):
+        if path.parent.name == "validation":
+            continue  # it evaluates outcomes but does not produce any
+        digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:12]
 
 
 def _modules(root: Path) -> dict[str, ast.Module]:

@@ -47,7 +47,7 @@ class Toy:
 
     def __call__(self, request: Request) -> Outcome:
         if isinstance(request, Suggest):
-            return Suggested(propose(request.problem))
+            return Suggested(propose(request.query))
         assert isinstance(request, Simulate)
         near = min(self._pours, key=lambda pour: _apart(pour.action, request.action))
         off = 0.5 * (request.parameters.wall_distance - 1.2)

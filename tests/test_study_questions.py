@@ -8,7 +8,7 @@ from types import ModuleType
 import pytest
 
 from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED
-from orchestrator.study.report.cell_results import LEVEL, RANDOM, Final, Found, Gathered, Key
+from orchestrator.study.study_statistics import LEVEL, RANDOM, Final, Found, Gathered, Key
 
 LEVELS, CUPS = ["bench1", "bench2"], ["cone"]
 

@@ -54,8 +54,7 @@ class LinkFigure:
 
     def ends(self, joints: FloatArray) -> FloatArray:
         """See `ArmFigure.ends`."""
-        from actors.arm.planning.frames import cell_transforms, flange_transforms
-        from actors.arm.planning.kinematics import MODELS, link_points
+        from actors.arm.planning.kinematics import MODELS, cell_transforms, flange_transforms, link_points
 
         cell, q = cell_transforms(self.spec), np.asarray(joints, dtype=float)
         points = cell.base.apply(link_points(q, MODELS[self.spec.model]))
@@ -68,7 +67,7 @@ class LinkFigure:
 
     def tool(self, joints: FloatArray) -> FloatArray:
         """See `ArmFigure.tool`."""
-        from actors.arm.planning.frames import cell_transforms, flange_transforms, quaternions
+        from actors.arm.planning.kinematics import cell_transforms, flange_transforms, quaternions
 
         cell = cell_transforms(self.spec)
         frames = cell.world.inverse @ flange_transforms(np.asarray(joints, dtype=float), self.spec) @ cell.tool
@@ -76,14 +75,14 @@ class LinkFigure:
 
     def pourer(self, joints: FloatArray) -> FloatArray:
         """See `ArmFigure.pourer`."""
-        from actors.arm.planning.frames import cell_transforms, pourer_transforms, quaternions
+        from actors.arm.planning.kinematics import cell_transforms, pourer_transforms, quaternions
 
         held = cell_transforms(self.spec).world.inverse @ pourer_transforms(np.asarray(joints, float), self.spec)
         return np.concatenate([held.position, quaternions(held.rotation)], axis=-1)
 
     def tool_of(self, poses: FloatArray) -> FloatArray:
         """See `ArmFigure.tool_of`."""
-        from actors.arm.planning.frames import Transforms, cell_transforms
+        from actors.arm.planning.kinematics import Transforms, cell_transforms
         from sim_engine.collision import rotations
 
         cell = cell_transforms(self.spec)

@@ -94,15 +94,15 @@ class ArmSpec(ABC):
 
     Attributes:
         kind: as registered in `decant.arms`, and as written in files.
-        stand_in: 'module:callable' that makes, from these settings, the emulator of the arm on a virtual bench. See
-            `actors.bench.device_emulators.ArmEmulator`; '' for a driver that only simulates.
+        emulator: 'module:callable' that makes, from these settings, the emulator of the arm on a virtual bench. See
+            `actors.bench.virtual_bench.ArmEmulator`; '' for a driver that only simulates.
         time_scale: bench seconds per second of the clock; 1 for hardware, 0 to skip all waits.
         announcement: from the operator's consent to the first movement [s].
         untilt_speed: angular velocity at which a stopped, tilted pourer is brought upright [rad/s].
     """
 
     kind: ClassVar[str]
-    stand_in: ClassVar[str] = ""
+    emulator: ClassVar[str] = ""
     time_scale: float
     announcement: float
     untilt_speed: float = math.radians(10.0)
@@ -227,7 +227,7 @@ class UrArmSpec(ArmSpec):
     time_scale: float = 1.0
 
     kind: ClassVar[str] = "ur"
-    stand_in: ClassVar[str] = "actors.emulators.ur_controller.arm_emulator:UrEmulator"
+    emulator: ClassVar[str] = "actors.emulators.ur_controller.arm_emulator:UrEmulator"
 
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
         """See `ArmSpec.driver`."""

@@ -15,8 +15,7 @@ from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from actors.balance.balance_interface import BalanceDriver
-from actors.balance.dialect_registry import dialects
-from actors.balance.dialects.dialect import Dialect, LineSettings
+from actors.balance.dialects.dialect import Dialect, LineSettings, dialects
 from actors.balance.simulated_balance import PATIENCE, BalanceSettings, ScaleSettings, VirtualBalance
 from actors.balance.weighing_plan import Placement
 from actors.interfaces import DeviceCheck, LaboratoryError
@@ -173,7 +172,7 @@ class BalanceDevice(ABC):
         """Upper limit of a call's duration [s of the clock]; deadlines around the driver should be a little longer."""
         return 120.0
 
-    def stand_in(self) -> BalanceEmulator | None:
+    def start_emulator(self) -> BalanceEmulator | None:
         """Start the emulator on a virtual bench; None if the device needs none."""
         return None
 
@@ -254,7 +253,7 @@ class SerialBalanceSpec(BalanceDevice):
 
     Attributes:
         port: device; under `/dev/serial/by-id/` it keeps its name when it is plugged in again.
-        dialect: one of `actors.balance.dialect_registry.dialects`, or 'auto'.
+        dialect: one of `actors.balance.dialects.dialect.dialects`, or 'auto'.
         baud: bits per second; None: detected.
         format: bits, parity and stop bits, as '8N1'; None: detected.
         handshake: how the balance may pause the line: by characters (Xon/Xoff), by wires (CTS), or not at all.
@@ -297,8 +296,8 @@ class SerialBalanceSpec(BalanceDevice):
         """See `BalanceDevice.driver`."""
         return resolve_name("actors.balance.serial_balance:SerialBalance"), (self, name)
 
-    def stand_in(self) -> BalanceEmulator | None:
-        """See `BalanceDevice.stand_in`."""
+    def start_emulator(self) -> BalanceEmulator | None:
+        """See `BalanceDevice.start_emulator`."""
         if self.virtual is None:
             return None
         emulator: BalanceEmulator = resolve_name(SERIAL_EMULATOR)(self, self.virtual)

@@ -19,13 +19,12 @@ from actors.arm.simulated_arm import NumbersSpec
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceDevice, BalanceSpec
 from actors.balance.weighing_plan import PourMasses
+from actors.bench.bench_operators import BenchContents, Hands, OperatorQuestions, PlayedOperator, VirtualOperator
 from actors.bench.consent import Setup
-from actors.bench.device_emulators import BenchEmulators, DeviceEmulators
-from actors.bench.operator_questions import OperatorQuestions
+from actors.bench.ground_truth import GroundTruth
 from actors.bench.pour_procedure import PourProcedure
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
-from actors.bench.virtual_bench import FollowedBench, GroundTruth, VirtualBench
-from actors.bench.virtual_operator import BenchContents, Hands, PlayedOperator, VirtualOperator
+from actors.bench.virtual_bench import BenchEmulators, DeviceEmulators, FollowedBench, VirtualBench
 from actors.interfaces import InvalidActionError, LaboratoryError, Notice, Operator, ProgressCallback, SimulatorPool
 from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
 from actors.runtime.remote_object import Device
@@ -43,7 +42,7 @@ class PouringBench:
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
-        self.arm, self.balance, self.nature = setup.arm, setup.balance, setup.nature
+        self.arm, self.balance, self.ground_truth = setup.arm, setup.balance, setup.ground_truth
         self._known: dict[str, dict[str, PourMasses]] = {}
         self._one_at_a_time = asyncio.Lock()
 
@@ -90,13 +89,13 @@ class OpenBench:
     Attributes:
         bench: runs pours.
         devices: the caller closes them after `close`.
-        stand_ins: the emulators of a virtual bench with device drivers; None otherwise.
+        emulators: the emulators of a virtual bench with device drivers; None otherwise.
         operator: answers the questions.
     """
 
     bench: PouringBench
     devices: list[Device]
-    stand_ins: DeviceEmulators | None = None
+    emulators: DeviceEmulators | None = None
     operator: Operator | None = None
 
     async def close(self) -> None:
@@ -106,9 +105,9 @@ class OpenBench:
         if self.bench.balance is not None:
             with contextlib.suppress(LaboratoryError):
                 await self.bench.balance.release()
-        if self.stand_ins is not None:
+        if self.emulators is not None:
             with contextlib.suppress(LaboratoryError):
-                await self.stand_ins.close()
+                await self.emulators.close()
 
 
 @dataclass
@@ -180,10 +179,10 @@ def _open_simulated(spec: VirtualBenchSpec, opening: _Opening, liquid: Simulator
     arm = opening.arm(arm_spec)
     assert balance_spec.device is not None
     balance = opening.balance(balance_spec.device, "virtual")
-    nature = SimulatedBench(spec, liquid, arm, balance)
-    operator = SimulatedOperator(nature, balance, spec.operator_time)
+    ground_truth = SimulatedBench(spec, liquid, arm, balance)
+    operator = SimulatedOperator(ground_truth, balance, spec.operator_time)
     setup = Setup(
-        "virtual", arm_spec, balance_spec, spec.operator_time, arm, balance, operator, nature, _discard_notice
+        "virtual", arm_spec, balance_spec, spec.operator_time, arm, balance, operator, ground_truth, _discard_notice
     )
     return OpenBench(PouringBench(setup), opening.devices, operator=operator)
 
@@ -201,29 +200,29 @@ async def _open_devices(
     operator: Operator | None,
     tell: Callable[[Notice], None],
 ) -> OpenBench:
-    stand_ins: DeviceEmulators | None = None
+    emulators: DeviceEmulators | None = None
     follows = False
     if spec.mode == "virtual":
-        stand_ins = DeviceEmulators(opening("stand-ins", BenchEmulators, arm_spec, balance_spec.device))
-        found = await stand_ins.found()
+        emulators = DeviceEmulators(opening("emulators", BenchEmulators, arm_spec, balance_spec.device))
+        found = await emulators.found()
         arm_spec, follows = found.arm, found.follows
         balance_spec = replace(balance_spec, device=found.balance)
     arm = opening.arm(arm_spec, None if spec.mode == "virtual" else spec.accepted_checksum)
     balance = None if balance_spec.device is None else opening.balance(balance_spec.device, spec.name)
-    if stand_ins is not None and balance_spec.device is not None and balance_spec.device.told:
-        stand_ins.told = balance
-    nature = GroundTruth(arm_spec.time_scale)
-    if stand_ins is not None and spec.bench is not None and liquid is not None:
-        hands = Hands(BenchContents(balance_spec.placement), None if balance is None else stand_ins.put)
+    if emulators is not None and balance_spec.device is not None and balance_spec.device.told:
+        emulators.told = balance
+    ground_truth = GroundTruth(arm_spec.time_scale)
+    if emulators is not None and spec.bench is not None and liquid is not None:
+        hands = Hands(BenchContents(balance_spec.placement), None if balance is None else emulators.put)
         if follows and isinstance(arm_spec, UrArmSpec):
-            nature = FollowedBench(spec.bench, arm_spec, stand_ins, hands, liquid)
+            ground_truth = FollowedBench(spec.bench, arm_spec, emulators, hands, liquid)
         else:
-            nature = VirtualBench(spec.bench, arm_spec.time_scale, stand_ins, hands, liquid)
+            ground_truth = VirtualBench(spec.bench, arm_spec.time_scale, emulators, hands, liquid)
         if spec.operator.answers == "virtual":
             operator = operator or VirtualOperator(hands, spec.operator.time / arm_spec.time_scale)
         elif operator is not None:
             operator = PlayedOperator(operator, hands)
     assert operator is not None
     questions = OperatorQuestions(operator, spec.operator, tell, arm_spec.time_scale)
-    setup = Setup(spec.mode, arm_spec, balance_spec, spec.operator.time, arm, balance, questions, nature, tell)
-    return OpenBench(PouringBench(setup), opening.devices, stand_ins, operator)
+    setup = Setup(spec.mode, arm_spec, balance_spec, spec.operator.time, arm, balance, questions, ground_truth, tell)
+    return OpenBench(PouringBench(setup), opening.devices, emulators, operator)

@@ -18,8 +18,8 @@ from actors.arm.arm_interface import ArmError, PlannedPour
 from actors.arm.arm_settings import ArmSpec
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSpec
-from actors.bench.operator_questions import OperatorQuestions
-from actors.bench.virtual_bench import GroundTruth
+from actors.bench.bench_operators import OperatorQuestions
+from actors.bench.ground_truth import GroundTruth
 from actors.interfaces import BenchLostError, LaboratoryError, Notice, OperatorQuestion
 from actors.runtime.remote_object import DeviceLostError
 
@@ -129,7 +129,7 @@ class Setup:
     arm: DeviceArm
     balance: DeviceBalance | None
     questions: OperatorQuestions
-    nature: GroundTruth
+    ground_truth: GroundTruth
     tell: Callable[[Notice], None]
 
 

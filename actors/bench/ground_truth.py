@@ -1,22 +1,32 @@
-"""The ground truth of a virtual bench: a 'real' liquid with hidden parameters, poured with hidden pose errors.
+"""The ground truth of a bench: what truly happens to the liquid, which calibration sees only through the balance.
 
-`hidden_pour` and `hidden_spill` simulate one pour of that liquid; `Spill` holds the resulting masses. The simulations
-run in a simulator pool of their own, so that they never occupy a simulator of the calibration. Calibration only sees
-the balance's readings.
+- `GroundTruth` has the hooks that a pour calls. On hardware they do nothing; virtual benches override them.
+- `hidden_pour` and `hidden_spill` simulate one pour of a virtual bench's 'real' liquid, which has hidden parameters and
+  is poured with hidden pose errors. `Spill` holds the resulting masses. The simulations run in a simulator pool of
+  their own, so that they never occupy a simulator of the calibration.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
+from actors.arm.arm_interface import Executed, PlannedPour
 from actors.interfaces import InvalidActionError, LaboratoryError, SimulatorPool
 from actors.laboratory_settings import VirtualBenchSpec
 from sim_engine.action import Action
 from sim_engine.outcome import PourOutcome, RecordedFrames, SimulatedPour
 from sim_engine.scene import PoseError, PourTask, Scene
+
+T = TypeVar("T")
+
+WATCHED_RATE = 10.0
+"""Frame rate of the hidden liquid's particles for the live view [1/s]."""
 
 ATTEMPTS = 3
 """Number of initial particle positions to try before the simulation of the liquid fails."""
@@ -145,3 +155,79 @@ def spill_of(outcome: PourOutcome, mass: float) -> Spill:
     times = outcome.curve_times
     end = max(outcome.simulated_time, times[-1] if times else 0.0) + 0.1
     return Spill((*times, end), (*curve, spilled), spilled, mass * outcome.retained)
+
+
+@dataclass(frozen=True)
+class PourAsk:
+    """The current pour; `seed` is the seed of all its randomness.
+
+    Attributes:
+        show: receives the liquid's frames if a live view needs them.
+    """
+
+    scene: Scene
+    action: Action
+    path: PlannedPour
+    seed: int
+    show: Callable[[RecordedFrames], None] | None = None
+
+    @property
+    def record_rate(self) -> float:
+        """Frame rate of the hidden liquid's particles [1/s]; 0 without a live view. The simulation is unaffected."""
+        return 0.0 if self.show is None else WATCHED_RATE
+
+    def shown(self, frames: RecordedFrames | None) -> None:
+        """Pass the liquid's frames to `show`."""
+        if self.show is not None and frames is not None:
+            self.show(frames)
+
+
+class GroundTruth:
+    """Hooks around arm and balance during a pour. On hardware they do nothing.
+
+    Args:
+        time_scale: bench seconds per second of the clock.
+    """
+
+    def __init__(self, time_scale: float) -> None:
+        self._time_scale = time_scale
+
+    async def prepare(self, pour: PourAsk) -> None:
+        """Called before the operator prepares the pour."""
+
+    @contextlib.asynccontextmanager
+    async def followed(self) -> AsyncIterator[None]:
+        """Context from before the arm leaves home until it is back."""
+        yield
+
+    async def note(self) -> None:
+        """Called at the end of each transfer motion of the arm."""
+
+    async def tilts(self) -> None:
+        """Called when the arm stands at the pour's first pose and is about to tilt."""
+
+    async def lands(self, executed: Executed | None, broken: Exception | None) -> None:
+        """Called after the executed motion; determines the liquid's masses.
+
+        Args:
+            executed: poses as read back from the arm, if available.
+            broken: why the pour was aborted, if it was.
+
+        Raises:
+            LaboratoryError: the masses are unknown.
+        """
+
+    async def lasting(self, doing: Awaitable[T], seconds: float) -> T:
+        """Await an operation of the arm that takes `seconds` of bench time."""
+        return await doing
+
+    async def wait(self, seconds: float) -> None:
+        """Let bench time pass [s]."""
+        await asyncio.sleep(seconds / self._time_scale)
+
+    async def settle(self, seconds: float) -> None:
+        """Wait at least `seconds` of bench time, so that the last drops fall."""
+        await self.wait(seconds)
+
+    async def end(self) -> None:
+        """Called when the pour is over, in every case."""

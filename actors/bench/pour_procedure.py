@@ -29,7 +29,7 @@ from actors.balance.balance_interface import BalanceError
 from actors.balance.weighing import Weighings
 from actors.balance.weighing_plan import PourMasses
 from actors.bench.consent import STUCK, Consent, Setup, grams, start_question
-from actors.bench.virtual_bench import PourAsk
+from actors.bench.ground_truth import PourAsk
 from actors.interfaces import (
     InvalidActionError,
     LaboratoryError,
@@ -211,7 +211,7 @@ class PourProcedure:
         finally:
             watching.cancel()
             await asyncio.gather(watching, return_exceptions=True)
-            await self._setup.nature.end()
+            await self._setup.ground_truth.end()
 
     # ---- steps in order
 
@@ -224,30 +224,30 @@ class PourProcedure:
             await setup.balance.device.revive()
             await setup.balance.resume()
         show = self._report.pour if self._report.watched else None
-        await setup.nature.prepare(PourAsk(self._scene, self._action, self._path, self._seed, show))
+        await setup.ground_truth.prepare(PourAsk(self._scene, self._action, self._path, self._seed, show))
         await self._weighings.before()
 
     async def _move(self) -> None:
         """Approach, pour and return home after one consent, unless a stop interrupts the motion."""
         setup, path = self._setup, self._path
         await self._consent.given(start_question(setup.spec, path))
-        async with self._setup.nature.followed():
+        async with self._setup.ground_truth.followed():
             await self._out_and_home()
 
     async def _out_and_home(self) -> None:
         setup, path = self._setup, self._path
         self._report.enter("approach")
         try:
-            await setup.nature.lasting(setup.arm.move_to_start(path, self._seen), path.approach_time)
+            await setup.ground_truth.lasting(setup.arm.move_to_start(path, self._seen), path.approach_time)
         except STUCK as error:
             await self._consent.bring_home(error, begun=self._begun)
             raise
-        await setup.nature.note()
-        await setup.nature.tilts()
+        await setup.ground_truth.note()
+        await setup.ground_truth.tilts()
         self._report.enter("tilt")
         self._begun = True
         try:
-            self._executed = await setup.nature.lasting(setup.arm.execute(path, self._follow), path.pour_time)
+            self._executed = await setup.ground_truth.lasting(setup.arm.execute(path, self._follow), path.pour_time)
         except ArmRefusedError as error:  # before any movement
             self._begun = False
             await self._consent.bring_home(error, begun=self._begun)
@@ -255,7 +255,7 @@ class PourProcedure:
         except _BROKEN_OFF as error:
             self._broken, self._executed = error, getattr(error, "executed", None)
             await self._consent.bring_upright(error)
-        await setup.nature.note()
+        await setup.ground_truth.note()
         try:
             if self._broken is not None:
                 await setup.arm.release()  # consented to with the return to upright
@@ -267,7 +267,7 @@ class PourProcedure:
     async def _after(self) -> PourMeasurement:
         await self._consent.make_safe()
         self._report.enter("settle")
-        await self._setup.nature.settle(SETTLING_TIME)
+        await self._setup.ground_truth.settle(SETTLING_TIME)
         self._report.enter("weigh")
         await self._weighings.after()
         measured = self._weighings.measurement(self._scene.liquid.mass)
@@ -280,13 +280,13 @@ class PourProcedure:
 
     async def _let_it_land(self) -> None:
         """The motion is over: let the ground truth pour the liquid and load the balance."""
-        await self._setup.nature.lands(self._executed, self._broken)
+        await self._setup.ground_truth.lands(self._executed, self._broken)
 
     async def _weigh_remaining(self) -> None:
         """After an aborted pour, weigh whatever can be weighed without touching anything."""
         with contextlib.suppress(LaboratoryError):
             await self._let_it_land()
-            await self._setup.nature.settle(SETTLING_TIME)
+            await self._setup.ground_truth.settle(SETTLING_TIME)
             await self._weighings.at_once()
 
     # ---- records

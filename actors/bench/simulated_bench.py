@@ -18,9 +18,8 @@ from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSpec, NumbersBalanceSpec
 from actors.balance.simulated_balance import BalanceSettings, Load
 from actors.balance.weighing_plan import Placement
-from actors.bench.ground_truth import Spill, TouchingError, draw_pose_error, hidden_spill, stream
-from actors.bench.operator_questions import OperatorQuestions
-from actors.bench.virtual_bench import GroundTruth, PourAsk
+from actors.bench.bench_operators import OperatorQuestions
+from actors.bench.ground_truth import GroundTruth, PourAsk, Spill, TouchingError, draw_pose_error, hidden_spill, stream
 from actors.interfaces import LaboratoryError, OperatorQuestion, OperatorSpec, PourFailedError, SimulatorPool
 from actors.laboratory_settings import VirtualBenchSpec
 

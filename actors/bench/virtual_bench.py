@@ -1,39 +1,42 @@
-"""The ground truth of a virtual bench: the hidden liquid follows the motion that the arm really executed.
+"""A virtual bench: emulators of the devices, and a liquid that follows the motion that the arm executed.
 
-Calibration only sees the balance's readings. The executed motion counts, not the planned motion and not the driver's
-view. An aborted motion leaves liquid in the pourer, or lets it run out while the pourer stays tilted. If part of the
-motion is missing, the masses are reported as unknown.
-
-`GroundTruth` is the interface and does nothing on hardware. `VirtualBench` simulates the liquid from the poses that the
-arm read back, `FollowedBench` from the joint history of the arm's emulator. `executed_pour` cuts the pour out of that
-history; `slipped` applies a grip error.
+- `BenchEmulators` starts and holds the emulators of arm and balance; it blocks. `actors.runtime.remote_object` places
+  it on the bench's machine, next to the drivers that connect to it. `DeviceEmulators` offers the same calls to the
+  event loop. The emulators themselves are in `actors.emulators`.
+- `VirtualBench` takes the motion from the poses that the arm read back, `FollowedBench` from the joint history of the
+  arm's emulator. `executed_pour` cuts the pour out of that history; `slipped` applies a grip error.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import importlib
 import math
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_interface import Executed, PlannedPour
-from actors.arm.arm_settings import UrArmSpec
-from actors.bench.device_emulators import DeviceEmulators, History
-from actors.bench.ground_truth import draw_pose_error, hidden_pour, spill_of, stream
-from actors.bench.virtual_operator import Hands
+from actors.arm.arm_interface import Executed
+from actors.arm.arm_settings import ArmSpec, UrArmSpec
+from actors.balance.balance_device import DeviceBalance
+from actors.balance.balance_settings import BalanceDevice, BalanceEmulator
+from actors.balance.simulated_balance import Load
+from actors.bench.bench_operators import Hands
+from actors.bench.ground_truth import GroundTruth, PourAsk, draw_pose_error, hidden_pour, spill_of, stream
 from actors.interfaces import LaboratoryError, SimulatorPool
 from actors.laboratory_settings import VirtualBenchSpec
-from sim_engine.action import Action
+from actors.runtime.remote_object import Device
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import RecordedFrames
-from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
+from sim_engine.scene import PoseError, PourTask, SampledMotion
 
 FloatArray = NDArray[np.float64]
+
+DEADLINE = 30.0
+"""Longest wait for any reply of the emulators [s]; their process may still be starting."""
 
 AT_START = 2e-3
 """Largest joint distance from the pour's first pose at which the arm counts as standing there [rad]."""
@@ -43,6 +46,198 @@ AT_REST = 1e-6
 
 LONGEST_REST = 6.0
 """Longest simulated rest in the middle of a motion [s]; by then, everything that can run out has run out."""
+
+UPRIGHT = math.radians(0.5)
+"""Below this tilt [rad] a pourer is upright; the motions to and from a pour keep it below."""
+
+NOTING_INTERVAL = 40.0
+"""Interval between two reads of the arm's history [s of controller time]; a virtual controller keeps two minutes."""
+
+LONGEST_GAP = 0.1
+"""Largest distance between two samples of a history without a gap [s of controller time]; the sampling rate is 125 Hz.
+"""
+
+
+@dataclass(frozen=True)
+class Found:
+    """The addresses at which drivers find the emulators.
+
+    Attributes:
+        arm: the arm's settings with the address of its emulator.
+        balance: the balance's settings with the address of its emulator; None if weights are typed.
+        follows: whether `history` is available.
+    """
+
+    arm: ArmSpec
+    balance: BalanceDevice | None
+    follows: bool
+
+
+@dataclass(frozen=True)
+class History:
+    """Recorded joint motion of the controller.
+
+    Attributes:
+        times: controller times [s], increasing.
+        joints: six joint angles at each time [rad].
+        now: controller time of the request [s].
+    """
+
+    times: tuple[float, ...]
+    joints: tuple[tuple[float, ...], ...]
+    now: float
+
+
+class ArmEmulator(Protocol):
+    """The emulator that an arm's driver connects to; created from an `ArmSpec`, which names it in `emulator`."""
+
+    @property
+    def arm(self) -> ArmSpec:
+        """The settings, with the emulator's address."""
+        ...
+
+    def install(self) -> None:
+        """Configure the emulator once, as a person would configure a real controller."""
+        ...
+
+    def history(self, since: float) -> History:
+        """Joint motion since a controller time [s]."""
+        ...
+
+    def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        """Inject a fault, or read the emulator's internal state."""
+        ...
+
+    def close(self) -> None:
+        """End the emulator. May be called again."""
+        ...
+
+
+def emulator_of(arm: ArmSpec) -> ArmEmulator | None:
+    """Start the emulator of an arm; None if the arm's driver is a simulation itself."""
+    if not arm.emulator:
+        return None
+    module, _, name = arm.emulator.partition(":")
+    return cast(ArmEmulator, getattr(importlib.import_module(module), name)(arm))
+
+
+class BenchEmulators:
+    """The emulators of arm and balance, in child processes that end with this process.
+
+    Args:
+        arm: settings of the arm.
+        balance: settings of the balance; None if weights are typed.
+    """
+
+    def __init__(self, arm: ArmSpec, balance: BalanceDevice | None) -> None:
+        self._spec = arm
+        self._arm = emulator_of(arm)
+        self._weighs = balance
+        self._balance: BalanceEmulator | None = None
+        try:
+            self._balance = None if balance is None else balance.start_emulator()
+        except BaseException:
+            self.close()
+            raise
+
+    def found(self) -> Found:
+        """Return the addresses of the emulators."""
+        arm = self._spec if self._arm is None else self._arm.arm
+        return Found(arm, self._weighs if self._balance is None else self._balance.device, self._arm is not None)
+
+    def install(self) -> None:
+        """See `ArmEmulator.install`."""
+        if self._arm is not None:
+            self._arm.install()
+
+    def prepare(self, seed: tuple[int, ...]) -> None:
+        """Prepare a new pour: reseed the balance's random numbers and empty the balance."""
+        if self._balance is not None:
+            self._balance.prepare(seed)
+
+    def put(self, mass: float) -> None:
+        """Set the mass on the balance from now on [kg]."""
+        if self._balance is not None:
+            self._balance.put(mass)
+
+    def history(self, since: float) -> History:
+        """See `ArmEmulator.history`."""
+        return self._arm_emulator.history(since)
+
+    def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        """See `ArmEmulator.fault`."""
+        return self._arm_emulator.fault(name, arguments)
+
+    @property
+    def _arm_emulator(self) -> ArmEmulator:
+        if self._arm is None:
+            raise LaboratoryError("nothing stands in for the arm here")
+        return self._arm
+
+    def order(self, what: str, values: dict[str, Any]) -> dict[str, Any]:
+        """Send a command to the balance emulator: 'unplug', 'plug', 'faults' …; see its `order`."""
+        if self._balance is None:
+            raise LaboratoryError("there is no virtual balance here")
+        return self._balance.order(what, values)
+
+    def close(self) -> None:
+        """End both emulators. May be called again."""
+        if self._arm is not None:
+            self._arm.close()
+        if self._balance is not None:
+            self._balance.close()
+
+
+class DeviceEmulators:
+    """`BenchEmulators` over a `Device`, for the event loop.
+
+    Args:
+        device: holds the `BenchEmulators`.
+
+    Attributes:
+        told: a balance whose driver receives the load directly; None if an emulator carries the load.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.told: DeviceBalance | None = None
+
+    async def found(self) -> Found:
+        """Return the addresses of the emulators."""
+        found: Found = await self.device.call("found", deadline=4.0 * DEADLINE)
+        return found
+
+    async def prepare(self, seed: tuple[int, ...]) -> None:
+        """Prepare a new pour."""
+        await self.device.call("prepare", seed, deadline=DEADLINE)
+        if self.told is not None:
+            await self.told.prepare(seed)
+
+    async def put(self, mass: float) -> None:
+        """Set the mass on the balance from now on [kg]."""
+        if self.told is not None:
+            await self.told.put(Load((0.0,), (mass,)))
+        else:
+            await self.device.call("put", mass, deadline=DEADLINE)
+
+    async def history(self, since: float) -> History:
+        """Joint motion since a controller time [s]; empty for a time in the future."""
+        history: History = await self.device.call("history", min(since, 1e12), deadline=DEADLINE)
+        return history
+
+    async def fault(self, name: str, **arguments: Any) -> dict[str, Any]:
+        """Request a fault from the controller's emulator."""
+        answer: dict[str, Any] = await self.device.call("fault", name, arguments, deadline=DEADLINE, urgent=True)
+        return answer
+
+    async def order(self, what: str, **values: Any) -> dict[str, Any]:
+        """Send a command to the balance emulator."""
+        answer: dict[str, Any] = await self.device.call("order", what, values, deadline=DEADLINE, urgent=True)
+        return answer
+
+    async def close(self) -> None:
+        """End both emulators."""
+        await self.device.call("close", deadline=DEADLINE)
 
 
 def slipped(motion: SampledMotion, grip_tilt: float) -> SampledMotion:
@@ -98,105 +293,13 @@ def _without_long_rests(
     return np.array([t for t, _ in kept]), joints[[i for _, i in kept]]
 
 
-T = TypeVar("T")
-
-UPRIGHT = math.radians(0.5)
-"""Below this tilt [rad] a pourer is upright; the motions to and from a pour keep it below."""
-
-NOTING_INTERVAL = 40.0
-"""Interval between two reads of the arm's history [s of controller time]; a virtual controller keeps two minutes."""
-
-WATCHED_RATE = 10.0
-"""Frame rate of the hidden liquid's particles for the live view [1/s]."""
-
-LONGEST_GAP = 0.1
-"""Largest distance between two samples of a history without a gap [s of controller time]; the sampling rate is 125 Hz.
-"""
-
-
-@dataclass(frozen=True)
-class PourAsk:
-    """The current pour; `seed` is the seed of all its randomness.
-
-    Attributes:
-        show: receives the liquid's frames if a live view needs them.
-    """
-
-    scene: Scene
-    action: Action
-    path: PlannedPour
-    seed: int
-    show: Callable[[RecordedFrames], None] | None = None
-
-    @property
-    def record_rate(self) -> float:
-        """Frame rate of the hidden liquid's particles [1/s]; 0 without a live view. The simulation is unaffected."""
-        return 0.0 if self.show is None else WATCHED_RATE
-
-    def shown(self, frames: RecordedFrames | None) -> None:
-        """Pass the liquid's frames to `show`."""
-        if self.show is not None and frames is not None:
-            self.show(frames)
-
-
-class GroundTruth:
-    """Hooks around arm and balance during a pour. On hardware they do nothing.
-
-    Args:
-        time_scale: bench seconds per second of the clock.
-    """
-
-    def __init__(self, time_scale: float) -> None:
-        self._time_scale = time_scale
-
-    async def prepare(self, pour: PourAsk) -> None:
-        """Called before the operator prepares the pour."""
-
-    @contextlib.asynccontextmanager
-    async def followed(self) -> AsyncIterator[None]:
-        """Context from before the arm leaves home until it is back."""
-        yield
-
-    async def note(self) -> None:
-        """Called at the end of each transfer motion of the arm."""
-
-    async def tilts(self) -> None:
-        """Called when the arm stands at the pour's first pose and is about to tilt."""
-
-    async def lands(self, executed: Executed | None, broken: Exception | None) -> None:
-        """Called after the executed motion; determines the liquid's masses.
-
-        Args:
-            executed: poses as read back from the arm, if available.
-            broken: why the pour was aborted, if it was.
-
-        Raises:
-            LaboratoryError: the masses are unknown.
-        """
-
-    async def lasting(self, doing: Awaitable[T], seconds: float) -> T:
-        """Await an operation of the arm that takes `seconds` of bench time."""
-        return await doing
-
-    async def wait(self, seconds: float) -> None:
-        """Let bench time pass [s]."""
-        await asyncio.sleep(seconds / self._time_scale)
-
-    async def settle(self, seconds: float) -> None:
-        """Wait at least `seconds` of bench time, so that the last drops fall."""
-        await self.wait(seconds)
-
-    async def end(self) -> None:
-        """Called when the pour is over, in every case."""
-
-
 class VirtualBench(GroundTruth):
     """A bench without hardware whose liquid follows the poses that the arm read back.
 
     Args:
         spec: the hidden liquid and errors.
         time_scale: bench seconds per second of the clock.
-        stand_ins: the emulators of arm and balance.
+        emulators: the emulators of arm and balance.
         hands: fill the pourer and hold the bench contents.
         simulators: a separate pool for the hidden liquid.
     """
@@ -205,13 +308,13 @@ class VirtualBench(GroundTruth):
         self,
         spec: VirtualBenchSpec,
         time_scale: float,
-        stand_ins: DeviceEmulators,
+        emulators: DeviceEmulators,
         hands: Hands,
         simulators: SimulatorPool,
     ) -> None:
         super().__init__(time_scale)
         self._spec, self._simulators = spec, simulators
-        self.stand_ins, self.things, self._hands = stand_ins, hands.things, hands
+        self.emulators, self.contents, self._hands = emulators, hands.contents, hands
         self._pour: PourAsk | None = None
         self._landed = False
 
@@ -219,8 +322,8 @@ class VirtualBench(GroundTruth):
         """See `GroundTruth.prepare`."""
         self._pour = pour
         self._hands.prepare(pour.scene.liquid.mass, stream(pour.seed, "arm"))
-        await self.stand_ins.prepare(stream(pour.seed, "balance"))
-        await self.stand_ins.put(self.things.carried)
+        await self.emulators.prepare(stream(pour.seed, "balance"))
+        await self.emulators.put(self.contents.carried)
 
     @contextlib.asynccontextmanager
     async def followed(self) -> AsyncIterator[None]:
@@ -243,8 +346,8 @@ class VirtualBench(GroundTruth):
         self._landed = True
         if motion is not None:
             spilled, retained = await self._simulate(self._pour, motion, error)
-            self.things.receive(spilled, retained)
-        await self.stand_ins.put(self.things.carried)
+            self.contents.receive(spilled, retained)
+        await self.emulators.put(self.contents.carried)
 
     def _motion(self, executed: Executed | None, grip_tilt: float) -> SampledMotion | None:
         """The true motion of the pourer; None if nothing left it."""
@@ -256,7 +359,7 @@ class VirtualBench(GroundTruth):
 
     async def _simulate(self, pour: PourAsk, motion: SampledMotion, error: PoseError) -> tuple[float, float]:
         """Masses spilled and retained [kg]; the same motion and seed give the same masses."""
-        mass = self.things.in_pourer
+        mass = self.contents.in_pourer
         scene = replace(pour.scene, liquid=pour.scene.liquid.model_copy(update={"mass": mass}))
         shift = PoseError(x=error.x, y=error.y, z=error.z)
         task = PourTask(scene, pour.action, SimulationParameters(), 0, pose_error=shift, motion=motion)
@@ -271,7 +374,7 @@ class FollowedBench(VirtualBench):
     """A virtual bench that uses the joint history of the arm's emulator, also after an aborted motion.
 
     Args:
-        spec, stand_ins, hands, simulators: as for `VirtualBench`.
+        spec, emulators, hands, simulators: as for `VirtualBench`.
         arm: the cell as configured; it may differ from the ground truth.
     """
 
@@ -279,11 +382,11 @@ class FollowedBench(VirtualBench):
         self,
         spec: VirtualBenchSpec,
         arm: UrArmSpec,
-        stand_ins: DeviceEmulators,
+        emulators: DeviceEmulators,
         hands: Hands,
         simulators: SimulatorPool,
     ) -> None:
-        super().__init__(spec, arm.time_scale, stand_ins, hands, simulators)
+        super().__init__(spec, arm.time_scale, emulators, hands, simulators)
         self._arm = arm
         self._noting = asyncio.Lock()
         self._times: list[float] = []
@@ -295,7 +398,7 @@ class FollowedBench(VirtualBench):
     async def followed(self) -> AsyncIterator[None]:
         """See `GroundTruth.followed`; reads the arm's history at regular intervals, however long the operator takes."""
         self._times, self._joints, self._landed, self._gap = [], [], False, ""
-        self._earlier, self._since = 0.0, (await self.stand_ins.history(math.inf)).now
+        self._earlier, self._since = 0.0, (await self.emulators.history(math.inf)).now
         following = asyncio.create_task(self._follow())
         try:
             yield
@@ -316,12 +419,12 @@ class FollowedBench(VirtualBench):
         gap is recorded, and the masses of the pour are then unknown.
         """
         async with self._noting:
-            history = await self.stand_ins.history(self._since)
+            history = await self.emulators.history(self._since)
             if history.now < self._since:  # the controller was switched off; its clock restarts at 0
                 self._gap = self._gap or "the controller was switched off, and forgot what its arm had done before"
                 self._earlier += self._since
                 self._since = 0.0
-                history = await self.stand_ins.history(0.0)
+                history = await self.emulators.history(0.0)
             if (missed := _missed(history, self._since)) > LONGEST_GAP:
                 self._gap = self._gap or f"{missed:.0f} s of its arm's motion are forgotten by the controller"
             self._take(history)
@@ -343,7 +446,7 @@ class FollowedBench(VirtualBench):
 
     def _motion(self, executed: Executed | None, grip_tilt: float) -> SampledMotion | None:
         """The true motion of the pourer from the pour's first pose on; None if the pourer never left it."""
-        from actors.arm.planning.frames import pourer_motion
+        from actors.arm.planning.kinematics import pourer_motion
 
         if self._gap:
             raise LaboratoryError(

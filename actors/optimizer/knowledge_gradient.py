@@ -51,8 +51,8 @@ region.
 Source: knowledge gradient, Frazier et al. 2009; the extension to hypotheses is this project's own.
 Limitations: looks one pour ahead; the places are not refined, so the best one by `least_loss` is included.
 
-**Gain of one more pour** (`worth`). It considers differences to the best poured action x̂, because better knowledge of
-both helps only if it changes their order, and no cost is below 0:
+**Gain of one more pour** (`pour_gains`). It considers differences to the best poured action x̂, because better
+knowledge of both helps only if it changes their order, and no cost is below 0:
 
     g(x) = Σ_j w_j min(E d⁺, E (b_j − f_j(x)⁺)⁺),    d ~ N(m_j(x̂)⁺ − m_j(x)⁺, s⁴ / (s² + n²))
 
@@ -76,8 +76,8 @@ from actors.optimizer import acquisition
 from actors.optimizer.feasible_region import Feasibility, Region
 from actors.optimizer.gaussian_process import GaussianProcess
 from actors.optimizer.model_discrepancy import ModelAveragedProcess, clipped_moments, shortfall
-from actors.optimizer.question_checks import Asked, tuples
-from actors.optimizer.questions import BenchOffset, DiscrepancyFound, ModelDiscrepancy, SuggestProblem
+from actors.optimizer.questions import BenchOffset, DiscrepancyFound, ModelDiscrepancy, PourQuery, SimulationQuery
+from actors.optimizer.surrogate_models import QueryArrays, tuples
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int_]
@@ -104,17 +104,17 @@ class KnowledgeGradient:
 
 
 def most_instructive(
-    problem: SuggestProblem,
+    query: SimulationQuery,
     process: GaussianProcess,
     candidates: Array,
     busy: Array,
     pouring: Array,
     feasibility: Feasibility | None,
 ) -> KnowledgeGradient:
-    """Choose `problem.count` places for simulations.
+    """Choose `query.count` places for simulations.
 
     Args:
-        problem: for its count and κ.
+        query: for its count and κ.
         process: of the real cost, from simulations.
         candidates: (m, dimension), m ≥ 1, places to consider.
         busy: (b, dimension), pending simulations.
@@ -122,7 +122,7 @@ def most_instructive(
         feasibility: of requests; it reduces the value of places with likely refusals.
     """
     mean, deviation = process.predict(candidates)
-    by_bound = np.argsort(mean - problem.kappa * deviation, kind="stable")
+    by_bound = np.argsort(mean - query.kappa * deviation, kind="stable")
     leaders = np.array(list(dict.fromkeys([*by_bound[:LEADERS], *np.argsort(mean, kind="stable")[:LEADERS]])))
     others = by_bound[LEADERS : LEADERS + ELSEWHERE]
     places = candidates[np.concatenate([leaders, others])]
@@ -138,13 +138,13 @@ def most_instructive(
     pours = joint.values(targets, targets, m, process.noise)
     allowed = np.ones(len(places)) if feasibility is None else np.exp(feasibility.log_probability(places))
     chosen, values = [], []
-    for _ in range(problem.count):
-        worth = joint.values(here, targets, m, process.simulated_noise) * allowed
-        best = int(np.argmax(worth))
+    for _ in range(query.count):
+        gains = joint.values(here, targets, m, process.simulated_noise) * allowed
+        best = int(np.argmax(gains))
         chosen.append(places[best])
-        values.append(float(worth[best]))
+        values.append(float(gains[best]))
         joint.observe(best, process.simulated_noise)
-    points = np.array(chosen).reshape(problem.count, candidates.shape[1])
+    points = np.array(chosen).reshape(query.count, candidates.shape[1])
     return KnowledgeGradient(points, np.array(values), float(pours.max()))
 
 
@@ -231,11 +231,11 @@ def looked_ahead(
     if feasibility is not None and (likely := feasibility.likely(targets)).any():
         targets = targets[likely]
     now = float(process.predict(targets)[0].min())
-    value = process.predict(places)[0] - left * (now - process.worst * foreseen(process, places, targets))
+    value = process.predict(places)[0] - left * (now - process.worst * predicted_minimum(process, places, targets))
     return np.asarray(places[int(np.argmin(allowed(value / process.worst, places)))])
 
 
-def foreseen(process: ModelAveragedProcess, places: Array, targets: Array) -> Array:
+def predicted_minimum(process: ModelAveragedProcess, places: Array, targets: Array) -> Array:
     """Least expected cost (p,) over targets (m, dimension), in units of the worst, after a pour at places (p, ·)."""
     means, deviations, _ = process.components(targets)
     at, its, noises = process.components(places)
@@ -261,7 +261,7 @@ LATEST = 8
 FORESIGHT = 4
 """Largest number of pours whose savings count: later pours could find the same otherwise."""
 
-WORTH_AT = 256
+GAIN_AT = 256
 """Number of places all over the region at which the gain of one more pour is computed."""
 
 DRAWN = 64
@@ -272,19 +272,19 @@ FORBIDDEN = 1e3
 
 
 def least_loss(
-    process: ModelAveragedProcess, mismatch: ModelDiscrepancy, known: Array, feasibility: Feasibility | None = None
+    process: ModelAveragedProcess, discrepancy: ModelDiscrepancy, known: Array, feasibility: Feasibility | None = None
 ) -> Score:
     """Return the score of a pour, to be minimised.
 
     Args:
         process: of the cost.
-        mismatch: for H and the limit.
+        discrepancy: for H and the limit.
         known: (k, dimension), poured actions that may be poured again; k ≥ 0.
         feasibility: of requests; None if no request was refused. An infeasible pour counts as the worst cost.
     """
     best = float(process.predict(known)[0].min()) / process.worst if len(known) else 0.0
-    left = min(mismatch.left, FORESIGHT) if len(known) else 0
-    allowed = _allowed(process, mismatch, feasibility)
+    left = min(discrepancy.pours_left, FORESIGHT) if len(known) else 0
+    allowed = _allowed(process, discrepancy, feasibility)
 
     def score(points: Array) -> Array:
         means, deviations, _ = process.components(points)
@@ -295,13 +295,13 @@ def least_loss(
 
 
 def _allowed(
-    process: ModelAveragedProcess, mismatch: ModelDiscrepancy, feasibility: Feasibility | None
+    process: ModelAveragedProcess, discrepancy: ModelDiscrepancy, feasibility: Feasibility | None
 ) -> Callable[[Array, Array], Array]:
     """Return a function that applies the limit and the feasibility to values (m,) of pours at points (m, dimension)."""
 
     def changed(value: Array, points: Array) -> Array:
-        if mismatch.limit is not None:
-            over = process.exceedance(points, mismatch.limit.loss) - mismatch.limit.probability
+        if discrepancy.limit is not None:
+            over = process.exceedance(points, discrepancy.limit.loss) - discrepancy.limit.probability
             value = value + FORBIDDEN * np.maximum(over, 0.0)
         if feasibility is not None:
             made = np.exp(feasibility.log_probability(points))
@@ -311,7 +311,7 @@ def _allowed(
     return changed
 
 
-def worth(process: ModelAveragedProcess, points: Array, known: Array) -> Array:
+def pour_gains(process: ModelAveragedProcess, points: Array, known: Array) -> Array:
     """Gain g (m,) of one more pour at points (m, dimension), given poured ones (k ≥ 1, dimension), in cost units."""
     place = known[int(np.argmin(process.predict(known)[0]))]
     means, deviations, noises = process.components(points)
@@ -380,60 +380,60 @@ def instructive(
 
 
 def proposals(
-    problem: SuggestProblem,
-    asked: Asked,
+    query: PourQuery,
+    arrays: QueryArrays,
     process: ModelAveragedProcess,
     candidates: Array,
     feasibility: Feasibility | None,
     rng: np.random.Generator,
 ) -> Array:
     """(count, dimension): the next pour, followed by simulations. Candidates (m, dimension), m ≥ 1."""
-    if problem.count == 0:
-        return np.empty((0, problem.space.dimension))
-    assert problem.mismatch is not None
-    known = pourable(asked, feasibility)
-    score = least_loss(process, problem.mismatch, known, feasibility)
+    if query.count == 0:
+        return np.empty((0, query.space.dimension))
+    assert query.discrepancy is not None
+    known = pourable(arrays, feasibility)
+    score = least_loss(process, query.discrepancy, known, feasibility)
     candidates = np.concatenate([candidates, known])
-    pour = acquisition.minimise(score, candidates, asked.region, rng)
-    left, allowed = min(problem.mismatch.left, FORESIGHT), _allowed(process, problem.mismatch, feasibility)
-    if problem.mismatch.looks_ahead:
+    pour = acquisition.minimise(score, candidates, arrays.region, rng)
+    left, allowed = min(query.discrepancy.pours_left, FORESIGHT), _allowed(process, query.discrepancy, feasibility)
+    if query.discrepancy.lookahead:
         pour = looked_ahead(process, pour, candidates, known, left, allowed, feasibility)
-    beside = instructive(process, problem.count - 1, candidates, score, pour, asked.busy, asked.region)
-    return np.concatenate([pour[None, :], beside])
+    simulations = instructive(process, query.count - 1, candidates, score, pour, arrays.busy, arrays.region)
+    return np.concatenate([pour[None, :], simulations])
 
 
-def pourable(asked: Asked, feasibility: Feasibility | None) -> Array:
+def pourable(arrays: QueryArrays, feasibility: Feasibility | None) -> Array:
     """Poured places (k, dimension) that may be poured again."""
-    known = asked.known[asked.region.allows(asked.known)]
+    known = arrays.known[arrays.region.allows(arrays.known)]
     return known if feasibility is None or not len(known) else known[feasibility.likely(known)]
 
 
 def found(
-    problem: SuggestProblem,
-    asked: Asked,
+    query: PourQuery,
+    arrays: QueryArrays,
     process: ModelAveragedProcess,
     points: Array,
     feasibility: Feasibility | None,
     rng: np.random.Generator,
 ) -> DiscrepancyFound:
     """Return the conclusions about the simulator, and the gain of one more pour."""
-    assert problem.mismatch is not None
-    limit, known = problem.mismatch.limit, pourable(asked, feasibility)
-    candidates = asked.region.draw(WORTH_AT, rng, even=True)
+    assert query.discrepancy is not None
+    limit, known = query.discrepancy.limit, pourable(arrays, feasibility)
+    candidates = arrays.region.draw(GAIN_AT, rng, even=True)
     if len(points):
-        candidates = np.concatenate([candidates, points[:1], _near(points[0], asked.region, rng)])
+        candidates = np.concatenate([candidates, points[:1], _near(points[0], arrays.region, rng)])
     candidates = np.concatenate([candidates, known])
     over = np.zeros(len(candidates)) if limit is None else process.exceedance(candidates, limit.loss)
     gain = None
     if len(known):
         kept = over <= (1.0 if limit is None else limit.probability)
-        gain = float(worth(process, candidates[kept], known).max()) if kept.any() else None
+        gain = float(pour_gains(process, candidates[kept], known).max()) if kept.any() else None
     shifts, deviations, factor = process.displaced()
     drawn: tuple[BenchOffset, ...] = ()
-    if problem.count == 0:
+    if query.count == 0:
         drawn = tuple(BenchOffset(*pair) for pair in zip(*map(tuples, process.drawn(DRAWN)), strict=True))
     return DiscrepancyFound(
-        ignorance=process.ignorance,
+        uninformative=process.uninformative,
         shifts=tuple(map(float, shifts)),
         deviations=tuple(map(float, deviations)),
         factor=factor,

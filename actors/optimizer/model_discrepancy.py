@@ -12,14 +12,14 @@ makes the valley wider or narrower than simulated, as deviating walls and lips d
 action, belongs to the hypothesis, too: a few pours close together determine it.
 
 Two further groups of hypotheses, of equal prior weight, do not rely on the simulator. In the contrary group it predicts
-the opposite, μ_j = clip(e^{g_j} (1 − f̂_s(z_j(x))), 0, 1). In the ignorant group it contains no information about this
-bench, and f is a GP around 0.6, more towards corners.
+the opposite, μ_j = clip(e^{g_j} (1 − f̂_s(z_j(x))), 0, 1). In the uninformative group it contains no information about
+this bench, and f is a GP around 0.6, more towards corners.
 
 The posterior weights are prior times marginal likelihood of the observations. No hypothesis is removed: the weight of a
-failing one decreases. The weight of the two further groups, called ignorance, measures how unreliable the simulator is.
+failing one decreases. The weight of the two further groups measures how unreliable the simulator is.
 
 Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001.
-Limitations: the set of hypotheses is fixed; predictions use at most 32 draws of them, and ignorance.
+Limitations: the set of hypotheses is fixed; predictions use at most 32 draws of them, and the uninformative group.
 """
 
 from __future__ import annotations
@@ -53,15 +53,17 @@ FARTHER = (0.4, 3.0)
 NOISES, NOISE_GROWTH = (0.002, 0.05), 0.15
 """Smallest and largest standard deviation of one observation at zero cost, log-uniform; and its increase at the largest
 cost."""
-IGNORANT_MEAN, IGNORANT_SIGNAL = 0.6, 0.4
-IGNORANT_EDGE = 0.3
-"""Difference of ignorance's expected cost between corners and middle: search boxes are drawn around good actions."""
-IGNORANT_LENGTHS = np.repeat((0.15, 0.3, 0.6), 3)
-IGNORANT_NOISES = np.tile((0.003, 0.01, 0.03), 3)
-"""ℓ and n of the components of ignorance. With a fixed scatter, pours that hardly scatter would count against it."""
+UNINFORMATIVE_MEAN, UNINFORMATIVE_SIGNAL = 0.6, 0.4
+UNINFORMATIVE_EDGE = 0.3
+"""Difference of the uninformative group's expected cost between corners and middle: search boxes are drawn around good
+actions."""
+UNINFORMATIVE_LENGTHS = np.repeat((0.15, 0.3, 0.6), 3)
+UNINFORMATIVE_NOISES = np.tile((0.003, 0.01, 0.03), 3)
+"""ℓ and n of the components of the uninformative group. With a fixed scatter, pours that hardly scatter would count
+against it."""
 CONTRARY, CONTRARY_REST = 128, 0.15
-"""Number of contrary hypotheses, which hold half of the prior ignorance; and their smallest σ. If they were certain of
-a total loss where the simulation has none, any failed pour would count for them."""
+"""Number of contrary hypotheses, which hold half of the prior weight of both groups; and their smallest σ. If they were
+certain of a total loss where the simulation has none, any failed pour would count for them."""
 KNOWN_SHARE = 0.75
 """Fraction of the hypotheses around earlier bench offsets, if there are any."""
 KNOWN_SPREAD = 0.25
@@ -94,23 +96,24 @@ class Hypotheses:
     centre: Array
 
     @classmethod
-    def of(cls, mismatch: ModelDiscrepancy, centre: Array) -> Hypotheses:
+    def of(cls, discrepancy: ModelDiscrepancy, centre: Array) -> Hypotheses:
         """Draw the hypotheses, the same for the same question: quasi-random, for even coverage by few draws."""
-        dimension = len(mismatch.play)
+        dimension = len(discrepancy.offset_priors)
         rows = qmc.Sobol(2 * dimension + 7, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES)
         rows = np.clip(np.concatenate([rows, rows[:CONTRARY]]), 1e-6, 1.0 - 1e-6)
         z = ndtri(rows[:, : 2 * dimension])
         width, gain, rest, length, far, known, noise = rows[:, 2 * dimension :].T
         spread, contrary = _evenly(FARTHER, far), np.arange(len(rows)) >= HYPOTHESES
         scales, shifts = np.ones((len(rows), dimension)), np.zeros((len(rows), dimension))
-        if mismatch.drawn:
-            index = np.minimum((known / KNOWN_SHARE * len(mismatch.drawn)).astype(int), len(mismatch.drawn) - 1)
+        if discrepancy.drawn:
+            index = np.minimum((known / KNOWN_SHARE * len(discrepancy.drawn)).astype(int), len(discrepancy.drawn) - 1)
             around = known < KNOWN_SHARE
             spread = np.where(around, KNOWN_SPREAD, spread)
-            scales[around] = np.array([one.scales for one in mismatch.drawn])[index[around]]
-            shifts[around] = np.array([one.shifts for one in mismatch.drawn])[index[around]]
+            scales[around] = np.array([one.scales for one in discrepancy.drawn])[index[around]]
+            shifts[around] = np.array([one.shifts for one in discrepancy.drawn])[index[around]]
         shift, factor, origin = (
-            np.array([getattr(play, name) for play in mismatch.play]) for name in ("shift", "factor", "origin")
+            np.array([getattr(prior, name) for prior in discrepancy.offset_priors])
+            for name in ("shift", "factor", "origin")
         )
         factors = np.exp(spread[:, None] * factor * z[:, dimension:])
         moved = spread[:, None] * shift * z[:, :dimension] + (factors - 1.0) * origin
@@ -151,38 +154,38 @@ class ModelAveragedProcess:
 
     Attributes:
         simulated: surrogate of the simulations.
-        weights: posterior weights (J + ignorant ones,); the last `len(IGNORANT_LENGTHS)` are those of the ignorant
-            group.
-        ignorance: the sum of these and of the contrary ones.
+        weights: posterior weights (J + uninformative ones,); the last `len(UNINFORMATIVE_LENGTHS)` are those of the
+            uninformative group.
+        uninformative: the sum of these and of the contrary ones.
     """
 
-    def __init__(self, simulated: GaussianProcess, points: Array, costs: Array, mismatch: ModelDiscrepancy) -> None:
+    def __init__(self, simulated: GaussianProcess, points: Array, costs: Array, discrepancy: ModelDiscrepancy) -> None:
         """Compute the posterior weights of the hypotheses.
 
         Args:
             simulated: of the same cost.
             points: (n, dimension), real observations, n ≥ 0.
             costs: (n,).
-            mismatch: of the question.
+            discrepancy: of the question.
         """
-        self.simulated, self.points, self.worst = simulated, points, mismatch.worst
-        self._costs = np.clip(costs / mismatch.worst, 0.0, 1.0)
-        self._all = Hypotheses.of(mismatch, _least(simulated))
+        self.simulated, self.points, self.worst = simulated, points, discrepancy.worst
+        self._costs = np.clip(costs / discrepancy.worst, 0.0, 1.0)
+        self._all = Hypotheses.of(discrepancy, _least(simulated))
         informed = self._evidences(self._informed(self._all, points), self._all.lengths)
-        ignorant = self._evidences(self._ignorant(points, self._costs), IGNORANT_LENGTHS)
-        half = 0.5 * mismatch.ignorance
-        prior = np.where(self._all.contrary, half / CONTRARY, (1.0 - mismatch.ignorance) / HYPOTHESES)
-        logs = np.concatenate([informed + np.log(prior), ignorant + np.log(half / len(ignorant))])
+        uninformative = self._evidences(self._uninformative(points, self._costs), UNINFORMATIVE_LENGTHS)
+        half = 0.5 * discrepancy.uninformative
+        prior = np.where(self._all.contrary, half / CONTRARY, (1.0 - discrepancy.uninformative) / HYPOTHESES)
+        logs = np.concatenate([informed + np.log(prior), uninformative + np.log(half / len(uninformative))])
         weights = np.exp(logs - logs.max())
         self.weights = weights / weights.sum()
-        informed_weights, ignorant_weights = self.weights[: len(informed)], self.weights[len(informed) :]
+        informed_weights, uninformative_weights = self.weights[: len(informed)], self.weights[len(informed) :]
         self._trusting = np.where(self._all.contrary, 0.0, informed_weights)
-        self.ignorance = float(informed_weights[self._all.contrary].sum() + ignorant_weights.sum())
+        self.uninformative = float(informed_weights[self._all.contrary].sum() + uninformative_weights.sum())
         kept, times = np.unique(_evenly_drawn(informed_weights, KEPT), return_counts=True)
         self._kept = self._all.only(kept)
-        self.mixture = np.concatenate([times / KEPT * informed_weights.sum(), ignorant_weights])
-        self._lengths = np.concatenate([self._kept.lengths, IGNORANT_LENGTHS])
-        self._least_noises = np.concatenate([self._kept.noises, IGNORANT_NOISES])
+        self.mixture = np.concatenate([times / KEPT * informed_weights.sum(), uninformative_weights])
+        self._lengths = np.concatenate([self._kept.lengths, UNINFORMATIVE_LENGTHS])
+        self._least_noises = np.concatenate([self._kept.noises, UNINFORMATIVE_NOISES])
         self._at_data = self._prior(points, self._costs)
         self._factors = self._factorised(self._at_data, self._lengths, points)
 
@@ -200,15 +203,17 @@ class ModelAveragedProcess:
         spreads = np.hypot(hypotheses.rests[:, None], gain * deviation)
         return _Prior(means, spreads, hypotheses.noises[:, None] + NOISE_GROWTH * means)
 
-    def _ignorant(self, points: Array, seen: Array | float) -> _Prior:
-        shape = len(IGNORANT_LENGTHS), len(points)
+    def _uninformative(self, points: Array, seen: Array | float) -> _Prior:
+        shape = len(UNINFORMATIVE_LENGTHS), len(points)
         edge = ((2.0 * points - 1.0) ** 2).mean(axis=1)
-        means = np.broadcast_to(IGNORANT_MEAN + IGNORANT_EDGE * np.clip(edge, 0.0, 1.0), shape)
-        noises = IGNORANT_NOISES[:, None] + NOISE_GROWTH * np.broadcast_to(seen, shape)  # from observed costs, if any
-        return _Prior(means, np.full(shape, IGNORANT_SIGNAL), noises)
+        means = np.broadcast_to(UNINFORMATIVE_MEAN + UNINFORMATIVE_EDGE * np.clip(edge, 0.0, 1.0), shape)
+        noises = UNINFORMATIVE_NOISES[:, None] + NOISE_GROWTH * np.broadcast_to(
+            seen, shape
+        )  # from observed costs, if any
+        return _Prior(means, np.full(shape, UNINFORMATIVE_SIGNAL), noises)
 
-    def _prior(self, points: Array, seen: Array | float = IGNORANT_MEAN) -> _Prior:
-        parts = self._informed(self._kept, points), self._ignorant(points, seen)
+    def _prior(self, points: Array, seen: Array | float = UNINFORMATIVE_MEAN) -> _Prior:
+        parts = self._informed(self._kept, points), self._uninformative(points, seen)
         return _Prior(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("means", "spreads", "noises")))
 
     # -- posterior moments -----------------------------------------------------------------------------------------
@@ -301,7 +306,7 @@ class ModelAveragedProcess:
     def hyperparameters(self) -> dict[str, float]:
         """Parameters of the hypotheses, by name."""
         noise = self.worst * float(self.mixture @ self._least_noises)
-        return {"noise": noise, "simulated_noise": self.simulated.noise, "ignorance": self.ignorance}
+        return {"noise": noise, "simulated_noise": self.simulated.noise, "uninformative": self.uninformative}
 
     def displaced(self) -> tuple[Array, Array, float]:
         """Shift of the cube's centre (dimension,), its deviation, and the median factor on the cost."""

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from actors.interfaces import LaboratoryError
-from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.runtime.remote_object import Device, DeviceLostError, MachineLostError
 
 DEADLINE = 600.0
@@ -16,11 +16,11 @@ DEADLINE = 600.0
 class Proposer:
     """The object inside the actor. It keeps no state between questions."""
 
-    def suggest(self, problem: SuggestProblem) -> Suggestion:
+    def suggest(self, query: SuggestionQuery) -> Suggestion:
         """See `actors.optimizer.suggest.propose`."""
         from actors.optimizer.suggest import propose
 
-        return propose(problem)
+        return propose(query)
 
 
 class DeviceOptimizer:
@@ -34,7 +34,7 @@ class DeviceOptimizer:
     def __init__(self, device: Device) -> None:
         self.device = device
 
-    async def suggest(self, problem: SuggestProblem) -> Suggestion:
+    async def suggest(self, query: SuggestionQuery) -> Suggestion:
         """See `Optimizer.suggest`.
 
         Raises:
@@ -43,7 +43,7 @@ class DeviceOptimizer:
             LaboratoryError: it cannot answer the question.
         """
         try:
-            suggestion: Suggestion = await self.device.call("suggest", problem, deadline=DEADLINE)
+            suggestion: Suggestion = await self.device.call("suggest", query, deadline=DEADLINE)
         except MachineLostError:
             raise
         except DeviceLostError:

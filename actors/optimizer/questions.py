@@ -1,13 +1,13 @@
 """Questions to the optimiser and its answers: plain values that are sent between processes, journalled and replayed.
 
-`SuggestProblem` is a question and `Suggestion` its answer. `ModelDiscrepancy` and `DiscrepancyFound` describe how a
-bench may differ from its simulator, `Risk` the disturbances of execution, `PosteriorQuestion` and `DesignQuestion` the
-calibration by weighed pours.
+`SuggestionQuery` is a question, with one type for each kind, and `Suggestion` its answer. `ModelDiscrepancy` and
+`DiscrepancyFound` describe how a bench may differ from its simulator, `Risk` the disturbances of execution,
+`PosteriorQuestion` and `DesignQuestion` the calibration by weighed pours.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Literal
 
 from sim_engine.search_space import Space
@@ -16,7 +16,7 @@ Numbers = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class Play:
+class OffsetPrior:
     """Prior of the bench offset along one axis, as standard deviations.
 
     Attributes:
@@ -48,26 +48,26 @@ class Limit:
 
 @dataclass(frozen=True)
 class ModelDiscrepancy:
-    """For `mean='adaptive'`: the ways in which the simulator may be wrong, and the budget of pours.
+    """The ways in which the simulator may be wrong, and the budget of pours.
 
     Attributes:
-        play: prior of the bench offset along each axis.
+        offset_priors: prior of the bench offset along each axis.
         drawn: bench offsets that are more likely than others, equally likely among themselves: from a calibration, or
             from pours into another receiver.
-        ignorance: prior probability that the simulator contains no information about this bench.
+        uninformative: prior probability that the simulator contains no information about this bench.
         worst: largest cost.
-        left: number of real observations after the proposed one.
+        pours_left: number of real observations after the proposed one.
         limit: kept by proposals, if any action keeps it.
-        looks_ahead: whether the next observation may be chosen for its information about other places.
+        lookahead: whether the next observation may be chosen for its information about other places.
     """
 
-    play: tuple[Play, ...]
+    offset_priors: tuple[OffsetPrior, ...]
     drawn: tuple[BenchOffset, ...] = ()
-    ignorance: float = 0.08
+    uninformative: float = 0.08
     worst: float = 1.0
-    left: int = 0
+    pours_left: int = 0
     limit: Limit | None = None
-    looks_ahead: bool = True
+    lookahead: bool = True
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class DiscrepancyFound:
     """Conclusions about the simulator.
 
     Attributes:
-        ignorance: probability that the simulator contains no information about this bench.
+        uninformative: probability that the simulator contains no information about this bench.
         shifts: difference of the simulator's action at the cube's centre; mean over all other hypotheses.
         deviations: of these shifts.
         factor: real over simulated cost, the median of those hypotheses.
@@ -86,7 +86,7 @@ class DiscrepancyFound:
         drawn: bench offsets drawn from the posterior, for another receiver; only with `count=0`.
     """
 
-    ignorance: float
+    uninformative: float
     shifts: Numbers
     deviations: Numbers
     factor: float
@@ -99,8 +99,11 @@ class DiscrepancyFound:
 Point = tuple[float, ...]
 """A point of the unit cube."""
 
-MeanName = Literal["constant", "zero", "simulated", "scaled", "adaptive"]
-AcquisitionName = Literal["lcb", "posterior_minimum", "random", "sobol", "knowledge", "least_loss"]
+MeanName = Literal["constant", "zero"]
+AcquisitionName = Literal["lcb", "posterior_minimum"]
+"""'lcb' minimises m(x) − κ s(x). 'posterior_minimum' minimises m(x); further points of the same answer use the
+penalised 'lcb'."""
+
 NoiseName = Literal["constant", "varying"]
 
 
@@ -219,7 +222,7 @@ class Risk:
 
 @dataclass(frozen=True)
 class RiskAnswer:
-    """Results over the disturbances, at each of `SuggestProblem.predict_at`.
+    """Results over the disturbances, at each of `SurrogateQuery.predict_at`.
 
     Attributes:
         expected: means over the disturbances.
@@ -247,85 +250,198 @@ class SearchEffort:
 
 
 @dataclass(frozen=True)
-class SuggestProblem:
-    """A question with everything that a proposal depends on; the optimiser actor keeps no relevant state.
+class SpaceFillingQuery:
+    """Points that fill the space evenly, far from known ones: the start of a search, without a surrogate.
+
+    Attributes:
+        space: searched box.
+        known: points that were tried before.
+        pending: requested points without an answer yet.
+        count: number of requested points.
+        seed: of every random choice in the answer.
+        constraints, infeasible, refused, failed: see `SurrogateQuery`.
+    """
+
+    space: Space
+    known: tuple[Point, ...] = ()
+    pending: tuple[Point, ...] = ()
+    count: int = 1
+    seed: int = 0
+    constraints: tuple[Linear, ...] = ()
+    infeasible: tuple[Point, ...] = ()
+    refused: tuple[Point, ...] = ()
+    failed: tuple[Point, ...] = ()
+
+
+@dataclass(frozen=True)
+class SurrogateQuery:
+    """Parts of every query that is answered by a surrogate of observations. Use one of its subclasses.
+
+    A query contains everything that the answer depends on; the optimiser actor keeps no relevant state.
 
     Attributes:
         space: searched box.
         data: observations of the cost.
-        pending: requested points without an answer yet.
-        count: number of requested points; 0 requests only `best_point`, map and predictions.
         seed: of every random choice in the answer.
-        mean: prior mean of the surrogate. 'constant' is fitted; 'zero' is the paper's. 'simulated' is the posterior
-            mean of a GP over `simulated`, the paper's D3. 'scaled' has real cost = ρ · simulated cost + remainder,
-            fitted together (for 'knowledge'). 'adaptive' averages over the ways in which the simulator may be wrong,
-            see `mismatch`.
-        simulated: cheap observations of the same cost, for the last three.
-        acquisition: 'lcb' minimises m(x) − κ s(x). 'posterior_minimum' minimises m(x); further points of the same
-            answer use the penalised 'lcb'. 'random' and 'sobol' only draw. 'knowledge' chooses *simulations*: those
-            most informative about the best action (needs a mean with simulations). 'least_loss' (for 'adaptive'): the
-            first point is a pour with a small loss on the way to a good action, the others are simulations that show in
-            which way the simulator is wrong.
         kappa: κ of the lower confidence bound, constant as in the paper.
         map_resolution: if > 0 and the space has at least two dimensions, the answer includes the surrogate on a square
             grid over the two most important axes.
         map_at: point of the unit cube through which the grid passes; by default the minimum, see `SurrogateMap.at`.
-        predict_at: further points for posterior predictions (a regression, with `count=0`).
-        context: if given, the observations are signed differences that also depend on coordinates that are not searched
-            (in calibration: c_r − c_s, and the simulated action). The minimised quantity is the mean of their absolute
-            values over these points of the context's unit cube. The points of `data` then have `space.dimension`
-            coordinates followed by those of the context.
+        predict_at: further points for posterior predictions.
+        constraints: kept by every proposal and by the best point.
         infeasible: places where a request was refused. They contain no information about the cost; proposals avoid
             places with a likely refusal.
         refused: the same for real requests: a simulation does not show that a place can be executed.
         failed: places of real requests that failed during execution, for example because the vessels touched. They are
             among `data` too, with the cost of the failure. Proposals avoid places with a likely failure, and the best
             point is one that is likely to succeed.
-        constraints: kept by every proposal.
         noise: of real observations: 'constant', or 'varying' with the expected cost if the observations support it.
-        posterior: with a context: weighed pours, for draws of the searched parameters given them.
-        design: with a posterior: which pour to weigh next.
-        risk: if given, the observations are of requests as executed, disturbances included: points of `data` have
-            `space.dimension` coordinates (which may leave the cube) followed by the disturbances' context. The
-            minimised, predicted and mapped quantity is the measure over the disturbances of a request.
-        pouring: 'knowledge': places of pending real observations; `pending` are simulations then.
         effort: limits the fit, and includes the fitted hyperparameters in the answer.
-        mismatch: 'adaptive': how the simulator may be wrong, and how many pours follow.
-        plain: 'lcb' as in the paper: κ is constant, and no point only fills space on a plateau.
     """
 
     space: Space
     data: Data
-    pending: tuple[Point, ...] = ()
-    count: int = 1
+    _: KW_ONLY
     seed: int = 0
-    mean: MeanName = "constant"
-    simulated: Data = Data()
-    acquisition: AcquisitionName = "lcb"
     kappa: float = 2.0
     map_resolution: int = 0
     map_at: Point = ()
     predict_at: tuple[Point, ...] = ()
-    context: tuple[Point, ...] = ()
+    constraints: tuple[Linear, ...] = ()
     infeasible: tuple[Point, ...] = ()
     refused: tuple[Point, ...] = ()
     failed: tuple[Point, ...] = ()
-    constraints: tuple[Linear, ...] = ()
     noise: NoiseName = "constant"
-    posterior: PosteriorQuestion | None = None
-    design: DesignQuestion | None = None
-    risk: Risk | None = None
-    pouring: tuple[Point, ...] = ()
     effort: SearchEffort | None = None
-    plain: bool = False
-    mismatch: ModelDiscrepancy | None = None
 
     @property
-    def beside(self) -> int:
+    def context_dimension(self) -> int:
         """Number of coordinates of an observation in addition to the space's."""
-        if self.risk is not None and self.risk.disturbances:
-            return len(self.risk.disturbances[0].context)
-        return len(self.context[0]) if self.context else 0
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegressionQuery(SurrogateQuery):
+    """No proposal: the best point, predictions and the map.
+
+    Attributes:
+        mean: prior mean of the surrogate. 'constant' is fitted; 'zero' is the paper's.
+    """
+
+    mean: MeanName = "constant"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProposalQuery(SurrogateQuery):
+    """Parts of every query that requests points.
+
+    Attributes:
+        pending: requested points without an answer yet.
+        count: number of requested points; 0 requests only the best point, map and predictions.
+    """
+
+    pending: tuple[Point, ...] = ()
+    count: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class MinimumQuery(ProposalQuery):
+    """Minimise a cost of which `data` are direct observations.
+
+    Attributes:
+        acquisition: see `AcquisitionName`.
+        mean: prior mean of the surrogate. 'constant' is fitted; 'zero' is the paper's.
+        plain: 'lcb' as in the paper: κ is constant, and no point only fills space on a plateau.
+    """
+
+    acquisition: AcquisitionName = "lcb"
+    mean: MeanName = "constant"
+    plain: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class RiskQuery(ProposalQuery):
+    """Minimise the mean or the CVaR of a cost over disturbances of the request.
+
+    The observations are of requests as executed: points of `data` have `space.dimension` coordinates (which may leave
+    the cube) followed by the disturbances' context. The minimised, predicted and mapped quantity is the measure over
+    the disturbances of a request. `predict_at` names the requests that the best point is chosen from.
+
+    Attributes:
+        risk: the disturbances and the measure.
+        acquisition: see `AcquisitionName`.
+    """
+
+    risk: Risk
+    acquisition: AcquisitionName = "lcb"
+
+    @property
+    def context_dimension(self) -> int:
+        """See `SurrogateQuery.context_dimension`."""
+        return len(self.risk.disturbances[0].context) if self.risk.disturbances else 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationQuery(ProposalQuery):
+    """Minimise the mean absolute value of signed differences over contexts that are not searched.
+
+    In a calibration the differences are c_r − c_s, and a context is the simulated action. Points of `data` have
+    `space.dimension` coordinates followed by those of the context.
+
+    Attributes:
+        contexts: points of the context's unit cube over which the absolute values are averaged.
+        posterior: weighed pours, for draws of the searched parameters given them.
+        design: with a posterior: which pour to weigh next.
+    """
+
+    contexts: tuple[Point, ...]
+    posterior: PosteriorQuestion | None = None
+    design: DesignQuestion | None = None
+
+    @property
+    def context_dimension(self) -> int:
+        """See `SurrogateQuery.context_dimension`."""
+        return len(self.contexts[0]) if self.contexts else 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PourQuery(ProposalQuery):
+    """Choose the next real pour, given pours (`data`) and simulations of the same cost. Pending points are simulations.
+
+    Attributes:
+        simulated: cheap observations.
+        acquisition: see `AcquisitionName`; or 'least_loss', with a `discrepancy`: the first point is a pour with a
+            small loss on the way to a good action, the others are simulations that show in which way the simulator is
+            wrong.
+        discrepancy: average over the ways in which the simulator may be wrong. None: the prior mean is the posterior
+            mean of a GP of the simulations, the paper's D3.
+    """
+
+    simulated: Data
+    acquisition: Literal["lcb", "posterior_minimum", "least_loss"] = "lcb"
+    discrepancy: ModelDiscrepancy | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationQuery(ProposalQuery):
+    """Choose the simulations that are most informative about the best real pour, by their knowledge gradient.
+
+    Attributes:
+        simulated: cheap observations.
+        pouring: places of pending real observations; `pending` are simulations.
+        coupling: of real and simulated cost. 'residual': see `PourQuery.discrepancy`. 'scaled': real cost = ρ ·
+            simulated cost + remainder, fitted together.
+    """
+
+    simulated: Data
+    pouring: tuple[Point, ...] = ()
+    coupling: Literal["residual", "scaled"] = "residual"
+
+
+SuggestionQuery = (
+    SpaceFillingQuery | RegressionQuery | MinimumQuery | RiskQuery | CalibrationQuery | PourQuery | SimulationQuery
+)
+"""A question to the optimiser; journals tag it with the name of its type."""
 
 
 @dataclass(frozen=True)
@@ -338,7 +454,7 @@ class SurrogateMap:
         axes: names of the two axes, in the space's order: those with the shortest fitted lengthscales. Empty for a
             space with two axes only.
         at: point of the unit cube through which the grid passes: every other axis is held at its value there. It is
-            `SuggestProblem.map_at`, or the minimum of the posterior mean: the minimiser that 'posterior_minimum' found,
+            `SurrogateQuery.map_at`, or the minimum of the posterior mean: the minimiser that 'posterior_minimum' found,
             otherwise `Suggestion.best_point`.
     """
 
@@ -372,25 +488,26 @@ class Suggestion:
         best_mean: posterior mean there.
         best_deviation: its standard deviation.
         hyperparameters: fitted values by name (for reports and plots); 'noise' and 'signal' in the cost's unit.
-        surrogate: see `SuggestProblem.map_resolution`.
-        predictions: posterior means at `SuggestProblem.predict_at`; empty without a surrogate.
+        surrogate: see `SurrogateQuery.map_resolution`.
+        predictions: posterior means at `SurrogateQuery.predict_at`; empty without a surrogate.
         prediction_deviations: their standard deviations.
         seconds: CPU seconds used.
         noises: standard deviations of single real observations at the proposals; empty without a surrogate.
-        bands: 'adaptive': shortest intervals that contain single real observations at the proposals with a probability
-            of `sim_engine.prediction_band.LEVEL`.
+        bands: with a `ModelDiscrepancy`: shortest intervals that contain single real observations at the proposals with
+            a probability of `sim_engine.prediction_band.LEVEL`.
         feasibilities: probabilities that the proposals are neither refused nor fail; empty without any refusal or
             failure.
-        posterior: answer to `SuggestProblem.posterior`; None without a surrogate.
+        posterior: answer to `CalibrationQuery.posterior`; None without a surrogate.
         best_noise: standard deviation of a single real observation at `best_point`; None without a surrogate.
-        risk: with a risk: further results at `SuggestProblem.predict_at`.
-        values: 'knowledge': value of a simulation at each point, given those before it; in the cost's unit, ≥ 0.
-        pour_value: 'knowledge': the same for the most valuable real observation.
-        gains: 'design': expected reduction of the variance of predictions by weighing a pour at each candidate,
-            averaged over the targets; in the cost's unit, squared.
-        uncertainty: 'design': the current variance, averaged over the targets.
-        mismatch: 'adaptive': the conclusions about the simulator.
-        fitted: with `SuggestProblem.effort`: hyperparameters of each process, to start the next fit with.
+        risk: with a risk: further results at `SurrogateQuery.predict_at`.
+        values: for a `SimulationQuery`: value of a simulation at each point, given those before it; in the cost's unit,
+            ≥ 0.
+        pour_value: for a `SimulationQuery`: the same for the most valuable real observation.
+        gains: with a `DesignQuestion`: expected reduction of the variance of predictions by weighing a pour at each
+            candidate, averaged over the targets; in the cost's unit, squared.
+        uncertainty: with a `DesignQuestion`: the current variance, averaged over the targets.
+        discrepancy: with a `ModelDiscrepancy`: the conclusions about the simulator.
+        fitted: with `SurrogateQuery.effort`: hyperparameters of each process, to start the next fit with.
     """
 
     points: tuple[Point, ...]
@@ -415,4 +532,4 @@ class Suggestion:
     fitted: tuple[tuple[float, ...], ...] = ()
     gains: tuple[float, ...] = ()
     uncertainty: float | None = None
-    mismatch: DiscrepancyFound | None = None
+    discrepancy: DiscrepancyFound | None = None

@@ -1,35 +1,53 @@
-"""`propose`: from a question to an answer. Pure: the same question gets the same answer on the same machine.
+"""`propose`: from a query to a suggestion. Pure: the same query has the same answer on the same machine.
 
-`describe`, `posterior_of` and `design_of` compute the parts of an answer: predictions, best observation, map, draws of
-θ. `slices` returns the surrogate over every pair of its axes, for plots of spaces with more than two.
+`check` rejects invalid queries. `describe`, `posterior_of` and `design_of` compute the parts of an answer: predictions,
+best observation, map, draws of θ. `slices` returns the surrogate over every pair of its axes, for plots of spaces with
+more than two.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from actors.optimizer import acquisition
-from actors.optimizer.experimental_design import WeighedDesign, expected_reductions
 from actors.optimizer.feasible_region import Feasibility, Region
-from actors.optimizer.knowledge_gradient import KnowledgeGradient, found, most_instructive, proposals
-from actors.optimizer.question_checks import Asked, array, check, tuples
+from actors.optimizer.knowledge_gradient import found, most_instructive, proposals
 from actors.optimizer.questions import (
+    CalibrationQuery,
+    Data,
     DesignQuestion,
+    MinimumQuery,
+    ModelDiscrepancy,
     Point,
     Posterior,
     PosteriorQuestion,
+    PourQuery,
+    ProposalQuery,
+    RiskQuery,
+    SimulationQuery,
+    SpaceFillingQuery,
     Suggestion,
-    SuggestProblem,
+    SuggestionQuery,
     SurrogateMap,
+    SurrogateQuery,
 )
 from actors.optimizer.risk_measures import RiskProcess
-from actors.optimizer.surrogate_models import Model, fit
-from actors.optimizer.theta_posterior import DISCREPANCY_PRIOR, drawn_beforehand, sample_posterior
+from actors.optimizer.surrogate_models import Model, QueryArrays, array, fit, tuples
+from actors.optimizer.theta_posterior import (
+    DISCREPANCY_PRIOR,
+    WeighedDesign,
+    drawn_beforehand,
+    expected_reductions,
+    sample_posterior,
+)
 from sim_engine.prediction_band import LEVEL
 
 Array = NDArray[np.float64]
@@ -39,65 +57,66 @@ WORST = 8
 
 
 def describe(
-    problem: SuggestProblem, asked: Asked, model: Model, points: Array, feasibility: Feasibility | None
+    query: SurrogateQuery, arrays: QueryArrays, model: Model, points: Array, feasibility: Feasibility | None
 ) -> dict[str, object]:
     """Return the surrogate's results about the proposals, the observations and further points."""
-    known = asked.known if len(asked.known) else asked.simulated
-    if problem.risk is not None:
-        known = asked.region.snap(array(problem.predict_at, problem.space.dimension))
+    risky, other_space = isinstance(query, RiskQuery), isinstance(query, RiskQuery | CalibrationQuery)
+    known = arrays.known if len(arrays.known) else arrays.simulated
+    if risky:
+        known = arrays.region.snap(array(query.predict_at, query.space.dimension))
     elif feasibility is not None:
         known = known[feasibility.likely(known)]
-    if problem.risk is None and (allowed := asked.region.allows(known)).any():
+    if not risky and (allowed := arrays.region.allows(known)).any():
         known = known[allowed]  # prior data may lie outside the current constraints
     means, deviations = model.surrogate.predict(points) if len(points) else (np.empty(0), np.empty(0))
     at_known, known_deviations = model.surrogate.predict(known)
     expected = at_known
-    if problem.risk is None and feasibility is not None and len(asked.costs):
+    if not risky and feasibility is not None and len(arrays.costs):
         made = feasibility.made(known)
-        expected = made * at_known + (1.0 - made) * asked.costs.max()
+        expected = made * at_known + (1.0 - made) * arrays.costs.max()
     best = int(np.argmin(expected))
     process = model.process
     description: dict[str, object] = {
         "means": tuple(map(float, means)),
         "deviations": tuple(map(float, deviations)),
-        "noises": () if problem.beside or problem.risk else tuple(map(float, model.noise_at(points))),
+        "noises": () if other_space else tuple(map(float, model.noise_at(points))),
         "best_point": tuple(map(float, known[best])),
         "best_mean": float(at_known[best]),
         "best_deviation": float(known_deviations[best]),
-        "best_noise": None if problem.beside or problem.risk else float(model.noise_at(known[best : best + 1])[0]),
+        "best_noise": None if other_space else float(model.noise_at(known[best : best + 1])[0]),
         "hyperparameters": {
             "signal": process.signal,
             "noise": process.noise,
             **process.hyperparameters,
             **({} if model.averaged is None else model.averaged.hyperparameters),
-            **dict(zip((f"length.{name}" for name in _axis_names(problem)), map(float, process.lengths), strict=True)),
+            **dict(zip((f"length.{name}" for name in _axis_names(query)), map(float, process.lengths), strict=True)),
         },
     }
     if model.averaged is not None and len(points):
         description["bands"] = tuples(model.averaged.bands(points, LEVEL))
-    if problem.predict_at:
+    if query.predict_at:
         predictions, spreads = model.surrogate.predict(
-            asked.region.snap(array(problem.predict_at, problem.space.dimension))
+            arrays.region.snap(array(query.predict_at, query.space.dimension))
         )
         description["predictions"] = tuple(map(float, predictions))
         description["prediction_deviations"] = tuple(map(float, spreads))
         if isinstance(model.surrogate, RiskProcess):
             description["risk"] = model.surrogate.answer(known, WORST)
-    if problem.map_resolution and problem.space.dimension >= 2:
-        sought = problem.acquisition == "posterior_minimum" and len(points) > 0
-        at = np.array(problem.map_at) if problem.map_at else points[0] if sought else known[best]
+    if query.map_resolution and query.space.dimension >= 2:
+        sought = _seeks_minimum(query) and len(points) > 0
+        at = np.array(query.map_at) if query.map_at else points[0] if sought else known[best]
         across, up = sorted(int(i) for i in np.argsort(model.lengths, kind="stable")[:2])
-        description["surrogate"] = mapped(problem, asked.region, model, at, (across, up), problem.map_resolution)
+        description["surrogate"] = mapped(query, arrays.region, model, at, (across, up), query.map_resolution)
     return description
 
 
 def posterior_of(
-    problem: SuggestProblem, question: PosteriorQuestion, region: Region, model: Model, rng: np.random.Generator
+    query: CalibrationQuery, question: PosteriorQuestion, region: Region, model: Model, rng: np.random.Generator
 ) -> Posterior:
     """Return draws of θ given weighed pours."""
-    contexts = array(question.contexts, model.process.points.shape[1] - problem.space.dimension)
+    contexts = array(question.contexts, query.context_dimension)
     if not len(contexts):
-        drawn = drawn_beforehand(question.count, problem.space.dimension, array(question.prior, 2), rng)
+        drawn = drawn_beforehand(question.count, query.space.dimension, array(question.prior, 2), rng)
         lack = (DISCREPANCY_PRIOR[0],) * question.count
         return Posterior(tuples(region.snap(drawn)), lack, float(question.count))
     sampled = sample_posterior(
@@ -114,27 +133,27 @@ def posterior_of(
 
 
 def design_of(
-    problem: SuggestProblem, question: DesignQuestion, made: PosteriorQuestion, model: Model, posterior: Posterior
+    query: CalibrationQuery, question: DesignQuestion, made: PosteriorQuestion, model: Model, posterior: Posterior
 ) -> dict[str, object]:
     """Return the expected information of weighing a pour at each candidate, in addition to those made."""
-    beside = model.process.points.shape[1] - problem.space.dimension
+    context_dimension = query.context_dimension
     gains, variance = expected_reductions(
         model.process,
         np.array(posterior.points),
         np.array(posterior.discrepancies),
-        WeighedDesign(array(made.contexts, beside), np.array(made.offsets), made.noise),
-        array(question.candidates, beside),
-        array(question.targets, beside),
+        WeighedDesign(array(made.contexts, context_dimension), np.array(made.offsets), made.noise),
+        array(question.candidates, context_dimension),
+        array(question.targets, context_dimension),
     )
     return {"gains": tuple(map(float, gains)), "uncertainty": variance}
 
 
-def _axis_names(problem: SuggestProblem) -> list[str]:
-    return [*problem.space.names, *(f"context{i + 1}" for i in range(problem.beside))]
+def _axis_names(query: SurrogateQuery) -> list[str]:
+    return [*query.space.names, *(f"context{i + 1}" for i in range(query.context_dimension))]
 
 
 def mapped(
-    problem: SuggestProblem, region: Region, model: Model, at: Array, axes: tuple[int, int], resolution: int
+    query: SurrogateQuery, region: Region, model: Model, at: Array, axes: tuple[int, int], resolution: int
 ) -> SurrogateMap:
     """The surrogate on the plane through `at`, shape (dimension,), that two axes of the space span."""
     across, up = axes
@@ -143,9 +162,9 @@ def mapped(
     grid = np.tile(at, (first.size, 1))
     grid[:, across], grid[:, up] = first.ravel(), second.ravel()
     mean, deviation = model.surrogate.predict(region.snap(grid))
-    shape, names = first.shape, problem.space.names
+    shape, names = first.shape, query.space.names
     cut: tuple[tuple[str, ...], Point] = ((), ())
-    if problem.space.dimension > 2:
+    if query.space.dimension > 2:
         cut = (names[across], names[up]), tuple(map(float, at))
     return SurrogateMap(tuples(mean.reshape(shape)), tuples(deviation.reshape(shape)), *cut)
 
@@ -160,81 +179,87 @@ SETTLED = 0.5
 """Factor on κ once the costs are more than noise."""
 
 
-def propose(problem: SuggestProblem) -> Suggestion:
-    """Answer a `SuggestProblem`.
+def propose(query: SuggestionQuery) -> Suggestion:
+    """Answer a query.
 
     With fewer than two observations there is no surrogate, and the points are Sobol points far from the known ones.
     Local penalisation avoids pending points and the other points of the same answer.
 
     Raises:
-        ValueError: the question cannot be answered: numbers that are not finite, wrong dimensions, sizes too large for
-            a dense GP.
+        ValueError: the query cannot be answered: numbers that are not finite, wrong dimensions, sizes too large for a
+            dense GP.
 
     Limitations: linear algebra differs between machines in the last bits, and so do proposals: journal the answer.
     """
-    check(problem)
-    with threadpool_limits(1):  # threads only slow down matrices this small, and sums in a fixed order are repeatable
-        return _answer(problem)
-
-
-def _answer(problem: SuggestProblem) -> Suggestion:
+    check(query)
     started = time.process_time()
-    rng = np.random.default_rng(problem.seed)
-    asked = Asked.of(problem)
-    model = fit(problem, asked)
-    feasibility = asked.feasibility()
+    with threadpool_limits(1):  # threads only slow down matrices this small, and sums in a fixed order are repeatable
+        answer = _fill_space(query) if isinstance(query, SpaceFillingQuery) else _answer(query)
+    return replace(answer, seconds=time.process_time() - started)
 
-    knowledge: KnowledgeGradient | None = None
-    if problem.acquisition == "random":
-        points = asked.region.draw(problem.count, rng, even=False)
-    elif problem.acquisition == "sobol" or model is None:
-        taken = np.concatenate([asked.known, asked.busy, asked.refused])
-        points = acquisition.spread_out(problem.count, taken, asked.region, rng, feasibility)
-    elif problem.acquisition == "knowledge":
-        candidates = _candidates(problem, asked, model, rng)
-        knowledge = most_instructive(problem, model.process, candidates, asked.busy, asked.pouring, feasibility)
-        points = knowledge.points
-    elif problem.acquisition == "least_loss" and model.averaged is not None:
-        points = proposals(problem, asked, model.averaged, _candidates(problem, asked, model, rng), feasibility, rng)
-    else:
-        points = _search(problem, asked, model, feasibility, rng)
 
+def _fill_space(query: SpaceFillingQuery) -> Suggestion:
+    known = Data(query.known, (0.0,) * len(query.known))
+    places = {name: getattr(query, name) for name in ("constraints", "infeasible", "refused", "failed", "pending")}
+    arrays = QueryArrays.of(MinimumQuery(query.space, known, **places))
+    feasibility, rng = arrays.feasibility(), np.random.default_rng(query.seed)
+    points = acquisition.spread_out(query.count, arrays.taken, arrays.region, rng, feasibility)
+    return Suggestion(tuples(points), feasibilities=_feasibilities(feasibility, points))
+
+
+def _answer(query: SurrogateQuery) -> Suggestion:
+    rng = np.random.default_rng(query.seed)
+    arrays = QueryArrays.of(query)
+    model = fit(query, arrays)
+    feasibility = arrays.feasibility()
     answer: dict[str, object] = {}
+    points = np.empty((0, query.space.dimension))
+    if isinstance(query, ProposalQuery) and model is None:
+        points = acquisition.spread_out(query.count, arrays.taken, arrays.region, rng, feasibility)
+    elif isinstance(query, SimulationQuery) and model is not None:
+        candidates = _candidates(arrays, model, rng)
+        knowledge = most_instructive(query, model.process, candidates, arrays.busy, arrays.pouring, feasibility)
+        points = knowledge.points
+        answer = {"values": tuple(map(float, knowledge.values)), "pour_value": knowledge.pour_value}
+    elif isinstance(query, PourQuery) and query.acquisition == "least_loss" and model is not None and model.averaged:
+        points = proposals(query, arrays, model.averaged, _candidates(arrays, model, rng), feasibility, rng)
+    elif isinstance(query, ProposalQuery) and model is not None:
+        points = _search(query, arrays, model, feasibility, rng)
+
     if model is not None:
-        answer = describe(problem, asked, model, points, feasibility)
-    if model is not None and problem.posterior is not None:
-        posterior = posterior_of(problem, problem.posterior, asked.region, model, rng)
-        answer["posterior"] = posterior
-        if problem.design is not None:
-            answer |= design_of(problem, problem.design, problem.posterior, model, posterior)
-    if model is not None and problem.effort is not None:
-        answer["fitted"] = tuples([process.theta for process in model.fitted])
-    if knowledge is not None:
-        answer |= {"values": tuple(map(float, knowledge.values)), "pour_value": knowledge.pour_value}
-    if model is not None and model.averaged is not None:
-        answer["mismatch"] = found(problem, asked, model.averaged, points, feasibility, rng)
-    if feasibility is not None and len(points):
-        answer["feasibilities"] = tuple(map(float, np.exp(feasibility.log_probability(points))))
-    return Suggestion(
-        points=tuples(points),
-        seconds=time.process_time() - started,
-        **answer,  # type: ignore[arg-type]
-    )
+        answer |= describe(query, arrays, model, points, feasibility)
+        if isinstance(query, CalibrationQuery) and query.posterior is not None:
+            posterior = posterior_of(query, query.posterior, arrays.region, model, rng)
+            answer["posterior"] = posterior
+            if query.design is not None:
+                answer |= design_of(query, query.design, query.posterior, model, posterior)
+        if query.effort is not None:
+            answer["fitted"] = tuples([process.theta for process in model.fitted])
+        if isinstance(query, PourQuery) and model.averaged is not None:
+            answer["discrepancy"] = found(query, arrays, model.averaged, points, feasibility, rng)
+    answer["feasibilities"] = _feasibilities(feasibility, points)
+    return Suggestion(tuples(points), **answer)  # type: ignore[arg-type]
 
 
-def _candidates(problem: SuggestProblem, asked: Asked, model: Model, rng: np.random.Generator) -> Array:
+def _feasibilities(feasibility: Feasibility | None, points: Array) -> tuple[float, ...]:
+    if feasibility is None or not len(points):
+        return ()
+    return tuple(map(float, np.exp(feasibility.log_probability(points))))
+
+
+def _candidates(arrays: QueryArrays, model: Model, rng: np.random.Generator) -> Array:
     """Candidates for the search: all over the region, and around the best observations."""
-    seen = asked.seen if problem.mean in ("simulated", "scaled", "adaptive") else asked.known
-    if problem.risk is not None:
+    seen = arrays.seen
+    if isinstance(model.surrogate, RiskProcess):
         seen = np.clip(seen, 0.0, 1.0)  # executed points may lie outside the box
     means = model.surrogate.predict(seen)[0]
     around = [seen[i] for i in np.argsort(means, kind="stable")[:4]]
-    return acquisition.search_candidates(asked.region, problem.space.dimension, around, rng)
+    return acquisition.search_candidates(arrays.region, seen.shape[1], around, rng)
 
 
 def _search(
-    problem: SuggestProblem,
-    asked: Asked,
+    query: ProposalQuery,
+    arrays: QueryArrays,
     model: Model,
     feasibility: Feasibility | None,
     rng: np.random.Generator,
@@ -242,56 +267,61 @@ def _search(
     """`count` minimisers of the acquisition, each avoiding the pending points and the ones before it."""
     chosen: list[Array] = []
     surrogate = model.surrogate
-    if problem.count:
-        candidates = _candidates(problem, asked, model, rng)
-    for index in range(problem.count):
-        taken = np.concatenate([asked.busy, np.array(chosen).reshape(-1, problem.space.dimension)])
-        if _fills_space(problem, asked, model, index):
-            avoided = np.concatenate([asked.known, taken, asked.refused])
-            chosen.append(acquisition.spread_out(1, avoided, asked.region, rng, feasibility)[0])
+    if query.count:
+        candidates = _candidates(arrays, model, rng)
+    for index in range(query.count):
+        pending = np.concatenate([arrays.busy, np.array(chosen).reshape(-1, query.space.dimension)])
+        if _fills_space(query, arrays, model, index):
+            avoided = np.concatenate([arrays.known, pending, arrays.refused])
+            chosen.append(acquisition.spread_out(1, avoided, arrays.region, rng, feasibility)[0])
             continue
-        conclude = problem.acquisition == "posterior_minimum" and index == 0
-        score = acquisition.lower_confidence_bound(surrogate, 0.0 if conclude else _kappa(problem, model))
-        score = acquisition.penalised(score, surrogate, taken[:0] if conclude else taken, candidates, feasibility)
-        chosen.append(acquisition.minimise(score, candidates, asked.region, rng))
-    return np.array(chosen).reshape(problem.count, problem.space.dimension)
+        conclude = _seeks_minimum(query) and index == 0
+        score = acquisition.lower_confidence_bound(surrogate, 0.0 if conclude else _kappa(query, model))
+        score = acquisition.penalised(score, surrogate, pending[:0] if conclude else pending, candidates, feasibility)
+        chosen.append(acquisition.minimise(score, candidates, arrays.region, rng))
+    return np.array(chosen).reshape(query.count, query.space.dimension)
 
 
-def _fills_space(problem: SuggestProblem, asked: Asked, model: Model, index: int) -> bool:
+def _seeks_minimum(query: SurrogateQuery) -> bool:
+    """Whether the first proposal is the minimiser of the posterior mean."""
+    return isinstance(query, MinimumQuery | RiskQuery | PourQuery) and query.acquisition == "posterior_minimum"
+
+
+def _fills_space(query: ProposalQuery, arrays: QueryArrays, model: Model, index: int) -> bool:
     """Whether the next point only fills space: every third one, while the costs may be pure noise.
 
     On a plateau the best pours look like a slope by chance. Following them, mostly along the faces of the cube, would
-    use up the whole budget. The paper's methods (`plain`, 'zero', 'simulated'), contexts and risks are excluded.
+    use up the whole budget. Only a `MinimumQuery` does so, without `plain` and with a constant mean.
     """
-    if problem.plain:
+    if not isinstance(query, MinimumQuery) or query.plain or query.mean != "constant" or _seeks_minimum(query):
         return False
-    number = len(asked.known) + len(asked.busy) + index
-    if problem.acquisition != "lcb" or problem.context or problem.risk or number % FILL_EVERY != FILL_EVERY - 1:
-        return False
-    return problem.mean == "constant" and model.process.evidence < STRUCTURE
+    number = len(arrays.known) + len(arrays.busy) + index
+    return number % FILL_EVERY == FILL_EVERY - 1 and model.process.evidence < STRUCTURE
 
 
-def _kappa(problem: SuggestProblem, model: Model) -> float:
+def _kappa(query: ProposalQuery, model: Model) -> float:
     """κ of the next point: half of it once the costs show structure.
 
     A constant κ continues to explore unknown regions long after the valley has been found, and a budget of twenty ends
-    before its bottom is reached. The paper's methods (`plain`, 'zero', 'simulated'), and contexts, are excluded.
+    before its bottom is reached. The paper's methods (`plain`, the mean 'zero', pours after simulations), and contexts,
+    are excluded.
     """
-    adapts = problem.mean == "constant" and not problem.context and not problem.plain
-    settled = adapts and model.process.evidence >= STRUCTURE
-    return problem.kappa * (SETTLED if settled else 1.0)
+    adapts = isinstance(query, RiskQuery) or (
+        isinstance(query, MinimumQuery) and query.mean == "constant" and not query.plain
+    )
+    return query.kappa * (SETTLED if adapts and model.process.evidence >= STRUCTURE else 1.0)
 
 
 MOST_AXES = 4
 
 
-def slices(problem: SuggestProblem, suggestion: Suggestion, resolution: int = 15) -> tuple[SurrogateMap, ...]:
+def slices(query: SurrogateQuery, suggestion: Suggestion, resolution: int = 15) -> tuple[SurrogateMap, ...]:
     """The surrogate over every pair of its axes, the others held as in `suggestion.surrogate`.
 
     Of more than `MOST_AXES` axes, those with the shortest lengthscales are used.
 
     Args:
-        problem: the question to the optimiser.
+        query: the query to the optimiser.
         suggestion: its answer, with a surrogate.
         resolution: number of places along an axis.
 
@@ -301,15 +331,170 @@ def slices(problem: SuggestProblem, suggestion: Suggestion, resolution: int = 15
     Limitations: answers contain one map only, because they are journalled. The surrogate is fitted again here, which
     takes as long as the first fit, and is identical except for the last bits on another machine.
     """
-    if suggestion.surrogate is None or problem.space.dimension <= 2:
+    if suggestion.surrogate is None or query.space.dimension <= 2:
         return ()
     with threadpool_limits(1):
-        asked = Asked.of(problem)
-        model = fit(problem, asked)
+        arrays = QueryArrays.of(query)
+        model = fit(query, arrays)
         if model is None:
             return ()
         axes = sorted(int(i) for i in np.argsort(model.lengths, kind="stable")[:MOST_AXES])
         at = np.array(suggestion.surrogate.at)
         return tuple(
-            mapped(problem, asked.region, model, at, pair, resolution) for pair in itertools.combinations(axes, 2)
+            mapped(query, arrays.region, model, at, pair, resolution) for pair in itertools.combinations(axes, 2)
         )
+
+
+MAX_OBSERVATIONS = 2_000
+"""Above it a fit takes minutes (O(n³)); a campaign that needs more should not use a dense GP."""
+MAX_COUNT = 256
+MAX_RESOLUTION = 200
+MAX_PREDICTIONS = 100_000
+MAX_DISTURBANCES = 512
+
+
+def check(query: SuggestionQuery) -> None:
+    """Reject queries that would lead to NaN or an endless computation.
+
+    Raises:
+        ValueError: names the invalid number and the valid range.
+    """
+    places = {name: getattr(query, name) for name in ("infeasible", "refused", "failed")}
+    counts = []
+    if isinstance(query, SpaceFillingQuery | ProposalQuery):
+        places["pending"] = query.pending
+        counts.append(("count", query.count, MAX_COUNT))
+    if isinstance(query, SpaceFillingQuery):
+        places["known"] = query.known
+    else:
+        places |= {"predict_at": query.predict_at, "map_at": (query.map_at,) if query.map_at else ()}
+        counts.append(("map_resolution", query.map_resolution, MAX_RESOLUTION))
+        counts.append(("len(predict_at)", len(query.predict_at), MAX_PREDICTIONS))
+        _check_surrogate(query)
+    if isinstance(query, SimulationQuery):
+        places["pouring"] = query.pouring
+    for name, points in places.items():
+        _check_points(name, points, query.space.dimension)
+    for name, value, limit in counts:
+        if not 0 <= value <= limit:
+            raise ValueError(f"{name} = {value} is outside 0 … {limit}")
+    _check_constraints(query)
+
+
+def _check_surrogate(query: SurrogateQuery) -> None:
+    dimension = query.space.dimension
+    observed = {"data": query.data}
+    if isinstance(query, PourQuery | SimulationQuery):
+        observed["simulated"] = query.simulated
+        _check_points("simulated", query.simulated.points, dimension)
+    if isinstance(query, CalibrationQuery):
+        _check_calibration(query)
+    if isinstance(query, RiskQuery):
+        _check_risk(query)
+    if isinstance(query, PourQuery):
+        if query.discrepancy is not None:
+            _check_discrepancy(query.discrepancy, dimension)
+        elif query.acquisition == "least_loss":
+            raise ValueError("acquisition='least_loss' needs a discrepancy")
+    _check_points("data", query.data.points, dimension + query.context_dimension)
+    for name, data in observed.items():
+        for index, cost in enumerate(data.costs):
+            if not math.isfinite(cost) or abs(cost) > 1e12:
+                raise ValueError(f"{name}: cost {index} is {cost}; leave failed trials out, or penalise them")
+    observations = sum(map(len, observed.values())) + len(query.infeasible) + len(query.refused)
+    if observations > MAX_OBSERVATIONS:
+        raise ValueError(f"{observations} observations and refusals, but at most {MAX_OBSERVATIONS} can be fitted")
+    if not (math.isfinite(query.kappa) and 0.0 <= query.kappa <= 100.0):
+        raise ValueError(f"kappa = {query.kappa} is outside 0 … 100")
+    _check_effort(query)
+
+
+def _check_calibration(query: CalibrationQuery) -> None:
+    if not query.contexts:
+        raise ValueError("contexts: none; differences are averaged over at least one")
+    if len(lengths := {len(point) for point in query.contexts}) > 1:
+        raise ValueError(f"context points of different lengths: {sorted(lengths)}")
+    _check_points("contexts", query.contexts, query.context_dimension)
+    _check_posterior(query)
+
+
+def _check_risk(query: RiskQuery) -> None:
+    risk = query.risk
+    if not 1 <= len(risk.disturbances) <= MAX_DISTURBANCES:
+        raise ValueError(f"risk: {len(risk.disturbances)} disturbances are outside 1 … {MAX_DISTURBANCES}")
+    if not 0.0 <= risk.level < 1.0:
+        raise ValueError(f"risk: level = {risk.level} is outside [0, 1)")
+    if len(query.data) > 1 and not query.predict_at:
+        raise ValueError("risk: predict_at must name the requests that the best is one of")
+    for index, one in enumerate(risk.disturbances):
+        sizes = len(one.scales), len(one.shifts), len(one.context)
+        if sizes != (query.space.dimension, query.space.dimension, query.context_dimension):
+            raise ValueError(f"risk: disturbance {index} has {sizes} numbers, which fit neither space nor the others")
+        if not all(math.isfinite(value) for value in (*one.scales, *one.shifts, *one.context)):
+            raise ValueError(f"risk: disturbance {index} is not finite")
+
+
+def _check_discrepancy(discrepancy: ModelDiscrepancy, dimension: int) -> None:
+    offsets = (part for one in discrepancy.drawn for part in (one.scales, one.shifts))
+    sizes = {len(discrepancy.offset_priors), *map(len, offsets)}
+    if sizes != {dimension}:
+        raise ValueError(f"discrepancy: priors and bench offsets have {sorted(sizes)} axes, the space has {dimension}")
+    valid = 0.0 < discrepancy.uninformative < 1.0 and 0.0 < discrepancy.worst < math.inf
+    if not valid or discrepancy.pours_left < 0:
+        raise ValueError("discrepancy: 0 < uninformative < 1, worst > 0 and pours_left ≥ 0 are required")
+
+
+def _check_effort(query: SurrogateQuery) -> None:
+    effort = query.effort
+    if effort is None:
+        return
+    if query.noise == "varying" and effort.start:
+        raise ValueError("effort: a start is for noise='constant' only")
+    if not 0 <= effort.iterations <= 1000:
+        raise ValueError(f"effort: iterations = {effort.iterations} is outside 0 … 1000")
+    if not all(math.isfinite(value) for start in effort.start for value in start):
+        raise ValueError("effort: the start must be finite")
+
+
+def _check_posterior(query: CalibrationQuery) -> None:
+    question = query.posterior
+    if question is None:
+        if query.design is not None:
+            raise ValueError("a design needs a posterior: what is known of the searched parameters")
+        return
+    _check_points("posterior", question.contexts, query.context_dimension)
+    for name, points in (
+        ("candidates", () if query.design is None else query.design.candidates),
+        ("targets", () if query.design is None else query.design.targets),
+    ):
+        _check_points(name, points, query.context_dimension)
+        if query.design is not None and not points:
+            raise ValueError(f"design: no {name}")
+    nothing_weighed = query.design is not None and not question.offsets
+    if len(question.offsets) != len(question.contexts) or not (question.contexts or nothing_weighed):
+        raise ValueError(f"posterior: {len(question.contexts)} pours but {len(question.offsets)} offsets")
+    if not all(math.isfinite(value) for value in (*question.offsets, question.noise)) or question.noise < 0.0:
+        raise ValueError("posterior: offsets and noise must be finite, the noise not negative")
+    if not 1 <= question.count <= 2000:
+        raise ValueError(f"posterior: count = {question.count} is outside 1 … 2000")
+
+
+def _check_constraints(query: SuggestionQuery) -> None:
+    for index, constraint in enumerate(query.constraints):
+        for name, weight in constraint.weights:
+            if name not in query.space.names:
+                raise ValueError(
+                    f"constraints: {index} names {name!r}, but the axes are {', '.join(query.space.names)}"
+                )
+            if not math.isfinite(weight):
+                raise ValueError(f"constraints: {index} has the weight {weight} for {name}")
+        if not math.isfinite(constraint.upper):
+            raise ValueError(f"constraints: {index} has the upper bound {constraint.upper}")
+
+
+def _check_points(name: str, points: Sequence[Point], dimension: int) -> None:
+    for index, point in enumerate(points):
+        if len(point) != dimension:
+            raise ValueError(f"{name}: point {index} has {len(point)} coordinates, expected {dimension}")
+        if not all(math.isfinite(u) and -10.0 <= u <= 11.0 for u in point):
+            raise ValueError(f"{name}: point {index} = {point} is not finite, or far outside the unit cube")

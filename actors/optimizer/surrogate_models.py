@@ -1,17 +1,20 @@
-"""The surrogate models of the questions: `fit` returns the fitted `Model` of a question.
+"""The surrogate models of the queries: `fit` returns the fitted `Model` of a query.
 
-`AbsoluteProcess` is the mean absolute value of a signed surrogate over a context that is not searched.
+`QueryArrays` holds a query as arrays; `array` and `tuples` convert points. `AbsoluteProcess` is the mean absolute value
+of a signed surrogate over a context that is not searched.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from actors.optimizer.feasible_region import Feasibility, Kind, Region
 from actors.optimizer.gaussian_process import (
     AFRESH,
     GaussianProcess,
@@ -23,11 +26,117 @@ from actors.optimizer.gaussian_process import (
     zero_mean_process,
 )
 from actors.optimizer.model_discrepancy import ModelAveragedProcess
-from actors.optimizer.question_checks import Asked, array
-from actors.optimizer.questions import SuggestProblem
+from actors.optimizer.questions import (
+    CalibrationQuery,
+    Data,
+    MinimumQuery,
+    Point,
+    PourQuery,
+    ProposalQuery,
+    RegressionQuery,
+    RiskQuery,
+    SimulationQuery,
+    SurrogateQuery,
+)
 from actors.optimizer.risk_measures import RiskProcess
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class QueryArrays:
+    """A query as arrays. Their order does not depend on the order of the answers; integer axes are rounded.
+
+    Attributes:
+        points: (n, dimension and context) of the observations, with their costs (n,).
+        known: (n, dimension), the same without context.
+        simulated: (k, dimension), with their costs (k,).
+        busy: (b, dimension), pending.
+        infeasible: (i, dimension), refused for any kind of request.
+        really_refused: (r, dimension), refused real requests.
+        failed: (f, dimension), real requests that failed during execution.
+        pouring: (p, dimension).
+    """
+
+    region: Region
+    points: Array
+    costs: Array
+    known: Array
+    simulated: Array
+    simulated_costs: Array
+    busy: Array
+    infeasible: Array
+    really_refused: Array
+    failed: Array
+    pouring: Array
+
+    @classmethod
+    def of(cls, query: SurrogateQuery) -> QueryArrays:
+        """Convert a query."""
+        dimension = query.space.dimension
+        region = Region(query.space, query.constraints)
+        points, costs = _sorted(query.data, dimension + query.context_dimension)
+        simulations = query.simulated if isinstance(query, PourQuery | SimulationQuery) else Data()
+        simulated, simulated_costs = _sorted(simulations, dimension)
+        points = region.snap(points)
+
+        def snapped(places: Sequence[Point]) -> Array:
+            return region.snap(array(sorted(places), dimension))
+
+        return cls(
+            region,
+            points,
+            costs,
+            points[:, :dimension],
+            region.snap(simulated),
+            simulated_costs,
+            snapped(query.pending if isinstance(query, ProposalQuery) else ()),
+            snapped(query.infeasible),
+            snapped(query.refused),
+            snapped(query.failed),
+            snapped(query.pouring if isinstance(query, SimulationQuery) else ()),
+        )
+
+    @property
+    def seen(self) -> Array:
+        """Places where the cost was observed, really or in simulation; (n + k, dimension)."""
+        return np.concatenate([self.known, self.simulated])
+
+    @property
+    def refused(self) -> Array:
+        """Places of all refusals: (i + r, dimension)."""
+        return np.concatenate([self.infeasible, self.really_refused])
+
+    @property
+    def taken(self) -> Array:
+        """Places that a point which fills the space avoids: tried, pending and refused ones."""
+        return np.concatenate([self.known, self.busy, self.refused])
+
+    def feasibility(self) -> Feasibility | None:
+        """Model of refusals and failures; None if there were none."""
+        kinds = [
+            Kind(self.seen, self.infeasible),
+            Kind(self.known, self.really_refused),
+            Kind(self.known, self.failed, by_chance=True),
+        ]
+        present = [kind for kind in kinds if len(kind.refused)]
+        return Feasibility(*present) if present else None
+
+
+def _sorted(data: Data, dimension: int) -> tuple[Array, Array]:
+    """Points (n, dimension) and costs (n,), sorted by their numbers."""
+    pairs = sorted(zip(data.points, data.costs, strict=True))
+    return array([point for point, _ in pairs], dimension), np.array([cost for _, cost in pairs], dtype=np.float64)
+
+
+def array(points: Sequence[Point], dimension: int) -> Array:
+    """Points as an array (n, dimension), also for n = 0."""
+    return np.array(points, dtype=np.float64).reshape(len(points), dimension)
+
+
+def tuples(rows: Array | Sequence[Array]) -> tuple[tuple[float, ...], ...]:
+    """Rows as tuples of plain floats, for a message."""
+    return tuple(tuple(map(float, row)) for row in rows)
 
 
 @dataclass(frozen=True)
@@ -77,49 +186,41 @@ class Model:
         return (self.averaged or self.process).noise_at(points)
 
 
-def fit(problem: SuggestProblem, asked: Asked) -> Model | None:
-    """Fit the surrogate of the problem; None with too few observations."""
-    points, costs = asked.points, asked.costs
-    informed = problem.mean in ("simulated", "scaled", "adaptive") and len(asked.simulated) >= 2
-    varying = problem.noise == "varying"
-    first = _search_for(problem, 0)
-    if informed and problem.mean == "simulated":
-        simulated = constant_mean_process(asked.simulated, asked.simulated_costs, search=first)
+def fit(query: SurrogateQuery, arrays: QueryArrays) -> Model | None:
+    """Fit the surrogate of a query; None with too few observations."""
+    points, costs = arrays.points, arrays.costs
+    varying, first = query.noise == "varying", _search_for(query, 0)
+    if isinstance(query, PourQuery | SimulationQuery) and len(arrays.simulated) >= 2:
+        if isinstance(query, SimulationQuery) and query.coupling == "scaled":
+            process = joint_process(
+                arrays.simulated, arrays.simulated_costs, points, costs, varying=varying, search=first
+            )
+            return Model(process, process, process.lengths, (process,))
+        simulated = constant_mean_process(arrays.simulated, arrays.simulated_costs, search=first)
+        if isinstance(query, PourQuery) and query.discrepancy is not None:
+            averaged = ModelAveragedProcess(simulated, points, costs, query.discrepancy)
+            return Model(averaged, simulated, simulated.lengths, (simulated,), averaged)
         if not len(points):
             return Model(simulated, simulated, simulated.lengths, (simulated,))
-        second = _search_for(problem, 1)
+        second = _search_for(query, 1)
         process = simulated_mean_process(simulated, points, costs, varying=varying, search=second)
         return Model(process, process, simulated.lengths, (simulated, process))
-    if informed and problem.mismatch is not None:
-        simulated = constant_mean_process(asked.simulated, asked.simulated_costs, search=first)
-        averaged = ModelAveragedProcess(simulated, points, costs, problem.mismatch)
-        return Model(averaged, simulated, simulated.lengths, (simulated,), averaged)
-    if informed:
-        process = joint_process(
-            asked.simulated,
-            asked.simulated_costs,
-            points,
-            costs,
-            varying=varying,
-            search=first,
-        )
-        return Model(process, process, process.lengths, (process,))
     if len(points) < 2:
         return None
-    build = zero_mean_process if problem.mean == "zero" else constant_mean_process
-    process = build(points, costs, varying=varying, search=first)
-    dimension = problem.space.dimension
-    if problem.risk is not None:
-        return Model(RiskProcess.of(process, problem.risk), process, process.lengths[:dimension], (process,))
-    if problem.context:
-        context = array(problem.context, points.shape[1] - dimension)
-        return Model(AbsoluteProcess(process, context), process, process.lengths[:dimension], (process,))
+    zero = isinstance(query, RegressionQuery | MinimumQuery) and query.mean == "zero"
+    process = (zero_mean_process if zero else constant_mean_process)(points, costs, varying=varying, search=first)
+    lengths = process.lengths[: query.space.dimension]
+    if isinstance(query, RiskQuery):
+        return Model(RiskProcess.of(process, query.risk), process, lengths, (process,))
+    if isinstance(query, CalibrationQuery):
+        context = array(query.contexts, query.context_dimension)
+        return Model(AbsoluteProcess(process, context), process, lengths, (process,))
     return Model(process, process, process.lengths, (process,))
 
 
-def _search_for(problem: SuggestProblem, number: int) -> HyperparameterSearch:
+def _search_for(query: SurrogateQuery, number: int) -> HyperparameterSearch:
     """Hyperparameter search of the `number`-th process."""
-    effort = problem.effort
+    effort = query.effort
     if effort is None or number >= len(effort.start):
         return AFRESH
     return HyperparameterSearch(np.array(effort.start[number], dtype=np.float64), effort.iterations)

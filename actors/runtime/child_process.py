@@ -30,7 +30,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection
 from typing import IO, Literal
 
@@ -43,6 +43,9 @@ GRACE = 10.0
 _ERRORS_KEPT = 2000
 _PR_SET_PDEATHSIG = 1
 
+_hidden: dict[str, str | None] = {}
+"""Previous values of variables that `own_environment` has changed."""
+
 
 def child_environment(changes: Mapping[str, str | None] | None = None) -> dict[str, str]:
     """Return a copy of this process's environment for a child. Other threads may change `os.environ` meanwhile.
@@ -52,10 +55,27 @@ def child_environment(changes: Mapping[str, str | None] | None = None) -> dict[s
     """
     while True:
         try:
-            wanted: dict[str, str | None] = {**dict(os.environ), **(changes or {})}
+            wanted: dict[str, str | None] = {**dict(os.environ), **_hidden, **(changes or {})}
             return {name: value for name, value in wanted.items() if value is not None}
         except KeyError:  # another thread removed a variable between listing the names and reading the values
             continue
+
+
+@contextlib.contextmanager
+def own_environment(**values: str) -> Iterator[None]:
+    """Set environment variables for a library in this process. Children that `ChildProcess` starts do not get them."""
+    before = {name: os.environ.get(name) for name in values}
+    _hidden.update(before)
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+            del _hidden[name]
 
 
 def python_module(module: str, *arguments: str) -> list[str]:

@@ -1,8 +1,12 @@
-"""A small process that cleans up after its parent was killed.
+"""A small process that acts after its parent has ended in any way, also by SIGKILL. Two tasks:
 
-Ray's own processes notice the death of the program that started them, but some need half a minute. The cleanup process
-holds the reading end of a pipe; only the parent holds the writing end. When the parent ends for any reason, the pipe
-closes. The cleanup process then ends every process that carries the cluster's mark and removes the cluster's folder.
+- `python -m actors.runtime.ray_cleanup folder FOLDER` ends every process of a private Ray and removes its folder.
+  Ray's own processes notice the death of the program that started them, but some need half a minute.
+- `python -m actors.runtime.ray_cleanup message ADDRESS` tells the user that the program was ended. If the head of a
+  cluster dies, or Ray on the program's own machine, Ray ends the program immediately: no further Python code runs.
+
+The process holds the reading end of a pipe; only the parent holds the writing end. When the parent ends, the pipe
+closes. A parent that ends in order writes `GOODBYE` before; then there is no message.
 """
 
 from __future__ import annotations
@@ -22,9 +26,11 @@ if TYPE_CHECKING:
 MARK = "DECANT_RAY_CLUSTER"
 """Environment variable that all processes of one Ray cluster carry; its value is the cluster's folder."""
 
+GOODBYE = b"goodbye"
 
-def cluster_processes(folder: Path) -> list[int]:
-    """Process ids of this user that belong to a cluster, except the calling process.
+
+def cluster_processes(folder: Path) -> list[psutil.Process]:
+    """Processes of this user that belong to a cluster, except the calling process.
 
     Most processes carry the mark in their environment. Ray's helpers overwrite it with their titles, but they hold log
     files open.
@@ -34,7 +40,7 @@ def cluster_processes(folder: Path) -> list[int]:
     """
     import psutil
 
-    return [p.pid for p in psutil.process_iter() if p.pid != os.getpid() and _belongs(p, folder)]
+    return [p for p in psutil.process_iter() if p.pid != os.getpid() and _belongs(p, folder)]
 
 
 def _belongs(process: psutil.Process, folder: Path) -> bool:
@@ -60,22 +66,37 @@ def end_cluster(folder: Path, *, patience: float = 10.0) -> None:
         processes = cluster_processes(folder)
         if not processes:
             break
-        for pid in processes:
+        for process in processes:
             with contextlib.suppress(OSError):
-                os.kill(pid, signal.SIGKILL)
+                os.kill(process.pid, signal.SIGKILL)
         time.sleep(0.1)
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def main() -> None:
-    """Wait for the parent's end of the pipe (standard input) to close, then clean up."""
+def main(task: str, subject: str) -> None:
+    """Wait until the parent's end of the pipe (standard input) closes, then perform the task.
+
+    Args:
+        task: 'folder' or 'message'.
+        subject: the cluster's folder, or its address.
+    """
     for sig in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(sig, signal.SIG_IGN)  # only the end of the parent counts
+    received = b""
     with contextlib.suppress(OSError):
-        while os.read(0, 4096):
-            pass
-    end_cluster(Path(sys.argv[1]))
+        while data := os.read(0, 4096):
+            received += data
+    if task == "folder":
+        end_cluster(Path(subject))
+    elif received != GOODBYE:
+        with contextlib.suppress(OSError):
+            print(
+                "decant ended in the midst of its work: it was killed, or Ray on this machine or at "
+                f"{subject} died and ended it.\n"
+                "what is done so far is kept: see to the cluster, then run the same command with --resume",
+                file=sys.stderr,
+            )
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

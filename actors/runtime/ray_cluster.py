@@ -1,19 +1,37 @@
-"""A laboratory on a Ray cluster: which nodes simulate, which node has the bench, and how their losses are reported.
+"""A Ray cluster that the user has started: its nodes, the software on them, the check before a run, and their losses.
 
-`JoinedCluster` reserves the bench and polls the nodes. It does not join the cluster; `actors.runtime.ray_runtime` does.
+- `check_cluster` finds out whether a cluster is suitable, before anything starts. It reserves nothing.
+- `JoinedCluster` reserves the bench and polls the nodes, from when the program has joined until it leaves.
+- `PinnedNode` places an actor on one node and reports whether that node has died.
+- `Versions` must be the same on every machine, so that a task has the same outcome on each of them.
+
+The check runs in a separate process, `python -m actors.runtime.ray_cluster ADDRESS`. It joins the cluster, reads its
+nodes, prints them as JSON and leaves. Ray waits for minutes if an address does not respond, and it may end a process
+that it cannot connect. Neither may happen to the program itself.
+
+`actors.runtime.ray_runtime` joins and leaves.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+import dataclasses
+import functools
+import importlib.metadata
+import json
+import socket
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any
 
 from actors.interfaces import LaboratoryError, Notice
-from actors.laboratory_settings import RaySpec
-from actors.runtime.cluster_nodes import Node, PinnedNode, living_nodes, this_node
+from actors.runtime.child_process import python_module, run
+from sim_engine.solver_fingerprint import ROOT, folder_digest
+
+if TYPE_CHECKING:
+    from actors.laboratory_settings import RaySpec
 
 LOOK_INTERVAL = 2.0
 """Time between two polls of the nodes [s]."""
@@ -23,6 +41,318 @@ RESERVE_DEADLINE = 20.0
 
 CLOSE_DEADLINE = 10.0
 """Longest time to release the bench [s]."""
+
+CONNECT_DEADLINE = 5.0
+"""Longest time for the head to accept a connection [s]."""
+
+JOIN_DEADLINE = 60.0
+"""Longest time to join, read the nodes and leave [s]."""
+
+WORKER_DEADLINE = 40.0
+"""Longest time for a node to start a Python process [s]."""
+
+_PATIENCE = 2.0
+"""Longest time for a node's own process to accept a connection [s]."""
+
+_SHORT_TIMEOUTS = {
+    "RAY_NUM_REDIS_GET_RETRIES": "3",
+    "RAY_gcs_server_request_timeout_seconds": "10",
+    "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
+}
+"""Shorter timeouts for Ray; its own are minutes long."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """A node, as listed by Ray.
+
+    Attributes:
+        id: Ray's id of the node.
+        host: name and address, for messages.
+        address, port: of the node's raylet, a process that every node has.
+        resources: by name; 'CPU' is the number of cores that Ray assigns.
+        versions: as the check has found them. None if no process could be started, or Decant is missing there.
+        problem: why the check has found no versions.
+    """
+
+    id: str
+    host: str
+    address: str
+    port: int
+    resources: Mapping[str, float]
+    versions: Versions | None = None
+    problem: str = ""
+
+    @property
+    def cpus(self) -> int:
+        """Cores that Ray assigns."""
+        return int(self.resources.get("CPU", 0.0))
+
+
+def living_nodes() -> dict[str, Node]:
+    """The nodes that Ray lists as alive, by id. Blocks for some milliseconds."""
+    import ray
+
+    return {
+        node["NodeID"]: Node(
+            node["NodeID"],
+            f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})",
+            node["NodeManagerAddress"],
+            int(node["NodeManagerPort"]),
+            node["Resources"],
+        )
+        for node in ray.nodes()
+        if node["Alive"]
+    }
+
+
+@dataclass(frozen=True)
+class PinnedNode:
+    """One node, for actors that may run only there.
+
+    Attributes:
+        node: the node.
+        options: Ray's options that place an actor there.
+    """
+
+    node: Node
+    options: Mapping[str, Any]
+
+    async def is_gone(self) -> bool:
+        """Whether the node has died.
+
+        Ray itself needs fifteen seconds to detect this; a dead node's raylet refuses connections at once. If a
+        connection times out, a packet may have been lost: then Ray decides."""
+        try:
+            _, writer = await asyncio.wait_for(
+                asyncio.open_connection(self.node.address, self.node.port), timeout=_PATIENCE
+            )
+            writer.close()
+            await writer.wait_closed()
+            return False
+        except ConnectionRefusedError:
+            return True
+        except (OSError, TimeoutError):
+            with contextlib.suppress(Exception):  # the head may have died, too
+                return self.node.id not in await asyncio.to_thread(living_nodes)
+            return False
+
+
+def this_node() -> PinnedNode:
+    """The node that this program is connected to; the program cannot continue without it."""
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    id_ = ray.get_runtime_context().get_node_id()
+    strategy = NodeAffinitySchedulingStrategy(id_, soft=False)
+    return PinnedNode(living_nodes()[id_], {"scheduling_strategy": strategy})
+
+
+@dataclass(frozen=True)
+class Versions:
+    """The versions on one machine.
+
+    Attributes:
+        python: e.g. '3.11.7'.
+        decant: the installed package's.
+        simulator: digest of the simulator's sources; a checkout may have changed without a new version.
+        taichi: it compiles the solver.
+        numpy: it makes the initial positions.
+    """
+
+    python: str
+    decant: str
+    simulator: str
+    taichi: str
+    numpy: str
+
+    def difference(self, other: Versions) -> str | None:
+        """The first version in which two machines differ, as a message; None if all are equal.
+
+        Args:
+            other: versions of the other machine.
+        """
+        for each in fields(self):
+            ours, theirs = getattr(self, each.name), getattr(other, each.name)
+            if ours != theirs:
+                what = "the simulator's code" if each.name == "simulator" else each.name.capitalize()
+                return f"{what}: {theirs} there, {ours} here"
+        return None
+
+
+@functools.cache
+def versions() -> Versions:
+    """The versions on this machine."""
+    return Versions(
+        python=sys.version.split()[0],
+        decant=_installed("decant"),
+        simulator=folder_digest(ROOT / "sim_engine"),
+        taichi=_installed("taichi"),
+        numpy=_installed("numpy"),
+    )
+
+
+def _installed(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def check_cluster(spec: RaySpec, *, need_bench: bool) -> list[Node]:
+    """Check that a laboratory can be opened on a cluster. The check leaves nothing on the cluster.
+
+    Args:
+        spec: the cluster.
+        need_bench: whether arm, balance and bench need their node.
+
+    Returns:
+        The nodes that are alive.
+
+    Raises:
+        LaboratoryError: with the problem and its remedy.
+    """
+    _check_answers(spec.address)
+    found = _read_cluster(spec.address)
+    if "error" in found:
+        raise LaboratoryError(f"Ray cluster at {spec.address}: {found['error']}")
+    nodes = [
+        Node(**{**node, "versions": Versions(**node["versions"]) if node["versions"] else None})
+        for node in found["nodes"]
+    ]
+    _check_nodes(spec, nodes)
+    if need_bench:
+        _check_bench(spec, nodes, found["available"])
+    return nodes
+
+
+def _check_answers(address: str) -> None:
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), CONNECT_DEADLINE).close()
+    except OSError as error:
+        reason = "no answer" if isinstance(error, TimeoutError) else (error.strerror or str(error))
+        raise LaboratoryError(
+            f"Ray cluster at {address}: nothing answers there ({reason}); is 'ray start --head' running on that "
+            "machine, and is this its address and port?"
+        ) from None
+
+
+def _read_cluster(address: str) -> dict[str, Any]:
+    try:
+        command = python_module("actors.runtime.ray_cluster", address)
+        process = run(command, timeout=JOIN_DEADLINE, environment=_SHORT_TIMEOUTS)
+    except TimeoutError:
+        return {
+            "error": f"it could not be joined within {JOIN_DEADLINE:g} s; is it Ray that answers there, and can this "
+            "machine and the cluster's reach each other on all of Ray's ports?"
+        }
+    for line in reversed(process.stdout.splitlines()):
+        if line.startswith("{"):
+            answer: dict[str, Any] = json.loads(line)
+            return answer
+    last = (process.stderr.strip().splitlines() or ["it ended without a word"])[-1]
+    return {"error": f"it can't be joined: {last}"}
+
+
+def _check_nodes(spec: RaySpec, nodes: list[Node]) -> None:
+    where = f"Ray cluster at {spec.address}"
+    if not any(node.cpus for node in nodes):
+        raise LaboratoryError(f"{where}: none of its {len(nodes)} node(s) has a core to simulate on (--num-cpus)")
+    for node in nodes:
+        if not node.cpus and spec.bench_resource not in node.resources:
+            continue  # no Decant process will run there
+        if node.versions is None:
+            raise LaboratoryError(f"{where}: node {node.host} can't run Decant: {node.problem}")
+        if (difference := versions().difference(node.versions)) is not None:
+            raise LaboratoryError(
+                f"{where}: node {node.host} is not like this machine: {difference}. Outcomes would depend on where "
+                "they are simulated; install the same on all machines"
+            )
+
+
+def _check_bench(spec: RaySpec, nodes: list[Node], available: dict[str, float]) -> None:
+    where, name = f"Ray cluster at {spec.address}", spec.bench_resource
+    if not any(node.resources.get(name, 0.0) >= 1.0 for node in nodes):
+        hosts = ", ".join(node.host for node in nodes)
+        raise LaboratoryError(
+            f"{where}: no node offers '{name}', which arm, balance and bench need (nodes: {hosts}); start Ray on the "
+            f"bench's machine with --resources='{{\"{name}\": 1}}', or name another resource with ray.bench_resource"
+        )
+    if available.get(name, 0.0) < 1.0:
+        raise LaboratoryError(f"{where}: '{name}' is in use; another program has the bench")
+
+
+def _collect(address: str) -> dict[str, Any]:
+    """The facts that the separate process collects."""
+    import logging
+
+    import ray
+
+    try:
+        ray.init(address=address, namespace="decant", logging_level=logging.CRITICAL, log_to_driver=False)
+    except Exception as error:
+        return {"error": _why(error)}
+    nodes = list(living_nodes().values())
+    requested = [_request_versions(node.id) for node in nodes]
+    ray.wait(requested, num_returns=len(requested), timeout=WORKER_DEADLINE)
+    still = living_nodes()  # Ray needs some time to notice that a node is dead
+    found = [_with_versions(node, ref) for node, ref in zip(nodes, requested, strict=True) if node.id in still]
+    answer = {"nodes": [dataclasses.asdict(node) for node in found], "available": ray.available_resources()}
+    ray.shutdown()
+    return answer
+
+
+def _request_versions(node: str) -> Any:
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    def there() -> dict[str, str]:
+        import dataclasses
+
+        from actors.runtime.ray_cluster import versions
+
+        return dataclasses.asdict(versions())
+
+    there_only = NodeAffinitySchedulingStrategy(node, soft=False)
+    return ray.remote(num_cpus=0, max_retries=0, scheduling_strategy=there_only)(there).remote()
+
+
+def _with_versions(node: Node, ref: Any) -> Node:
+    import ray
+
+    try:
+        return dataclasses.replace(node, versions=Versions(**ray.get(ref, timeout=0.0)))
+    except ray.exceptions.GetTimeoutError:
+        problem = f"it did not start a Python process within {WORKER_DEADLINE:g} s"
+    except ray.exceptions.RayTaskError as error:
+        problem = f"{error.cause!r}; install Decant there, in the environment that Ray runs in"
+    except Exception as error:
+        problem = (str(error).strip().splitlines() or [repr(error)])[0]
+    return dataclasses.replace(node, problem=problem)
+
+
+def _why(error: BaseException) -> str:
+    """Ray's reason, in words that help the user to fix it."""
+    chain: list[str] = []
+    link: BaseException | None = error
+    while link is not None:
+        chain.append(f"{type(link).__name__}: {link}")
+        link = link.__cause__ or link.__context__
+    text = "\n".join(chain)
+    if "Version mismatch" in text:
+        return " ".join(text[text.index("Version mismatch") :].split())
+    if "AuthenticationError" in text or "InvalidAuthToken" in text:
+        return (
+            "it asks for a token that this program does not have; set RAY_AUTH_TOKEN_PATH to a copy of the file that "
+            "the cluster was started with, and RAY_AUTH_MODE=token"
+        )
+    if "No node info found" in text:
+        return (
+            "this machine is not a node of it; run 'ray start' with its address here first (--num-cpus=0 if nothing "
+            "should be simulated here)"
+        )
+    return f"it can't be joined: {(str(error).strip().splitlines() or [repr(error)])[0]}"
 
 
 @dataclass
@@ -137,3 +467,7 @@ class JoinedCluster:
             self.tell(Notice("info", f"machine {now[id_].host} has joined with {now[id_].cpus} core(s)"))
         if now.keys() - before.keys():
             self.grown(self.cpus)
+
+
+if __name__ == "__main__":
+    print(json.dumps(_collect(sys.argv[1])), flush=True)

@@ -1,10 +1,17 @@
-"""Starts and ends Ray for this process: a private Ray (`actors.runtime.private_ray`) or an existing cluster.
+"""Starts and ends Ray for this process: a private Ray on this machine, or an existing cluster.
 
-- A cluster is joined with the environment as it is (its token is the user's) and left running. Ray itself removes the
-  actors of a program that leaves the cluster or dies.
-- `start_ray` and `stop_ray` count their calls: the last `stop_ray` ends Ray or leaves the cluster.
-- A private Ray whose own processes die, or that was cut off, does not reply any more. `ray_lost` and `watch_ray` report
-  this within seconds.
+A private Ray leaves nothing behind. It runs:
+
+- with a stated amount of memory, and without dashboard, autoscaler or usage statistics.
+- on the loopback interface only, with its own token.
+- in a short private folder that is removed at the end. `actors.runtime.ray_cleanup` removes it after this program was
+  killed. Folders of programs that have ended are also removed at the next start.
+
+A cluster is joined with the environment as it is (its token is the user's) and left running. Ray itself removes the
+actors of a program that leaves the cluster or dies.
+
+`start_ray` and `stop_ray` count their calls: the last `stop_ray` ends Ray or leaves the cluster. A private Ray whose
+own processes die, or that was cut off, does not reply any more. `ray_lost` and `watch_ray` report this within seconds.
 """
 
 from __future__ import annotations
@@ -12,28 +19,30 @@ from __future__ import annotations
 import asyncio
 import atexit
 import contextlib
+import fcntl
 import logging
+import os
+import re
+import secrets
 import signal
 import sys
+import tempfile
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from io import TextIOWrapper
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING, Any
 
 from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import LaboratorySpec
-from actors.runtime.cluster_exit_message import dismiss, speaker
-from actors.runtime.private_ray import (
-    PrivateRay,
-    close_private,
-    dead_processes,
-    forget_logs,
-    is_forgotten,
-    open_private,
-    ray_settings,
-    start_private,
-)
+from actors.laboratory_settings import LaboratorySpec, simulator_count
+from actors.runtime.child_process import ChildProcess, own_environment, python_module
+from actors.runtime.ray_cleanup import GOODBYE, MARK, end_cluster
+
+if TYPE_CHECKING:
+    import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a package of their own
 
 START_DEADLINE = 120.0
 """Longest time that Ray may take to start [s]; a busy machine with a cold disk needs twenty."""
@@ -41,90 +50,193 @@ START_DEADLINE = 120.0
 LOOK_INTERVAL = 2.0
 """Time between two checks whether a private Ray still treats this program as alive [s]."""
 
+WATCH_INTERVAL = 1.0
+"""Time between two checks for losses of Ray [s]."""
+
+_LONGEST_FOLDER = 40
+"""Ray puts sockets about 65 characters below its folder, and a socket's path may have 107."""
+
+_WORKER_LOG = re.compile(r"(?:worker-|python-core-worker-).*[-_](\d+)\.(?:out|err|log)")
+"""Name of a worker's log; the number is its process id."""
+
+_PROGRAM = "decant_program"
+"""Resource of a private Ray, of which this program holds all. Ray takes it back when it treats the program as dead."""
+
+_TOKEN = secrets.token_hex(32)
+"""Ray refuses users without this token. One per process, since Ray reads it only once."""
+
+_JOIN_SETTINGS = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}
+
+_PRIVATE_SETTINGS = {
+    **_JOIN_SETTINGS,
+    "RAY_AUTH_MODE": "token",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    # By default Ray runs all its workers at nice 15. Here only simulators lower their priority, not an arm.
+    "RAY_worker_niceness": "0",
+    # Makes Ray use 127.0.0.1 as the node's address and listen only there. This is its default on Windows and macOS; on
+    # Linux it would listen on the network.
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+    # Ray keeps 100,000 each of dead actors, dead workers and calls for its dashboard, which is not used here: over
+    # weeks this fills memory.
+    "RAY_maximum_gcs_destroyed_actor_cached_count": "50",
+    "RAY_maximum_gcs_dead_worker_cached_count": "50",
+    "RAY_task_events_report_interval_ms": "0",
+    # Ray's own processes log about 5 MB an hour, up to gigabytes.
+    "RAY_ROTATION_MAX_BYTES": "2000000",
+    "RAY_ROTATION_BACKUP_COUNT": "1",
+}
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass
-class _Cluster:
-    """A running Ray: a private one, or a cluster joined at its address."""
+class _PrivateRay:
+    """The resources of a private Ray.
 
-    private: PrivateRay | None
+    Attributes:
+        folder: everything that Ray writes.
+        lock: held while this program runs.
+        cleanup: the process that cleans up after this program.
+        processes: Ray's own processes, by name.
+        membership: the placement group that exists for as long as Ray treats this program as alive.
+    """
+
+    folder: Path
+    lock: TextIOWrapper
+    cleanup: ChildProcess
+    processes: dict[str, psutil.Process] = field(default_factory=dict)
+    membership: Any = None
+
+
+@dataclass
+class _Session:
+    """The Ray that this process uses: a private one, or a cluster joined at its address."""
+
+    private: _PrivateRay | None
     address: str | None
     uses: int = 1
     stop: threading.Event = field(default_factory=threading.Event)
     ready: threading.Event = field(default_factory=threading.Event)
     failure: BaseException | None = None
-    forgotten: bool = False
+    cut_off: bool = False
     keeper: threading.Thread | None = None
 
+    @property
+    def dead(self) -> list[str]:
+        """Ray's own processes that have died."""
+        processes = {} if self.private is None else self.private.processes
+        return [name for name, process in processes.items() if not _runs(process)]
 
-_cluster: _Cluster | None = None
+
+_session: _Session | None = None
 _guard = threading.RLock()
 
 
 def start_ray(spec: LaboratorySpec) -> None:
     """Start Ray for a laboratory, join its cluster, or use the Ray that this process has already started.
 
-    Blocks for some seconds. From a running event loop, call it in a thread (`asyncio.to_thread`), and then
-    `keep_signals` in the main thread.
+    Blocks for some seconds. From a running event loop, use `open_ray`.
 
     Raises:
         LaboratoryError: Ray does not start, or this process has another Ray.
     """
-    global _cluster
+    global _session
     address = None if spec.ray is None else spec.ray.address
     with _guard:
-        if _cluster is not None:
-            if _cluster.address != address:
+        if _session is not None:
+            if _session.address != address:
                 raise LaboratoryError(
-                    f"this process already uses {_cluster.address or 'a Ray of its own'}; end it first"
+                    f"this process already uses {_session.address or 'a Ray of its own'}; end it first"
                 )
-            _cluster.uses += 1
+            _session.uses += 1
             return
         _refuse_foreign_ray()
-        cluster = _Cluster(open_private() if address is None else None, address)
+        session = _Session(_open_private() if address is None else None, address)
         try:
-            _start_keeper(cluster, spec)
+            _start_keeper(session, spec)
         except BaseException:
-            _close_cluster(cluster)
+            _close(session)
             raise
-        _cluster = cluster
+        _session = session
         atexit.register(_stop_at_exit)
+    keep_signals()
+
+
+async def open_ray(spec: LaboratorySpec) -> None:
+    """`start_ray` from an event loop, in its main thread if there are signal handlers to keep. May be cancelled.
+
+    Raises:
+        LaboratoryError: as for `start_ray`.
+    """
+    starting = asyncio.ensure_future(asyncio.to_thread(start_ray, spec))
+    try:
+        await asyncio.shield(starting)
+    except asyncio.CancelledError:
+        # The start cannot be interrupted, and must not continue after its caller has ended.
+        await asyncio.wait({starting})
+        if starting.exception() is None:
+            await asyncio.to_thread(stop_ray)
+        raise
     keep_signals()
 
 
 def stop_ray() -> None:
     """Undo one `start_ray`. The last call ends a private Ray with all its processes, or leaves a cluster."""
-    global _cluster
+    global _session
     with _guard:
-        if _cluster is None:
+        if _session is None:
             return
-        _cluster.uses -= 1
-        if _cluster.uses > 0:
+        _session.uses -= 1
+        if _session.uses > 0:
             return
-        cluster, _cluster = _cluster, None
+        session, _session = _session, None
         atexit.unregister(_stop_at_exit)
-        _close_cluster(cluster)
+        _close(session)
 
 
 def ray_folder() -> Path | None:
     """Folder of the private Ray; None if there is none."""
-    return None if _cluster is None or _cluster.private is None else _cluster.private.folder
+    return None if _session is None or _session.private is None else _session.private.folder
 
 
-def forget_ray_logs() -> None:
-    """Remove the logs of dead workers of a private Ray. Takes little time; may be called at any time."""
-    cluster = _cluster
-    if cluster is not None and cluster.private is not None:
-        forget_logs(cluster.private)
+def forget_ray_logs(folder: Path | None = None) -> int:
+    """Remove the logs of Ray's workers that have ended: each bench that is opened and closed leaves some.
+
+    Args:
+        folder: of a private Ray; default: of this process's, if there is one.
+
+    Returns:
+        Number of files removed.
+    """
+    import psutil
+
+    folder = folder or ray_folder()
+    removed = 0
+    for path in [] if folder is None else folder.glob("session_*/logs/*-*"):
+        found = _WORKER_LOG.fullmatch(path.name)
+        if found is not None and not psutil.pid_exists(int(found[1])):
+            path.unlink(missing_ok=True)
+            removed += 1
+    return removed
 
 
 def ray_lost() -> str:
     """The lost part of a private Ray, a process or its connection to this one; empty while nothing is lost."""
-    cluster = _cluster
-    if cluster is None or cluster.private is None:
+    session = _session
+    if session is None:
         return ""
-    return ", ".join(dead_processes()) or ("connection to this program" if cluster.forgotten else "")
+    return ", ".join(session.dead) or ("connection to this program" if session.cut_off else "")
+
+
+async def watch_ray(died: Callable[[str], None]) -> None:
+    """Wait until a private Ray has lost one of its own processes or its connection to this one. May wait for ever.
+
+    Args:
+        died: called once with a message that names the lost part.
+    """
+    while not (lost := ray_lost()):
+        await asyncio.sleep(WATCH_INTERVAL)
+    died(f"Ray on this machine has lost its {lost}, and with it all that it ran; nothing can be asked of it any more")
 
 
 def keep_signals() -> None:
@@ -154,8 +266,8 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 def _stop_at_exit() -> None:
     with _guard:
-        if _cluster is not None:
-            _cluster.uses = 1
+        if _session is not None:
+            _session.uses = 1
     stop_ray()
 
 
@@ -165,83 +277,221 @@ def _refuse_foreign_ray() -> None:
         raise LaboratoryError("this process has already started a Ray of its own; end it before opening a laboratory")
 
 
-def _close_cluster(cluster: _Cluster) -> None:
-    cluster.stop.set()
-    if cluster.keeper is not None:
-        cluster.keeper.join(timeout=30.0)
-    if cluster.private is not None:
-        close_private(cluster.private)
+def _close(session: _Session) -> None:
+    session.stop.set()
+    if session.keeper is not None:
+        session.keeper.join(timeout=30.0)
+    if session.private is not None:
+        end_cluster(session.private.folder, patience=15.0)
+        session.private.lock.close()
+        session.private.cleanup.close(15.0)
 
 
-def _start_keeper(cluster: _Cluster, spec: LaboratorySpec) -> None:
+def _start_keeper(session: _Session, spec: LaboratorySpec) -> None:
     """Start Ray in a thread that lives as long as Ray does.
 
     Linux ends Ray's processes when the *thread* that started them ends. If a thread of an executor started Ray, or a
     main thread that ends early, Ray would end with it.
     """
-    cluster.keeper = threading.Thread(target=_keep, args=(cluster, spec), name="ray-keeper", daemon=True)
-    cluster.keeper.start()
-    if not cluster.ready.wait(START_DEADLINE):
+    session.keeper = threading.Thread(target=_keep, args=(session, spec), name="ray-keeper", daemon=True)
+    session.keeper.start()
+    if not session.ready.wait(START_DEADLINE):
         raise LaboratoryError(
             f"Ray did not start within {START_DEADLINE:.0f} s; is this machine busy, or short of memory? Try again, or "
             "do without Ray (--in-process)"
         )
-    if cluster.failure is not None:
-        raise cluster.failure
+    if session.failure is not None:
+        raise session.failure
 
 
-def _keep(cluster: _Cluster, spec: LaboratorySpec) -> None:
-    settings = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"} if cluster.private is None else cluster.private.settings()
-    with ray_settings(**settings):
-        messenger = None
+def _keep(session: _Session, spec: LaboratorySpec) -> None:
+    exit_message: ChildProcess | None = None
+    settings = dict(_JOIN_SETTINGS)
+    if (private := session.private) is not None:
+        settings = {**_PRIVATE_SETTINGS, "RAY_AUTH_TOKEN_PATH": str(private.folder / "token")}
+    with own_environment(**settings):
         try:
-            if cluster.private is None:
-                _join(cluster)
-                messenger = speaker(str(cluster.address))
-            else:
-                start_private(cluster.private, spec)
+            with _ray_internals(helpers=private is None):
+                if private is not None:
+                    with own_environment(**{MARK: str(private.folder)}):
+                        _start_private(private, spec)
+                else:
+                    _join(str(session.address))
+                    command = python_module("actors.runtime.ray_cleanup", "message", str(session.address))
+                    exit_message = ChildProcess(command, output=False, errors="shown")
         except Exception as error:
-            what = "Ray does not start" if cluster.address is None else f"Ray cluster at {cluster.address}"
-            cluster.failure = LaboratoryError(f"{what}: {error}")
-            cluster.failure.__cause__ = error
-        cluster.ready.set()
-        if cluster.failure is None:
-            _monitor(cluster)
+            what = "Ray does not start" if session.address is None else f"Ray cluster at {session.address}"
+            session.failure = LaboratoryError(f"{what}: {error}")
+            session.failure.__cause__ = error
+        session.ready.set()
+        if session.failure is None:
+            _monitor(session)
         import ray
 
         ray.shutdown()
-        if messenger is not None:
-            dismiss(messenger)
+        if exit_message is not None:
+            with contextlib.suppress(OSError):
+                exit_message.write(GOODBYE)
+            exit_message.close()
 
 
-def _monitor(cluster: _Cluster) -> None:
+def _monitor(session: _Session) -> None:
     """Monitor Ray until it is to be ended. Callers that wait for a reply use `ray_lost` to find out whether one can
     arrive.
     """
-    while not cluster.stop.wait(LOOK_INTERVAL):
-        if cluster.private is None or cluster.forgotten or dead_processes():
+    while not session.stop.wait(LOOK_INTERVAL):
+        if session.private is None or session.cut_off or session.dead:
             continue
-        with contextlib.suppress(Exception):  # its directory is just ending: the next check detects that
-            cluster.forgotten = is_forgotten()
+        with contextlib.suppress(Exception):  # Ray's directory is just ending: the next check detects that
+            session.cut_off = _is_cut_off(session.private.membership)
 
 
-def _join(cluster: _Cluster) -> None:
+def _join(address: str) -> None:
     import ray
 
-    ray.init(address=cluster.address, namespace="decant", logging_level=logging.ERROR, log_to_driver=False)
+    ray.init(address=address, namespace="decant", logging_level=logging.ERROR, log_to_driver=False)
 
 
-WATCH_INTERVAL = 1.0
-"""Time between two checks for losses of Ray [s]."""
+# ---- a private Ray
 
 
-async def watch_ray(died: Callable[[str], None]) -> None:
-    """Wait until a private Ray has lost one of its own processes or its connection to this one. May wait for ever.
+def _root() -> Path:
+    """Private folder for the clusters of this user."""
+    base = Path(tempfile.gettempdir())
+    name = f"decant-{os.getuid()}"
+    if len(str(base / name)) > _LONGEST_FOLDER - 10:
+        base = Path("/tmp")
+    root = base / name
+    root.mkdir(mode=0o700, exist_ok=True)
+    status = root.lstat()
+    if root.is_symlink() or status.st_uid != os.getuid():
+        raise LaboratoryError(f"{root} belongs to somebody else; remove it or set TMPDIR to a folder of your own")
+    root.chmod(0o700)
+    return root
+
+
+def prune_clusters(root: Path) -> list[Path]:
+    """Remove the clusters of programs that have ended, including processes left from them.
+
+    A running program holds a lock on its cluster's `alive` file; the system releases it however the program ends.
 
     Args:
-        died: called once with a message that names the lost part.
-    """
+        root: contains a folder for each cluster.
 
-    while not (lost := ray_lost()):
-        await asyncio.sleep(WATCH_INTERVAL)
-    died(f"Ray on this machine has lost its {lost}, and with it all that it ran; nothing can be asked of it any more")
+    Returns:
+        The folders removed.
+    """
+    removed = []
+    for folder in sorted(p for p in root.iterdir() if p.is_dir()):
+        with contextlib.suppress(OSError), (folder / "alive").open("a") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            end_cluster(folder)
+            removed.append(folder)
+    return removed
+
+
+def _open_private() -> _PrivateRay:
+    """Create a folder, a token and a cleanup process. Ray does not run yet."""
+    root = _root()
+    with (root / "lock").open("w") as only_one:  # only one process at a time creates or removes folders
+        fcntl.flock(only_one, fcntl.LOCK_EX)
+        prune_clusters(root)
+        folder = Path(tempfile.mkdtemp(prefix="", dir=root))
+        lock = (folder / "alive").open("w")
+        fcntl.flock(lock, fcntl.LOCK_EX)
+    token = folder / "token"
+    token.touch(mode=0o600)
+    token.write_text(_TOKEN)
+    command = python_module("actors.runtime.ray_cleanup", "folder", str(folder))
+    return _PrivateRay(folder, lock, ChildProcess(command, output=False, errors="dropped"))
+
+
+def _start_private(private: _PrivateRay, spec: LaboratorySpec) -> None:
+    """Start Ray's processes and connect to them; its settings must be in the environment. Linux ends them with this
+    thread.
+
+    Raises:
+        LaboratoryError: Ray listens on an interface other than loopback.
+    """
+    import psutil
+    import ray
+    from ray.util.placement_group import placement_group
+
+    for attempt in range(3):
+        try:
+            ray.init(
+                address="local",
+                num_cpus=simulator_count(spec),
+                num_gpus=0,
+                resources={_PROGRAM: 1},
+                object_store_memory=max(spec.object_store_mb, 80) * 1024 * 1024,
+                include_dashboard=False,
+                logging_level=logging.ERROR,
+                log_to_driver=False,
+                _temp_dir=str(private.folder),
+                _node_ip_address="127.0.0.1",
+            )
+            break
+        except Exception:
+            # Two programs that start at once may be given the same free port.
+            ray.shutdown()
+            if attempt == 2:
+                raise
+            time.sleep(1.0 + attempt)
+    address = ray.util.get_node_ip_address()
+    if address != "127.0.0.1":
+        raise LaboratoryError(f"Ray listens on {address} instead of this machine only; was it imported too early?")
+    children = [p for p in psutil.Process().children() if p.environ().get(MARK) == str(private.folder)]
+    private.processes = {p.name(): p for p in children}
+    private.membership = placement_group([{_PROGRAM: 1.0}])
+
+
+def _runs(process: psutil.Process) -> bool:
+    import psutil
+
+    with contextlib.suppress(psutil.Error):
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    return False
+
+
+def _is_cut_off(membership: Any) -> bool:
+    """Whether Ray treats this program as dead because its connection was cut. Ray has then ended all of its actors and
+    tasks, and removed its placement groups.
+
+    Queries Ray's directory: this takes a millisecond, or a minute if the directory does not respond.
+    """
+    from ray.util.placement_group import placement_group_table
+
+    return placement_group_table(membership).get("state") not in ("PENDING", "PREPARED", "CREATED")
+
+
+@contextlib.contextmanager
+def _ray_internals(*, helpers: bool) -> Iterator[None]:
+    """Context for `ray.init`: the only place that uses Ray's private API, for two things that its public API lacks.
+
+    - Ray reads most of its environment variables when it is imported. If the user's program has imported it before,
+      or this process has used another Ray, Ray must read them again.
+    - `ray.init` starts a dashboard server, an autoscaler and a log monitor. None of them is used here. The first two
+      need 90 MB and seconds of Ray's start each; the third keeps up to 200 logs open. `include_dashboard=False`
+      still starts the server, with fewer functions. The other two have options only in `ray start`, which would
+      need another process.
+
+    Args:
+        helpers: whether to start the three processes.
+    """
+    was_imported = "ray" in sys.modules
+    from ray._private.node import Node
+    from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-defined]
+
+    if was_imported:
+        Config.initialize("")
+        AuthenticationTokenLoader.instance().reset_cache()
+    left_out = () if helpers else ("start_api_server", "start_monitor", "start_log_monitor")
+    before = {name: getattr(Node, name) for name in left_out if hasattr(Node, name)}
+    for name in before:
+        setattr(Node, name, lambda node, **settings: None)
+    try:
+        yield
+    finally:
+        for name, method in before.items():
+            setattr(Node, name, method)

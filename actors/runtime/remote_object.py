@@ -2,7 +2,7 @@
 
 - `LocalDevice` runs the object's methods in threads of this process, `RayDevice` in a Ray actor.
 - Urgent calls do not wait for the running call: this is how a moving arm is stopped.
-- `actor_class` makes each Ray actor class only once, because Ray keeps every class for the life of the program.
+- `actor_class`, `kill_actor` and `mark_retrieved` are for all who use Ray actors.
 
 Lost devices are not restarted by themselves: the caller does that with `revive`.
 """
@@ -14,15 +14,19 @@ import contextlib
 import functools
 from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from actors.interfaces import BenchLostError, LaboratoryError
-from actors.runtime.cluster_nodes import PinnedNode
+
+if TYPE_CHECKING:
+    from actors.runtime.ray_cluster import PinnedNode
 
 
 @functools.cache
 def actor_class(cls: Hashable, groups: tuple[tuple[str, int], ...]) -> Any:
     """Make a Ray actor class whose actors and calls Ray does not retry.
+
+    Each class is made only once, because Ray keeps every class for the life of the program.
 
     Args:
         cls: a class that workers can import.
@@ -34,6 +38,20 @@ def actor_class(cls: Hashable, groups: tuple[tuple[str, int], ...]) -> Any:
     import ray
 
     return ray.remote(max_restarts=0, max_task_retries=0, concurrency_groups=dict(groups))(cls)
+
+
+def kill_actor(actor: Any) -> None:
+    """End an actor's process at once. May be called again, and after Ray has ended."""
+    import ray
+
+    with contextlib.suppress(Exception):
+        ray.kill(actor)
+
+
+def mark_retrieved(reply: asyncio.Future[Any]) -> None:
+    """Mark a result as retrieved: if the caller was cancelled or gave up, asyncio does not log a late error."""
+    if not reply.cancelled():
+        reply.exception()
 
 
 LOOK_INTERVAL = 20.0
@@ -104,7 +122,7 @@ class LocalDevice:
         """See `Device.call`."""
         executor = self._control if urgent else self._work
         future = asyncio.wrap_future(executor.submit(getattr(self._object, method), *args))
-        future.add_done_callback(_seen)
+        future.add_done_callback(mark_retrieved)
         done, _ = await asyncio.wait({future}, timeout=deadline)
         if not done:
             raise DeviceLostError(f"{self.name}: no answer to '{method}' within {deadline:g} s")
@@ -160,7 +178,7 @@ class RayDevice:
         group = "control" if urgent else "work"
         ref = getattr(self._actor, method).options(concurrency_group=group).remote(*args)
         future = asyncio.wrap_future(ref.future())
-        future.add_done_callback(_seen)
+        future.add_done_callback(mark_retrieved)
         self._calls.add(future)
         future.add_done_callback(self._calls.discard)
         waited = await self._waited(future, deadline)
@@ -168,8 +186,7 @@ class RayDevice:
             self._check_ray()
             # It may be blocked for ever; a new one is created before the next pour.
             self._lost = True
-            with contextlib.suppress(Exception):
-                ray.kill(self._actor)
+            kill_actor(self._actor)
             await self._check_machine(method)
             raise DeviceLostError(f"{self.name}: no answer to '{method}' within {waited:.3g} s")
         try:
@@ -206,7 +223,7 @@ class RayDevice:
     async def _answers(self, future: asyncio.Future[Any], patience: float) -> bool:
         """Whether the process replies to any call, including the pending one, within a time [s]."""
         look = asyncio.wrap_future(self._actor.__ray_call__.remote(_pid).future())
-        look.add_done_callback(_seen)
+        look.add_done_callback(mark_retrieved)
         done, _ = await asyncio.wait({future, look}, timeout=patience, return_when=asyncio.FIRST_COMPLETED)
         return bool(done)
 
@@ -254,17 +271,8 @@ class RayDevice:
 
     async def close(self) -> None:
         """See `Device.close`."""
-        import ray
-
         self._lost = True
-        with contextlib.suppress(Exception):
-            ray.kill(self._actor)
-
-
-def _seen(answer: asyncio.Future[Any]) -> None:
-    """Mark the result as retrieved: if the caller was cancelled or gave up, an error needs no report."""
-    if not answer.cancelled():
-        answer.exception()
+        kill_actor(self._actor)
 
 
 def _pid(_: Any) -> int:

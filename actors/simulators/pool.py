@@ -1,262 +1,35 @@
-"""A pool of simulators in separate processes. It replaces processes that die and repeats their jobs.
+"""The pool of simulators: a queue, and workers that run its jobs.
 
-- `RaySimulatorPool` assigns jobs to workers.
-- `WorkerPool` starts the workers, replaces lost ones and ends them.
-- `Member` is one worker: its state, and the jobs that were sent to it (`SentJob`).
+    pool = WorkerPool(2, make_worker)
+    outcome = await pool.simulate(task)
+    …
+    await pool.close()
 
-The simulation itself runs in `actors.simulators.ray_worker`.
+- `WorkerPool` has the queue, turns between users, retries, deadlines and statistics. It implements `SimulatorPool`.
+- `Worker` is one simulator. `actors.simulators.local_worker` has a thread and a child process,
+  `actors.simulators.ray_worker` a Ray actor.
+- `WorkerPool.share` gives one of several users a `SimulatorPool` of its own. Users take turns.
+
+Simulations are idempotent: a job whose worker died is repeated by another worker.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
-from typing import Any
+from typing import Protocol
 
-from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
-from actors.runtime.cluster_nodes import Versions
-from actors.simulators.ray_worker import CONTROL, Greeting, WorkerReply, simulator_actor
-from actors.simulators.simulation_task import RETRIES, Account, PoolStatistics, Simulator, pour_simulator
-from actors.simulators.task_transfer import Packer
+from actors.interfaces import LaboratoryError, SimulationError
+from actors.runtime.remote_object import mark_retrieved
 from sim_engine.outcome import SimulatedPour
 from sim_engine.scene import PourTask
 
-
-@dataclass(eq=False)
-class SimulationJob:
-    """A simulation that a caller waits for.
-
-    Attributes:
-        task: packed, without paths.
-        meshes: Ray's references of its meshes.
-        future: receives the result, or the error.
-        deaths: number of simulators that died during this job.
-    """
-
-    task: PourTask
-    meshes: Sequence[Any]
-    future: asyncio.Future[SimulatedPour]
-    deaths: int = 0
-
-    def fail(self, error: Exception) -> None:
-        """Set the error as the outcome."""
-        if not self.future.done():
-            self.future.set_exception(error)
-
-
-@dataclass(eq=False)
-class SentJob:
-    """A job that was sent to a simulator.
-
-    Attributes:
-        number: unique number of this transmission.
-        recalled: the result is not needed any more, because the job was cancelled or given to another simulator.
-    """
-
-    job: SimulationJob
-    number: int
-    recalled: bool = False
-
-
-@dataclass(eq=False)
-class Member:
-    """A simulator actor. A number is used only once, so that a dead worker is never mistaken for a live one.
-
-    Attributes:
-        greeted: done when its process is up, or has failed to start.
-        sent: jobs in the order in which they run; the first one is running.
-        overdue: fires when the first job takes too long.
-        begun: start of the first job, by the event loop's clock [s].
-    """
-
-    number: int
-    actor: Any
-    greeted: asyncio.Future[Greeting]
-    sent: deque[SentJob] = field(default_factory=deque)
-    overdue: asyncio.TimerHandle | None = None
-    begun: float = 0.0
-
-    @property
-    def greeting(self) -> Greeting | None:
-        """None unless its process is up."""
-        done = self.greeted.done() and not self.greeted.cancelled() and self.greeted.exception() is None
-        return self.greeted.result() if done else None
-
-    @property
-    def spare(self) -> SentJob | None:
-        """The last job, if it cannot have begun and is still needed."""
-        return self.sent[-1] if len(self.sent) > 1 and not self.sent[-1].recalled else None
-
-    def drop_timer(self) -> None:
-        """Stop timing the first job."""
-        if self.overdue is not None:
-            self.overdue.cancel()
-            self.overdue = None
-
-
-def look_away(answer: asyncio.Future[Any]) -> None:
-    """Mark a late result as retrieved, so that asyncio does not log it."""
-    if not answer.cancelled():
-        answer.exception()
-
-
-RESTART_PAUSE = 20.0
-"""Pause after a worker's process failed to start [s], because the cause may last."""
-
-_REPORT_PAUSE = 1.0
-"""Losses within this time are reported together [s]: a lost node loses many workers."""
-
-
-class WorkerPool:
-    """Keeps a number of simulator actors alive. If some cannot be placed because a node is lost, it waits for them.
-
-    Args:
-        size: number of workers.
-        start: starts an actor.
-        expected: versions that workers must have; None if they cannot differ.
-        changed: called when a worker is up, or cannot start.
-        tell: called with a message about losses.
-    """
-
-    def __init__(
-        self,
-        size: int,
-        start: Callable[[], Any],
-        *,
-        expected: Versions | None,
-        changed: Callable[[], None],
-        tell: Callable[[str], None],
-    ) -> None:
-        self._start, self._expected, self._changed, self._report = start, expected, changed, tell
-        self._loop = asyncio.get_running_loop()
-        self._members: dict[int, Member] = {}
-        self._numbers = 0
-        self._losses: list[tuple[str, int]] = []
-        self._closed = False
-        self.size = size
-        self.problem = ""
-        for _ in range(size):
-            self._add()
-
-    @property
-    def up(self) -> list[Member]:
-        """Workers whose processes have started."""
-        return [member for member in self._members.values() if member.greeting is not None]
-
-    @property
-    def hopeless(self) -> bool:
-        """Whether no worker is up or starting."""
-        return not self._members
-
-    def __contains__(self, member: Member) -> bool:
-        return member.number in self._members
-
-    async def greeted(self) -> list[Greeting]:
-        """The greetings of the workers; waits for those that are starting."""
-        if self._members:
-            await asyncio.wait([member.greeted for member in self._members.values()])
-        return [member.greeting for member in self.up if member.greeting is not None]
-
-    def grow(self, size: int) -> None:
-        """Increase the number of workers to at least `size`."""
-        while self.size < size and not self._closed:
-            self.size += 1
-            self._add()
-
-    def lose(self, member: Member, orphans: int) -> None:
-        """Replace a worker that is lost or has to be ended.
-
-        Args:
-            member: the worker.
-            orphans: number of its jobs that other workers take over.
-        """
-        self._remove(member)
-        if not self._losses:
-            self._loop.call_later(_REPORT_PAUSE, self._report_losses)
-        self._losses.append(("" if member.greeting is None else member.greeting.host, orphans))
-        self._add()
-
-    async def close(self, deadline: float) -> None:
-        """Make the workers write their compiled kernels, then end their processes.
-
-        Args:
-            deadline: longest time for writing [s].
-        """
-        self._closed = True
-        members = list(self._members.values())
-        up = self.up
-        self._members = {}
-        closing = {asyncio.wrap_future(member.actor.close.remote().future()) for member in up}
-        if closing:
-            await asyncio.wait(closing, timeout=deadline)
-        for answer in closing:
-            answer.add_done_callback(look_away)
-        for member in members:
-            _kill(member)
-
-    def _add(self) -> None:
-        if self._closed:
-            return
-        self._numbers += 1
-        actor = self._start()
-        member = Member(self._numbers, actor, asyncio.wrap_future(actor.greet.remote().future()))
-        self._members[member.number] = member
-        member.greeted.add_done_callback(partial(self._greeted, member))
-
-    def _greeted(self, member: Member, greeted: asyncio.Future[Greeting]) -> None:
-        """A worker's process is up, or does not start."""
-        error = None if greeted.cancelled() else greeted.exception()
-        if member not in self:
-            return
-        if (greeting := member.greeting) is None:
-            if "error raised in its creation task" in str(error):
-                self._refuse(member, f"a simulator's process does not start: {_last_line(error)}")
-            else:
-                self.lose(member, 0)
-        elif self._expected is not None and (difference := self._expected.difference(greeting.versions)):
-            self._refuse(member, f"the simulator on {greeting.host} is not like this machine's: {difference}")
-        self._changed()
-
-    def _refuse(self, member: Member, problem: str) -> None:
-        """Reject a worker that would fail again or return different results; start another one later."""
-        self._remove(member)
-        if problem != self.problem:
-            self.problem = problem
-            self._report(problem)
-        self._loop.call_later(RESTART_PAUSE, self._add)
-
-    def _remove(self, member: Member) -> None:
-        self._members.pop(member.number, None)
-        _kill(member)
-
-    def _report_losses(self) -> None:
-        losses, self._losses = self._losses, []
-        if self._closed:
-            return
-        hosts = ", ".join(sorted({host for host, _ in losses if host}))
-        self._report(
-            f"{len(losses)} simulator(s) lost{f' on {hosts}' if hosts else ''}: "
-            f"{sum(count for _, count in losses)} simulation(s) are repeated by others; "
-            f"{len(self.up)} of {self.size} are up"
-        )
-
-
-def _kill(member: Member) -> None:
-    import ray
-
-    with contextlib.suppress(Exception):
-        ray.kill(member.actor)
-
-
-def _last_line(error: BaseException | None) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[-1] if lines else repr(error)
-
+RETRIES = 2
+"""Number of repetitions of a job after workers died during it."""
 
 DEADLINE = 1800.0
 """Longest time for one job on one worker [s]: a worker that needs half an hour counts as dead, not slow."""
@@ -270,79 +43,283 @@ DRAIN_DEADLINE = 10.0
 CLOSE_DEADLINE = 10.0
 """Time that a worker has to write its kernels at the end [s]."""
 
-AHEAD = 1
-"""Number of jobs queued at a busy worker, so that it begins the next one without a request."""
+RESTART_PAUSE = 20.0
+"""Pause after a worker could not be used [s], because the cause may last."""
+
+_REPORT_PAUSE = 1.0
+"""Losses within this time are reported together [s]: a lost node loses many workers."""
 
 
-class RaySimulatorPool:
-    """`SimulatorPool` over Ray actors. Jobs begin in their order of arrival, as far as deaths of workers allow.
+class WorkerLostError(Exception):
+    """The worker has died or does not respond. The text says how, if that is known."""
 
-    - Each busy worker has its next job queued. If a worker becomes idle while another one still has a job waiting, the
-      job is taken back and given to the idle one.
-    - Simulations are idempotent. A job whose worker died is repeated by another one.
-    - The pool needs a running Ray (`actors.runtime.ray_runtime`) and is created inside an event loop.
+
+class WorkerUnusableError(Exception):
+    """The worker does not start, or would return different results than other workers. The text is for the user."""
+
+
+@dataclass(frozen=True)
+class Greeting:
+    """A worker's description of itself when it is up.
+
+    Attributes:
+        pid: its process id.
+        host: the name and address of another machine, for messages; '' on this one.
+    """
+
+    pid: int
+    host: str = ""
+
+
+@dataclass(frozen=True)
+class WorkerReply:
+    """A result, and the time that the worker spent on it [s]."""
+
+    result: SimulatedPour
+    seconds: float
+
+
+class Worker(Protocol):
+    """One simulator. It runs its jobs one after another."""
+
+    async def start(self) -> Greeting:
+        """Start it and wait until it is up.
+
+        Raises:
+            WorkerLostError: it died during the start.
+            WorkerUnusableError: another worker would fail in the same way.
+        """
+        ...
+
+    async def run(self, number: int, task: PourTask) -> WorkerReply:
+        """Run a job after those that were sent before.
+
+        Args:
+            number: identifies the job for `cancel`.
+            task: the pour to simulate.
+
+        Raises:
+            JobCancelledError: the job was cancelled.
+            InvalidActionError, SimulationError: it has no result.
+            WorkerLostError: the worker died.
+        """
+        ...
+
+    def cancel(self, number: int) -> None:
+        """Cancel a job: it never begins, or it stops between two time steps. Does not wait."""
+        ...
+
+    async def close(self, patience: float) -> None:
+        """Let the worker write its compiled kernels, then end it.
+
+        Args:
+            patience: longest time for writing [s]; 0 ends it at once.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class PoolStatistics:
+    """Statistics of a pool.
+
+    Attributes:
+        jobs: finished, including refused ones.
+        cancelled: cancelled because the result was not needed any more.
+        deaths: workers lost and replaced.
+        busy_s: wall-clock time that workers worked, summed [s]; by their own clocks if they report it.
+    """
+
+    jobs: int
+    cancelled: int
+    deaths: int
+    busy_s: float
+
+
+@dataclass(eq=False)
+class _Job:
+    """A simulation that a caller waits for. `deaths` counts the workers that died during it."""
+
+    task: PourTask
+    user: object
+    future: asyncio.Future[SimulatedPour]
+    deaths: int = 0
+
+    def fail(self, error: Exception) -> None:
+        if not self.future.done():
+            self.future.set_exception(error)
+
+
+class _Queue:
+    """Waiting jobs. Repeated jobs come first. Then users take turns; jobs of one user keep their order."""
+
+    def __init__(self) -> None:
+        self._repeated: deque[_Job] = deque()
+        self._turns: dict[object, deque[_Job]] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._repeated or self._turns)
+
+    def add(self, job: _Job) -> None:
+        self._turns.setdefault(job.user, deque()).append(job)
+
+    def repeat(self, jobs: Sequence[_Job]) -> None:
+        self._repeated.extendleft(reversed(jobs))
+
+    def pop(self) -> _Job:
+        if self._repeated:
+            return self._repeated.popleft()
+        user = next(iter(self._turns))
+        jobs = self._turns.pop(user)
+        job = jobs.popleft()
+        if jobs:
+            self._turns[user] = jobs  # behind the other users
+        return job
+
+    def discard(self, job: _Job) -> bool:
+        """Remove a job. Returns whether it was waiting."""
+        jobs = self._repeated if job in self._repeated else self._turns.get(job.user, deque())
+        if job not in jobs:
+            return False
+        jobs.remove(job)
+        if job.user in self._turns and not self._turns[job.user]:
+            del self._turns[job.user]
+        return True
+
+
+@dataclass(eq=False)
+class _SentJob:
+    """A job that was sent to a worker. A recalled one was cancelled, or given to another worker."""
+
+    job: _Job
+    number: int
+    recalled: bool = False
+
+
+@dataclass(eq=False)
+class _Member:
+    """A worker of the pool.
+
+    Attributes:
+        started: done when the worker is up, or has failed to start.
+        sent: jobs in the order in which they run; the first one is running.
+        overdue: fires when the first job takes too long.
+        begun: start of the first job [s of time.monotonic()].
+    """
+
+    worker: Worker
+    started: asyncio.Task[Greeting]
+    sent: deque[_SentJob] = field(default_factory=deque)
+    overdue: asyncio.TimerHandle | None = None
+    begun: float = 0.0
+
+    @property
+    def greeting(self) -> Greeting | None:
+        """None unless the worker is up."""
+        done = self.started.done() and not self.started.cancelled() and self.started.exception() is None
+        return self.started.result() if done else None
+
+    @property
+    def spare(self) -> _SentJob | None:
+        """The last job, if it cannot have begun and is still needed."""
+        return self.sent[-1] if len(self.sent) > 1 and not self.sent[-1].recalled else None
+
+    def recall(self, sent: _SentJob) -> None:
+        """Recall a job: it never begins, or it stops between two time steps."""
+        sent.recalled = True
+        self.worker.cancel(sent.number)
+
+    def stop_timer(self) -> None:
+        if self.overdue is not None:
+            self.overdue.cancel()
+            self.overdue = None
+
+
+class WorkerPool:
+    """A `SimulatorPool` of workers. Jobs begin in their order of arrival, as far as turns and deaths allow.
+
+    Workers that die are replaced. Workers that cannot be placed, because a node of a cluster is lost, are waited for.
+    The pool starts with `open` or with the first job.
 
     Args:
         size: number of workers.
-        make: creates a worker's simulator, inside its process.
+        make_worker: creates one; it is not started yet.
+        separate: whether workers are separate processes. Others cannot be killed, so that deadlines do not apply.
+        ahead: number of jobs sent to a busy worker, so that it begins the next one without a request. If a worker
+            becomes idle while another one still has such a job, the job is given to the idle one.
         retries: how often a job is tried again after a death.
         deadline: longest time for one job [s].
-        cpus: cores that Ray counts for a worker.
-        placement: Ray's options that place the workers.
-        expected: versions that workers must have; None if they cannot differ.
         tell: called with a message about losses.
     """
 
     def __init__(
         self,
         size: int,
+        make_worker: Callable[[], Worker],
         *,
-        make: Callable[[], Simulator] = pour_simulator,
+        separate: bool = True,
+        ahead: int = 0,
         retries: int = RETRIES,
         deadline: float = DEADLINE,
-        cpus: float = 1.0,
-        placement: Mapping[str, Any] | None = None,
-        expected: Versions | None = None,
         tell: Callable[[str], None] = lambda text: None,
     ) -> None:
-        self._retries, self._deadline = retries, deadline
-        self._loop = asyncio.get_running_loop()
-        self._waiting: deque[SimulationJob] = deque()
-        self._sendings = 0
-        self._packer = Packer()
-        self._meshes: dict[Path, Any] = {}
-        self._account = Account(size)
+        self._size, self._make_worker, self._separate, self._ahead = size, make_worker, separate, ahead
+        self._retries, self._deadline, self._report = retries, deadline, tell
+        self._members: list[_Member] = []
+        self._queue = _Queue()
+        self._sendings = self._jobs = self._cancelled = self._deaths = 0
+        self._busy_s = 0.0
+        self._losses: list[tuple[str, int]] = []
+        self._ending: set[asyncio.Task[None]] = set()
         self._wait_timer: asyncio.TimerHandle | None = None
+        self._problem = ""
         self._abandoned: LaboratoryError | None = None
-        self._closed = False
-        start = partial(simulator_actor, make, cpus=cpus, placement=placement or {})
-        self._workers = WorkerPool(size, start, expected=expected, changed=self._dispatch, tell=tell)
+        self._is_open = self._closed = False
 
     @property
     def size(self) -> int:
         """Number of workers, including those that are not up yet."""
-        return self._workers.size
+        return self._size
 
     @property
     def separate(self) -> bool:
-        """Whether simulators run in separate processes: always True."""
-        return True
+        """See `SimulatorPool.separate`."""
+        return self._separate
 
     def statistics(self) -> PoolStatistics:
-        """Statistics of the pool so far."""
-        return self._account.statistics()
+        """Statistics up to now, including running jobs."""
+        busy_s = self._busy_s + sum(time.monotonic() - member.begun for member in self._up if member.sent)
+        return PoolStatistics(self._jobs, self._cancelled, self._deaths, busy_s)
+
+    def share(self) -> PoolShare:
+        """Return a `SimulatorPool` for one of several users."""
+        return PoolShare(self)
+
+    def open(self) -> None:
+        """Start the workers. Needs a running event loop. May be called again."""
+        if not self._is_open:
+            self._is_open = True
+            for _ in range(self._size):
+                self._add()
 
     def grow(self, size: int) -> None:
         """Increase the number of workers to at least `size`."""
-        self._workers.grow(size)
-        self._account.resize(self._workers.size)
+        while self._size < size and not self._closed:
+            self._size += 1
+            self._add()
 
     async def pids(self) -> list[int]:
         """Process ids of the workers; waits for those that are starting."""
-        return [greeting.pid for greeting in await self._workers.greeted()]
+        self.open()
+        if self._members:
+            await asyncio.wait([member.started for member in self._members])
+        return [member.greeting.pid for member in self._members if member.greeting is not None]
 
-    async def simulate(self, task: PourTask) -> SimulatedPour:
+    async def simulate(self, task: PourTask, user: object = None) -> SimulatedPour:
         """See `SimulatorPool.simulate`.
+
+        Args:
+            task: the pour to simulate.
+            user: users take turns.
 
         Raises:
             LaboratoryError: no simulator is up and none starts, or the error that the pool was abandoned with.
@@ -351,146 +328,15 @@ class RaySimulatorPool:
             raise SimulationError("the pool of simulators is closed")
         if self._abandoned is not None:
             raise self._abandoned
-        packed, serialized = self._packer.pack(task)
-        for mesh in serialized:
-            if mesh.key not in self._meshes:
-                import ray
-
-                self._meshes[mesh.key] = ray.put(mesh)
-        job = SimulationJob(packed, [self._meshes[mesh.key] for mesh in serialized], self._loop.create_future())
-        self._waiting.append(job)
+        self.open()
+        job = _Job(task, user, asyncio.get_running_loop().create_future())
+        self._queue.add(job)
         self._dispatch()
         try:
             return await job.future
         except asyncio.CancelledError:
-            self._give_up(job)
+            self._cancel(job)
             raise
-
-    def _dispatch(self) -> None:
-        """Assign waiting jobs to workers. If none waits, move jobs from busy workers to idle ones."""
-        while self._waiting and (member := self._next_member()) is not None:
-            self._send(self._waiting.popleft(), member)
-        if not self._waiting:
-            self._level()
-        self._limit_wait()
-
-    def _next_member(self) -> Member | None:
-        """The worker that is expected to begin another job first."""
-        free = [member for member in self._workers.up if len(member.sent) <= AHEAD]
-        return min(free, key=lambda member: (len(member.sent), member.begun), default=None)
-
-    def _level(self) -> None:
-        members = self._workers.up
-        for idle in [member for member in members if not member.sent]:
-            busy = next((member for member in members if member.spare is not None), None)
-            if busy is None or (spare := busy.spare) is None:
-                return
-            _recall(busy, spare)
-            self._send(spare.job, idle)
-
-    def _send(self, job: SimulationJob, member: Member) -> None:
-        self._sendings += 1
-        sent = SentJob(job, self._sendings)
-        ref = member.actor.simulate.remote(sent.number, job.task, *job.meshes)
-        member.sent.append(sent)
-        if len(member.sent) == 1:
-            self._begin(member)
-        answer = asyncio.wrap_future(ref.future())
-        answer.add_done_callback(partial(self._answered, member, sent))
-
-    def _begin(self, member: Member) -> None:
-        """Start timing a worker's first job."""
-        self._account.begin(member.number)
-        member.begun = self._loop.time()
-        member.overdue = self._loop.call_later(self._deadline, self._overdue, member)
-
-    def _end(self, member: Member, worked: float | None = None) -> None:
-        member.drop_timer()
-        self._account.end(member.number, worked)
-
-    def _answered(self, member: Member, sent: SentJob, answer: asyncio.Future[WorkerReply]) -> None:
-        import ray
-
-        error = answer.exception()
-        if member not in self._workers:
-            return  # its jobs are at other workers
-        if isinstance(error, ray.exceptions.RayActorError):
-            self._lose(member)
-            return
-        was_first = member.sent[0] is sent
-        member.sent.remove(sent)
-        if was_first:
-            self._end(member, None if error is not None else answer.result().seconds)
-            if member.sent:
-                self._begin(member)
-        if not sent.recalled:
-            self._account.jobs += 1
-            _settle(sent.job, answer)
-        self._dispatch()
-
-    def _overdue(self, member: Member) -> None:
-        """The first job has taken too long."""
-        sent = member.sent[0]
-        if not sent.recalled:
-            sent.recalled = True
-            sent.job.fail(SimulationError(f"no result within {self._deadline:g} s; its simulator was replaced"))
-        self._lose(member)
-
-    def _give_up(self, job: SimulationJob) -> None:
-        """Give up a job whose caller does not wait any more."""
-        self._account.cancelled += 1
-        if job in self._waiting:
-            self._waiting.remove(job)
-            return
-        for member in self._workers.up:
-            for sent in member.sent:
-                if sent.job is job and not sent.recalled:
-                    _recall(member, sent)
-                    self._loop.call_later(DRAIN_DEADLINE, self._still_draining, member, sent)
-
-    def _still_draining(self, member: Member, sent: SentJob) -> None:
-        if member in self._workers and member.sent and member.sent[0] is sent:
-            self._lose(member)
-
-    def _lose(self, member: Member) -> None:
-        """Replace a worker that is lost or has to be ended. Its jobs go to others; its running job counts one death."""
-        self._account.deaths += 1
-        self._end(member)
-        orphans = [sent.job for sent in member.sent if not sent.recalled]
-        if member.sent and not member.sent[0].recalled:
-            first = orphans[0]
-            first.deaths += 1
-            if first.deaths > self._retries:
-                particles = first.task.parameters.particles
-                first.fail(
-                    SimulationError(
-                        f"{first.deaths} simulators died over this job; they may lack memory (particles: {particles})"
-                    )
-                )
-                del orphans[0]
-        self._waiting.extendleft(reversed(orphans))
-        self._workers.lose(member, len(orphans))
-        self._dispatch()
-
-    def _limit_wait(self) -> None:
-        """Limit the wait of jobs while no worker is up. If none is starting, they fail at once."""
-        if not self._waiting or self._workers.up:
-            if self._wait_timer is not None:
-                self._wait_timer.cancel()
-                self._wait_timer = None
-        elif self._workers.hopeless:
-            self._fail_waiting()
-        elif self._wait_timer is None:
-            self._wait_timer = self._loop.call_later(START_DEADLINE, self._fail_waiting)
-
-    def _fail_waiting(self) -> None:
-        """Fail waiting jobs with an error of the laboratory, not of their simulations."""
-        self._wait_timer = None
-        reason = self._workers.problem or (
-            f"no simulator was up for {START_DEADLINE:g} s; is there a free core, and memory, for one?"
-        )
-        while self._waiting:
-            self._waiting.popleft().fail(LaboratoryError(reason))
 
     def abandon(self, error: LaboratoryError) -> None:
         """Fail all present and future jobs, because their simulators cannot be restored.
@@ -499,49 +345,252 @@ class RaySimulatorPool:
             error: the reason.
         """
         self._abandoned = error
-        for member in self._workers.up:
-            self._waiting.extend(sent.job for sent in member.sent if not sent.recalled)
-            for sent in member.sent:
+        for member in self._up:
+            for sent in [sent for sent in member.sent if not sent.recalled]:
                 sent.recalled = True
-        while self._waiting:
-            self._waiting.popleft().fail(error)
+                sent.job.fail(error)
+        self._fail_waiting(error)
 
     async def close(self) -> None:
-        """Write the workers' compiled kernels and end their processes; remaining jobs have no result."""
+        """Write the workers' compiled kernels and end them; remaining jobs have no result. May be called again."""
         if self._closed:
             return
         self._closed = True
+        self._stop_waiting()
+        error = SimulationError("the pool of simulators is closed")
+        patience = CLOSE_DEADLINE
+        for member in self._up:
+            member.stop_timer()
+            if member.sent:
+                patience = CLOSE_DEADLINE + DRAIN_DEADLINE
+            for sent in [sent for sent in member.sent if not sent.recalled]:
+                member.recall(sent)
+                sent.job.fail(error)
+        self._fail_waiting(error)
+        members, self._members = self._members, []
+        if self._abandoned is not None:
+            patience = 0.0
+        for member in members:
+            self._end(member, 0.0 if member.greeting is None and self._separate else patience)
+        await asyncio.gather(*self._ending, return_exceptions=True)
+
+    # ---- workers
+
+    @property
+    def _up(self) -> list[_Member]:
+        return [member for member in self._members if member.greeting is not None]
+
+    def _add(self) -> None:
+        if self._closed:
+            return
+        worker = self._make_worker()
+        member = _Member(worker, asyncio.ensure_future(worker.start()))
+        self._members.append(member)
+        member.started.add_done_callback(partial(self._started, member))
+
+    def _started(self, member: _Member, started: asyncio.Task[Greeting]) -> None:
+        """A worker is up, or does not start."""
+        error = None if started.cancelled() else started.exception()
+        if member not in self._members:
+            return
+        if isinstance(error, WorkerUnusableError):
+            self._refuse(member, str(error))
+        elif member.greeting is None:
+            self._lose(member)
+        self._dispatch()
+
+    def _refuse(self, member: _Member, problem: str) -> None:
+        """Reject a worker that would fail again or return different results; start another one later."""
+        self._members.remove(member)
+        self._end(member, 0.0)
+        if problem != self._problem:
+            self._problem = problem
+            self._report(problem)
+        asyncio.get_running_loop().call_later(RESTART_PAUSE, self._add)
+
+    def _end(self, member: _Member, patience: float) -> None:
+        task = asyncio.ensure_future(member.worker.close(patience))
+        self._ending.add(task)
+        task.add_done_callback(self._ending.discard)
+        task.add_done_callback(mark_retrieved)
+
+    def _lose(self, member: _Member, reason: str = "") -> None:
+        """Replace a worker that is lost or has to be ended. Its jobs go to others; its running job counts one death."""
+        self._deaths += 1
+        self._stop_timing(member)
+        orphans = [sent.job for sent in member.sent if not sent.recalled]
+        if member.sent and not member.sent[0].recalled:
+            first = orphans[0]
+            first.deaths += 1
+            if first.deaths > self._retries:
+                how = f" (the last one: {reason})" if reason else ""
+                first.fail(
+                    SimulationError(
+                        f"{first.deaths} simulators died over this job{how}; they may lack memory (particles: "
+                        f"{first.task.parameters.particles})"
+                    )
+                )
+                del orphans[0]
+        self._queue.repeat(orphans)
+        self._members.remove(member)
+        self._end(member, 0.0)
+        if not self._losses:
+            asyncio.get_running_loop().call_later(_REPORT_PAUSE, self._report_losses)
+        self._losses.append(("" if member.greeting is None else member.greeting.host, len(orphans)))
+        self._add()
+        self._dispatch()
+
+    def _report_losses(self) -> None:
+        losses, self._losses = self._losses, []
+        if self._closed:
+            return
+        hosts = ", ".join(sorted({host for host, _ in losses if host}))
+        self._report(
+            f"{len(losses)} simulator(s) lost{f' on {hosts}' if hosts else ''}: "
+            f"{sum(count for _, count in losses)} simulation(s) are repeated by others; "
+            f"{len(self._up)} of {self._size} are up"
+        )
+
+    # ---- jobs
+
+    def _dispatch(self) -> None:
+        """Assign waiting jobs to workers. If none waits, move jobs from busy workers to idle ones."""
+        while self._queue and (member := self._next_member()) is not None:
+            self._send(self._queue.pop(), member)
+        if not self._queue:
+            self._level()
+        self._limit_wait()
+
+    def _next_member(self) -> _Member | None:
+        """The worker that is expected to begin another job first."""
+        free = [member for member in self._up if len(member.sent) <= self._ahead]
+        return min(free, key=lambda member: (len(member.sent), member.begun), default=None)
+
+    def _level(self) -> None:
+        members = self._up
+        for idle in [member for member in members if not member.sent]:
+            busy = next((member for member in members if member.spare is not None), None)
+            if busy is None or (spare := busy.spare) is None:
+                return
+            busy.recall(spare)
+            self._send(spare.job, idle)
+
+    def _send(self, job: _Job, member: _Member) -> None:
+        self._sendings += 1
+        sent = _SentJob(job, self._sendings)
+        member.sent.append(sent)
+        if len(member.sent) == 1:
+            self._start_timing(member)
+        reply = asyncio.ensure_future(member.worker.run(sent.number, job.task))
+        reply.add_done_callback(partial(self._replied, member, sent))
+
+    def _start_timing(self, member: _Member) -> None:
+        member.begun = time.monotonic()
+        if self._separate:
+            member.overdue = asyncio.get_running_loop().call_later(self._deadline, self._overdue, member)
+
+    def _stop_timing(self, member: _Member, worked: float | None = None) -> None:
+        """Add the time of a worker's first job to the statistics: its own measurement [s], or since it began."""
+        member.stop_timer()
+        if member.sent:
+            self._busy_s += time.monotonic() - member.begun if worked is None else worked
+
+    def _replied(self, member: _Member, sent: _SentJob, reply: asyncio.Task[WorkerReply]) -> None:
+        error = asyncio.CancelledError() if reply.cancelled() else reply.exception()
+        if member not in self._members:
+            return  # its jobs are at other workers
+        if isinstance(error, WorkerLostError):
+            self._lose(member, str(error))
+            return
+        if member.sent[0] is sent:
+            self._stop_timing(member, None if error is not None else reply.result().seconds)
+            member.sent.popleft()
+            if member.sent:
+                self._start_timing(member)
+        else:
+            member.sent.remove(sent)
+        if not sent.recalled:
+            self._jobs += 1
+            if error is None and not sent.job.future.done():
+                sent.job.future.set_result(reply.result().result)
+            elif isinstance(error, LaboratoryError):
+                sent.job.fail(error)
+            elif error is not None:
+                sent.job.fail(SimulationError(f"the simulator's answer was lost: {error!r}"))
+        if not isinstance(error, asyncio.CancelledError):  # else the event loop ends
+            self._dispatch()
+
+    def _overdue(self, member: _Member) -> None:
+        """The first job has taken too long."""
+        sent = member.sent[0]
+        if not sent.recalled:
+            sent.recalled = True
+            sent.job.fail(SimulationError(f"no result within {self._deadline:g} s; its simulator was replaced"))
+        self._lose(member)
+
+    def _cancel(self, job: _Job) -> None:
+        """Cancel a job whose caller does not wait any more."""
+        self._cancelled += 1
+        if self._queue.discard(job):
+            return
+        for member in self._up:
+            for sent in member.sent:
+                if sent.job is job and not sent.recalled:
+                    member.recall(sent)
+                    if self._separate:
+                        asyncio.get_running_loop().call_later(DRAIN_DEADLINE, self._still_draining, member, sent)
+
+    def _still_draining(self, member: _Member, sent: _SentJob) -> None:
+        if member in self._members and member.sent and member.sent[0] is sent:
+            self._lose(member)
+
+    def _limit_wait(self) -> None:
+        """Limit the wait of jobs while no worker is up. If none is starting, they fail at once."""
+        if not self._queue or self._up:
+            self._stop_waiting()
+        elif not self._members:
+            self._fail_waiting(self._no_worker())
+        elif self._wait_timer is None:
+            self._wait_timer = asyncio.get_running_loop().call_later(
+                START_DEADLINE, lambda: self._fail_waiting(self._no_worker())
+            )
+
+    def _stop_waiting(self) -> None:
         if self._wait_timer is not None:
             self._wait_timer.cancel()
-        busy = [member for member in self._workers.up if member.sent]
-        for member in busy:
-            member.drop_timer()
-            for sent in [sent for sent in member.sent if not sent.recalled]:
-                _recall(member, sent)
-                self._waiting.append(sent.job)
-        while self._waiting:
-            self._waiting.popleft().fail(SimulationError("the pool of simulators is closed"))
-        patience = CLOSE_DEADLINE + (DRAIN_DEADLINE if busy else 0.0)
-        await self._workers.close(0.0 if self._abandoned is not None else patience)
+            self._wait_timer = None
+
+    def _no_worker(self) -> LaboratoryError:
+        """The laboratory's error, not the simulations': no worker is up."""
+        reason = f"no simulator was up for {START_DEADLINE:g} s; is there a free core, and memory, for one?"
+        return LaboratoryError(self._problem or reason)
+
+    def _fail_waiting(self, error: LaboratoryError) -> None:
+        self._stop_waiting()
+        while self._queue:
+            self._queue.pop().fail(error)
 
 
-def _recall(member: Member, sent: SentJob) -> None:
-    """Recall a job. If it has not begun, it never begins; if it has, it stops between two steps."""
-    sent.recalled = True
-    with contextlib.suppress(Exception):
-        member.actor.recall.options(concurrency_group=CONTROL).remote(sent.number)
+class PoolShare:
+    """A `SimulatorPool` for one of several users of a pool.
 
+    Args:
+        pool: the pool; closing a share does not close it.
+    """
 
-def _settle(job: SimulationJob, answer: asyncio.Future[WorkerReply]) -> None:
-    """Set a job's result, or the reason why there is none."""
-    import ray
+    def __init__(self, pool: WorkerPool) -> None:
+        self._pool = pool
 
-    error = answer.exception()
-    if error is None:
-        if not job.future.done():
-            job.future.set_result(answer.result().result.copied())
-    elif isinstance(error, ray.exceptions.RayTaskError):
-        known = isinstance(error.cause, InvalidActionError | SimulationError)
-        job.fail(error.cause if known else SimulationError(f"the simulator failed: {error.cause!r}"))
-    else:
-        job.fail(SimulationError(f"the simulator's answer was lost: {error}"))
+    @property
+    def size(self) -> int:
+        """Size of the whole pool: a share uses all of it while the others are idle."""
+        return self._pool.size
+
+    @property
+    def separate(self) -> bool:
+        """See `SimulatorPool.separate`."""
+        return self._pool.separate
+
+    async def simulate(self, task: PourTask) -> SimulatedPour:
+        """See `SimulatorPool.simulate`."""
+        return await self._pool.simulate(task, self)

@@ -1,24 +1,45 @@
-"""The Ray actor around a `JobRunner`: one process, one Taichi, one job at a time.
+"""Workers of the simulator pool as Ray actors: one process, one Taichi, one job at a time, on any machine.
 
-`SimulatorProcess` runs inside the actor; `simulator_actor` starts it. Restarts and retries belong to
-`actors.simulators.pool`.
+- `RayWorker` is this program's side, `SimulatorProcess` runs inside the actor. `ray_pool` makes a pool of them.
+- `Packer` and `unpack` transfer meshes as bytes, since a path is valid on one machine only. Both machines then have
+  the same content, so that everything derived from it (distance grids, outcomes) has the same keys.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import dataclasses
+import hashlib
 import os
 import socket
+import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
-from actors.runtime.cluster_nodes import Versions, versions
-from actors.runtime.remote_object import actor_class
-from actors.simulators.simulation_task import JobRunner, Simulator
-from actors.simulators.task_transfer import SerializedMesh, unpack
-from sim_engine.outcome import SimulatedPour
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.interfaces import InvalidActionError, SimulationError
+from actors.runtime.ray_cluster import Versions, versions
+from actors.runtime.remote_object import actor_class, kill_actor, mark_retrieved
+from actors.simulators.job_runner import JobCancelledError, JobRunner, Simulator, pour_simulator
+from actors.simulators.pool import (
+    DEADLINE,
+    RETRIES,
+    Greeting,
+    WorkerLostError,
+    WorkerPool,
+    WorkerReply,
+    WorkerUnusableError,
+)
+from sim_engine.resources import cache_directory
 from sim_engine.scene import PourTask
+from sim_engine.vessel.shapes import MeshShape, VesselSpec
 
 NICENESS = 15
 """Priority of simulators, below the arm's driver, the optimiser and other programs [nice]."""
@@ -26,28 +47,8 @@ NICENESS = 15
 CONTROL = "control"
 """Concurrency group of calls that do not queue behind a job."""
 
-
-@dataclass(frozen=True)
-class Greeting:
-    """A simulator process's description of itself when it is up.
-
-    Attributes:
-        pid: process id.
-        host: the machine's name and address, for messages.
-        versions: of everything that affects its results.
-    """
-
-    pid: int
-    host: str
-    versions: Versions
-
-
-@dataclass(frozen=True)
-class WorkerReply:
-    """A result, and the time that the process worked for it [s]."""
-
-    result: SimulatedPour
-    seconds: float
+FOLDER = "meshes"
+"""Folder in the cache directory for meshes received from other machines."""
 
 
 class SimulatorProcess:
@@ -61,11 +62,11 @@ class SimulatorProcess:
         self._runner = JobRunner(make)
         self._recalled: set[int] = set()
 
-    def greet(self) -> Greeting:
-        """Return the greeting as soon as the process is up."""
+    def greet(self) -> tuple[Greeting, Versions]:
+        """Return the greeting, and the versions of everything that affects results, as soon as the process is up."""
         import ray
 
-        return Greeting(os.getpid(), f"{socket.gethostname()} ({ray.util.get_node_ip_address()})", versions())
+        return Greeting(os.getpid(), f"{socket.gethostname()} ({ray.util.get_node_ip_address()})"), versions()
 
     def simulate(self, number: int, task: PourTask, *meshes: SerializedMesh) -> WorkerReply:
         """See `JobRunner.simulate`.
@@ -83,7 +84,7 @@ class SimulatorProcess:
         return WorkerReply(result, time.monotonic() - begin)
 
     def recall(self, number: int) -> None:
-        """Cancel a job that is not needed any more: it ends between two steps, or never begins.
+        """Cancel a job: it ends between two steps, or never begins.
 
         This call runs concurrently with a job. Ray's own cancelling returns to the caller at once, but a job that
         waited behind another one would still run to its end.
@@ -97,13 +98,192 @@ class SimulatorProcess:
         self._runner.close()
 
 
-def simulator_actor(make: Callable[[], Simulator], *, cpus: float, placement: Mapping[str, Any]) -> Any:
-    """Start an actor. Returns its handle at once, before the process is up.
+class RayWorker:
+    """A `Worker` in a Ray actor.
 
     Args:
         make: creates the simulator, inside the actor.
-        cpus: cores that Ray counts for it.
-        placement: Ray's options that place it.
+        packer: shared by the workers of a pool.
+        options: Ray's options that place the actor.
+        expected: versions that it must have; None if they cannot differ.
     """
-    made = actor_class(SimulatorProcess, ((CONTROL, 1),))
-    return made.options(num_cpus=cpus, **placement).remote(make)
+
+    def __init__(
+        self, make: Callable[[], Simulator], packer: Packer, options: Mapping[str, Any], expected: Versions | None
+    ) -> None:
+        self._packer, self._expected = packer, expected
+        self._actor = actor_class(SimulatorProcess, ((CONTROL, 1),)).options(**options).remote(make)
+
+    async def start(self) -> Greeting:
+        """See `Worker.start`."""
+        import ray
+
+        try:
+            greeting: Greeting
+            greeting, found = await asyncio.wrap_future(self._actor.greet.remote().future())
+        except ray.exceptions.RayActorError as error:
+            if "error raised in its creation task" in str(error):
+                raise WorkerUnusableError(f"a simulator's process does not start: {_last_line(error)}") from error
+            raise WorkerLostError from error
+        if self._expected is not None and (difference := self._expected.difference(found)):
+            raise WorkerUnusableError(f"the simulator on {greeting.host} is not like this machine's: {difference}")
+        return greeting
+
+    async def run(self, number: int, task: PourTask) -> WorkerReply:
+        """See `Worker.run`."""
+        import ray
+
+        packed, meshes = self._packer.shared(task)
+        try:
+            reply = await asyncio.wrap_future(self._actor.simulate.remote(number, packed, *meshes).future())
+        except ray.exceptions.RayActorError as error:
+            raise WorkerLostError from error
+        except ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, InvalidActionError | SimulationError | JobCancelledError):
+                raise error.cause from None
+            raise SimulationError(f"the simulator failed: {error.cause!r}") from error
+        return WorkerReply(reply.result.copied(), reply.seconds)
+
+    def cancel(self, number: int) -> None:
+        """See `Worker.cancel`."""
+        with contextlib.suppress(Exception):  # Ray has ended
+            self._actor.recall.options(concurrency_group=CONTROL).remote(number)
+
+    async def close(self, patience: float) -> None:
+        """See `Worker.close`."""
+        if patience > 0.0:
+            closing = asyncio.wrap_future(self._actor.close.remote().future())
+            closing.add_done_callback(mark_retrieved)
+            await asyncio.wait({closing}, timeout=patience)
+        kill_actor(self._actor)
+
+
+def ray_pool(
+    size: int,
+    make: Callable[[], Simulator] = pour_simulator,
+    *,
+    cpus: float = 1.0,
+    placement: Mapping[str, Any] | None = None,
+    expected: Versions | None = None,
+    retries: int = RETRIES,
+    deadline: float = DEADLINE,
+    tell: Callable[[str], None] = lambda text: None,
+) -> WorkerPool:
+    """A pool of Ray actors; needs a running Ray (`actors.runtime.ray_runtime`).
+
+    Args:
+        size: number of workers.
+        make: creates a worker's simulator, inside its process.
+        cpus: cores that Ray counts for a worker.
+        placement: Ray's options that place the workers.
+        expected: versions that workers must have; None if they cannot differ.
+        retries, deadline, tell: see `WorkerPool`.
+    """
+    options = {"num_cpus": cpus, **(placement or {})}
+    worker = partial(RayWorker, make, Packer(), options, expected)
+    return WorkerPool(size, worker, ahead=1, retries=retries, deadline=deadline, tell=tell)
+
+
+def _last_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else repr(error)
+
+
+@dataclass(frozen=True, eq=False)
+class SerializedMesh:
+    """One mesh file.
+
+    Attributes:
+        key: digest of the content, then the file's own name for messages. It is the path below `FOLDER`.
+        content: (n,) uint8; an array is passed through shared memory without a copy.
+    """
+
+    key: Path
+    content: NDArray[np.uint8]
+
+
+class Packer:
+    """Makes tasks independent of this machine's files. Each mesh is read once, at its first use."""
+
+    def __init__(self) -> None:
+        self._meshes: dict[MeshShape, SerializedMesh] = {}
+        self._references: dict[Path, Any] = {}
+
+    def pack(self, task: PourTask) -> tuple[PourTask, list[SerializedMesh]]:
+        """Return the task without paths, and its meshes.
+
+        Raises:
+            SimulationError: a mesh cannot be read.
+        """
+        meshes: list[SerializedMesh] = []
+
+        def packed(vessel: VesselSpec) -> VesselSpec:
+            if not isinstance(vessel.shape, MeshShape):
+                return vessel
+            mesh = self._serialized(vessel.shape)
+            meshes.append(mesh)
+            return _with_path(vessel, vessel.shape, mesh.key)
+
+        return _with_vessels(task, packed(task.scene.pourer), packed(task.scene.receiver)), meshes
+
+    def shared(self, task: PourTask) -> tuple[PourTask, list[Any]]:
+        """Return the task without paths, and Ray's references of its meshes. Raises as `pack` does."""
+        packed, meshes = self.pack(task)
+        for mesh in meshes:
+            if mesh.key not in self._references:
+                import ray
+
+                self._references[mesh.key] = ray.put(mesh)
+        return packed, [self._references[mesh.key] for mesh in meshes]
+
+    def _serialized(self, shape: MeshShape) -> SerializedMesh:
+        if shape not in self._meshes:
+            try:
+                content = shape.path.read_bytes()
+            except OSError as error:
+                raise SimulationError(f"{shape.path}: the mesh can't be read: {error.strerror}") from error
+            key = Path(hashlib.sha256(content).hexdigest()[:24]) / shape.path.name
+            self._meshes[shape] = SerializedMesh(key, np.frombuffer(content, np.uint8))
+        return self._meshes[shape]
+
+
+def unpack(task: PourTask, meshes: Sequence[SerializedMesh]) -> PourTask:
+    """Return a packed task with its meshes as files of this machine.
+
+    Args:
+        task: as `Packer.pack` made it.
+        meshes: its meshes.
+
+    Raises:
+        OSError: the cache directory cannot be written.
+    """
+    if not meshes:
+        return task
+    paths = {mesh.key: _write(mesh) for mesh in meshes}
+
+    def unpacked(vessel: VesselSpec) -> VesselSpec:
+        shape = vessel.shape
+        return _with_path(vessel, shape, paths[shape.path]) if isinstance(shape, MeshShape) else vessel
+
+    return _with_vessels(task, unpacked(task.scene.pourer), unpacked(task.scene.receiver))
+
+
+def _write(mesh: SerializedMesh) -> Path:
+    """Write the mesh to a file. Other processes of this machine may write the same one."""
+    path = cache_directory() / FOLDER / mesh.key
+    if not path.exists() or path.stat().st_size != mesh.content.size:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+            file.write(mesh.content.tobytes())
+        Path(file.name).replace(path)
+    return path
+
+
+def _with_path(vessel: VesselSpec, shape: MeshShape, path: Path) -> VesselSpec:
+    return vessel.model_copy(update={"shape": shape.model_copy(update={"path": path})})
+
+
+def _with_vessels(task: PourTask, pourer: VesselSpec, receiver: VesselSpec) -> PourTask:
+    if pourer is task.scene.pourer and receiver is task.scene.receiver:
+        return task
+    return dataclasses.replace(task, scene=dataclasses.replace(task.scene, pourer=pourer, receiver=receiver))

@@ -35,10 +35,21 @@ if TYPE_CHECKING:
     from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingStatus, Reply
     from actors.balance.serial_balance import SerialBalance
     from actors.balance.simulated_balance import Load
-    from actors.bench.device_emulators import ArmEmulator, History
     from actors.bench.pour_feasibility import plan_pour
+    from actors.bench.virtual_bench import ArmEmulator, History
     from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
-    from actors.optimizer.questions import Data, Suggestion, SuggestProblem
+    from actors.optimizer.questions import (
+        CalibrationQuery,
+        Data,
+        MinimumQuery,
+        PourQuery,
+        RegressionQuery,
+        RiskQuery,
+        SimulationQuery,
+        SpaceFillingQuery,
+        Suggestion,
+        SuggestionQuery,
+    )
     from orchestrator.config.arm_file import ArmSettings, CellSection
     from orchestrator.config.balance_file import BalanceDeviceSection
     from orchestrator.config.yaml.yaml_source import Place, Report
@@ -69,10 +80,9 @@ if TYPE_CHECKING:
     )
     from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
     from orchestrator.strategies.deployment.objectives import Objective, Objectives
-    from orchestrator.strategies.optimizer_queries import OptimizerQueries
     from orchestrator.strategies.stage_result import ResultPart, StageResult
     from orchestrator.strategies.strategy import Progress, Strategy
-    from orchestrator.strategies.trials import SeedStream, Trial, Trials
+    from orchestrator.strategies.trials import OptimizerQueries, SeedStream, Trial, Trials
     from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
     from sim_engine.liquids import Liquid, SimulationParameters
     from sim_engine.outcome import Fractions, Loss, PourMeasurement, PourOutcome
@@ -124,6 +134,7 @@ __all__ = [
     "BalanceEmulator",
     "Calibration",
     "CalibrationPlan",
+    "CalibrationQuery",
     "CalibrationSettings",
     "CellSection",
     "Choice",
@@ -151,6 +162,7 @@ __all__ = [
     "Load",
     "Loss",
     "MeasuredPour",
+    "MinimumQuery",
     "MotionPath",
     "Name",
     "Number",
@@ -167,6 +179,7 @@ __all__ = [
     "Pour",
     "PourMeasurement",
     "PourOutcome",
+    "PourQuery",
     "Poured",
     "Problems",
     "ProfileShape",
@@ -174,10 +187,12 @@ __all__ = [
     "Quantity",
     "Reading",
     "ReadingStatus",
+    "RegressionQuery",
     "Reply",
     "Report",
     "Request",
     "ResultPart",
+    "RiskQuery",
     "Scene",
     "SearchSettings",
     "SeedStream",
@@ -189,14 +204,16 @@ __all__ = [
     "Simulate",
     "Simulated",
     "SimulationParameters",
+    "SimulationQuery",
     "Slots",
     "Space",
+    "SpaceFillingQuery",
     "StageResult",
     "Strategy",
     "Suggest",
-    "SuggestProblem",
     "Suggested",
     "Suggestion",
+    "SuggestionQuery",
     "Switch",
     "Text",
     "Trial",
@@ -235,7 +252,18 @@ _SOURCES = {
     "sim_engine.scene": ("PoseError", "Scene"),
     "sim_engine.search_space": ("Axis", "Space"),
     # Strategies
-    "actors.optimizer.questions": ("Data", "SuggestProblem", "Suggestion"),
+    "actors.optimizer.questions": (
+        "CalibrationQuery",
+        "Data",
+        "MinimumQuery",
+        "PourQuery",
+        "RegressionQuery",
+        "RiskQuery",
+        "SimulationQuery",
+        "SpaceFillingQuery",
+        "Suggestion",
+        "SuggestionQuery",
+    ),
     "orchestrator.requests": (
         "Answered",
         "Ask",
@@ -262,10 +290,9 @@ _SOURCES = {
         "MeasuredPour",
     ),
     "orchestrator.strategies.deployment.deployment_base": ("MAP_RESOLUTION", "Deployment", "SearchSettings"),
-    "orchestrator.strategies.optimizer_queries": ("OptimizerQueries",),
     "orchestrator.strategies.stage_result": ("ResultPart", "StageResult"),
     "orchestrator.strategies.strategy": ("Progress", "Strategy"),
-    "orchestrator.strategies.trials": ("SeedStream", "Trial", "Trials"),
+    "orchestrator.strategies.trials": ("OptimizerQueries", "SeedStream", "Trial", "Trials"),
     # Objectives
     "orchestrator.strategies.deployment.objectives": ("Objective", "Objectives"),
     # Balances
@@ -292,7 +319,7 @@ _SOURCES = {
     ),
     "actors.arm.arm_settings": ("ArmDiagnostics", "ArmSpec"),
     "actors.arm.planned_pour": ("ExecutedMotion", "MotionPath"),
-    "actors.bench.device_emulators": ("ArmEmulator", "History"),
+    "actors.bench.virtual_bench": ("ArmEmulator", "History"),
     "actors.bench.pour_feasibility": ("plan_pour",),
     "orchestrator.config.arm_file": ("ArmSettings", "CellSection"),
     "orchestrator.config.yaml.yaml_source": ("Place", "Report"),

@@ -6,12 +6,14 @@ import fcntl
 import getpass
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-REMARKS_NAME = "remarks.json"
+from orchestrator.run_errors import RunError
+
+ANNOTATIONS_NAME = "remarks.json"
 
 
 class Note(BaseModel):
@@ -38,56 +40,47 @@ class Annotations(BaseModel):
     notes: tuple[Note, ...] = ()
 
 
-class AnnotationsError(Exception):
+class AnnotationsError(RunError):
     """The annotations of a run can't be read or written; the text gives the reason and the remedy."""
 
 
-def read_remarks(run: Path) -> Annotations:
+def read_annotations(run: Path) -> Annotations:
     """The annotations of a run; empty if there are none.
 
     Raises:
         AnnotationsError: the file is not a file of annotations.
     """
-    path = run / REMARKS_NAME
+    path = run / ANNOTATIONS_NAME
     try:
         return Annotations.model_validate_json(path.read_bytes())
     except FileNotFoundError:
         return Annotations()
     except (OSError, ValidationError) as error:
-        raise AnnotationsError(f"{path}: can't be read ({str(error).splitlines()[0]}); mend or remove it") from None
+        raise AnnotationsError(f"{path}: can't be read ({str(error).splitlines()[0]}); correct or remove it") from None
 
 
-def tag(run: Path, add: tuple[str, ...] = (), remove: tuple[str, ...] = ()) -> Annotations:
-    """Add tags to a run, and remove others.
+def annotate(
+    run: Path, *, add: Sequence[str] = (), remove: Sequence[str] = (), note: str | None = None, by: str | None = None
+) -> Annotations:
+    """Add tags to a run, remove others, and add a note.
 
-    Raises:
-        AnnotationsError: as `read_remarks`, or the file can't be written.
-    """
+    The file is replaced atomically; concurrent changes wait for each other.
 
-    def changed(before: Annotations) -> Annotations:
-        tags = dict.fromkeys((*before.tags, *add))
-        return before.model_copy(update={"tags": tuple(name for name in tags if name not in remove)})
-
-    return _change(run, changed)
-
-
-def note(run: Path, text: str, by: str | None = None) -> Annotations:
-    """Add a note to a run.
+    Args:
+        note: text of the note.
+        by: its author; the user of this process unless given.
 
     Raises:
-        AnnotationsError: as `tag`.
+        AnnotationsError: as `read_annotations`, or the file can't be written.
     """
-    written = Note(time=time.time(), by=_me() if by is None else by, text=text)
-    return _change(run, lambda before: before.model_copy(update={"notes": (*before.notes, written)}))
-
-
-def _change(run: Path, change: Callable[[Annotations], Annotations]) -> Annotations:
-    """Read the file, change it, and replace it atomically; concurrent changes wait for each other."""
-    path = run / REMARKS_NAME
+    path = run / ANNOTATIONS_NAME
+    notes = [] if note is None else [Note(time=time.time(), by=_user() if by is None else by, text=note)]
     try:
         with path.with_suffix(".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            changed = change(read_remarks(run))
+            before = read_annotations(run)
+            tags = tuple(name for name in dict.fromkeys((*before.tags, *add)) if name not in remove)
+            changed = Annotations(tags=tags, notes=(*before.notes, *notes))
             draft = path.with_suffix(".part")
             text = json.dumps(changed.model_dump(mode="json"), indent=2, ensure_ascii=False)
             draft.write_text(text + "\n", encoding="utf-8")
@@ -97,7 +90,7 @@ def _change(run: Path, change: Callable[[Annotations], Annotations]) -> Annotati
     return changed
 
 
-def _me() -> str:
+def _user() -> str:
     try:
         return getpass.getuser()
     except (KeyError, OSError):  # a container's user may have no name

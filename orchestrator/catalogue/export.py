@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.catalogue.catalogue_index import TABLES, Column
+from orchestrator.catalogue.run_reading import TABLES, Column
 from orchestrator.journal.run_record import Row
 from sim_engine.resources import require
 
@@ -21,7 +21,7 @@ FORMATS = ("csv", "parquet")
 DICTIONARY = "dictionary.csv"
 
 
-def export(tables: Mapping[str, Sequence[Row]], folder: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
+def write_tables(tables: Mapping[str, Sequence[Row]], folder: Path, formats: Iterable[str] = FORMATS) -> list[Path]:
     """Write tables as 'runs.csv', 'pours.parquet' …, and the meanings of their columns as 'dictionary.csv'.
 
     Times are UTC. In CSV, times are ISO 8601, lists and mappings are JSON, and unknown values are empty. In Parquet,

@@ -1,7 +1,10 @@
-"""Queries of the catalogue: runs and pours by date, vessels, liquid, strategy and words, and comparisons of runs.
+"""Conditions of catalogue queries, their conversion to SQL, and comparisons of runs.
 
-- `searching` creates a `CatalogueQuery` from text; `find_runs`, `find_pours` and `one_run` execute queries.
+- `CONDITIONS` declares the conditions for the command line, the HTTP API and notebooks.
+- `condition_sql` converts conditions to SQL, which `orchestrator.catalogue.catalogue` executes.
 - `differing_settings` and `outcomes` compare runs.
+
+The module imports nothing heavy: `decant --help` needs it.
 """
 
 from __future__ import annotations
@@ -9,15 +12,40 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict, get_type_hints
 
-from orchestrator.catalogue.catalogue_index import Catalogue, CatalogueError
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-from orchestrator.journal.run_record import Row
 from sim_engine.errors import InvalidArgumentError
+
+_Text = str | None
+
+
+class Conditions(TypedDict, total=False):
+    """Conditions in addition to words. All given ones must hold; names may contain * and ?, and case is ignored."""
+
+    since: Annotated[
+        _Text, "Begun (of a pour: weighed) at that date or later: 2030-03-01, 2030-03 (a month), 7d (ago)."
+    ]
+    until: Annotated[_Text, "… at that date or before; a day or month counts to its end."]
+    campaign: Annotated[_Text, "Name of the campaign."]
+    pourer: Annotated[_Text, "Vessel that was poured from, by name."]
+    receiver: Annotated[_Text, "Vessel that was poured into, by name."]
+    liquid: Annotated[_Text, "What was poured, by name."]
+    strategy: Annotated[_Text, "C1 to C4, D1 to D3, or one of a package."]
+    mode: Annotated[_Text, "'virtual' or 'real'."]
+    state: Annotated[_Text, "finished, paused, failed, unknown, interrupted …"]
+    tag: Annotated[_Text, "A tag of the run."]
+
+
+class PourConditions(Conditions, total=False):
+    """Conditions for pours."""
+
+    run: str | Path | None
+
+
+CONDITIONS = {name: hint.__metadata__[0] for name, hint in get_type_hints(Conditions, include_extras=True).items()}
+"""Names and descriptions of `Conditions`."""
 
 _AGO = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 _DATES = (("%Y-%m-%dT%H:%M:%S", 0), ("%Y-%m-%dT%H:%M", 60), ("%Y-%m-%d", 86_400), ("%Y-%m", -1), ("%Y", -12))
@@ -25,124 +53,57 @@ _DATES = (("%Y-%m-%dT%H:%M:%S", 0), ("%Y-%m-%dT%H:%M", 60), ("%Y-%m-%d", 86_400)
 
 MODES = {"virtual": "virtual", "real": "hardware", "hardware": "hardware"}
 
-
-@dataclass(frozen=True)
-class CatalogueQuery:
-    """Conditions; all given ones must hold. Texts may contain * and ?; case is ignored.
-
-    Attributes:
-        words: each must occur in a run: in its names, vessels, liquid, strategy, state, tags or notes.
-        since, until: seconds since 1970; compared with the start of a run, or the weighing of a pour.
-        run: name of the folder, or its path.
-        mode: 'virtual' or 'hardware'.
-        limit: maximum number of rows, the newest ones.
-    """
-
-    words: tuple[str, ...] = ()
-    since: float | None = None
-    until: float | None = None
-    run: str | None = None
-    campaign: str | None = None
-    pourer: str | None = None
-    receiver: str | None = None
-    liquid: str | None = None
-    strategy: str | None = None
-    mode: str | None = None
-    state: str | None = None
-    tag: str | None = None
-    limit: int | None = None
+_LISTS = ("liquid", "pourer", "receiver", "strategy")
+_SEARCHED = ("run", "path", "campaign", "mode", "state", "reason", "laboratory", *_LISTS, "tags", "notes")
+_ALL_TEXT = " || ' ' || ".join(f"coalesce({name}, '')" for name in _SEARCHED)
+_LIKE = "lower({}) glob lower(?)"
+_ANY_LIKE = "exists (select 1 from json_each({}) where lower(value) glob lower(?))"
 
 
-class NoSuchRunError(CatalogueError):
-    """The catalogue has no such run."""
+def condition_sql(table: str, conditions: Mapping[str, Any]) -> tuple[str, list[Any]]:
+    """The SQL condition of a query, and its values.
 
-
-def find_runs(catalogue: Catalogue, search: CatalogueQuery) -> list[Row]:
-    """Runs, the newest first; see `catalogue_index.RUNS`."""
-    where, values = _conditions(search, "run")
-    found = catalogue.rows("run", where, values, "begun desc, path")
-    if search.state is not None:  # no journal contains 'interrupted'
-        pattern = _like(search.state)
-        found = [row for row in found if re.fullmatch(pattern, str(row["state"]), re.IGNORECASE)]
-    return found[: search.limit]
-
-
-def find_pours(catalogue: Catalogue, search: CatalogueQuery) -> list[Row]:
-    """Pours, the oldest first; beyond the limit only the newest. See `catalogue_index.POURS`."""
-    where, values = _conditions(search, "pour")
-    if search.state is not None:
-        paths = [row["path"] for row in find_runs(catalogue, CatalogueQuery(state=search.state))]
-        where, values = f"{where} and path in ({', '.join('?' * len(paths))})", [*values, *paths]
-    found = catalogue.rows("pour", where, values, "time, path, id")
-    return found if search.limit is None else found[max(len(found) - search.limit, 0) :]
-
-
-def one_run(catalogue: Catalogue, name: str) -> Row:
-    """The run with that name, or in that folder; an unambiguous beginning of a name is enough.
+    Args:
+        table: 'run' or 'pour'.
+        conditions: those of `CONDITIONS`, as text; 'words', each of which must occur in a run's names, vessels, liquid,
+            strategy, state, tags or notes; 'run', the name of a run's folder, or its path. None sets no condition.
 
     Raises:
-        NoSuchRunError: there is none.
-        CatalogueError: there are several.
+        ValueError: a date or the mode is invalid.
     """
-    path = str(Path(name).absolute())
-    runs = catalogue.rows("run", "path = ?", [path])
-    runs = runs or catalogue.rows("run", "run = ?", [name])
-    runs = runs or catalogue.rows("run", "substr(run, 1, length(?)) = ?", [name, name], "run")
-    if len(runs) == 1:
-        return runs[0]
-    if not runs:
-        raise NoSuchRunError(
-            f"{name}: no such run in the catalogue; `decant runs` lists the newest, `decant runs add FOLDER` enters "
-            "runs that it doesn't know"
-        )
-    places = "\n  ".join(row["path"] for row in runs[:10])
-    raise CatalogueError(f"{name}: {len(runs)} runs are called so; name one by its folder:\n  {places}")
-
-
-def _conditions(search: CatalogueQuery, table: str) -> tuple[str, list[Any]]:
-    parts: list[str] = ["1"]
+    if unknown := conditions.keys() - {*CONDITIONS, "words", "run", "limit"}:
+        raise TypeError(f"no condition is called {', '.join(sorted(unknown))}")
+    own, of_run = ["1"], [f"instr(lower({_ALL_TEXT}), lower(?)) > 0" for _ in conditions.get("words") or ()]
     values: list[Any] = []
-    when = "begun" if table == "run" else "time"
-    for condition, value in ((f"{when} >= ?", search.since), (f"{when} < ?", search.until)):
-        if value is not None:
-            parts.append(condition)
-            values.append(value)
-    for name in ("campaign", "mode"):
-        if (text := getattr(search, name)) is not None:
-            parts.append(f"lower({name}) glob lower(?)")
-            values.append(text)
-    for name in ("pourer", "receiver", "liquid", "strategy"):
-        if (text := getattr(search, name)) is not None:
-            several = f"exists (select 1 from json_each({name}) where lower(value) glob lower(?))"
-            parts.append(several if table == "run" else f"lower({name}) glob lower(?)")
-            values.append(text)
-    if search.run is not None:
-        parts.append("(lower(run) glob lower(?) or path = ?)")
-        values += [search.run, str(Path(search.run).absolute())]
-    inside: list[str] = []
-    if search.tag is not None:
-        inside.append("exists (select 1 from json_each(run.tags) where lower(value) glob lower(?))")
-        values.append(search.tag)
-    for word in search.words:
-        inside.append(f"instr(lower({_EVERYTHING}), lower(?)) > 0")
-        values.append(word)
-    if inside:
-        condition = " and ".join(inside)
-        parts.append(condition if table == "run" else f"path in (select path from run where {condition})")
-    return " and ".join(parts), values
-
-
-_EVERYTHING = " || ' ' || ".join(
-    f"coalesce(run.{name}, '')"
-    for name in (
-        *("run", "path", "campaign", "mode", "state", "reason", "laboratory", "liquid", "pourer", "receiver"),
-        *("strategy", "tags", "notes"),
-    )
-)
-
-
-def _like(text: str) -> str:
-    return "".join({"*": ".*", "?": "."}.get(letter, re.escape(letter)) for letter in text)
+    run_values: list[Any] = list(conditions.get("words") or ())
+    for name, text in conditions.items():
+        match name:
+            case "words" | "limit":
+                continue
+            case _ if text is None:
+                continue
+            case "since" | "until":
+                column, sign = "begun" if table == "run" else "time", ">=" if name == "since" else "<"
+                own.append(f"{column} {sign} ?")
+                values.append(moment(text, end=name == "until"))
+            case "mode":
+                if text.lower() not in MODES:
+                    raise InvalidArgumentError(f"mode '{text}' is not one of {', '.join(MODES)}")
+                own.append("mode = ?")
+                values.append(MODES[text.lower()])
+            case "run":
+                own.append("(lower(run) glob lower(?) or path = ?)")
+                values += [str(text), str(Path(text).absolute())]
+            case "state" | "tag":
+                of_run.append(_LIKE.format(name) if name == "state" else _ANY_LIKE.format("tags"))
+                run_values.append(text)
+            case _:
+                own.append((_ANY_LIKE if table == "run" and name in _LISTS else _LIKE).format(name))
+                values.append(text)
+    if of_run:
+        condition = " and ".join(of_run)
+        own.append(condition if table == "run" else f"path in (select path from runs where {condition})")
+    return " and ".join(own), values + run_values
 
 
 def moment(text: str, *, end: bool = False, now: datetime | None = None) -> float:
@@ -178,45 +139,17 @@ def _after(begin: datetime, lasts: int) -> datetime:
     return begin.replace(year=begin.year + months // 12, month=months % 12 + 1)
 
 
-def searching(
-    *,
-    since: str | None = None,
-    until: str | None = None,
-    mode: str | None = None,
-    words: Sequence[str] = (),
-    **others: Any,
-) -> CatalogueQuery:
-    """A query from typed text; see `CatalogueQuery`, `moment`, and `MODES` for `mode`.
-
-    Raises:
-        ValueError: a date or a mode is invalid.
-    """
-    if mode is not None and mode.lower() not in MODES:
-        raise InvalidArgumentError(f"mode '{mode}' is not one of {', '.join(MODES)}")
-    return CatalogueQuery(
-        words=tuple(words),
-        since=None if since is None else moment(since),
-        until=None if until is None else moment(until, end=True),
-        mode=None if mode is None else MODES[mode.lower()],
-        **others,
-    )
-
-
 _MISSING = object()
 
 
-def differing_settings(runs: Sequence[Path]) -> dict[str, list[Any]]:
+def differing_settings(plans: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
     """Settings in which runs differ: place in the plan → its value in each run, None if a run does not have it.
 
     If a whole section is missing in one run, the section is listed, not all of its values.
 
-    Raises:
-        RunError: a journal can't be read.
+    Args:
+        plans: the fingerprints of the runs' plans.
     """
-    plans = []
-    for run in runs:
-        with JournalReader(run / JOURNAL_NAME) as journal:
-            plans.append(journal.header.fingerprint)
     found: dict[str, list[Any]] = {}
     _compare("", plans, found)
     return found
@@ -237,7 +170,7 @@ def _compare(place: str, values: Sequence[Any], found: dict[str, list[Any]]) -> 
     found[place] = [None if value is _MISSING else value for value in values]
 
 
-def outcomes(run: Row) -> dict[str, Any]:
+def outcomes(run: Mapping[str, Any]) -> dict[str, Any]:
     """The result of a run, one value for each line of a comparison: by θ, and by receiver."""
     theta = {f"θ* {name}": value for name, value in (run["theta"] or {}).items()}
     shown: dict[str, Any] = {

@@ -1,179 +1,226 @@
-"""Reads a run's folder as rows of the catalogue: the plan from the journal's header, the outcomes from its entries.
+"""The catalogue's rows: their columns, and their content, read from a run's folder.
 
-Vessels are not built, and meshes and plug-ins may be missing.
+- `RUNS` and `POURS` declare the columns once.
+- `read_run` reads the plan from the journal's header, and the outcomes from its entries. Vessels are not built, and
+  meshes and plug-ins may be missing.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from orchestrator.catalogue.annotations import AnnotationsError, read_remarks
-from orchestrator.journal.codec import CodecError, decode_outcome, decode_request, from_json
-from orchestrator.journal.journal import JOURNAL_NAME, Entry, JournalReader, Kind
-from orchestrator.journal.run_record import Row, pour_row
-from orchestrator.requests import Outcome, Pour, Poured
+from orchestrator.catalogue.annotations import Annotations, AnnotationsError, read_annotations
+from orchestrator.journal.codec import CodecError, from_json
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.run_record import PourMade, Row, pour_row, read_record
 from orchestrator.run_errors import RunError
 from orchestrator.runs.prior_data import scenes_in
+from orchestrator.strategies.stage_result import displayed_action
+from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.outcome import Loss
 
-_KINDS = (
-    Kind.CAMPAIGN_STATE,
-    Kind.REQUESTED,
-    Kind.FINISHED,
-    Kind.POUR_STARTED,
-    Kind.POUR_WITHDRAWN,
-    Kind.POUR_FINISHED,
-    Kind.STAGE_CLOSED,
+ColumnType = Literal["text", "texts", "integer", "number", "time", "values"]
+"""'texts' are several texts, 'values' a mapping; both are stored as JSON in the index and in CSV."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column.
+
+    Attributes:
+        unit: unit of its numbers; empty without one.
+        meaning: description in one line.
+    """
+
+    name: str
+    type: ColumnType
+    meaning: str
+    unit: str = ""
+
+
+ACTION_COLUMNS = tuple(displayed_action(dict.fromkeys(ACTION_DIMENSIONS)))
+"""Columns of an action, in display units."""
+
+_WHICH_RUN = (
+    Column("run", "text", "name of the run's folder"),
+    Column("campaign", "text", "name of the campaign"),
+    Column("mode", "text", "'virtual', or 'hardware' for a real bench"),
 )
+
+RUNS = (
+    *_WHICH_RUN,
+    Column("path", "text", "the run's folder"),
+    Column("begun", "time", "when its journal was begun"),
+    Column("ended", "time", "when the last entry was written; of a run that goes on, until now"),
+    Column(
+        "state",
+        "text",
+        "of the campaign, as in its journal; 'interrupted' where its process died without a word; "
+        "'unreadable' if its journal is missing or damaged",
+    ),
+    Column("reason", "text", "why it is in that state, where there is something to report"),
+    Column("laboratory", "text", "name of the laboratory"),
+    Column("seed", "integer", "of every random choice"),
+    Column("liquid", "texts", "names of the liquids"),
+    Column("pourer", "texts", "names of the vessels that were poured from"),
+    Column("receiver", "texts", "names of the vessels that were poured into"),
+    Column("strategy", "texts", "of calibration and deployment"),
+    Column("simulations", "integer", "that were finished, failed ones included"),
+    Column("pours", "integer", "that were weighed"),
+    Column("failed_pours", "integer", "that failed, or were lost"),
+    Column("open_pours", "integer", "that had begun and have no outcome: under way, or UNKNOWN"),
+    Column("spilled_g", "number", "next to the receiver, of all weighed pours together", "g"),
+    Column("test_discrepancy", "number", "mean |measured − simulated| spillage of θ* on pours kept for testing", "1"),
+    Column("theta", "values", "θ*, in SI units"),
+    Column("recommended", "values", "by receiver: action to use from now on (display units), expected and best loss"),
+    Column("tags", "texts", "given by people: `decant runs tag`"),
+    Column("notes", "texts", "written by people: `decant runs note`"),
+)
+"""Columns of the table of runs."""
+
+POURS = (
+    *_WHICH_RUN,
+    Column("path", "text", "the run's folder"),
+    Column("time", "time", "when it was weighed, or had failed; when it began where it has no outcome"),
+    Column("stage", "text", "of the campaign"),
+    Column("id", "integer", "of the request within the run"),
+    Column("number", "integer", "of the pour within its stage, from 1"),
+    Column("purpose", "text", "'calibration', or 'pour' where something is minimised"),
+    Column("strategy", "text", "that asked for it"),
+    Column("pourer", "text", "vessel that was poured from"),
+    Column("receiver", "text", "vessel that was poured into"),
+    Column("liquid", "text", "what was poured"),
+    *(
+        Column(name, "number", dimension.meaning, dimension.display_unit)
+        for name, dimension in zip(ACTION_COLUMNS, ACTION_DIMENSIONS.values(), strict=True)
+    ),
+    Column("outcome", "text", "'weighed', 'failed', or 'open': begun, no outcome; UNKNOWN once its process has died"),
+    Column("loaded_g", "number", "in the pourer before", "g"),
+    Column("spilled_g", "number", "next to the receiver", "g"),
+    Column("retained_g", "number", "left in the pourer", "g"),
+    Column("spillage", "number", "spilled / poured; empty where less than 5 % was poured", "1"),
+    Column("loss", "number", "what the deployment minimised, as measured", "of loss_name"),
+    Column("predicted_loss", "number", "what its strategy expected", "of loss_name"),
+    Column("predicted_deviation", "number", "how well that was known: its standard deviation", "of loss_name"),
+    Column("loss_name", "text", "which loss, see `loss` of a campaign; 'objectives' for a weighted sum"),
+    Column("reason", "text", "why it failed"),
+    Column("seconds", "number", "from its request to its outcome", "s"),
+)
+"""Columns of the table of pours; one row for each pour that had begun."""
+
+TABLES: dict[str, tuple[Column, ...]] = {"run": RUNS, "pour": POURS}
+"""The columns of both tables: for the index, exports, their data dictionary and the API."""
+
+UNREADABLE = "unreadable"
+"""The state of a run of which only the folder is known; its reason is why it can't be read."""
 
 
 @dataclass(frozen=True)
 class RunRead:
-    """The catalogue's content of a run.
-
-    Attributes:
-        run, pours: rows, by the names of the columns.
-        problem: why a part of it could not be read; empty otherwise.
-    """
+    """The catalogue's content of a run: rows by the names of the columns, and its tags and notes."""
 
     run: Row
     pours: list[Row] = field(default_factory=list)
-    problem: str = ""
-
-
-UNREADABLE = "unreadable"
-"""The state of a run of which only the folder is known."""
+    annotations: Annotations = field(default_factory=Annotations)
 
 
 def read_run(directory: Path) -> RunRead:
-    """Read a run, also while it is being written. Errors are stored in `problem` and never raised."""
-    row: Row = {}
+    """Read a run, also while it is being written. A run that can't be read is `UNREADABLE`; nothing is raised."""
+    annotations = Annotations()
     try:
-        remarks = read_remarks(directory)
-        row |= {"tags": remarks.tags, "notes": [note.text for note in remarks.notes]}
+        annotations = read_annotations(directory)
         with JournalReader(directory / JOURNAL_NAME) as journal:
-            return _Reading(journal, {"run": directory.name, "path": str(directory), **row}).read()
+            return RunRead(*_rows(journal, directory), annotations)
     except (RunError, CodecError, AnnotationsError, OSError) as error:
-        return unreadable(directory, str(error), row)
+        return unreadable(directory, str(error), annotations)
     except Exception as error:  # damaged content can cause any error, and must not hide other runs
-        return unreadable(directory, f"{directory}: its journal is damaged ({type(error).__name__}: {error})", row)
+        return unreadable(
+            directory, f"{directory}: its journal is damaged ({type(error).__name__}: {error})", annotations
+        )
 
 
-def unreadable(directory: Path, problem: str, remarks: Row | None = None) -> RunRead:
-    """An unreadable run: its folder, the time of its last change, and the reason.
-
-    Args:
-        remarks: its tags and notes.
-    """
+def unreadable(directory: Path, problem: str, annotations: Annotations) -> RunRead:
+    """An unreadable run: its folder, the time of its last change, and the reason."""
     row: Row = {"run": directory.name, "path": str(directory), "state": UNREADABLE, "reason": problem}
     with contextlib.suppress(OSError):
         row["begun"] = row["ended"] = directory.stat().st_mtime
-    return RunRead(row | (remarks or {}), problem=problem)
+    return RunRead(row, annotations=annotations)
 
 
-class _Reading:
-    """One pass over a journal."""
-
-    def __init__(self, journal: JournalReader, row: Row) -> None:
-        self._journal = journal
-        self._run = row
-        self._plan = journal.header.fingerprint
-        self._scenes = {str(scene["name"]): scene for scene in scenes_in(self._plan)}
-        deployment = self._plan.get("deployment") or {}
-        self._deployed = {str(scene["name"]) for scene in deployment.get("scenes", ())}
-        simple = bool(deployment) and deployment.get("objectives") is None
-        self._loss = Loss(**deployment["loss"]) if simple else None
-        self._pours: dict[int, Row] = {}
-
-    def read(self) -> RunRead:
-        laboratory, last, simulations = self._plan.get("laboratory") or {}, self._journal.header.created, 0
-        state, reason = "queued", ""
-        results: dict[str, Mapping[str, Any]] = {}
-        pours: dict[int, tuple[str, Pour]] = {}
-        for entry in self._journal.entries(kinds=_KINDS):
-            last, body = entry.t, entry.body
-            match entry.kind:
-                case Kind.CAMPAIGN_STATE:
-                    state, reason = body["after"], body["reason"]
-                case Kind.STAGE_CLOSED:
-                    results[entry.stage] = body["result"]
-                case Kind.FINISHED:
-                    simulations += body["outcome"]["type"] in ("Simulated", "Failed")
-                case Kind.REQUESTED if body["request"]["type"] == "Pour":
-                    request = decode_request(body["request"])
-                    assert isinstance(request, Pour)
-                    pours[body["id"]] = (entry.stage, request)
-                case Kind.POUR_WITHDRAWN:
-                    self._pours.pop(body["id"], None)
-                case Kind.POUR_STARTED | Kind.POUR_FINISHED:
-                    self._pours[body["id"]] = self._pour(entry, *pours[body["id"]])
-        scenes = self._scenes.values()
-        rows = list(self._pours.values())
-        self._run |= {
-            "campaign": self._journal.header.name,
-            "mode": laboratory.get("mode", "virtual"),
-            "begun": self._journal.header.created,
-            "ended": last,
-            "state": state,
-            "reason": reason,
-            "laboratory": laboratory.get("name"),
-            "seed": self._plan.get("seed"),
-            "liquid": _names(scene["liquid"]["name"] for scene in scenes),
-            "pourer": _names(scene["pourer"]["name"] for scene in scenes),
-            "receiver": _names(scene["receiver"]["name"] for scene in scenes),
-            "strategy": _names(filter(None, (self._strategy(part) for part in ("calibration", "deployment")))),
-            "simulations": simulations,
-            "pours": sum(row["outcome"] == "weighed" for row in rows),
-            "failed_pours": sum(row["outcome"] == "failed" for row in rows),
-            "open_pours": sum(row["outcome"] == "open" for row in rows),
-            "spilled_g": sum(row.get("spilled_g") or 0.0 for row in rows),
-        }
-        self._run |= _result_columns(results, {name: scene["receiver"]["name"] for name, scene in self._scenes.items()})
-        return RunRead(self._run, rows)
-
-    def _pour(self, entry: Entry, stage: str, pour: Pour) -> Row:
-        written = entry.body.get("outcome")
-        outcome = None if written is None else decode_outcome(written)
-        scene = self._scenes.get(pour.scene, {})
-        calibrating = pour.purpose == "calibration" or pour.scene not in self._deployed
-        row = pour_row(pour, outcome)
-        row |= {"predicted_loss": row.pop("predicted"), "reason": row.pop("failed", "")}
-        return row | {
-            "run": self._run["run"],
-            "path": self._run["path"],
-            "campaign": self._journal.header.name,
-            "mode": (self._plan.get("laboratory") or {}).get("mode", "virtual"),
-            "time": entry.t,
-            "stage": stage,
-            "id": entry.body["id"],
-            "purpose": pour.purpose,
-            "strategy": self._strategy("calibration" if calibrating else "deployment"),
-            "pourer": scene.get("pourer", {}).get("name", ""),
-            "receiver": scene.get("receiver", {}).get("name", pour.scene),
-            "liquid": scene.get("liquid", {}).get("name", ""),
-            "outcome": "open" if outcome is None else "weighed" if isinstance(outcome, Poured) else "failed",
-            "loss": self._measured_loss(outcome, calibrating),
-            "loss_name": "" if calibrating else "objectives" if self._loss is None else self._loss.name,
-            "predicted_deviation": None if pour.predicted is None else pour.predicted.deviation,
-            "seconds": entry.body.get("seconds"),
-        }
-
-    def _measured_loss(self, outcome: Outcome | None, calibrating: bool) -> float | None:
-        if calibrating or self._loss is None or not isinstance(outcome, Poured):
-            return None  # weighted objectives need the plan: use `decant.open_run(run).pours`
-        weighed, particles = outcome.measurement, (self._plan.get("parameters") or {}).get("particles", 0)
-        return self._loss(weighed.fractions, loaded_mass=weighed.loaded, particles=int(particles))
-
-    def _strategy(self, part: str) -> str:
-        return str(((self._plan.get(part) or {}).get("settings") or {}).get("strategy", ""))
+def _rows(journal: JournalReader, directory: Path) -> tuple[Row, list[Row]]:
+    """The row of a run and those of its pours."""
+    plan, record = journal.header.fingerprint, read_record(journal)
+    laboratory = plan.get("laboratory") or {}
+    scenes = {str(scene["name"]): scene for scene in scenes_in(plan)}
+    about = {
+        "run": directory.name,
+        "path": str(directory),
+        "campaign": journal.header.name,
+        "mode": laboratory.get("mode", "virtual"),
+    }
+    pours = [about | _pour(pour, plan, scenes) for pour in record.pours if pour.came != "not begun"]
+    outcomes = [row["outcome"] for row in pours]
+    run = about | {
+        "begun": record.created,
+        "ended": record.ended,
+        "state": str(record.state),
+        "reason": record.reason,
+        "laboratory": laboratory.get("name"),
+        "seed": plan.get("seed"),
+        **{key: _different(s[key]["name"] for s in scenes.values()) for key in ("liquid", "pourer", "receiver")},
+        "strategy": _different(filter(None, (_strategy(plan, part) for part in ("calibration", "deployment")))),
+        "simulations": sum(stage.simulations for stage in record.stages.values()),
+        "pours": outcomes.count("weighed"),
+        "failed_pours": outcomes.count("failed"),
+        "open_pours": outcomes.count("open"),
+        "spilled_g": sum(row.get("spilled_g") or 0.0 for row in pours),
+    }
+    receivers = {name: scene["receiver"]["name"] for name, scene in scenes.items()}
+    return run | _result_columns(journal.stage_results(), receivers), pours
 
 
-def _names(found: Iterator[str]) -> list[str]:
-    return list(dict.fromkeys(found))
+def _pour(pour: PourMade, plan: Mapping[str, Any], scenes: Mapping[str, Any]) -> Row:
+    request, deployment = pour.request, plan.get("deployment") or {}
+    scene = scenes.get(request.scene, {})
+    deployed = any(scene["name"] == request.scene for scene in deployment.get("scenes", ()))
+    calibrating = request.purpose == "calibration" or not deployed
+    # The loss of weighted objectives needs the plan: use `decant.open_run(run).pours`.
+    loss = None if calibrating or deployment.get("objectives") is not None else Loss(**deployment["loss"])
+    measured = None
+    if loss is not None and pour.measured is not None:
+        particles = int((plan.get("parameters") or {}).get("particles", 0))
+        measured = loss(pour.measured.fractions, loaded_mass=pour.measured.loaded, particles=particles)
+    row = pour_row(request, pour.outcome)
+    return {
+        **row,
+        "predicted_loss": row.pop("predicted"),
+        "reason": row.pop("failed", ""),
+        "time": pour.time,
+        "stage": pour.stage,
+        "id": pour.id,
+        "purpose": request.purpose,
+        "strategy": _strategy(plan, "calibration" if calibrating else "deployment"),
+        "pourer": scene.get("pourer", {}).get("name", ""),
+        "receiver": scene.get("receiver", {}).get("name", request.scene),
+        "liquid": scene.get("liquid", {}).get("name", ""),
+        "outcome": "open" if pour.came == "unknown" else pour.came,
+        "loss": measured,
+        "loss_name": "" if calibrating else "objectives" if loss is None else loss.name,
+        "predicted_deviation": None if request.predicted is None else request.predicted.deviation,
+        "seconds": pour.seconds,
+    }
+
+
+def _strategy(plan: Mapping[str, Any], part: str) -> str:
+    return str(((plan.get(part) or {}).get("settings") or {}).get("strategy", ""))
+
+
+def _different(names: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(names))
 
 
 def _result_columns(results: Mapping[str, Mapping[str, Any]], receivers: Mapping[str, str]) -> Row:

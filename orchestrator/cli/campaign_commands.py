@@ -199,7 +199,7 @@ def plan(
     from orchestrator.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
     from orchestrator.strategies.deployment.deployment_result import Deployed
-    from orchestrator.strategies.repeated_simulation import Foreseen
+    from orchestrator.strategies.single_action import PredictedPour
 
     chosen = planning_plan(read_campaign(campaign, laboratory, seed), parameters, receiver, iterations)
     assert chosen.deployment is not None
@@ -229,7 +229,7 @@ def plan(
         if recommended is None:
             raise RefusalError(f"{stage.name}: no action could be planned; every simulation failed. See {directory}")
         receiver_name = stage.name.removeprefix(DEPLOYMENT)
-        repeated = result_of(run_result.results, PREDICTION + receiver_name, Foreseen).over_seeds
+        repeated = result_of(run_result.results, PREDICTION + receiver_name, PredictedPour).over_seeds
         spillage = repeated.get("spillage")
         told = published.summary.receivers[result.scene]
         answers.append(

@@ -29,7 +29,7 @@ from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, p
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Executed, PathReport, PlannedPour
     from orchestrator.strategies.campaign_plan import CampaignPlan
-    from orchestrator.strategies.single_pour import WeighedPour
+    from orchestrator.strategies.single_action import WeighedPour
     from sim_engine.action import Action
     from sim_engine.scene import Scene
 
@@ -235,7 +235,7 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
     from orchestrator.run_service import RunRequest, RunResources
     from orchestrator.runs.motion_approval import SafetyRecordError, report_lines, required_checksum
     from orchestrator.runs.stages import StageDefinition
-    from orchestrator.strategies.single_pour import OnePour, OnePoured
+    from orchestrator.strategies.single_action import OnePour, OnePoured
 
     plan = dataclasses.replace(
         _only(chosen),

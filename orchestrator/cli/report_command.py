@@ -112,8 +112,8 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
 
 def _of_study(what: Path) -> Path:
     from orchestrator.cli.study_command import read_study
-    from orchestrator.study.report.study_page import write_report
     from orchestrator.study.study_folder import StudyError, check_settings, file_of
+    from orchestrator.study.study_page import write_report
 
     with Refused(StudyError):
         plan = read_study(what if what.is_file() else file_of(what))

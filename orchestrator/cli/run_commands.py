@@ -1,19 +1,31 @@
-"""Options and help texts of `decant runs …`, the catalogue of runs.
+"""The commands `decant runs …`: queries of the catalogue, printed as tables or JSON.
 
-Their work is done in `catalogue_output`.
+The commands query this machine's catalogue or a daemon's through `CatalogueClient`. Everything slow is imported when a
+command is called, so that `--help` starts fast.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import inspect
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestrator.catalogue.query_conditions import CONDITIONS
+from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.cli.command_options import Json, call, examples
+from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, print_json, print_message, print_note
+
+if TYPE_CHECKING:
+    from orchestrator.catalogue.catalogue import Catalogue, CatalogueClient
+    from orchestrator.journal.run_record import Row
+
+NEWEST = 20
 
 KEYWORD = inspect.Parameter.KEYWORD_ONLY
 
@@ -77,95 +89,182 @@ _CONDITIONS: dict[str, Any] = {
 }
 
 
-def _asking(*others: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a decorator that adds the catalogue's conditions and some of `_OTHERS` as one mapping."""
-    options = {name: _OTHERS[name] for name in others} | _CONDITIONS
+def _command(
+    *lines: str, name: str | None = None, conditions: Sequence[str] = ()
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a decorator that registers a command.
 
-    def taking(command: Callable[..., None]) -> Callable[..., None]:
-        own = inspect.signature(command, eval_str=True).parameters
-        # The state directory is an option as well, so the options have other names up to this point.
-        names = {f"asked_{name}": name for name in options}
+    Args:
+        lines: examples for the help.
+        name: name of the command, if it isn't that of the function.
+        conditions: names in `_OTHERS`; these and the catalogue's conditions become options, and the function gets their
+            values as one mapping.
+    """
+    options = {option: _OTHERS[option] for option in conditions} | (_CONDITIONS if conditions else {})
+    # The state directory is an option as well, so the options have other names up to the call.
+    names = {f"asked_{option}": option for option in options}
 
+    def register(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
         def call_it(**given: Any) -> None:
-            found = {name: given.pop(key) for key, name in names.items()}
-            command(conditions={**found, "words": found.get("words") or ()}, **given)
+            if names:
+                given["conditions"] = {option: given.pop(key) for key, option in names.items()}
+            call(command, **given)
 
-        parameters = [
-            *(inspect.Parameter(key, KEYWORD, default=None, annotation=options[name]) for key, name in names.items()),
-            *(one.replace(kind=KEYWORD) for one in own.values() if one.name != "conditions"),
-        ]
-        call_it.__name__, call_it.__doc__ = command.__name__, command.__doc__
-        call_it.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        call_it.__annotations__ = {one.name: one.annotation for one in parameters}
-        return call_it
+        if names:
+            own = inspect.signature(command, eval_str=True).parameters.values()
+            parameters = [
+                *(inspect.Parameter(key, KEYWORD, default=None, annotation=options[o]) for key, o in names.items()),
+                *(one.replace(kind=KEYWORD) for one in own if one.name != "conditions"),
+            ]
+            call_it.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+            call_it.__annotations__ = {one.name: one.annotation for one in parameters}
+        runs.command(name, epilog=examples(*lines))(call_it)
+        return command
 
-    return taking
+    return register
 
 
 @runs.callback()
 def newest(context: typer.Context, state: State = None, daemon: Daemon = False) -> None:
     """Run `decant runs` without a command."""
     if context.invoked_subcommand is None:
-        from orchestrator.cli import catalogue_output as verb
-
-        call(verb.list_runs, {"limit": verb.NEWEST}, daemon=daemon, as_json=False)
+        call(list_runs, {"limit": NEWEST}, daemon=daemon)
 
 
-@runs.command(
-    "list",
-    epilog=examples(
-        "decant runs list --receiver beaker --mode real --since 2030-03",
-        "decant runs list water spring-clean   # both words, anywhere: names, vessels, tags, notes",
-        "decant runs list --daemon --since 7d   # on the machine at $DECANT_URL",
-    ),
+@_command(
+    "decant runs list --receiver beaker --mode real --since 2030-03",
+    "decant runs list water spring-clean   # both words, anywhere: names, vessels, tags, notes",
+    "decant runs list --daemon --since 7d   # on the machine at $DECANT_URL",
+    name="list",
+    conditions=("words", "limit"),
 )
-@_asking("words", "limit")
-def list_(conditions: dict[str, Any], state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
+def list_runs(conditions: dict[str, Any], state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
     """List runs, newest first; all given conditions must hold."""
-    from orchestrator.cli import catalogue_output as verb
+    from orchestrator.results.console_view import print_table
 
-    call(verb.list_runs, conditions, daemon=daemon, as_json=as_json)
+    with _client(daemon) as client:
+        found = client.runs(conditions)
+    if as_json:
+        print_json({"runs": found})
+        return
+    if not found:
+        print_note("no run; `decant runs add FOLDER` enters runs that the catalogue doesn't know")
+        return
+    rows = [
+        {
+            "run": run["run"],
+            "begun": _date(run["begun"]),
+            "mode": _mode(run["mode"]),
+            "state": run["state"],
+            "strategies": ", ".join(run["strategy"]),
+            "liquid": ", ".join(run["liquid"]),
+            "from": ", ".join(run["pourer"]),
+            "into": ", ".join(run["receiver"]),
+            "pours": _count_of_pours(run),
+            "best loss": "  ".join(
+                f"{name} {_loss(one['best_loss'], one['loss'])}" for name, one in run["recommended"].items()
+            ),
+            "tags": ", ".join(run["tags"]),
+        }
+        for run in found
+    ]
+    print_table(rows, right=("pours",))
 
 
-runs.command("search", hidden=True)(list_)
-
-
-@runs.command(
-    epilog=examples(
-        "decant runs pours --receiver beaker --since 2030-03-01 --until 2030-03-31",
-        "decant runs pours --liquid glycerol --mode real --json",
-    )
+@_command(
+    "decant runs pours --receiver beaker --since 2030-03-01 --until 2030-03-31",
+    "decant runs pours --liquid glycerol --mode real --json",
+    conditions=("words", "run", "limit"),
 )
-@_asking("words", "run", "limit")
 def pours(conditions: dict[str, Any], state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
     """List pours with their actions, weighed spillage and predictions."""
-    from orchestrator.cli import catalogue_output as verb
+    with _client(daemon) as client:
+        found = client.pours(conditions)
+    if as_json:
+        print_json({"pours": found})
+    elif found:
+        _print_pours(found)
+    else:
+        print_note("no pour that this holds for")
 
-    call(verb.list_pours, conditions, daemon=daemon, as_json=as_json)
 
-
-@runs.command(epilog=examples("decant runs show quickstart-20300301-1"))
+@_command("decant runs show quickstart-20300301-1")
 def show(run: Which, state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
     """Show one run: state, θ*, recommendations, pours, tags, notes, and files."""
-    from orchestrator.cli import catalogue_output as verb
+    with _client(daemon) as client:
+        found = client.run(run)
+    if as_json:
+        print_json(found)
+        return
+    lines = {
+        "run": f"{found['run']}  {_mode(found['mode'])}",
+        "state": f"{found['state']}{': ' + found['reason'] if found['reason'] else ''}",
+        "begun": f"{_date(found['begun'])}, ended {_date(found['ended'])}",
+        "campaign": f"{found['campaign']}, seed {found['seed']}, laboratory {found['laboratory']}",
+        "strategies": ", ".join(found["strategy"]),
+        "liquid": "{}, from {} into {}".format(*(", ".join(found[key]) for key in ("liquid", "pourer", "receiver"))),
+        "work": f"{found['simulations']} simulations, {_count_of_pours(found)} pours, "
+        f"{found['spilled_g'] or 0:.1f} g spilled",
+        "θ*": ", ".join(f"{key} {value:.4g}" for key, value in found["theta"].items()),
+        "test |Δ|": _percent(found["test_discrepancy"]),
+        **{
+            f"best for {receiver}": f"{_action(one['action'])}: {_loss(one['predicted_loss'], one['loss'])} expected, "
+            f"{_loss(one['best_loss'], one['loss'])} the best poured"
+            for receiver, one in found["recommended"].items()
+        },
+        "tags": ", ".join(found["tags"]),
+        "folder": found["path"],
+    }
+    width = max(map(len, lines))
+    for key, text in lines.items():
+        if text:
+            print(f"{key:<{width}}  {text}")
+    for note in found["notes"]:
+        print(f"{'note':<{width}}  {_date(note['time'])} {note['by']}: {note['text']}")
+    if found["list_of_pours"]:
+        print()
+        _print_pours(found["list_of_pours"], of_one_run=True)
 
-    call(verb.show, run, daemon=daemon, as_json=as_json)
 
-
-@runs.command(
-    epilog=examples("decant runs check quickstart-20300301-1", "decant runs check runs/quickstart-20300301-1")
-)
+@_command("decant runs check quickstart-20300301-1", "decant runs check runs/quickstart-20300301-1")
 def check(run: Which, state: State = None, as_json: Json = False) -> None:
     """Check a run's records: SQLite's own check, the hash chain over all entries, and the ledger of pours.
 
     Exit code 0: complete and unchanged, or of an older version without a hash chain. 1: damaged or incomplete.
     """
-    from orchestrator.cli import catalogue_output as verb
+    from orchestrator.journal.journal import JOURNAL_NAME
+    from orchestrator.journal.journal_check import check_journal, has_begun
 
-    call(verb.check, run, as_json=as_json)
+    folder = Path(run)
+    if folder.is_dir():
+        if not has_begun(folder / JOURNAL_NAME):
+            raise RefusalError(f"{folder}: there is no run in this folder", BAD_INPUT)
+    else:
+        with _client() as client:
+            folder = Path(client.run(run)["path"])
+    with _refusing():
+        found = check_journal(folder / JOURNAL_NAME)
+    if as_json:
+        print_json(
+            {
+                "run": folder,
+                "complete": not found.problems,
+                "problems": found.problems,
+                "entries": found.entries,
+                "entries_without_chain": found.unchecked,
+                "pours": found.pours,
+            }
+        )
+    else:
+        print(f"{folder}: {found.verdict}")
+        for pour in found.pours:
+            print(f"  {pour}")
+    if found.problems:
+        raise RefusalError(f"{folder}: {len(found.problems)} problem(s) found", FAILED)
 
 
-@runs.command(epilog=examples("decant runs compare quickstart-20300301-1 quickstart-20300301-2"))
+@_command("decant runs compare quickstart-20300301-1 quickstart-20300301-2")
 def compare(
     which: Annotated[list[str], typer.Argument(help="Two or more runs.", show_default=False)],
     state: State = None,
@@ -173,12 +272,26 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Compare runs: the settings in which they differ, and their outcomes."""
-    from orchestrator.cli import catalogue_output as verb
+    from orchestrator.results.console_view import print_table
 
-    call(verb.compare, which, daemon=daemon, as_json=as_json)
+    if len(which) < 2:
+        raise RefusalError("comparing takes two runs or more: decant runs compare RUN RUN", BAD_INPUT)
+    with _client(daemon) as client:
+        found = client.compare(which)
+    if as_json:
+        print_json(found)
+        return
+    heads = [Path(path).name for path in found["runs"]]
+    heads = heads if len(set(heads)) == len(heads) else found["runs"]
+    asked = [_compared(place, heads, values) for place, values in found["settings"].items()]
+    outcomes = found["outcomes"]
+    keys = dict.fromkeys(key for one in outcomes for key in one)
+    ended = [_compared(key, heads, [one.get(key) for one in outcomes]) for key in keys]
+    print_table(asked or [_compared("(the same settings)", heads, [""] * len(heads))], title="asked for")
+    print_table(ended, title="came to")
 
 
-@runs.command(epilog=examples("decant runs tag quickstart-20300301-1 good paper", "decant runs tag RUN --remove good"))
+@_command("decant runs tag quickstart-20300301-1 good paper", "decant runs tag RUN --remove good")
 def tag(
     run: Which,
     tags: Annotated[list[str] | None, typer.Argument(help="Tags to add.")] = None,
@@ -187,12 +300,14 @@ def tag(
     daemon: Daemon = False,
 ) -> None:
     """Add tags to a run, or remove them. They are stored in the run's folder and are copied with it."""
-    from orchestrator.cli import catalogue_output as verb
+    if not tags and not remove:
+        raise RefusalError("name tags to put on the run, or --remove those to take off", BAD_INPUT)
+    with _client(daemon) as client:
+        found = client.tag(run, tags or [], remove or [])
+    print(f"{found['run']}: {', '.join(found['tags']) or 'no tags'}")
 
-    call(verb.tag, run, tags or [], remove or [], daemon=daemon)
 
-
-@runs.command(epilog=examples("decant runs note quickstart-20300301-1 'the tray was wet from the first pour on'"))
+@_command("decant runs note quickstart-20300301-1 'the tray was wet from the first pour on'")
 def note(
     run: Which,
     text: Annotated[str, typer.Argument(help="Text of the note.")],
@@ -200,17 +315,16 @@ def note(
     daemon: Daemon = False,
 ) -> None:
     """Add a note to a run, with date and author. It is stored in the run's folder."""
-    from orchestrator.cli import catalogue_output as verb
+    with _client(daemon) as client:
+        found = client.note(run, text)
+    print(f"{found['run']}: {len(found['notes'])} note{'s' * (len(found['notes']) > 1)}")
 
-    call(verb.note, run, text, daemon=daemon)
 
-
-@runs.command(
-    epilog=examples(
-        "decant runs export table/ --since 2030-03 --until 2030-03", "decant runs export table/ --format csv"
-    )
+@_command(
+    "decant runs export table/ --since 2030-03 --until 2030-03",
+    "decant runs export table/ --format csv",
+    conditions=("words", "limit"),
 )
-@_asking("words", "limit")
 def export(
     folder: Annotated[Path, typer.Argument(help="Folder for the files.")],
     conditions: dict[str, Any],
@@ -220,25 +334,214 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Export runs and pours as CSV and Parquet, with a data dictionary: `runs.*`, `pours.*` and `dictionary.csv`."""
-    from orchestrator.cli import catalogue_output as verb
+    from orchestrator.catalogue.export import FORMATS
+    from sim_engine.resources import MissingExtraError
 
-    call(verb.export, folder, conditions, formats, daemon=daemon, as_json=as_json)
+    if wrong := sorted(set(formats or ()) - set(FORMATS)):
+        raise RefusalError(f"--format {wrong[0]}: should be {' or '.join(FORMATS)}", BAD_INPUT)
+    try:
+        with _client(daemon) as client:
+            found = client.export(folder, conditions, formats or FORMATS)
+    except MissingExtraError as error:
+        raise RefusalError(f"{error}; or --format csv", BAD_INPUT) from None
+    if as_json:
+        print_json(found)
+        return
+    print_note(f"{found['runs']} runs, {found['pours']} pours")
+    print("\n".join(found["files"]))
 
 
-@runs.command(epilog=examples("decant runs add runs/", "decant runs add /media/usb/runs/quickstart-20300301-1"))
+@_command("decant runs add runs/", "decant runs add /media/usb/runs/quickstart-20300301-1")
 def add(
     folders: Annotated[list[Path], typer.Argument(help="Folders of runs, or folders that contain runs.")],
     state: State = None,
 ) -> None:
     """Register runs that the catalogue lacks: from an older version, from another machine, or moved."""
-    from orchestrator.cli import catalogue_output as verb
+    from orchestrator.catalogue.run_registry import enter, runs_below
 
-    call(verb.add, folders)
+    found: list[Path] = []
+    for folder in folders:
+        if not folder.is_dir():
+            raise RefusalError(f"{folder}: is not a folder", BAD_INPUT)
+        below = list(runs_below(folder.absolute()))
+        if not below:
+            raise RefusalError(f"{folder}: there is no run in it (no journal.sqlite, at any depth)", BAD_INPUT)
+        found += below
+    with _refusing():
+        enter(found)
+    with _catalogue():
+        pass
+    print(f"{len(found)} run{'s' * (len(found) > 1)} entered, or known already")
 
 
-@runs.command(epilog=examples("decant runs rebuild"))
+@_command("decant runs rebuild")
 def rebuild(state: State = None) -> None:
     """Rebuild the index from the runs' journals; runs that no longer exist are removed from it."""
-    from orchestrator.cli import catalogue_output as verb
+    with _catalogue(rebuild=True) as catalogue:
+        count = len(catalogue.runs({}))
+    print(f"{count} run{'s' * (count != 1)} in the catalogue")
 
-    call(verb.rebuild)
+
+# -- formatting ------------------------------------------------------------------------------------------------------
+
+
+def _mode(text: str | None) -> str:
+    """Return 'REAL' or 'VIRTUAL', so that the two kinds of bench can't be confused."""
+    return "REAL" if text == "hardware" else "VIRTUAL" if text else ""
+
+
+_OPEN = "has begun and has no outcome: under way, or UNKNOWN"
+
+
+def _print_pours(pours: Sequence[Row], *, of_one_run: bool = False) -> None:
+    """Print a table of pours; values that are equal in all pours are printed once, above it."""
+    from orchestrator.catalogue.run_reading import ACTION_COLUMNS
+    from orchestrator.results.console_view import print_table
+
+    used = {name: [pour[name] for pour in pours] for name in ACTION_COLUMNS}
+    used = {name: values for name, values in used.items() if any(value is not None for value in values)}
+    equal = {name for name, values in used.items() if len(values) > 1 and len({_number(v, 6) for v in values}) == 1}
+    units = _units()
+    rows = [
+        {
+            "": _date(pour["time"]),
+            "run": "" if of_one_run else pour["run"],
+            "mode": _mode(pour["mode"]),
+            "by": pour["strategy"] if pour["purpose"] != "calibration" else f"{pour['strategy']} (calibration)",
+            "into": pour["receiver"],
+            "pour": str(pour["number"]),
+            **{f"{_words(name)} [{units[name]}]": _number(pour[name], 4) for name in used if name not in equal},
+            "spilled [g]": "" if pour["spilled_g"] is None else f"{pour['spilled_g']:.1f}",
+            "spilled / poured": _percent(pour["spillage"]),
+            "loss": _loss(pour["loss"], pour["loss_name"]),
+            "expected": _loss(pour["predicted_loss"], pour["loss_name"], pour["predicted_deviation"]),
+            "remark": _OPEN if pour["outcome"] == "open" else pour["reason"] or "",
+        }
+        for pour in pours
+    ]
+    if equal:
+        print(f"in all of them: {_action({name: pours[0][name] for name in used if name in equal})}")
+    print_table(rows, right=[name for name in rows[0] if name not in ("", "run", "mode", "by", "into", "remark")])
+    weighed = [pour for pour in pours if pour["spillage"] is not None]
+    if weighed:
+        mean = sum(pour["spillage"] for pour in weighed) / len(weighed)
+        least = min(weighed, key=lambda pour: float(pour["spillage"]))
+        print(
+            f"{len(pours)} pours, {len(weighed)} weighed: {_percent(mean)} spilled in the mean, at least "
+            f"{_percent(least['spillage'])} (pour {least['number']} of {least['stage']}, {least['run']})"
+        )
+
+
+def _loss(value: float | None, name: str | None, deviation: float | None = None) -> str:
+    """Format the loss of a pour or a prediction with its unit: '3.4 %', '3.4 ± 1.2 %'."""
+    from orchestrator.results.loss_units import named_loss_unit
+
+    return "" if value is None else named_loss_unit(str(name)).text(value, deviation)
+
+
+def _percent(value: float | None) -> str:
+    """Format a fraction in percent; '' if it is unknown."""
+    return "" if value is None else f"{100 * value:.2f} %"
+
+
+def _count_of_pours(run: Row) -> str:
+    """Format the number of pours: '6', or '6 + 1 without a weight'."""
+    lost = (run["failed_pours"] or 0) + (run["open_pours"] or 0)
+    return f"{run['pours'] or 0}" + (f" + {lost} without a weight" if lost else "")
+
+
+def _action(values: Mapping[str, float | None]) -> str:
+    """Format an action: 'angular velocity 41.2 deg/s, x offset 112 mm'."""
+    units = _units()
+    known = ((name, value) for name, value in values.items() if value is not None)
+    return ", ".join(f"{_words(name)} {value:.4g} {units.get(name, '')}" for name, value in known)
+
+
+def _units() -> dict[str, str]:
+    from orchestrator.catalogue.run_reading import POURS
+
+    return {column.name: column.unit for column in POURS}
+
+
+def _words(name: str) -> str:
+    suffixes = ("_deg_s2", "_deg_s", "_deg", "_mm", "_s")
+    return name.removesuffix(next((s for s in suffixes if name.endswith(s)), "")).replace("_", " ")
+
+
+def _compared(name: str, heads: Sequence[str], values: Sequence[Any]) -> dict[str, str]:
+    """Return one row of a comparison."""
+    return {"": name, **{head: _plain(value) for head, value in zip(heads, values, strict=True)}}
+
+
+def _plain(value: Any) -> str:
+    if value is None:
+        return ""
+    text = f"{value:.5g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}…"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}g}"
+
+
+def _date(seconds: float | None) -> str:
+    """Format a time in this machine's time zone."""
+    return "" if seconds is None else datetime.fromtimestamp(seconds).strftime("%Y-%m-%d %H:%M")
+
+
+# -- access to the catalogue -----------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _client(daemon: bool = False) -> Iterator[CatalogueClient]:
+    """Open a client of this machine's catalogue or of the daemon's."""
+    try:
+        if daemon:
+            from orchestrator.cli.queue_commands import connected_client
+            from orchestrator.daemon.daemon_client import RemoteCatalogueClient
+
+            with connected_client(None, None) as client, _refusing():
+                yield RemoteCatalogueClient(client)
+        else:
+            with _catalogue() as catalogue, _refusing():
+                yield catalogue
+    except ValueError as error:  # an invalid date
+        raise RefusalError(str(error), BAD_INPUT) from None
+
+
+@contextlib.contextmanager
+def _catalogue(*, rebuild: bool = False) -> Iterator[Catalogue]:
+    """Open the catalogue and update it; problems with unreadable runs are printed at the end."""
+    from orchestrator.catalogue.catalogue import Catalogue
+
+    with _refusing():
+        begin = time.monotonic()
+
+        def progress(number: int, count: int) -> None:
+            if time.monotonic() - begin > 2.0 and (number % 20 == 0 or number == count):
+                print_note(f"reading runs: {number} of {count}")
+
+        with Catalogue() as catalogue:
+            if catalogue.warning:
+                print_message(f"note: {catalogue.warning}")
+            refreshed = catalogue.refresh(progress, rebuild=rebuild)
+            yield catalogue
+    for problem in refreshed.problems:
+        print_message(f"note: {problem}")
+    if refreshed.missing:
+        print_note(
+            f"note: {refreshed.missing} known run{'s are' if refreshed.missing > 1 else ' is'} not where it was; what "
+            "was last known of it is shown (`decant runs add` after a move, `decant runs rebuild` forgets it)"
+        )
+
+
+@contextlib.contextmanager
+def _refusing() -> Iterator[None]:
+    from orchestrator.run_errors import RunError
+
+    try:
+        yield
+    except RunError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    except OSError as error:
+        raise RefusalError(f"{error.filename or ''}: {error.strerror or error}".lstrip(": "), BAD_INPUT) from None

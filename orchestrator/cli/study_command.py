@@ -60,7 +60,7 @@ def study(
         shown = list(status.failed.items())[:SHOWN_FAILURES]
         lines = [f"{len(status.failed)} of {len(cells)} cells failed, {len(status.skipped)} need one of them:"]
         lines += [f"  {name}: {why}" for name, why in shown]
-        lines.append(f"what is done is kept; mend that and go on with: decant study {file}")
+        lines.append(f"finished cells are kept; correct that and continue with: decant study {file}")
         raise RefusalError("\n".join(lines))
 
 
@@ -124,13 +124,13 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> CellStatus:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-    from orchestrator.study.study_folder import finished_results, warning
+    from orchestrator.study.study_folder import code_warning, finished_results
     from orchestrator.study.study_plan import cells_of
     from orchestrator.study.study_runner import run_cells
 
     cells = cells_of(plan)
     finished = finished_results(folder, cells)
-    if len(finished) < len(cells) and (text := warning(finished)) is not None:
+    if len(finished) < len(cells) and (text := code_warning(finished)) is not None:
         print_note(text)
     print_note(f"study {folder}, {jobs} at a time")
     columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[left]}")]
@@ -169,7 +169,7 @@ def _duration(seconds: float) -> str:
 
 
 def _report(plan: StudyPlan, folder: Path) -> Path:
-    from orchestrator.study.report.study_page import write_report
+    from orchestrator.study.study_page import write_report
 
     page = write_report(plan, folder)
     print_note(f"figures, tables and a page: {page}")

@@ -19,11 +19,10 @@ from fastapi import APIRouter, Depends, HTTPException, Query, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from orchestrator.catalogue.annotations import AnnotationsError, Note
-from orchestrator.catalogue.catalogue_client import LocalCatalogueClient
-from orchestrator.catalogue.catalogue_index import TABLES, Catalogue, Column
-from orchestrator.catalogue.queries import NoSuchRunError
-from orchestrator.catalogue.query_conditions import CONDITIONS
+from orchestrator.catalogue.annotations import Note
+from orchestrator.catalogue.catalogue import Catalogue, NoSuchRunError
+from orchestrator.catalogue.queries import CONDITIONS
+from orchestrator.catalogue.run_reading import TABLES, Column
 from orchestrator.daemon.access_control import Daemon, Operator, Viewer
 from orchestrator.daemon.run_readout import REPORT
 from orchestrator.daemon.supervisor import Supervisor
@@ -141,13 +140,13 @@ class NotesOut(BaseModel):
     notes: list[Note]
 
 
-async def _in_catalogue(daemon: Supervisor, query: Callable[[LocalCatalogueClient], T], by: str | None = None) -> T:
+async def _in_catalogue(daemon: Supervisor, query: Callable[[Catalogue], T]) -> T:
     """Query the catalogue in a thread: the first query may read many journals."""
 
     def work() -> T:
         with Catalogue(daemon.settings.state) as catalogue:
             catalogue.refresh()
-            return query(LocalCatalogueClient(catalogue, by))
+            return query(catalogue)
 
     try:
         return await asyncio.to_thread(work)
@@ -155,7 +154,7 @@ async def _in_catalogue(daemon: Supervisor, query: Callable[[LocalCatalogueClien
         raise HTTPException(404, str(error)) from None
     except (ValueError, MissingExtraError) as error:
         raise HTTPException(422, str(error)) from None
-    except (RunError, AnnotationsError, OSError) as error:
+    except (RunError, OSError) as error:
         raise HTTPException(409, str(error)) from None
 
 
@@ -166,13 +165,13 @@ async def runs(daemon: Daemon, person: Viewer, asked: RunsAsked) -> Any:
     The list includes runs of the command line if it uses the same state directory. All given conditions must hold;
     names may contain the wildcards * and ?.
     """
-    return await _in_catalogue(daemon, lambda client: client.runs(asked))
+    return await _in_catalogue(daemon, lambda catalogue: catalogue.runs(asked))
 
 
 @router.get("/pours", operation_id="pours", response_model=_several(PreviousPour))
 async def pours(daemon: Daemon, person: Viewer, asked: PoursAsked) -> Any:
     """List the pours of all runs, oldest first: the action, the measured spillage and the prediction."""
-    return await _in_catalogue(daemon, lambda client: client.pours(asked))
+    return await _in_catalogue(daemon, lambda catalogue: catalogue.pours(asked))
 
 
 @router.get("/runs/compare", operation_id="compare_runs")
@@ -182,7 +181,7 @@ async def compare(
     run: Annotated[list[str], Query(min_length=2, max_length=20, description="Names of two or more runs.")],
 ) -> RunComparison:
     """Compare runs: the settings in which they differ, and their outcomes."""
-    return RunComparison.model_validate(await _in_catalogue(daemon, lambda client: client.compare(run)))
+    return RunComparison.model_validate(await _in_catalogue(daemon, lambda catalogue: catalogue.compare(run)))
 
 
 @router.get(
@@ -195,10 +194,10 @@ async def export(daemon: Daemon, person: Viewer, asked: ExportAsked) -> Response
     """Export runs and pours as files with a data dictionary, in one zip archive."""
     formats = dict.fromkeys(asked.pop("format"))
 
-    def written(client: LocalCatalogueClient) -> bytes:
+    def written(catalogue: Catalogue) -> bytes:
         archive = BytesIO()
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
-            found = client.export(Path(folder), asked, list(formats))
+            found = catalogue.export(Path(folder), asked, list(formats))
             for path in map(Path, found.pop("files")):
                 packed.write(path, path.name)
             packed.comment = json.dumps(found).encode()
@@ -212,7 +211,7 @@ async def export(daemon: Daemon, person: Viewer, asked: ExportAsked) -> Response
 @router.get("/runs/{run}", operation_id="run", response_model=PreviousRunDetail)
 async def run(daemon: Daemon, person: Viewer, run: str) -> Any:
     """Return one run by its folder's name or a prefix of it: θ*, recommendation, pours, tags and notes."""
-    return await _in_catalogue(daemon, lambda client: client.run(run))
+    return await _in_catalogue(daemon, lambda catalogue: catalogue.run(run))
 
 
 @router.get(
@@ -223,7 +222,7 @@ async def run(daemon: Daemon, person: Viewer, run: str) -> Any:
 )
 async def run_report(daemon: Daemon, person: Viewer, run: str) -> FileResponse:
     """Return the report of a run."""
-    path = Path((await _in_catalogue(daemon, lambda client: client.run(run)))["path"]) / REPORT
+    path = Path((await _in_catalogue(daemon, lambda catalogue: catalogue.run(run)))["path"]) / REPORT
     if not path.is_file():
         raise HTTPException(404, f"{run} has no report")
     return FileResponse(path, media_type="text/html")
@@ -232,7 +231,7 @@ async def run_report(daemon: Daemon, person: Viewer, run: str) -> FileResponse:
 @router.post("/runs/{run}/tags", operation_id="tag_run")
 async def tag(daemon: Daemon, person: Operator, run: str, body: TagsIn) -> TagsOut:
     """Add tags to a run or remove them. They are stored in the run's folder."""
-    found = await _in_catalogue(daemon, lambda client: client.tag(run, body.add, body.remove))
+    found = await _in_catalogue(daemon, lambda catalogue: catalogue.tag(run, body.add, body.remove))
     daemon.note(person.name, "tag", detail=f"{found['run']}: {', '.join(found['tags'])}")
     return TagsOut.model_validate(found)
 
@@ -240,6 +239,6 @@ async def tag(daemon: Daemon, person: Operator, run: str, body: TagsIn) -> TagsO
 @router.post("/runs/{run}/notes", operation_id="note_run")
 async def note(daemon: Daemon, person: Operator, run: str, body: NoteIn) -> NotesOut:
     """Add a note to a run, with date and author. It is stored in the run's folder."""
-    found = await _in_catalogue(daemon, lambda client: client.note(run, body.text), person.name)
+    found = await _in_catalogue(daemon, lambda catalogue: catalogue.note(run, body.text, person.name))
     daemon.note(person.name, "note", detail=f"{found['run']}: {body.text}")
     return NotesOut.model_validate(found)

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from actors.arm.arm_settings import ArmSpec
 from actors.bench.bench_factory import needs_person
 from actors.interfaces import DeviceCheck, LaboratoryError
-from actors.simulators.shared_pool import WarmSimulators
+from actors.laboratory import WarmSimulators
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.daemon_settings import DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, DesiredState, QueueItem, Store

@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import Any
 
 from actors.interfaces import LaboratoryError
-from actors.simulators.shared_pool import WarmSimulators
+from actors.laboratory import WarmSimulators
 from orchestrator.catalogue.run_registry import make_state_directory
 from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, WITHDRAWN, DesiredState, QueueItem, Store

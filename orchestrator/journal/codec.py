@@ -21,7 +21,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
-from orchestrator.journal.upgrade import upgraded_request
+from orchestrator.journal.upgrade import upgraded_outcome, upgraded_request
 from orchestrator.requests import Outcome, Request
 from orchestrator.run_errors import RunError
 
@@ -51,7 +51,7 @@ def encode_outcome(outcome: Outcome) -> dict[str, Any]:
 
 def decode_outcome(data: Mapping[str, Any]) -> Outcome:
     """Inverse of `encode_outcome`. Raises CodecError."""
-    return typing.cast(Outcome, from_json(data, Outcome))
+    return typing.cast(Outcome, from_json(upgraded_outcome(data), Outcome))
 
 
 def canonical(data: Any) -> str:

@@ -31,6 +31,8 @@ class PourMade:
 
     Attributes:
         came: status; 'unknown': it had begun and its outcome was not reported.
+        time: when it finished, or began if it has no outcome (seconds since 1970); 0 if it has not begun.
+        outcome: as recorded; None without one.
         measured: the measurement, if it was weighed.
         reason: why it failed.
         said: the operator's answer about it; '' without one.
@@ -41,6 +43,8 @@ class PourMade:
     id: int
     request: Pour
     came: Came = "not begun"
+    time: float = 0.0
+    outcome: Outcome | None = None
     measured: PourMeasurement | None = None
     reason: str = ""
     said: str = ""
@@ -140,11 +144,11 @@ class _Reading:
                 failed = body["outcome"]["type"] == "Failed" or body["outcome"]["outcome"].get("invalid") is not None
                 stage.failed_simulations += failed
             case Kind.POUR_STARTED:
-                self._pours[key].came = "unknown"
+                self._pours[key].came, self._pours[key].time = "unknown", entry.t
             case Kind.POUR_WITHDRAWN:
                 self._pours[key].came = "not begun"
             case Kind.POUR_FINISHED:
-                self._poured(self._pours[key], body)
+                self._poured(self._pours[key], entry)
                 record.stages[entry.stage].pours += 1
             case Kind.OPERATOR_ASKED:
                 self._asks(key, entry, body["question"])
@@ -193,9 +197,10 @@ class _Reading:
             self.record.questions.append(self._asked[key])
 
     @staticmethod
-    def _poured(pour: PourMade, body: dict[str, Any]) -> None:
-        pour.seconds = body.get("seconds")
-        match decode_outcome(body["outcome"]):
+    def _poured(pour: PourMade, entry: Entry) -> None:
+        pour.time, pour.seconds = entry.t, entry.body.get("seconds")
+        pour.outcome = decode_outcome(entry.body["outcome"])
+        match pour.outcome:
             case Poured(measurement):
                 pour.came, pour.measured = "weighed", measurement
             case Failed(_, reason):

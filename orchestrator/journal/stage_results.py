@@ -27,9 +27,9 @@ DECLARED_IN = (
     "orchestrator.strategies.calibration.calibration_base",
     "orchestrator.strategies.calibration.calibration_scores",
     "orchestrator.strategies.deployment.deployment_result",
-    "orchestrator.strategies.deployment.confirmation",
-    "orchestrator.strategies.repeated_simulation",
-    "orchestrator.strategies.single_pour",
+    "orchestrator.strategies.single_action",
+    "orchestrator.strategies.single_action",
+    "orchestrator.strategies.single_action",
     "orchestrator.study.study_strategies",
 )
 """Modules that declare Decant's own kinds of results; named as text, so that results do not import strategies."""

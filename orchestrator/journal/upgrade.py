@@ -13,13 +13,74 @@ from typing import Any
 Data = Mapping[str, Any]
 
 
+_SURROGATE = (
+    *("space", "data", "seed", "kappa", "map_resolution", "map_at", "predict_at", "constraints", "infeasible"),
+    *("refused", "failed", "noise", "effort"),
+)
+_PROPOSAL = (*_SURROGATE, "pending", "count")
+_FIELDS = {
+    "SpaceFillingQuery": ("space", "pending", "count", "seed", "constraints", "infeasible", "refused", "failed"),
+    "RegressionQuery": (*_SURROGATE, "mean"),
+    "MinimumQuery": (*_PROPOSAL, "acquisition", "mean", "plain"),
+    "RiskQuery": (*_PROPOSAL, "acquisition", "risk"),
+    "CalibrationQuery": (*_PROPOSAL, "posterior", "design"),
+    "PourQuery": (*_PROPOSAL, "simulated", "acquisition"),
+    "SimulationQuery": (*_PROPOSAL, "simulated", "pouring"),
+}
+"""Fields that each type of query has in common with the single type of version 0.2."""
+
+
 def upgraded_request(data: Data) -> Data:
-    """A request as this version reads it. A question with the mean 'pooled' has 'scaled', the nearest one."""
+    """A request as this version reads it: the single type of query of version 0.2 becomes one of several.
+
+    A pour of the models 'pooled' and 'scaled' becomes one of the model 'residual'.
+    """
     problem = data.get("problem")
-    if not isinstance(problem, Mapping) or "widening" not in problem:
+    if not isinstance(problem, Mapping):
         return data
-    problem = {key: value for key, value in problem.items() if key != "widening"}
-    return {**data, "problem": {**problem, "mean": {"pooled": "scaled"}.get(problem["mean"], problem["mean"])}}
+    kind = _type_of(problem)
+    query = {"type": kind} | {name: problem[name] for name in _FIELDS[kind] if name in problem}
+    if kind == "SpaceFillingQuery":
+        query["known"] = problem["data"]["points"]
+    if kind == "CalibrationQuery":
+        query["contexts"] = problem["context"]
+    if kind == "SimulationQuery":
+        query["coupling"] = "residual" if problem["mean"] == "simulated" else "scaled"
+    if kind == "PourQuery" and (found := problem.get("mismatch")):
+        names = {"play": "offset_priors", "ignorance": "uninformative", "left": "pours_left"}
+        query["discrepancy"] = _renamed(found, names | {"looks_ahead": "lookahead"})
+    if problem["count"] == 0:
+        query.pop("pending", None)  # a query without a proposal has no pending points
+    return {**{key: value for key, value in data.items() if key != "problem"}, "query": query}
+
+
+def _type_of(problem: Data) -> str:
+    if problem["acquisition"] == "sobol":
+        return "SpaceFillingQuery"
+    if problem.get("risk") is not None:
+        return "RiskQuery"
+    if problem.get("context"):
+        return "CalibrationQuery"
+    if problem["acquisition"] == "knowledge":
+        return "SimulationQuery"
+    if problem["mean"] not in ("constant", "zero"):
+        return "PourQuery"
+    return "RegressionQuery" if problem["count"] == 0 else "MinimumQuery"
+
+
+def upgraded_outcome(data: Data) -> Data:
+    """An outcome as this version reads it."""
+    suggestion = data.get("suggestion")
+    if not isinstance(suggestion, Mapping) or "mismatch" not in suggestion:
+        return data
+    suggestion = _renamed(suggestion, {"mismatch": "discrepancy"})
+    if found := suggestion["discrepancy"]:
+        suggestion["discrepancy"] = _renamed(found, {"ignorance": "uninformative"})
+    return {**data, "suggestion": suggestion}
+
+
+def _renamed(data: Data, names: Mapping[str, str]) -> dict[str, Any]:
+    return {names.get(key, key): value for key, value in data.items()}
 
 
 def upgraded_result(data: Data) -> Data:

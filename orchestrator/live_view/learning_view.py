@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from actors.optimizer.questions import SpaceFillingQuery
 from orchestrator.live_view import map_images as pictures
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
@@ -121,11 +122,11 @@ class LearningStage:
 
     def suggested(self, event: RequestFinished, request: Suggest, outcome: Suggested) -> None:
         """Draw the surrogate of a suggestion, unless it was drawn recently."""
-        problem, suggestion = request.problem, outcome.suggestion
-        if suggestion.surrogate is None:
+        query, suggestion = request.query, outcome.suggestion
+        if suggestion.surrogate is None or isinstance(query, SpaceFillingQuery):
             return
         # A space of actions belongs to the stage's receiver, a space of parameters to the calibration.
-        acting = problem.space.names[0] in ACTION_DIMENSIONS
+        acting = query.space.names[0] in ACTION_DIMENSIONS
         scene = self._scene_of_stage.get(event.stage)
         deploying = acting and scene is not None and self._plan.deployment is not None
         where = safe_name(scene or "") if deploying else CALIBRATION
@@ -133,20 +134,20 @@ class LearningStage:
         if deploying and self._plan.deployment is not None:
             unit = deployment_unit(self._plan.deployment)
         subject = self._names.get(scene or "", scene or "") if deploying else "θ"
-        known = f"{len(problem.data)} observations"
-        if len(problem.simulated):
-            known = f"{len(problem.data)} pours and {len(problem.simulated)} simulations"
+        known = f"{len(query.data)} observations"
+        if simulations := len(pictures.simulated_points(query)):
+            known = f"{len(query.data)} pours and {simulations} simulations"
         title = f"{subject}: what is known after {known}"
         self._picture(
             f"{PLACE}/{where}/surrogate",
             event.time,
-            lambda: pictures.png(pictures.surrogate_picture(problem, suggestion, unit, title)),
+            lambda: pictures.png(pictures.surrogate_picture(query, suggestion, unit, title)),
         )
-        if problem.space.dimension > MAPPED:
+        if query.space.dimension > MAPPED:
             self._picture(
                 f"{PLACE}/{where}/slices",
                 event.time,
-                lambda: pictures.png(pictures.slices_picture(problem, suggestion, unit, title)),
+                lambda: pictures.png(pictures.slices_picture(query, suggestion, unit, title)),
                 SLICING_INTERVAL,
             )
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.questions import Point, PourQuery, SimulationQuery, Suggestion, SurrogateQuery
 from actors.optimizer.suggest import slices
 from orchestrator.results import figure_style as style
 from orchestrator.results.loss_units import LossUnit
@@ -26,6 +26,11 @@ FloatArray = NDArray[np.float64]
 _DPI = 80
 
 
+def simulated_points(query: SurrogateQuery) -> tuple[Point, ...]:
+    """Simulated observations of a query; empty if its type has none."""
+    return query.simulated.points if isinstance(query, PourQuery | SimulationQuery) else ()
+
+
 def png(figure: Figure) -> bytes:
     """Encode a figure as PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -37,21 +42,21 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: LossUnit, title: str) -> Figure:
+def surrogate_picture(query: SurrogateQuery, suggestion: Suggestion, unit: LossUnit, title: str) -> Figure:
     """Draw mean, deviation and lower bound of a surrogate over two axes, with observations and the next points.
 
     Args:
-        problem: suggestion query.
+        query: suggestion query.
         suggestion: result with a surrogate.
         unit: unit of the cost.
         title: title of the picture.
     """
     assert suggestion.surrogate is not None
-    surrogate, space = suggestion.surrogate, problem.space
+    surrogate, space = suggestion.surrogate, query.space
     plane = surrogate.plane(space)
     columns = [space.names.index(name) for name in plane.names]
     mean, deviation = (unit.factor * np.asarray(grid, float) for grid in (surrogate.mean, surrogate.deviation))
-    bound = mean - problem.kappa * deviation
+    bound = mean - query.kappa * deviation
     figure, axes = style.new_figure(1, 3, size=(15.0, 5.2), layout=None)
     figure.subplots_adjust(left=0.065, right=0.955, bottom=0.13, top=0.85, wspace=0.18)
     held = style.display_values(dict(surrogate.held(space)))
@@ -59,9 +64,9 @@ def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: Los
     panels = (
         (f"expected {unit.label}", np.maximum(mean, 0.0), "viridis_r"),
         (f"± σ [{unit.unit}]", deviation, "cividis"),
-        (f"lower bound, mean − {problem.kappa:g} σ [{unit.unit}]", bound, "viridis_r"),
+        (f"lower bound, mean − {query.kappa:g} σ [{unit.unit}]", bound, "viridis_r"),
     )
-    simulated = problem.simulated.points
+    simulated = simulated_points(query)
     across, up = plane.axes
     scales = [style.display_factor(axis.name) for axis in (across, up)]
     places = np.linspace(0.0, 1.0, len(mean))
@@ -72,7 +77,7 @@ def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: Los
         bar.ax.tick_params(labelsize=13)
         for points, look in (
             (simulated, {"marker": "o", "s": 14, "facecolor": "none", "edgecolor": style.INK}),
-            (problem.data.points, {"marker": "o", "s": 55, "facecolor": "white", "edgecolor": style.INK}),
+            (query.data.points, {"marker": "o", "s": 55, "facecolor": "white", "edgecolor": style.INK}),
             (suggestion.points, {"marker": "*", "s": 330, "facecolor": style.BEST, "edgecolor": "white"}),
         ):
             if points:
@@ -84,32 +89,32 @@ def surrogate_picture(problem: SuggestProblem, suggestion: Suggestion, unit: Los
         style.frame(panel, up, "y")
         panel.tick_params(labelsize=13, labelleft=panel is axes[0])
     axes[0].set_ylabel(style.label(up.name), fontsize=14)
-    axes[1].set_xlabel(f"{style.label(across.name)}      {_key(problem, suggestion)}", fontsize=14)
+    axes[1].set_xlabel(f"{style.label(across.name)}      {_key(query, suggestion)}", fontsize=14)
     return figure
 
 
-def slices_picture(problem: SuggestProblem, suggestion: Suggestion, unit: LossUnit, title: str) -> Figure:
+def slices_picture(query: SurrogateQuery, suggestion: Suggestion, unit: LossUnit, title: str) -> Figure:
     """Draw a surrogate over each pair of axes: mean below the diagonal, deviation above it, with data and next points.
 
     Args:
-        problem: suggestion query with more than two axes.
+        query: suggestion query with more than two axes.
         suggestion: result with a surrogate.
         unit: unit of the cost.
         title: title of the picture.
     """
-    maps = slices(problem, suggestion)
-    names = [name for name in problem.space.names if any(name in one.axes for one in maps)]
+    maps = slices(query, suggestion)
+    names = [name for name in query.space.names if any(name in one.axes for one in maps)]
     if not names:
         return words(f"{title}: too little for slices")
-    axis_of = dict(zip(problem.space.names, problem.space.axes, strict=True))
-    column_of = {name: problem.space.names.index(name) for name in names}
+    axis_of = dict(zip(query.space.names, query.space.axes, strict=True))
+    column_of = {name: query.space.names.index(name) for name in names}
     figure, axes = style.new_figure(len(names), len(names), size=(15.0, 9.0), squeeze=False)
     figure.suptitle(title, fontsize=17, color=style.INK, x=0.01, ha="left")
     means = [unit.factor * np.maximum(np.asarray(one.mean, float), 0.0) for one in maps]
     deviations = [unit.factor * np.asarray(one.deviation, float) for one in maps]
     seen = (
-        (problem.simulated.points, {"marker": "o", "s": 10, "facecolor": "none", "edgecolor": style.INK}),
-        (problem.data.points, {"marker": "o", "s": 30, "facecolor": "white", "edgecolor": style.INK}),
+        (simulated_points(query), {"marker": "o", "s": 10, "facecolor": "none", "edgecolor": style.INK}),
+        (query.data.points, {"marker": "o", "s": 30, "facecolor": "white", "edgecolor": style.INK}),
         (suggestion.points, {"marker": "*", "s": 200, "facecolor": style.BEST, "edgecolor": "white"}),
     )
     drawn: dict[str, Any] = {}
@@ -144,13 +149,13 @@ def slices_picture(problem: SuggestProblem, suggestion: Suggestion, unit: LossUn
         bar = figure.colorbar(drawn[kind], ax=axes, pad=0.01, aspect=40)
         bar.set_label(text, fontsize=13)
         bar.ax.tick_params(labelsize=12)
-    held = style.display_values(dict(problem.space.decode(maps[0].at)))
-    figure.supxlabel(f"each cut goes through {held}      {_key(problem, suggestion)}", fontsize=13, color=style.INK)
+    held = style.display_values(dict(query.space.decode(maps[0].at)))
+    figure.supxlabel(f"each cut goes through {held}      {_key(query, suggestion)}", fontsize=13, color=style.INK)
     return figure
 
 
-def _key(problem: SuggestProblem, suggestion: Suggestion) -> str:
-    marks = ["○ poured   ∘ simulated" if problem.simulated.points else "○ observed"]
+def _key(query: SurrogateQuery, suggestion: Suggestion) -> str:
+    marks = ["○ poured   ∘ simulated" if simulated_points(query) else "○ observed"]
     return "   ".join([*marks, "★ next"] if suggestion.points else marks)
 
 

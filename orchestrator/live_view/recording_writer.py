@@ -1,7 +1,7 @@
 """The process that writes a campaign's recording; `RerunMonitor` starts it and sends events.
 
 A separate process is used, since drawing and packing take CPU time, and so that its failure does not affect the
-campaign. The input is a stream of pickles: `Opening`, events, `Missed` and `Closing`. If the parent process dies, the
+campaign. The input is a stream of pickles, whose messages `rerun_subscriber` declares. If the parent process dies, the
 stream ends and the recording is completed.
 """
 
@@ -18,48 +18,19 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from orchestrator.live_view.recording_sink import SENDING
+from orchestrator.live_view.rerun_subscriber import Closing, Missed
 
 if TYPE_CHECKING:
     from orchestrator.live_view.run_recording import CampaignRecording
-    from orchestrator.strategies.campaign_plan import CampaignPlan
 
 WAITING = 64
 """Largest number of events waiting here. More wait in the pipe, then at the sender, which counts dropped events."""
 
 NICENESS = 5
-
-
-@dataclass(frozen=True)
-class Opening:
-    """The first message.
-
-    Attributes:
-        path: path of the `.rrd`.
-        url: URL of a Rerun server to send to as well; '' for none.
-    """
-
-    path: Path
-    plan: CampaignPlan
-    url: str = ""
-
-
-@dataclass(frozen=True)
-class Missed:
-    """Number of events dropped so far."""
-
-    dropped: int
-
-
-@dataclass(frozen=True)
-class Closing:
-    """The last message; `dropped` is the number of missing events."""
-
-    dropped: int
 
 
 def main() -> None:

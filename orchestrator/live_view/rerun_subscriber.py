@@ -14,11 +14,11 @@ import queue
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from actors.runtime.child_process import ChildProcess
-from orchestrator.live_view.recording_writer import Closing, Missed, Opening
 from orchestrator.live_view.viewer_server import environment
 from orchestrator.runs.events import Event
 from orchestrator.strategies.campaign_plan import CampaignPlan
@@ -102,6 +102,34 @@ CAPACITY = 4_000
 
 PATIENCE = 30.0
 """Longest time to wait until the recording is complete [s]."""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """The first message.
+
+    Attributes:
+        path: path of the `.rrd`.
+        url: URL of a Rerun server to send to as well; '' for none.
+    """
+
+    path: Path
+    plan: CampaignPlan
+    url: str = ""
+
+
+@dataclass(frozen=True)
+class Missed:
+    """Number of events dropped so far."""
+
+    dropped: int
+
+
+@dataclass(frozen=True)
+class Closing:
+    """The last message; `dropped` is the number of missing events."""
+
+    dropped: int
 
 
 class RerunMonitor:

@@ -28,7 +28,7 @@ from orchestrator.runs.events import (
     StrategyProgressed,
 )
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.deployment.confirmation import PURPOSE as CONFIRM
+from orchestrator.strategies.single_action import CONFIRM
 from orchestrator.strategies.strategy import Progress
 
 CHECKPOINT_WORDS = {

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from actors.arm.arm_settings import UrArmSpec
     from actors.arm.planned_pour import PourPath
-    from actors.arm.planning.frames import Transforms
+    from actors.arm.planning.kinematics import Transforms
     from actors.arm.planning.trajectory import SampledPath
     from sim_engine.vessel.vessel import Vessel
 
@@ -61,7 +61,7 @@ def draw_path(
     path: PourPath, spec: UrArmSpec, pourer: Vessel, receiver: Vessel, *, title: str, note: str = ""
 ) -> Figure:
     """The figure of `path_png`."""
-    from actors.arm.planning.frames import cell_transforms
+    from actors.arm.planning.kinematics import cell_transforms
     from actors.arm.planning.trajectory import SampledPath
 
     stretches = [SampledPath.of(name, getattr(path, name), spec) for name, _, _ in _WAYS]

@@ -13,8 +13,8 @@ from orchestrator.results.stage_views import SPLITS
 from orchestrator.results.surrogate_figures import posterior_lines
 from orchestrator.results.wording import risk_line, trust_line, window_line
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.deployment.confirmation import Confirmed
 from orchestrator.strategies.deployment.deployment_result import ParetoAction
+from orchestrator.strategies.single_action import Confirmed
 from sim_engine.prediction_band import PredictionInterval, SampleStatistics
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ def _remarks(rows: Iterable[ReceiverSummary], unit: LossUnit) -> list[Renderable
             remarks.append(Text(f"  {receiver}: {row.gave_up}", style="yellow"))
         elif not _has_losses(row):
             remarks.append(Text(f"  {receiver}: nothing was learnt; see the journal for what failed", style="yellow"))
-        remarks += [Text(f"  {receiver}, nothing beats: {_compromise(one)}") for one in row.front or ()]
+        remarks += [Text(f"  {receiver}, nothing beats: {_scalarization(one)}") for one in row.front or ()]
         if row.risk is not None:
             remarks.append(Text(f"  {receiver}, {risk_line(row.risk, unit)}"))
         if row.window is not None:
@@ -188,7 +188,7 @@ def _remarks(rows: Iterable[ReceiverSummary], unit: LossUnit) -> list[Renderable
     return remarks
 
 
-def _compromise(one: ParetoAction) -> str:
+def _scalarization(one: ParetoAction) -> str:
     """'spillage 1.2 ± 0.3 %, time 40.0 ± 1.0 %  with angular velocity 41.2 deg/s, …'."""
     parts = [
         f"{name.replace('_', ' ')} {100 * at_least_nothing(mean):.1f} ± {100 * one.deviations[name]:.1f} %"

@@ -18,11 +18,11 @@ from pydantic.json_schema import GenerateJsonSchema
 from orchestrator.journal.stage_results import kinds
 from orchestrator.strategies.calibration.calibration_scores import CalibrationGain
 from orchestrator.strategies.calibration.posterior_summary import PosteriorSummary
-from orchestrator.strategies.deployment.confirmation import Confirmed
 from orchestrator.strategies.deployment.deployment_result import ParetoAction, RiskFound
 from orchestrator.strategies.deployment.model_monitoring import Believed
-from orchestrator.strategies.deployment.real_pours import Foretold
+from orchestrator.strategies.deployment.real_pours import PredictionCheck
 from orchestrator.strategies.deployment.safe_window import WindowFound
+from orchestrator.strategies.single_action import Confirmed
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from sim_engine.liquids import SimulationParameters
 from sim_engine.model_validity import NotCovered
@@ -134,7 +134,7 @@ class ReceiverSummary(ResultPart):
     predicted_spillage: float | None
     predicted_spillage_deviation: float | None
     untrustworthy_simulation: bool
-    trust: Foretold | Believed
+    trust: PredictionCheck | Believed
     gave_up: str | None
     ended: str | None
     front: tuple[ParetoAction, ...] | None

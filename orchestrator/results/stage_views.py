@@ -23,9 +23,8 @@ from orchestrator.strategies.calibration.calibration_scores import (
     recommended_theta,
 )
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.deployment.confirmation import Confirmed
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.repeated_simulation import Foreseen
+from orchestrator.strategies.single_action import Confirmed, PredictedPour
 from orchestrator.strategies.stage_result import DisplayedMap, StageResult
 from sim_engine.liquids import SimulationParameters
 
@@ -101,9 +100,9 @@ def confirmations_of(results: Results) -> dict[str, Confirmed]:
     return {result.scene: result for result in all_of(results, Confirmed)}
 
 
-def predictions_of(results: Results) -> dict[str, Foreseen]:
+def predictions_of(results: Results) -> dict[str, PredictedPour]:
     """Results of the repeated simulations of the recommended actions, by scene."""
-    return {result.scene: result for result in all_of(results, Foreseen)}
+    return {result.scene: result for result in all_of(results, PredictedPour)}
 
 
 def calibrated_label(evaluation: Scores) -> str | None:

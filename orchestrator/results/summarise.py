@@ -24,9 +24,8 @@ from orchestrator.results.stage_views import (
 )
 from orchestrator.strategies.calibration.calibration_scores import Scores
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.deployment.confirmation import Confirmed
 from orchestrator.strategies.deployment.deployment_result import Deployed, Recommended
-from orchestrator.strategies.repeated_simulation import Foreseen
+from orchestrator.strategies.single_action import Confirmed, PredictedPour
 from sim_engine.liquids import Liquid
 from sim_engine.model_validity import NotCovered
 from sim_engine.search_space import Axis
@@ -116,7 +115,7 @@ _NOTHING: dict[str, None] = dict.fromkeys(Recommended.model_fields)
 def _receiver(
     name: str,
     result: Deployed,
-    predicted: Foreseen | None,
+    predicted: PredictedPour | None,
     not_covered: Sequence[NotCovered],
     liquid: Liquid | None,
     confirmed: Confirmed | None,

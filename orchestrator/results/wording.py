@@ -20,13 +20,13 @@ from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.deployment_result import RiskFound
 from orchestrator.strategies.deployment.model_monitoring import DOUBT, Believed
-from orchestrator.strategies.deployment.real_pours import Foretold
+from orchestrator.strategies.deployment.real_pours import PredictionCheck
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from sim_engine.scene import Scene
 from sim_engine.search_space import Axis
 
 
-def trust_line(trust: Foretold | Believed) -> str | None:
+def trust_line(trust: PredictionCheck | Believed) -> str | None:
     """What the pours say of the simulator; None where that is nothing.
 
     Args:

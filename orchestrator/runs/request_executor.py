@@ -212,7 +212,7 @@ class RequestExecutor:
             for attempt in range(1, SUGGESTIONS + 1):
                 try:
                     async with asyncio.timeout(self.deadlines.suggest):
-                        return Suggested(await self._laboratory.optimizer.suggest(request.problem))
+                        return Suggested(await self._laboratory.optimizer.suggest(request.query))
                 except Exception as error:
                     reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
                     if attempt == SUGGESTIONS or isinstance(error, BenchLostError):

@@ -238,8 +238,8 @@ class _Run:
         finally:
             self._unknown_pours = bool(scheduler.unknown_pours)
         if executor.speculation.used > used:
-            text = f"{executor.speculation.used - used} simulation(s) of {stage.name} were made while the arm was pouring "
-                "before"
+            count = executor.speculation.used - used
+            text = f"{count} simulation(s) of {stage.name} were made while the arm was pouring before"
             self._journal.append(Kind.NOTE, {"text": text}, stage=stage.name)
         self._subscribers.emit(StageClosed(stage=stage.name, result=result))
         return result

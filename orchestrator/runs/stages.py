@@ -17,7 +17,7 @@ import numpy as np
 from orchestrator.journal.stage_results import Results, result_of
 from orchestrator.requests import Order
 from orchestrator.run_errors import RunError
-from orchestrator.strategies.calibration.action_prior import drawn_benches
+from orchestrator.strategies.calibration.action_prior import Contexts, drawn_benches
 from orchestrator.strategies.calibration.active_design import ActivePours
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.calibration_scores import (
@@ -29,7 +29,6 @@ from orchestrator.strategies.calibration.calibration_scores import (
     recommended_theta,
     shift_left_over,
 )
-from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.calibration.pour_design import DesignedPours, DesignPoured
 from orchestrator.strategies.campaign_plan import (
     CalibrationPlan,
@@ -39,11 +38,10 @@ from orchestrator.strategies.campaign_plan import (
     MeasuredPour,
     RecordSet,
 )
-from orchestrator.strategies.deployment.bench_offset import displacement
-from orchestrator.strategies.deployment.confirmation import Confirmation
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.repeated_simulation import RepeatedSimulation
+from orchestrator.strategies.deployment.model_monitoring import displacement
+from orchestrator.strategies.single_action import Confirmation, RepeatedSimulation
 from orchestrator.strategies.strategy import Strategy
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import Scene

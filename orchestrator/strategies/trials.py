@@ -1,6 +1,7 @@
-"""Simulated trials in the order of their requests, and the seeds that strategies use.
+"""Requests of a strategy that are queued or pending: simulated trials and queries to the optimiser, with their seeds.
 
 - `Trial` is one searched point with its simulations; `Trials` is the sequence of all trials.
+- `OptimizerQueries` holds the pending queries with the continuation of each.
 - `SeedStream` yields seeds for one strategy, without repetition.
 
 The order of the requests, and not that of completion, defines the data of each decision. Decisions therefore do not
@@ -10,12 +11,14 @@ depend on which simulation finishes first.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from actors.optimizer.questions import Data, Point
-from orchestrator.requests import Simulate
+from actors.optimizer.questions import Data, Point, Suggestion, SuggestionQuery
+from orchestrator.requests import Failed, Outcome, Simulate, Suggest, Suggested
+from orchestrator.run_errors import LearningError
 
 
 @dataclass
@@ -26,7 +29,7 @@ class Trial:
         point: point in the unit cube of the searched space.
         requests: simulations whose costs are averaged.
         costs: cost of each answered request, by index; None if the request yielded no cost.
-        context: further coordinates of the observation; see `SuggestProblem.context`.
+        context: further coordinates of the observation; see `CalibrationQuery`.
         refused: whether some request was refused because its action is impossible. It has no cost and is not counted as
             lost.
     """
@@ -186,3 +189,43 @@ class SeedStream:
     def rng(self) -> np.random.Generator:
         """Random generator for other random choices."""
         return self._rng
+
+
+class OptimizerQueries:
+    """Suggest requests, each with a function that handles its answer."""
+
+    def __init__(self, seeds: SeedStream) -> None:
+        self._seeds = seeds
+        self._unissued: list[Suggest] = []
+        self._then: dict[Suggest, Callable[[Suggestion], None]] = {}
+
+    def put(self, query: SuggestionQuery, purpose: str, then: Callable[[Suggestion], None]) -> None:
+        """Queue a query and draw its seed."""
+        request = Suggest(replace(query, seed=self._seeds.next()), purpose)
+        self._unissued.append(request)
+        self._then[request] = then
+
+    def issue(self) -> list[Suggest]:
+        """Return the queries that have not been issued yet."""
+        issued, self._unissued = self._unissued, []
+        return issued
+
+    @property
+    def out(self) -> bool:
+        """Whether an answer is pending."""
+        return bool(self._then)
+
+    def answer(self, request: Suggest, outcome: Outcome) -> None:
+        """Pass an answer to the continuation of its request.
+
+        Raises:
+            ValueError: the request was not made or has been answered already.
+            LearningError: the optimiser returned no suggestion, so that there is no next point to try.
+        """
+        then = self._then.pop(request, None)
+        if then is None:
+            raise ValueError(f"this query was not made, or has been answered already (purpose {request.purpose!r})")
+        if not isinstance(outcome, Suggested):
+            reason = outcome.reason if isinstance(outcome, Failed) else f"unexpected outcome {type(outcome).__name__}"
+            raise LearningError(f"the optimiser has no answer to {request.purpose!r}: {reason}")
+        then(outcome.suggestion)

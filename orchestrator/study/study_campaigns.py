@@ -29,11 +29,10 @@ from orchestrator.runs.stages import (
     stage_seed,
     with_posterior,
 )
-from orchestrator.strategies.calibration.action_prior import region_of
+from orchestrator.strategies.calibration.action_prior import Contexts, region_of
 from orchestrator.strategies.calibration.active_design import ActivePours
 from orchestrator.strategies.calibration.calibration_scores import CalibrationEvaluation
 from orchestrator.strategies.calibration.pointwise_calibration import C1Settings
-from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.calibration.pour_design import DesignedPours, DesignPoured, draw_allowed, stratified
 from orchestrator.strategies.campaign_plan import CampaignPlan, OutputSettings, RecordedPour, RecordSet
 from orchestrator.strategies.deployment.costing import Costing

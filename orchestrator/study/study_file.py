@@ -1,45 +1,51 @@
-"""Study files: the YAML sections of a study and their conversion to a plan.
+"""Study files: the settings of a study, and their resolution to a plan.
 
-- `StudyFile` is the whole file; `LevelSection` is a level of mismatch between bench and simulator.
+- `StudyFile` is the whole file; `LevelSettings` is a level of mismatch between bench and simulator.
 - `CalibrationsBase` and `DeploymentsBase` list the compared strategies. Keys for strategies of installed packages are
   added to them.
 - `load_study` reads a file and returns its `StudyPlan`.
-
-Levels and strategies are resolved in `study_resolution`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 from pydantic import Field, create_model
 
+from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.laboratory_file import HiddenLiquid, LaboratoryFile
 from orchestrator.config.run_snapshot import as_file
 from orchestrator.config.search_ranges import Parameters, ParametersBase
 from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.references import References
-from orchestrator.config.yaml.section_validation import validate
+from orchestrator.config.yaml.section_validation import PlacedProblems, validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
 from orchestrator.strategies.calibration.continuous_calibration import C4Settings
 from orchestrator.strategies.calibration.pointwise_calibration import C1Settings, C2Settings, C3Settings
-from orchestrator.strategies.campaign_plan import CampaignPlan, StrategySettings
+from orchestrator.strategies.campaign_plan import (
+    CalibrationPlan,
+    CampaignPlan,
+    DeploymentPlan,
+    Premises,
+    StrategySettings,
+)
 from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
 from orchestrator.strategies.strategy_registry import calibrations, deployments
-from orchestrator.study.study_plan import ALL, StudyPlan
-from orchestrator.study.study_resolution import bench_of, calibration_arms, deployment_arms, levels_of, written_levels
+from orchestrator.study.study_plan import ALL, CalibrationArm, DeploymentArm, Level, StudyPlan
 from sim_engine.liquids import SimulationParameters
+from sim_engine.scene import PoseError
 from sim_engine.search_space import Space
 from sim_engine.settings.model import (
     MADE,
+    Example,
     FilePath,
     Name,
     PathOr,
@@ -47,6 +53,7 @@ from sim_engine.settings.model import (
     PositivePourCount,
     PositiveSimulationCount,
     PourCount,
+    Problems,
     Seed,
     Settings,
     SimulationCount,
@@ -54,59 +61,70 @@ from sim_engine.settings.model import (
 )
 
 
-class ArmSection(Settings):
+class ArmSettings(Settings):
     """A compared strategy: its number of repetitions and its budget."""
 
-    required: ClassVar[dict[str, str]] = {"repetitions": "10"}
-
-    repetitions: Annotated[PositiveCount, Field(le=10_000)] | None = None
+    repetitions: Annotated[PositiveCount, Field(le=10_000), Example("10")]
     """Number of runs: each run of a calibration has its own pours, a deployment runs once per receiver."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether the budget is given; a draft may lack it."""
+        return all(self.value(key) is not None for key in self.required_keys() if key != "repetitions")
 
     def changes(self) -> dict[str, Any]:
         """Settings of the strategy that the arm gives."""
-        own = type(self).model_fields.keys() - ArmSection.model_fields.keys()
+        own = type(self).model_fields.keys() - ArmSettings.model_fields.keys()
         return {name: value for name in own if (value := getattr(self, name)) is not None}
 
 
 def _arm(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
-    """Make the section of an arm from some of its strategy's settings; only the given ones are required."""
+    """Make the settings of an arm from some of its strategy's settings.
+
+    Args:
+        keys: names of those that may be left out.
+        required: names of the others, with an example.
+    """
     fields: Any = {}
-    for key in keys:
+    for key in (*required, *keys):
         info = settings.model_fields[key]
         value: Any = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation
-        fields[key] = (value | None, Field(None, description=info.description))
-    name = f"{settings.model_fields['strategy'].default}ArmSection"
-    model = create_model(name, __base__=ArmSection, __doc__=ArmSection.__doc__, **fields)
-    model.required = ArmSection.required | required
-    model.variant = settings.model_fields["strategy"].default
+        if key in required:
+            fields[key] = (Annotated[value, Example(required[key])], Field(description=info.description))
+        else:
+            fields[key] = (value | None, Field(None, description=info.description))
+    strategy = settings.model_fields["strategy"].default
+    model = create_model(f"{strategy}ArmSettings", __base__=ArmSettings, __doc__=ArmSettings.__doc__, **fields)
+    model.variant = strategy
+    model.retired = {old: new for old, new in settings.retired.items() if new.partition(":")[0] in fields}
     return model
 
 
-C1Arm: Any = _arm(C1Settings, "per_axis", per_axis="10")
-C2Arm: Any = _arm(C2Settings, "samples", samples="18")
-C3Arm: Any = _arm(C3Settings, "iterations", "initial", "kappa", iterations="59")
-C4Arm: Any = _arm(C4Settings, "simulations", "initial", "kappa", simulations="108")
-D2Arm: Any = _arm(D2Settings, "pours", "mean", "initial", "kappa", pours="15")
+C1Arm: Any = _arm(C1Settings, per_axis="10")
+C2Arm: Any = _arm(C2Settings, samples="18")
+C3Arm: Any = _arm(C3Settings, "initial", "kappa", iterations="59")
+C4Arm: Any = _arm(C4Settings, "initial", "kappa", simulations="108")
+D2Arm: Any = _arm(D2Settings, "mean", "initial", "kappa", pours="15")
 
 
-class D1ArmSection(_arm(D1Settings, "simulations_per_iteration", "initial", "kappa")):  # type: ignore[misc]
+class D1ArmSettings(_arm(D1Settings, "simulations_per_iteration", "initial", "kappa")):  # type: ignore[misc]
     """A compared strategy: its number of repetitions and its budget."""
 
     iterations: list[PositiveSimulationCount] = Field(default=[15], min_length=1)
     """Iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
 
 
-class D3ArmSection(_arm(D3Settings, "pours", "prior_simulations", "initial", "kappa", pours="15")):  # type: ignore[misc]
+class D3ArmSettings(_arm(D3Settings, "prior_simulations", "initial", "kappa", pours="15")):  # type: ignore[misc]
     """A compared strategy: its number of repetitions and its budget."""
 
     per_pour: SimulationCount | None = None
     """Simulations between two pours; not 'free', because the requests would then depend on the clock."""
 
 
-class C4ActiveArmSection(_arm(C4Settings, "simulations", "initial", "kappa", simulations="108", pours="6")):  # type: ignore[misc]
+class C4ActiveArmSettings(_arm(C4Settings, "initial", "kappa", simulations="108")):  # type: ignore[misc]
     """C4 with pours that it chooses itself, each by its expected information about the deployments."""
 
-    pours: PositivePourCount | None = None
+    pours: Annotated[PositivePourCount, Example("6")]
     """Number of training pours to choose; the score uses the repetition's test pours."""
 
     design_simulations: PositiveSimulationCount = 64
@@ -136,14 +154,14 @@ class CalibrationsBase(Settings):
     """C4 as in the paper: the surrogate treats the action's influence as noise. It is compared only; no deployment uses
     it."""
 
-    C4_active: C4ActiveArmSection | None = None
+    C4_active: C4ActiveArmSettings | None = None
     """C4 on fewer pours that are chosen actively. It is compared only; no deployment uses it."""
 
 
 class DeploymentsBase(Settings):
     """The compared deployments, into each of the base campaign's receivers."""
 
-    D1: D1ArmSection | None = None
+    D1: D1ArmSettings | None = None
     """Plan in simulation, pour once."""
 
     D2: D2Arm | None = None
@@ -152,10 +170,10 @@ class DeploymentsBase(Settings):
     D2_paper: D2Arm | None = None
     """D2 as in the paper: a surrogate with a zero mean."""
 
-    D3: D3ArmSection | None = None
+    D3: D3ArmSettings | None = None
     """Real pours with a simulated prior; the campaign selects the model of the prior."""
 
-    D3_paper: D3ArmSection | None = None
+    D3_paper: D3ArmSettings | None = None
     """D3 as in the paper: a GP of the residual around the simulations' mean, without a check."""
 
 
@@ -171,19 +189,17 @@ def _with_others(base: type[Settings], installed: Mapping[str, type[StrategySett
     return create_model(name, __base__=base, __doc__=base.__doc__, __cls_kwargs__=MADE, **fields)
 
 
-CalibrationsSection: Any = _with_others(CalibrationsBase, calibrations())
-DeploymentsSection: Any = _with_others(DeploymentsBase, deployments())
+CalibrationsSettings: Any = _with_others(CalibrationsBase, calibrations())
+DeploymentsSettings: Any = _with_others(DeploymentsBase, deployments())
 
 
-class LevelSection(Settings):
+class LevelSettings(Settings):
     """Level of mismatch between the bench and the simulator."""
 
-    required: ClassVar[dict[str, str]] = {"name": "moderate", "liquid": "{particles: 4000, cohesion: 0.05 N/m}"}
-
-    name: Name | None = None
+    name: Annotated[Name, Example("moderate")]
     """Name of the level in figures and folders."""
 
-    liquid: HiddenLiquid | None = None
+    liquid: Annotated[HiddenLiquid, Example("{particles: 4000, cohesion: 0.05 N/m}")]
     """Hidden θ of the 'real' liquid; calibration never reads it."""
 
     pose_error: PoseErrorSection = PoseErrorSection()
@@ -196,18 +212,13 @@ class LevelSection(Settings):
 class StudyFile(Settings):
     """A study: repeated and compared calibrations and deployments of a campaign."""
 
-    required: ClassVar[dict[str, str]] = {
-        "name": "paper",
-        "campaign": "../campaigns/paper.yaml",
-    }
-
-    name: Name | None = None
+    name: Annotated[Name, Example("paper")]
     """Name of the study; runs are written to study-NAME."""
 
     seed: Seed = 0
     """Seed of all random choices."""
 
-    campaign: FilePath | None = None
+    campaign: Annotated[FilePath, Example("../campaigns/paper.yaml")]
     """File of the base campaign: vessels, motions, action spaces, ranges of θ, calibration pours, loss."""
 
     laboratory: PathOr[LaboratoryFile] | None = None
@@ -226,7 +237,7 @@ class StudyFile(Settings):
     holdout: PositivePourCount | None = None
     """Number of these pours that are kept for testing."""
 
-    mismatch: list[LevelSection] | None = None
+    mismatch: list[LevelSettings] | None = None
     """Levels of mismatch between bench and simulator. Unless given, there is one level: the laboratory's bench under
     its own name."""
 
@@ -236,18 +247,33 @@ class StudyFile(Settings):
     random_baseline: SimulationCount = 0
     """Number of random parameters that each calibration is compared with."""
 
-    calibration: CalibrationsSection | None = None
+    calibration: CalibrationsSettings | None = None
     """The calibrations."""
 
-    deployment: DeploymentsSection | None = None
+    deployment: DeploymentsSettings | None = None
     """The deployments."""
 
-    confirm: PourCount | None = None
+    confirm: PourCount = 0
     """Number of repetitions of each deployment's recommended action at its end, on the same bench with new random
-    errors; 0 unless given. The number can be raised later, like the repetitions."""
+    errors. The number can be raised later, like the repetitions."""
 
     directory: FilePath | None = None
     """Directory for the study's folder; unless given, 'runs' in the working directory."""
+
+    def check_values(self, problems: Problems) -> None:
+        """See `Settings`."""
+        names = [level.name for level in self.mismatch or ()]
+        if self.mismatch == []:
+            problems.add("is empty; name at least one level, or remove the key", "mismatch")
+        for i, name in enumerate(names):
+            if name is not None and name in names[:i]:
+                problems.add(f"a level '{name}' stands above already", "mismatch", i)
+        if not problems.valid("calibration", "deployment"):
+            return
+        if self.calibration is None and self.deployment is None:
+            problems.add("there is nothing to compare; add a 'calibration' or a 'deployment' section", key=True)
+        if self.confirm and self.deployment is None:
+            problems.add("there is no deployment to confirm; add a 'deployment' section, or remove it", "confirm")
 
 
 def load_study(path: Path) -> StudyPlan:
@@ -269,7 +295,6 @@ def load_study(path: Path) -> StudyPlan:
 
 def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
     base = _base(file, root, report)
-    written = written_levels(file.mismatch, root, report)
     if base is None:
         return None
     calibration = base.calibration
@@ -285,22 +310,14 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
             f"{holdout} of {count} pours for testing: a study needs at least one, and leaves two or more to fit",
         )
     at = root.at("laboratory" if file.laboratory is not None else "campaign")
-    bench = bench_of(base.laboratory, at, report)
+    bench = _bench(base.laboratory, at, report)
     if bench is None:
         return None
-    levels = levels_of(written, base.laboratory.name, bench)
+    levels = _levels(file.mismatch, base.laboratory.name, bench)
     names = tuple(level.name for level in levels)
     compared = file.compared or (names[0] if names else "")
     if names and compared not in (*names, ALL):
         report.add(root.at("compared"), f"no such level; there are {', '.join(names)}, and all")
-    if (
-        file.calibration is None
-        and file.deployment is None
-        and not any(report.is_broken(root.at(key)) for key in ("calibration", "deployment"))
-    ):
-        report.add(root, "there is nothing to compare; add a 'calibration' or a 'deployment' section", key=True)
-    if file.confirm and file.deployment is None and not report.is_broken(root.at("deployment")):
-        report.add(root.at("confirm"), "there is no deployment to confirm; add a 'deployment' section, or remove it")
     plan = replace(
         calibration,
         parameters=searched,
@@ -312,8 +329,8 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
             name: value for name, value in base.parameters.model_dump().items() if name not in searched.names
         },
     )
-    arms = calibration_arms(file.calibration, plan, count - holdout, names, compared, root, report)
-    poured = deployment_arms(file.deployment, base.deployment, arms, root, report)
+    arms = _calibration_arms(file.calibration, plan, count - holdout, names, compared, root, report)
+    poured = _deployment_arms(file.deployment, base.deployment, arms, root, report)
     if not arms and not poured and not report.problems:
         empty = next(key for key in ("calibration", "deployment") if file.value(key) is not None)
         examples = {
@@ -321,7 +338,7 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
             "deployment": "D2: {repetitions: 10, pours: 15}",
         }
         report.add(root.at(empty), f"there is nothing to compare; name a strategy, for example '{examples[empty]}'")
-    if report.problems or file.name is None:
+    if report.problems:
         return None
     return StudyPlan(
         name=file.name,
@@ -334,7 +351,7 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
         pour_count=count,
         holdout=holdout,
         compared=compared,
-        confirm=file.confirm or 0,
+        confirm=file.confirm,
         directory=resolved(Path("runs") if file.directory is None else root.directory / file.directory),
     )
 
@@ -343,7 +360,7 @@ def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
     references, laboratory = References(report), None
     if file.laboratory is not None:
         laboratory = references.laboratory(file.laboratory, root.at("laboratory"))
-    if file.campaign is None:
+    if not file.campaign:  # missing in a draft
         return None
     path = resolved(root.directory / file.campaign)
     if (missing := missing_file(path)) is not None:
@@ -402,3 +419,162 @@ def _searched(file: StudyFile, base: CampaignPlan, root: Place, report: Report) 
             report.add(root.at("search"), "is empty; name parameters, or remove the key")
         return base.calibration.parameters
     return Space(tuple(axes[name] for name in known))
+
+
+HARDWARE = (
+    "laboratory '{}' is hardware. An arm moves only for one run, after '--enable-motion' and with a person next to it; "
+    "the cells of a study run in processes of their own, which ask no operator. Pour there with 'decant run', and "
+    "name a virtual laboratory here"
+)
+
+BUDGETS = (
+    *("grid", "per_axis", "samples", "simulations"),
+    *("pours", "iterations", "simulations_per_iteration", "prior_simulations", "per_pour", "prices", "mean"),
+    *("risk_limit", "stop", "good_enough"),
+)
+"""Settings that an arm does not take from the base campaign, because the study defines each budget."""
+
+AS_IN_THE_PAPER: dict[str, dict[str, Any]] = {
+    "D2_paper": {"mean": "zero"},
+    "D3_paper": {"model": "residual"},
+}
+"""Settings in which the paper's forms differ from the defaults."""
+
+
+def _bench(laboratory: LaboratorySpec, at: Place, report: Report) -> VirtualBenchSpec | None:
+    """The bench of a study. Without a usable one, the reason is added to the report and the result is None."""
+    if laboratory.mode != "virtual":
+        report.add(at, HARDWARE.format(laboratory.name))
+    elif laboratory.arm is not None and laboratory.operator.answers != "virtual":
+        report.add(
+            at,
+            f"laboratory '{laboratory.name}' asks an operator, and a study asks none; set 'operator: {{answers: "
+            "virtual}' in it",
+        )
+    elif laboratory.bench is None:
+        report.add(
+            at,
+            f"laboratory '{laboratory.name}' has no virtual bench to pour on; name one that has, for example "
+            "../laboratories/twin.yaml",
+        )
+    else:
+        # Simulated readings need no waiting; an arm over wires needs its real time.
+        wired = laboratory.arm is not None
+        return replace(laboratory.bench, time_scale=laboratory.bench.time_scale if wired else 0.0)
+    return None
+
+
+def _levels(written: Iterable[LevelSettings] | None, laboratory: str, bench: VirtualBenchSpec) -> tuple[Level, ...]:
+    """The benches of all levels: as given, or the laboratory's own under its name. Incomplete levels are left out."""
+    if written is None:
+        return (Level(laboratory, bench),)
+    return tuple(
+        Level(
+            level.name,
+            replace(
+                bench,
+                liquid=level.liquid.parameters(),
+                pose_error=PoseError(**level.pose_error.model_dump()),
+                pose_noise=PoseError(**level.pose_noise.model_dump()),
+            ),
+        )
+        for level in written
+        if level.name is not None and level.liquid is not None
+    )
+
+
+def _calibration_arms(
+    section: Settings | None,
+    base: CalibrationPlan,
+    train: int,
+    levels: tuple[str, ...],
+    compared: str,
+    root: Place,
+    report: Report,
+) -> tuple[CalibrationArm, ...]:
+    """The calibrations of a study; problems are added to the report.
+
+    Args:
+        base: plan with space and scene; pours and budget are filled in here and later.
+        train: number of pours on which every θ of C1 to C3 is simulated.
+        levels: names of all levels; C4 runs at all of them, the others at `compared`.
+    """
+    arms = []
+    for key, arm in _arms(section):
+        at, kind = root.at("calibration", key), calibrations()[arm.variant]
+        if not arm.complete:
+            continue
+        changes = arm.changes()
+        if "averaging" in kind.model_fields:
+            shared = getattr(base.settings, "averaging", "context")
+            changes["averaging"] = "noise" if key == "C4_paper" else shared
+        settings = kind.like(base.settings, without=BUDGETS, **changes)
+        budget = next((name for name in ("iterations", "simulations") if getattr(settings, name, None)), "")
+        initial, most = getattr(settings, "initial", None), getattr(settings, budget, None)
+        if initial is not None and most is not None and initial > most:
+            if "initial" in changes:
+                report.add(at.at("initial"), f"{initial} random θ don't fit into {budget}: {most}")
+            settings = settings.with_values(initial=most)
+        settled = settings.settled(base.parameters.names, train, PlacedProblems(at, report))
+        if settled is None:
+            continue
+        prior, known = (base.prior, base.parameter_prior) if kind.has_prior else ((), ())
+        plan = replace(base, settings=settled, prior=prior, parameter_prior=known)
+        own = getattr(arm, "pours", 0)  # only an arm that chooses its pours has the key
+        if own:
+            plan = replace(plan, design="active", design_simulations=arm.design_simulations)
+        where = levels if key == "C4" or compared == ALL else (compared,)
+        arms.append(CalibrationArm(_label(key), plan, arm.repetitions or 1, where, own))
+    return tuple(arms)
+
+
+def _deployment_arms(
+    section: Settings | None,
+    base: DeploymentPlan | None,
+    calibrated: tuple[CalibrationArm, ...],
+    root: Place,
+    report: Report,
+) -> tuple[DeploymentArm, ...]:
+    """The deployments of a study; problems are added to the report."""
+    if section is None:
+        return ()
+    if base is None:
+        report.add(root.at("deployment"), "the base campaign has no 'deployment' section to take receivers from")
+        return ()
+    most = max((arm.repetitions for arm in calibrated if arm.label == "C4"), default=0)
+    arms: list[DeploymentArm] = []
+    for key, arm in _arms(section):
+        at, kind = root.at("deployment", key), deployments()[arm.variant]
+        if key == "D2_paper" and arm.mean == "constant":
+            report.add(at.at("mean"), "D2_paper has the paper's mean, 'zero'; remove the key, or compare with D2")
+        repetitions = arm.repetitions or 1
+        if kind.simulates and repetitions > most:
+            report.add(
+                at.at("repetitions") if arm.repetitions is not None else at,
+                f"{arm.variant} simulates with the θ* that C4 finds in the same repetition, and C4 has {most}; "
+                f"add 'calibration: {{C4: {{repetitions: {repetitions}, simulations: 108}}}}'",
+            )
+        if not arm.complete:
+            continue
+        changes = arm.changes() | AS_IN_THE_PAPER.get(key, {})
+        rounds = changes.pop("iterations", None)
+        settings = kind.like(base.settings, without=BUDGETS, **changes)
+        settings.check(Premises(base.actions, base.objectives is not None), PlacedProblems(at, report))
+        common = replace(base, settings=settings, data=None, confirm=0)  # a study has its own 'confirm'
+        if rounds is None:
+            arms.append(DeploymentArm(_label(key), common, repetitions))
+        for n in sorted(set(rounds or ())):
+            plan = common.with_settings(iterations=n)
+            arms.append(DeploymentArm(f"{key}-{n}", plan, repetitions))
+    return tuple(arms)
+
+
+def _arms(section: Settings | None) -> list[tuple[str, Any]]:
+    """The arms that a file has, by their keys."""
+    keys = () if section is None else type(section).model_fields
+    return [(key, arm) for key in keys if (arm := getattr(section, key)) is not None]
+
+
+def _label(key: str) -> str:
+    """Name of an arm in figures and folders."""
+    return key.replace("_", "-")

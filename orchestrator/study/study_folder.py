@@ -2,7 +2,7 @@
 
 - `CellResult` is the content of a result file; `read_result` and `write_result` access it.
 - `opened` locks the folder for one process and checks its settings.
-- `code_now` and `warning` compare the code that made the finished cells with the current one.
+- `code_now` and `code_warning` compare the code that made the finished cells with the current one.
 
 Cells are run in `study_runner`.
 """
@@ -20,7 +20,7 @@ from typing import Any
 
 from pydantic import SerializeAsAny, field_validator
 
-from actors.runtime.cluster_nodes import sources, versions
+from actors.runtime.ray_cluster import versions
 from orchestrator.journal.codec import digest, first_difference, from_json, to_json
 from orchestrator.journal.journal_file import locked_alone
 from orchestrator.journal.stage_results import decode_result
@@ -28,6 +28,7 @@ from orchestrator.journal.upgrade import upgraded_fingerprint
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from orchestrator.study.study_plan import StudyCell, StudyPlan, study_fingerprint
+from sim_engine.solver_fingerprint import folder_digest
 
 CELLS, RESULT, LOG, SETTINGS = "cells", "result.json", "process-{}.log", "study.json"
 SOURCE = "study-file.txt"
@@ -181,8 +182,8 @@ def code_now() -> dict[str, str]:
     here = versions()
     return {
         "decant": here.decant,
-        "optimiser": sources(_ROOT / "actors" / "optimizer" / "core"),
-        "strategies": sources(_ROOT / "orchestrator" / "strategies"),
+        "optimiser": folder_digest(_ROOT / "actors" / "optimizer"),
+        "strategies": folder_digest(_ROOT / "orchestrator" / "strategies"),
         "solver": here.simulator,
     }
 
@@ -192,7 +193,7 @@ def made_by(results: Mapping[str, CellResult]) -> Counter[tuple[tuple[str, str],
     return Counter(tuple(result.code.items()) for result in results.values())
 
 
-def warning(results: Mapping[str, CellResult]) -> str | None:
+def code_warning(results: Mapping[str, CellResult]) -> str | None:
     """Warning for a study that continues with other code than that of its finished cells; None if the code is equal.
 
     Args:
@@ -211,7 +212,7 @@ def warning(results: Mapping[str, CellResult]) -> str | None:
     )
 
 
-def told(results: Mapping[str, CellResult]) -> str:
+def code_summary(results: Mapping[str, CellResult]) -> str:
     """Text for the page: the number of different codes of the cells, and their digests."""
     count = made_by(results)
     if not count:

@@ -1,20 +1,46 @@
-"""Runs the unfinished cells of a study in child processes.
+"""Runs the cells of a study in child processes: `python -m orchestrator.study.study_runner STUDY.yaml` is one.
 
-`run_cells` starts each cell as soon as the cells that it needs are finished, several at a time. `CellProcess` is one
-child process, `CellStatus` the progress. Cells themselves are executed in `cell_process`.
+- `run_cells` starts each cell as soon as the cells that it needs are finished, several at a time. `CellProcess` is one
+  child process, `CellStatus` the progress.
+- `work` is the loop of a child process. Each line of its stdin names a cell, each line of its stdout is the JSON list
+  [cell, error or null]. The process and its simulator are kept, since starting Python, Taichi and its kernels takes
+  longer than a small cell.
+- A child process ends with its stdin, also during a cell. The cell's journal has its progress, and the next process
+  continues it.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
+import os
+import queue
+import sys
+import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ChildProcess, python_module
-from orchestrator.study.study_folder import LOG, is_finished
+from actors.simulators.local_worker import thread_pool
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.run_errors import RunError
+from orchestrator.run_service import RunRequest, RunResources, RunService
+from orchestrator.runs.stages import CALIBRATION
+from orchestrator.study.study_campaigns import campaign_of
+from orchestrator.study.study_file import load_study
+from orchestrator.study.study_folder import (
+    LOG,
+    CellResult,
+    code_now,
+    is_finished,
+    read_result,
+    run_folder,
+    write_result,
+)
 from orchestrator.study.study_plan import StudyCell, StudyPlan, cells_of, estimated_seconds
 
 WAKE = 0.1
@@ -55,14 +81,14 @@ Watch = Callable[[CellStatus], None]
 
 def cell_command(study: StudyPlan) -> list[str]:
     """Command that runs cells in a separate process."""
-    return python_module("orchestrator.study.cell_process", str(study.source))
+    return python_module("orchestrator.study.study_runner", str(study.source))
 
 
 class CellProcess:
     """A process that runs cells, one at a time.
 
     Args:
-        command: command of the process; see `orchestrator.study.cell_process` for its input and output.
+        command: command of the process; see `work` for its input and output.
         log: file for its other output.
 
     Attributes:
@@ -196,3 +222,97 @@ def _end(processes: Iterable[CellProcess]) -> None:
         if not process.child.wait(max(deadline - time.monotonic(), 0.1)):
             process.child.kill()
         process.close()
+
+
+def run_cell(study: StudyPlan, cell: StudyCell, folder: Path, resources: RunResources) -> CellResult:
+    """Run a cell, or continue it, and write its result.
+
+    Args:
+        folder: folder of the study.
+        resources: shared by all cells of a process.
+
+    Raises:
+        RunError: it can't begin or go on.
+        LaboratoryError: its laboratory can't be opened.
+    """
+    directory = run_folder(folder, cell.id)
+    plan, stages = campaign_of(study, cell, lambda other: read_result(folder, other).results, directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    handle = RunService().start(RunRequest(plan, stages, directory, "if begun"), resources)
+    result = asyncio.run(handle.wait())
+    kept = CellResult(
+        results=dict(result.results),
+        simulations=result.simulations,
+        pours=result.pours,
+        cpu_s=result.cpu_s,
+        seconds=result.seconds,
+        expected=tuple(_expected(directory)) if cell.arm.startswith("C4") else (),
+        code=code_now(),
+    )
+    write_result(folder, cell.id, kept)
+    return kept
+
+
+def _expected(directory: Path) -> list[tuple[int, float]]:
+    """For each θ that C4 chose: simulations requested until then, and the mean |Δ| that its surrogate expected."""
+    asked, found = 0, list[tuple[int, float]]()
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        for entry in journal.entries(stage=CALIBRATION, kinds=[Kind.REQUESTED, Kind.DECISION]):
+            if entry.kind == Kind.REQUESTED:
+                asked += entry.body["request"]["type"] == "Simulate"
+            elif "mean" in (entry.body.get("values") or {}):
+                found.append((asked, entry.body["values"]["mean"]))
+    return found
+
+
+def named_cells() -> Iterator[str]:
+    """The lines of stdin, until it ends; during a cell, this process ends with it."""
+    names: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+    idle, over = threading.Event(), threading.Event()
+
+    def read() -> None:
+        with os.fdopen(0, "r", encoding="utf-8", closefd=False) as lines:
+            for line in lines:
+                names.put(line.strip())
+        over.set()
+        if not idle.is_set():
+            os._exit(1)
+        names.put(None)
+
+    threading.Thread(target=read, daemon=True).start()
+    while True:
+        idle.set()
+        name = names.get()
+        idle.clear()
+        if name is None or over.is_set():
+            return
+        yield name
+
+
+def work(path: Path, resources: RunResources | None = None) -> None:
+    """Run the cells that stdin names until it ends.
+
+    Args:
+        path: path of the study's file.
+        resources: by default, one simulator in this process.
+    """
+    # Libraries print to stdout, which is only for answers: from here on they print to the log.
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    code_now()  # of the sources that this process has read, before they change
+    study = load_study(path)
+    cells = {cell.id: cell for cell in cells_of(study)}
+    simulators = thread_pool()
+    resources = resources or RunResources(in_process=True, simulators=simulators)
+    for name in named_cells():
+        problem = None
+        try:
+            run_cell(study, cells[name], study.folder, resources)
+        except (RunError, LaboratoryError) as error:
+            problem = str(error)
+        print(json.dumps([name, problem]), file=answers, flush=True)
+    asyncio.run(simulators.close())  # compiled kernels reach their cache
+
+
+if __name__ == "__main__":
+    work(Path(sys.argv[1]))

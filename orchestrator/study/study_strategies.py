@@ -12,7 +12,7 @@ from typing import Literal
 
 from orchestrator.requests import Decision, Failed, Outcome, Poured, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.single_pour import OnePour
+from orchestrator.strategies.single_action import OnePour
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from orchestrator.strategies.strategy import Progress, Strategy, is_sound
 from orchestrator.strategies.trials import SeedStream

@@ -11,8 +11,14 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
-from sim_engine.fluid.scene_setup import SceneSetup
-from sim_engine.fluid.strength import adhesion, cohesion_acceleration, eddy_rate, pull_interval, relax_interval
+from sim_engine.fluid.scene_setup import (
+    SceneSetup,
+    adhesion,
+    cohesion_acceleration,
+    eddy_rate,
+    pull_interval,
+    relax_interval,
+)
 
 
 @ti.data_oriented

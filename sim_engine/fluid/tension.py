@@ -35,8 +35,8 @@ from sim_engine.fluid.kernels import (
     wall_bond,
 )
 from sim_engine.fluid.neighbours import in_eights, take_seats
+from sim_engine.fluid.scene_setup import RANGE
 from sim_engine.fluid.state import STRETCHES, VESSELS
-from sim_engine.fluid.strength import RANGE
 
 ALONE = 3.0
 """Weight of the missing bonds. At 1 drops lose their density; at 2 and range 2.8 oscillations decay faster."""

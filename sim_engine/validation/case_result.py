@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -121,6 +122,19 @@ class Figure:
     y_labels: tuple[str, ...]
     series: tuple[Series, ...]
     log_x: bool | tuple[bool, ...] = False
+
+
+def collected(
+    runs: Iterable[tuple[Sequence[Measurement], Sequence[Series]]],
+) -> tuple[list[Measurement], list[Series]]:
+    """Measurements and curves of several runs; a curve that several of them have is drawn only once."""
+    measurements: list[Measurement] = []
+    curves: dict[tuple[str, str], Series] = {}
+    for found, series in runs:
+        measurements += found
+        for curve in series:
+            curves.setdefault((curve.name, curve.kind), curve)
+    return measurements, list(curves.values())
 
 
 @dataclass(frozen=True)

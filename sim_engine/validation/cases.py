@@ -8,15 +8,20 @@ from dataclasses import dataclass, replace
 
 from sim_engine.liquids import SimulationParameters
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation import capillarity as droplet
-from sim_engine.validation import convergence, dam_break, sensitivity, sloshing, torricelli
-from sim_engine.validation import hydrostatic_cases as at_rest
-from sim_engine.validation import hydrostatic_cases as tilting
-from sim_engine.validation import jet_landing as landing
-from sim_engine.validation import viscous_flows as thick
-from sim_engine.validation import wall_tightness as walls
-from sim_engine.validation import whole_pours as pours
-from sim_engine.validation.case_result import CaseResult, Figure, Measurement, Series, at_least
+from sim_engine.validation import (
+    capillarity,
+    convergence,
+    dam_break,
+    hydrostatic_cases,
+    jet_landing,
+    sensitivity,
+    sloshing,
+    torricelli,
+    viscous_flows,
+    wall_tightness,
+    whole_pours,
+)
+from sim_engine.validation.case_result import CaseResult, Figure, Measurement, at_least, collected
 
 PLAIN = SimulationParameters(cohesion=0.0, viscosity=1.0, friction=0.0)
 """θ of the cases, as their references assume. Water's own viscosity has no effect in a cup, a liquid has no dry
@@ -84,112 +89,83 @@ def describe(parameters: SimulationParameters) -> str:
 
 
 def _at_rest(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    found: list[Measurement] = []
-    curves: list[Series] = []
-    for n in (2_000, 5_000) if effort.full else (2_000,):
-        measurements, figure = at_rest.at_rest(n, PLAIN)
-        found += measurements
-        curves += figure.series
-    # the limit is drawn only once
-    unique = {(s.name, s.kind): s for s in curves}
-    return found, replace(figure, series=tuple(unique.values()))
+    runs = [hydrostatic_cases.at_rest(n, PLAIN) for n in ((2_000, 5_000) if effort.full else (2_000,))]
+    found, curves = collected((measurements, figure.series) for measurements, figure in runs)
+    return found, replace(runs[-1][1], series=tuple(curves))
 
 
 def _retention(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    found: list[Measurement] = []
-    curves: list[Series] = []
     if effort.full:
         runs = [
-            (tilting.straight_cup(), 500, tilting.ANGLES),
-            (tilting.straight_cup(), 1_000, tilting.ANGLES),
-            (tilting.straight_cup(), 2_000, tilting.ANGLES),
-            (tilting.straight_cup(), 5_000, tilting.ANGLES),
-            (tilting.conical_cup(), 2_000, tilting.ANGLES),
-            (tilting.mesh_jug(), 2_000, tilting.ANGLES),
+            (hydrostatic_cases.straight_cup(), 500, hydrostatic_cases.ANGLES),
+            (hydrostatic_cases.straight_cup(), 1_000, hydrostatic_cases.ANGLES),
+            (hydrostatic_cases.straight_cup(), 2_000, hydrostatic_cases.ANGLES),
+            (hydrostatic_cases.straight_cup(), 5_000, hydrostatic_cases.ANGLES),
+            (hydrostatic_cases.conical_cup(), 2_000, hydrostatic_cases.ANGLES),
+            (hydrostatic_cases.mesh_jug(), 2_000, hydrostatic_cases.ANGLES),
         ]
     else:
-        runs = [(tilting.straight_cup(), 500, tilting.ANGLES[:1])]
-    for vessel, particles, angles in runs:
-        measurements, series = tilting.slow_tilt(vessel, LOAD, particles, PLAIN, angles, SEEDS if effort.full else 1)
-        found += measurements
-        curves += [s for s in series if s not in curves]
-    return found, tilting.retention_figure(curves)
+        runs = [(hydrostatic_cases.straight_cup(), 500, hydrostatic_cases.ANGLES[:1])]
+    seeds = SEEDS if effort.full else 1
+    found, curves = collected(
+        hydrostatic_cases.slow_tilt(vessel, LOAD, n, PLAIN, angles, seeds) for vessel, n, angles in runs
+    )
+    return found, hydrostatic_cases.retention_figure(curves)
 
 
 def _outflow(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    found: list[Measurement] = []
-    curves: list[Series] = []
-    for n in (500, 1_000, 2_000, 5_000) if effort.full else (500, 1_000):
-        measurements, series = pours.outflow(simulator, n, PLAIN, seeds=3 if n <= 2_000 else 1)
-        found += measurements
-        curves += series
-    return found, pours.outflow_figure(curves)
+    numbers = (500, 1_000, 2_000, 5_000) if effort.full else (500, 1_000)
+    found, curves = collected(whole_pours.outflow(simulator, n, PLAIN, seeds=3 if n <= 2_000 else 1) for n in numbers)
+    return found, whole_pours.outflow_figure(curves)
 
 
 def _delivered(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
-    return pours.delivered(simulator, 2_000, PLAIN, seeds=10 if effort.full else 3), None
+    return whole_pours.delivered(simulator, 2_000, PLAIN, seeds=10 if effort.full else 3), None
 
 
 def _jet(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    return pours.free_jet(simulator, 5_000 if effort.full else 1_000, PLAIN)
+    return whole_pours.free_jet(simulator, 5_000 if effort.full else 1_000, PLAIN)
 
 
 def _column(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
     numbers = (2_000, 5_000, 10_000) if effort.full else (2_000,)
-    return [m for n in numbers for m in at_rest.tall_column(n, PLAIN)], None
+    return [m for n in numbers for m in hydrostatic_cases.tall_column(n, PLAIN)], None
 
 
 def _sloshing(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    found: list[Measurement] = []
-    curves: list[Series] = []
-    for n in (2_000, 5_000, 10_000) if effort.full else (2_000,):
-        measurements, series = sloshing.sloshing(n, PLAIN)
-        found += measurements
-        curves += series
+    numbers = (2_000, 5_000, 10_000) if effort.full else (2_000,)
+    found, curves = collected(sloshing.sloshing(n, PLAIN) for n in numbers)
     return found, sloshing.sloshing_figure(curves)
 
 
 def _torricelli(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    found: list[Measurement] = []
-    curves: list[Series] = []
-    discharges: dict[int, float] = {}
-    for n in (6_000, 12_000) if effort.full else (6_000,):
-        measurements, series, discharges[n] = torricelli.torricelli(n, PLAIN)
-        found += measurements
-        curves += series
-    if len(discharges) > 1:
-        found.append(torricelli.steadiness(discharges))
+    runs = {n: torricelli.torricelli(n, PLAIN) for n in ((6_000, 12_000) if effort.full else (6_000,))}
+    found, curves = collected(run[:2] for run in runs.values())
+    if len(runs) > 1:
+        found.append(torricelli.steadiness({n: discharge for n, (_, _, discharge) in runs.items()}))
     return found, torricelli.torricelli_figure(curves)
 
 
 def _dam_break(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    found: list[Measurement] = []
-    curves: list[Series] = []
-    for width in dam_break.MEASURED:
-        measurements, series = dam_break.dam_break(width, 16 if effort.full else 12, PLAIN)
-        found += measurements
-        curves += series
+    across = 16 if effort.full else 12
+    found, curves = collected(dam_break.dam_break(width, across, PLAIN) for width in dam_break.MEASURED)
     return found, dam_break.dam_figure(curves)
 
 
 def _cohesion(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     free = PLAIN.model_copy(update={"viscosity": 0.0})
-    found = droplet.cube_to_sphere(2_000, free)
-    curves: list[Series] = []
-    tensions: dict[int, float] = {}
-    for n in (2_000, 10_000) if effort.full else (2_000,):
-        measurements, series, tensions[n] = droplet.oscillation(n, free)
-        found += measurements
-        curves += series
-    if len(tensions) > 1:
-        found.append(droplet.same_tension(tensions))
-    return found, droplet.droplet_figure(curves)
+    sphere = capillarity.cube_to_sphere(2_000, free)
+    runs = {n: capillarity.oscillation(n, free) for n in ((2_000, 10_000) if effort.full else (2_000,))}
+    found, curves = collected([(sphere, []), *(run[:2] for run in runs.values())])
+    if len(runs) > 1:
+        found.append(capillarity.same_tension({n: tension for n, (_, _, tension) in runs.items()}))
+    return found, capillarity.droplet_figure(curves)
 
 
 def _landing(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     if effort.full:
-        return landing.compared(simulator, (500, 1_000, 2_000), 10_000, PLAIN, SEEDS)
-    return landing.compared(simulator, (500,), 1_000, PLAIN)
+        return jet_landing.compared(simulator, (500, 1_000, 2_000), 10_000, PLAIN, SEEDS)
+    return jet_landing.compared(simulator, (500,), 1_000, PLAIN)
 
 
 def _convergence(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
@@ -205,15 +181,15 @@ def _sensitivity(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Mea
 
 def _walls(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
     many = effort.pours if effort.pours is not None else 40 if effort.full else 5
-    return walls.walls(many, 10_000 if effort.full else 1_500), None
+    return wall_tightness.walls(many, 10_000 if effort.full else 1_500), None
 
 
 def _repeatability(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
-    return pours.repeatability(simulator, 2_000 if effort.full else 500, PLAIN), None
+    return whole_pours.repeatability(simulator, 2_000 if effort.full else 500, PLAIN), None
 
 
 def _of_thick_liquids(
-    work: thick.Work,
+    work: viscous_flows.Work,
 ) -> Callable[[PourSimulator, CaseEffort], tuple[list[Measurement], Figure | None]]:
     return lambda simulator, effort: work(simulator, effort.full)
 
@@ -324,7 +300,7 @@ CASES: tuple[Case, ...] = (
         "The standard pour, twice with one seed and once with another.",
         _repeatability,
     ),
-    *(Case(name, title, about, _of_thick_liquids(work)) for name, title, about, work in thick.CASES),
+    *(Case(name, title, about, _of_thick_liquids(work)) for name, title, about, work in viscous_flows.CASES),
 )
 
 

@@ -22,7 +22,7 @@ from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.validation import capillarity as wetting
-from sim_engine.validation.case_result import Figure, Measurement, Series, reported, within
+from sim_engine.validation.case_result import Figure, Measurement, Series, collected, reported, within
 from sim_engine.validation.container_runs import MARGIN, Container, block, box, run, still_pose, stir
 from sim_engine.vessel.distance_grid import SignedDistanceGrid
 from sim_engine.vessel.shapes import cylinder
@@ -409,11 +409,9 @@ def puddle(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Fig
 def _figure(
     runs: list[tuple[list[Measurement], list[Series]]], words: tuple[str, str, str]
 ) -> tuple[list[Measurement], Figure]:
-    curves: list[Series] = []
-    for _, series in runs:
-        curves += [one for one in series if (one.name, one.kind) not in [(c.name, c.kind) for c in curves]]
+    found, curves = collected(runs)
     title, x, y = words
-    return [m for measurements, _ in runs for m in measurements], Figure((title,), (x,), (y,), tuple(curves))
+    return found, Figure((title,), (x,), (y,), tuple(curves))
 
 
 PEER: dict[float, tuple[float, ...]] = {

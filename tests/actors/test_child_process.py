@@ -18,7 +18,14 @@ import pytest
 
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.interfaces import LaboratoryError
-from actors.runtime.child_process import ChildProcess, ConnectedProcess, child_environment, run, run_async
+from actors.runtime.child_process import (
+    ChildProcess,
+    ConnectedProcess,
+    child_environment,
+    own_environment,
+    run,
+    run_async,
+)
 from tests.support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[2]
@@ -202,7 +209,7 @@ def test_children_end_with_a_parent_that_is_killed(waits: str, options: str) -> 
 
 
 def test_a_connected_process_ends_with_its_connection() -> None:
-    child = ConnectedProcess("actors.simulators.process_worker")
+    child = ConnectedProcess("actors.simulators.local_worker")
     assert child.alive
     child.connection.close()
     child.close(PATIENCE)
@@ -217,6 +224,15 @@ def test_a_balance_whose_process_was_killed_says_so() -> None:
             balance.state()
     finally:
         balance.close()
+
+
+def test_what_is_set_for_a_library_in_this_process_does_not_reach_other_children(monkeypatch) -> None:
+    monkeypatch.setenv("DECANT_TEST_OLD", "before")
+    names = ("DECANT_TEST_OLD", "DECANT_TEST_NEW")
+    with own_environment(DECANT_TEST_OLD="changed", DECANT_TEST_NEW="added"):
+        assert [os.environ[name] for name in names] == ["changed", "added"]
+        assert [child_environment().get(name) for name in names] == ["before", None]
+    assert [os.environ.get(name) for name in names] == ["before", None]
 
 
 # ---- one place
@@ -263,7 +279,7 @@ def test_one_module_of_the_product_starts_programs() -> None:
 AT_THE_START = {
     "orchestrator/catalogue/run_registry.py",  # `--state`, before anything is started
     "orchestrator/daemon/server_process.py",  # what the previous program left, before anything is started
-    "actors/runtime/private_ray.py",  # read by Ray's library in this process; it has no other way
+    "actors/runtime/child_process.py",  # `own_environment`: read by Ray's library, which has no other way
 }
 """Files that change this process's environment outside of an import."""
 
@@ -309,3 +325,13 @@ def test_tests_and_scripts_give_every_child_an_environment() -> None:
             if not any(word.arg in ("env", None) for word in node.keywords):
                 found.append(f"{path.relative_to(ROOT)}:{node.lineno}")
     assert not found, "\n".join(["add env=child_environment() (actors.runtime.child_process):", *found])
+
+
+def test_rays_private_api_is_used_in_one_function_only() -> None:
+    found = {
+        (str(path.relative_to(ROOT)), node.name)
+        for path, tree in trees(*PRODUCT, about=r"\bray\._")
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and re.search(r"\bray\._", ast.unparse(node))
+    }
+    assert found == {("actors/runtime/ray_runtime.py", "_ray_internals")}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from actors.simulators.simulation_task import JobCancelledError, JobRunner
+from actors.simulators.job_runner import JobCancelledError, JobRunner
 
 
 def never() -> bool:

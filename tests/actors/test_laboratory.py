@@ -14,14 +14,14 @@ import pytest
 from actors.interfaces import LaboratoryError
 from actors.laboratory import check_laboratory, open_laboratory
 from actors.laboratory_settings import LaboratorySpec
-from actors.optimizer.questions import Data, SuggestProblem
+from actors.optimizer.questions import Data, MinimumQuery
 from actors.runtime.remote_object import DeviceLostError
 from orchestrator.config.file_loading import load_laboratory
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PourTask
 from sim_engine.search_space import Axis, Space
 
-PROBLEM = SuggestProblem(
+PROBLEM = MinimumQuery(
     space=Space((Axis("x_offset", 0.08, 0.15), Axis("angular_velocity", 0.3, 2.0))),
     data=Data(((0.1, 0.2), (0.6, 0.4), (0.9, 0.8), (0.3, 0.9)), (0.4, 0.1, 0.5, 0.3)),
     count=2,
@@ -69,7 +69,7 @@ def test_a_question_that_makes_no_sense_is_an_error_that_says_so(fake):
     async def play():
         async with laboratory(True, fake) as opened:
             await opened.optimizer.suggest(
-                SuggestProblem(space=PROBLEM.space, data=Data(((0.5, 0.5), (float("nan"), 0.1)), (1.0, 2.0)))
+                MinimumQuery(space=PROBLEM.space, data=Data(((0.5, 0.5), (float("nan"), 0.1)), (1.0, 2.0)))
             )
 
     with pytest.raises(LaboratoryError, match="the optimiser can't answer"):

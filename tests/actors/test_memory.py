@@ -14,7 +14,7 @@ from actors.runtime.child_process import child_environment
 PROGRAM = """
 import json
 import psutil
-from actors.simulators.simulation_task import give_back
+from actors.simulators.job_runner import give_back
 
 def resident():
     return psutil.Process().memory_info().rss

@@ -6,7 +6,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.optimizer.questions import Data, SuggestProblem
+from actors.optimizer.questions import (
+    CalibrationQuery,
+    Data,
+    MinimumQuery,
+    PourQuery,
+    RegressionQuery,
+    SpaceFillingQuery,
+)
 from actors.optimizer.suggest import propose
 from sim_engine.search_space import Axis, Space
 from tests.support.hypothesis_examples import examples
@@ -36,24 +43,20 @@ cost = st.sampled_from([0.0, 1.0, 1.0]) | st.floats(-1e6, 1e6)
     simulated=st.lists(st.tuples(coordinate, coordinate, cost), max_size=8),
     pending=st.lists(st.tuples(coordinate, coordinate), max_size=3),
     mean=st.sampled_from(["constant", "zero", "simulated"]),
-    acquisition=st.sampled_from(["lcb", "posterior_minimum", "random", "sobol"]),
+    acquisition=st.sampled_from(["lcb", "posterior_minimum"]),
     count=st.integers(0, 3),
     seed=st.integers(0, 2**31),
 )
 def test_any_finite_data_gives_finite_proposals_inside_the_cube(
     observed, simulated, pending, mean, acquisition, count, seed
 ):
-    problem = SuggestProblem(
-        PLANE,
-        data_of([p[:2] for p in observed], [p[2] for p in observed]),
-        pending=tuple(pending),
-        count=count,
-        seed=seed,
-        mean=mean,
-        simulated=data_of([p[:2] for p in simulated], [p[2] for p in simulated]),
-        acquisition=acquisition,
-    )
-    answer = propose(problem)
+    data = data_of([p[:2] for p in observed], [p[2] for p in observed])
+    simulated = data_of([p[:2] for p in simulated], [p[2] for p in simulated])
+    parts = {"pending": tuple(pending), "count": count, "seed": seed, "acquisition": acquisition}
+    if mean == "simulated":
+        answer = propose(PourQuery(PLANE, data, simulated=simulated, **parts))
+    else:
+        answer = propose(MinimumQuery(PLANE, data, mean=mean, **parts))
     assert len(answer.points) == count
     assert all(len(p) == 2 and all(0.0 <= u <= 1.0 for u in p) for p in answer.points)
     assert all(map(math.isfinite, (*answer.means, *answer.deviations)))
@@ -63,10 +66,10 @@ def test_any_finite_data_gives_finite_proposals_inside_the_cube(
 
 def test_the_same_question_gets_the_same_answer_and_another_seed_another():
     points = cover(12)
-    problem = SuggestProblem(PLANE, data_of(points, bowl(points)), count=2, seed=3, acquisition="lcb")
+    problem = MinimumQuery(PLANE, data_of(points, bowl(points)), count=2, seed=3, acquisition="lcb")
     first, again = propose(problem), propose(problem)
     assert (first.points, first.means, first.hyperparameters) == (again.points, again.means, again.hyperparameters)
-    drawn = [propose(SuggestProblem(PLANE, Data(), seed=s, acquisition="random")).points for s in (1, 2)]
+    drawn = [propose(SpaceFillingQuery(PLANE, seed=s)).points for s in (1, 2)]
     assert drawn[0] != drawn[1]
 
 
@@ -79,27 +82,26 @@ def test_the_same_question_gets_the_same_answer_and_another_seed_another():
         ({"kappa": float("nan")}, "kappa"),
         ({"count": -1}, "count"),
         ({"map_resolution": 10_000}, "map_resolution"),
-        ({"context": ((0.5,),), "mean": "zero"}, "context needs mean='constant'"),
     ],
 )
 def test_a_question_that_cannot_be_answered_is_refused_with_its_number(change, complaint):
     with pytest.raises(ValueError, match=complaint):
-        propose(SuggestProblem(**{"space": PLANE, "data": Data(), **change}))
+        propose(MinimumQuery(**{"space": PLANE, "data": Data(), **change}))
 
 
 def test_the_minimum_of_a_smooth_cost_is_found_in_a_few_steps():
     data = Data()
     for step in range(15):
-        point = propose(SuggestProblem(PLANE, data, seed=step)).points[0]
+        point = propose(MinimumQuery(PLANE, data, seed=step)).points[0]
         data = data.added(point, float(bowl([point])[0]))
-    best = propose(SuggestProblem(PLANE, data, acquisition="posterior_minimum")).points[0]
+    best = propose(MinimumQuery(PLANE, data, acquisition="posterior_minimum")).points[0]
     assert np.linalg.norm(np.array(best) - (0.3, 0.6)) < 0.05
 
 
 @pytest.mark.parametrize("ripple", [0.0, 1e-4])
 def test_on_a_plateau_it_keeps_looking_where_nothing_is_known(ripple):
     corner = 0.3 * cover(6)  # (almost) everything spilled in one corner
-    answer = propose(SuggestProblem(PLANE, data_of(corner, 1.0 - ripple * cover(6)[:, 0])))
+    answer = propose(MinimumQuery(PLANE, data_of(corner, 1.0 - ripple * cover(6)[:, 0])))
     assert min(np.linalg.norm(np.array(answer.points[0]) - p) for p in corner) > 0.3
     assert answer.deviations[0] > 0.01
 
@@ -107,7 +109,7 @@ def test_on_a_plateau_it_keeps_looking_where_nothing_is_known(ripple):
 def test_duplicates_that_disagree_are_taken_for_noise():
     points = np.array([[0.5, 0.5]] * 6 + [[0.1, 0.1]] * 6)
     costs = np.array([0.4, 0.6] * 3 + [0.85, 0.95] * 3)
-    answer = propose(SuggestProblem(PLANE, data_of(points, costs), count=0, predict_at=((0.5, 0.5), (0.1, 0.1))))
+    answer = propose(RegressionQuery(PLANE, data_of(points, costs), predict_at=((0.5, 0.5), (0.1, 0.1))))
     assert answer.predictions == pytest.approx((0.5, 0.9), abs=0.06)
     assert 0.03 < answer.hyperparameters["noise"] < 0.3
 
@@ -116,7 +118,7 @@ def test_the_best_point_is_not_the_luckiest():
     good, tempting, bad = (0.2, 0.5), (0.6, 0.5), (0.9, 0.9)
     costs = [0.18, 0.22, 0.25, 0.15, 0.2, 0.05, 0.6, 0.55, 0.5, 0.62, 0.9, 0.92]  # 0.05: one lucky pour
     data = data_of([good] * 5 + [tempting] * 5 + [bad] * 2, costs)
-    answer = propose(SuggestProblem(PLANE, data, count=0))
+    answer = propose(RegressionQuery(PLANE, data))
     assert answer.best_point == good
     assert answer.best_mean == pytest.approx(0.2, abs=0.1)
 
@@ -124,19 +126,19 @@ def test_the_best_point_is_not_the_luckiest():
 def test_points_that_are_still_out_are_not_asked_for_again():
     points = cover(12, 1)
     data = data_of(points, bowl(points))
-    alone = propose(SuggestProblem(PLANE, data)).points[0]
-    beside = propose(SuggestProblem(PLANE, data, pending=(alone,))).points[0]
+    alone = propose(MinimumQuery(PLANE, data)).points[0]
+    beside = propose(MinimumQuery(PLANE, data, pending=(alone,))).points[0]
     assert math.dist(alone, beside) > 0.05
-    several = propose(SuggestProblem(PLANE, data, count=4)).points
+    several = propose(MinimumQuery(PLANE, data, count=4)).points
     assert min(math.dist(p, q) for i, p in enumerate(several) for q in several[:i]) > 0.05
 
 
 def test_without_data_points_are_spread_over_the_cube():
-    points = np.array(propose(SuggestProblem(PLANE, Data(), count=8, seed=5)).points)
+    points = np.array(propose(MinimumQuery(PLANE, Data(), count=8, seed=5)).points)
     quarters = {(int(2 * x), int(2 * y)) for x, y in points}
     assert len(quarters) == 4
     one = Data(((0.1, 0.1),), (0.5,))
-    assert math.dist(propose(SuggestProblem(PLANE, one)).points[0], (0.1, 0.1)) > 0.5
+    assert math.dist(propose(MinimumQuery(PLANE, one)).points[0], (0.1, 0.1)) > 0.5
 
 
 def test_simulations_are_the_prior_mean_and_pours_correct_it():
@@ -144,10 +146,10 @@ def test_simulations_are_the_prior_mean_and_pours_correct_it():
     sims = data_of(simulated, bowl(simulated))
     shifted = cover(6, 3)
     places = ((0.2, 0.2), (0.3, 0.6), tuple(map(float, shifted[0])))
-    prior = propose(SuggestProblem(PLANE, Data(), mean="simulated", simulated=sims, count=0, predict_at=places))
+    prior = propose(PourQuery(PLANE, Data(), simulated=sims, count=0, predict_at=places))
     assert prior.predictions == pytest.approx(bowl(places), abs=0.05)
     real = data_of(shifted, bowl(shifted) + 0.4)  # reality spills 0.4 more everywhere
-    corrected = propose(SuggestProblem(PLANE, real, mean="simulated", simulated=sims, count=0, predict_at=places))
+    corrected = propose(PourQuery(PLANE, real, simulated=sims, count=0, predict_at=places))
     assert corrected.predictions[2] == pytest.approx(bowl(places)[2] + 0.4, abs=0.1)
     assert corrected.predictions[1] > prior.predictions[1] + 0.15
 
@@ -156,18 +158,14 @@ def test_far_from_all_pours_the_simulations_are_believed():
     sims = data_of(cover(30, 2), bowl(cover(30, 2)))
     near = np.array([[0.1, 0.9], [0.2, 0.8]])
     far = ((0.95, 0.1), (0.9, 0.2))
-    question = SuggestProblem(
-        PLANE, data_of(near, bowl(near)), mean="simulated", simulated=sims, count=0, predict_at=far
-    )
+    question = PourQuery(PLANE, data_of(near, bowl(near)), simulated=sims, count=0, predict_at=far)
     assert propose(question).predictions == pytest.approx(bowl(far), abs=0.1)
 
 
 def test_first_pour_goes_to_the_minimum_of_the_simulated_surrogate():
     simulated = cover(30, 2)
     sims = data_of(simulated, bowl(simulated))
-    first = propose(
-        SuggestProblem(PLANE, Data(), mean="simulated", simulated=sims, acquisition="posterior_minimum", count=3)
-    )
+    first = propose(PourQuery(PLANE, Data(), simulated=sims, acquisition="posterior_minimum", count=3))
     assert math.dist(first.points[0], (0.3, 0.6)) < 0.08
     assert min(math.dist(first.points[0], p) for p in first.points[1:]) > 0.03
 
@@ -176,11 +174,8 @@ def test_a_mean_absolute_difference_is_minimised_over_its_context():
     # d(x, z) = x − z: the mean of |x − z| over z is least at the median of z, here 0.2, while the mean of z is 0.38
     line = Space((Axis("x", 0.0, 1.0),))
     joint = cover(40, 6)
-    problem = SuggestProblem(
-        line,
-        data_of(joint, joint[:, 0] - joint[:, 1]),
-        acquisition="posterior_minimum",
-        context=((0.1,), (0.15,), (0.2,), (0.55,), (0.9,)),
+    problem = CalibrationQuery(
+        line, data_of(joint, joint[:, 0] - joint[:, 1]), contexts=((0.1,), (0.15,), (0.2,), (0.55,), (0.9,))
     )
     answer = propose(problem)
     assert answer.points[0][0] == pytest.approx(0.2, abs=0.04)
@@ -189,7 +184,7 @@ def test_a_mean_absolute_difference_is_minimised_over_its_context():
 
 def test_the_map_has_the_second_axis_in_its_rows():
     points = cover(30, 7)
-    answer = propose(SuggestProblem(PLANE, data_of(points, points[:, 1]), count=0, map_resolution=5))
+    answer = propose(RegressionQuery(PLANE, data_of(points, points[:, 1]), map_resolution=5))
     mean = np.array(answer.surrogate.mean)
     assert mean.shape == (5, 5)
     assert mean[:, 2] == pytest.approx(np.linspace(0, 1, 5), abs=0.1)
@@ -200,7 +195,7 @@ def test_of_many_axes_the_map_shows_the_two_that_matter_through_the_best_place()
     box = Space(tuple(Axis(name, 0.0, 1.0) for name in "vwxyz"))
     points = cover(60, 9, dimension=5)
     costs = 2.0 * ((points[:, [1, 3]] - (0.3, 0.6)) ** 2).sum(axis=1) + 0.1 * points[:, 4]
-    asked = SuggestProblem(box, data_of(points, costs), acquisition="posterior_minimum", map_resolution=5, seed=1)
+    asked = MinimumQuery(box, data_of(points, costs), acquisition="posterior_minimum", map_resolution=5, seed=1)
     answer = propose(asked)
     drawn = answer.surrogate
     assert drawn.axes == ("w", "y")
@@ -217,7 +212,7 @@ def test_without_a_minimiser_the_map_goes_through_the_best_place_that_was_observ
     box = Space(tuple(Axis(name, 0.0, 1.0) for name in "xyz"))
     points = cover(20, 3, dimension=3)
     for acquisition, count in (("lcb", 2), ("posterior_minimum", 0)):
-        asked = SuggestProblem(box, data_of(points, bowl(points[:, :2])), acquisition=acquisition, count=count)
+        asked = MinimumQuery(box, data_of(points, bowl(points[:, :2])), acquisition=acquisition, count=count)
         answer = propose(replace(asked, map_resolution=3))
         assert answer.surrogate.at == answer.best_point
 
@@ -225,16 +220,14 @@ def test_without_a_minimiser_the_map_goes_through_the_best_place_that_was_observ
 def test_around_a_simulated_mean_the_simulations_say_which_axes_matter():
     box = Space(tuple(Axis(name, 0.0, 1.0) for name in "xyz"))
     cheap, dear = cover(40, 4, dimension=3), cover(3, 5, dimension=3)
-    asked = SuggestProblem(
-        box, data_of(dear, bowl(dear[:, 1:])), mean="simulated", simulated=data_of(cheap, bowl(cheap[:, 1:])), count=0
-    )
+    asked = PourQuery(box, data_of(dear, bowl(dear[:, 1:])), simulated=data_of(cheap, bowl(cheap[:, 1:])), count=0)
     assert propose(replace(asked, map_resolution=3)).surrogate.axes == ("y", "z")
 
 
 def test_a_suggestion_at_a_hundred_points_takes_far_less_than_a_simulation():
     points = cover(100, 8)
     costs = bowl(points) + 0.1 * np.random.default_rng(8).standard_normal(100)
-    problem = SuggestProblem(PLANE, data_of(points, costs))
+    problem = MinimumQuery(PLANE, data_of(points, costs))
     assert min(propose(problem).seconds for _ in range(3)) < 0.25  # 0.03 s where nothing else runs
 
 
@@ -244,7 +237,7 @@ def test_once_costs_show_structure_less_is_given_for_the_unknown():
 
     def excess(costs, kappa, **changes):
         """By how much the proposal misses the least m − κ s of a cover."""
-        problem = SuggestProblem(PLANE, Data(points, tuple(costs)), kappa=2.0, seed=1, predict_at=cover)
+        problem = MinimumQuery(PLANE, Data(points, tuple(costs)), kappa=2.0, seed=1, predict_at=cover)
         answer = propose(replace(problem, **changes))
         bound = np.array(answer.predictions) - kappa * np.array(answer.prediction_deviations)
         return (answer.means[0] - kappa * answer.deviations[0] - bound.min()) / np.std(costs)
@@ -263,7 +256,7 @@ def test_asked_plainly_it_does_not_leave_the_bound_to_fill_space_on_a_plateau():
 
     def excess(plain):
         """By how much the proposal misses the least m − 2 s of a cover."""
-        answer = propose(SuggestProblem(PLANE, Data(points, costs), seed=1, predict_at=everywhere, plain=plain))
+        answer = propose(MinimumQuery(PLANE, Data(points, costs), seed=1, predict_at=everywhere, plain=plain))
         bound = np.array(answer.predictions) - 2.0 * np.array(answer.prediction_deviations)
         return (answer.means[0] - 2.0 * answer.deviations[0] - bound.min()) / np.std(costs)
 

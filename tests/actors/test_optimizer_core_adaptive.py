@@ -6,16 +6,25 @@ import numpy as np
 import pytest
 
 from actors.optimizer.gaussian_process import highest_density_intervals
-from actors.optimizer.knowledge_gradient import foreseen
-from actors.optimizer.question_checks import Asked
-from actors.optimizer.questions import BenchOffset, Data, Limit, ModelDiscrepancy, Play, SuggestProblem
+from actors.optimizer.knowledge_gradient import predicted_minimum
+from actors.optimizer.questions import (
+    BenchOffset,
+    Data,
+    Limit,
+    MinimumQuery,
+    ModelDiscrepancy,
+    OffsetPrior,
+    PourQuery,
+    SimulationQuery,
+    SuggestionQuery,
+)
 from actors.optimizer.suggest import propose
-from actors.optimizer.surrogate_models import fit
+from actors.optimizer.surrogate_models import QueryArrays, fit
 from orchestrator.journal.codec import canonical, from_json, to_json
 from sim_engine.search_space import Axis, Space
 
 PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
-PLAY = (Play(shift=0.14), Play(factor=0.05, origin=0.2))
+PRIORS = (OffsetPrior(shift=0.14), OffsetPrior(factor=0.05, origin=0.2))
 ASK = tuple((x, y) for x in (0.15, 0.4, 0.65, 0.9) for y in (0.1, 0.35, 0.6, 0.85))
 MOVED = (0.12, 0.0)
 
@@ -41,17 +50,16 @@ def shelf(points):
     return 0.066 + 0.9 * np.clip(0.35 - y, 0.0, 0.35) / 0.35
 
 
-def asked(simulator, poured, mean="adaptive", **changes):
-    """A question after 60 simulations and some pours."""
+def asked(simulator, poured, **changes):
+    """A query after 60 simulations and some pours."""
     simulated = np.random.default_rng(1).random((60, 2))
-    problem = SuggestProblem(
+    query = PourQuery(
         PLANE,
         data_of(poured, cup(poured)) if len(poured) else Data(),
-        mean=mean,
         simulated=data_of(simulated, simulator(simulated)),
-        mismatch=ModelDiscrepancy(PLAY, left=10) if mean == "adaptive" else None,
+        discrepancy=ModelDiscrepancy(PRIORS, pours_left=10),
     )
-    return replace(problem, **changes)
+    return replace(query, **changes)
 
 
 def error(answer):
@@ -60,7 +68,7 @@ def error(answer):
 
 def averaged(question):
     """The hypotheses as that question weighs them."""
-    return fit(question, Asked.of(question)).averaged
+    return fit(question, QueryArrays.of(question)).averaged
 
 
 POURED = [(0.47, 0.6), (0.3, 0.75), (0.42, 0.45), (0.2, 0.5)]
@@ -68,30 +76,33 @@ POURED = [(0.47, 0.6), (0.3, 0.75), (0.42, 0.45), (0.2, 0.5)]
 
 def test_pours_tell_by_how_much_the_receiver_is_displaced():
     answer = propose(asked(displaced, POURED, count=0, predict_at=ASK))
-    found = answer.mismatch
+    found = answer.discrepancy
     assert found.shifts[0] == pytest.approx(MOVED[0], abs=2.5 * found.deviations[0])
-    assert found.deviations[0] < 0.5 * propose(asked(displaced, [], count=0)).mismatch.deviations[0]
-    scaled = propose(asked(displaced, POURED, "scaled", count=0, predict_at=ASK))
-    assert error(answer) < error(scaled)
+    assert found.deviations[0] < 0.5 * propose(asked(displaced, [], count=0)).discrepancy.deviations[0]
+    query = asked(displaced, POURED)
+    scaled = SimulationQuery(PLANE, query.data, simulated=query.simulated, coupling="scaled", count=0, predict_at=ASK)
+    assert error(answer) < error(propose(scaled))
 
 
-def test_ignorance_grows_by_pours_that_no_displacement_explains_and_shrinks_by_those_that_are_as_simulated():
+def test_pours_that_no_displacement_explains_make_the_simulator_uninformative():
     poured = [(0.9, 0.1), (0.1, 0.1), (0.35, 0.6), (0.9, 0.9), (0.6, 0.3)]
-    right = propose(asked(cup, poured, count=0)).mismatch
-    wrong = propose(asked(lambda x: 1.0 - 0.8 * cup(x), poured, count=0)).mismatch
-    before = propose(asked(cup, [], count=0)).mismatch
-    assert before.ignorance == pytest.approx(0.08)
-    assert right.ignorance < 0.02
-    assert wrong.ignorance > 0.9
+    right = propose(asked(cup, poured, count=0)).discrepancy
+    wrong = propose(asked(lambda x: 1.0 - 0.8 * cup(x), poured, count=0)).discrepancy
+    before = propose(asked(cup, [], count=0)).discrepancy
+    assert before.uninformative == pytest.approx(0.08)
+    assert right.uninformative < 0.02
+    assert wrong.uninformative > 0.9
 
 
 def test_after_a_pour_that_lost_all_in_place_of_little_the_next_goes_where_the_simulator_sees_most_lost():
     question = asked(lambda x: 1.0 - 0.8 * cup(x), [], acquisition="least_loss", count=1)
     first = propose(question).points[0]
     assert cup(first)[0] > 0.9
-    second = propose(replace(question, data=data_of([first], cup(first)), mismatch=ModelDiscrepancy(PLAY, left=9)))
+    second = propose(
+        replace(question, data=data_of([first], cup(first)), discrepancy=ModelDiscrepancy(PRIORS, pours_left=9))
+    )
     assert cup(second.points[0])[0] < 0.1
-    assert second.mismatch.ignorance > 0.5
+    assert second.discrepancy.uninformative > 0.5
 
 
 @pytest.mark.parametrize(("simulated_width", "factor"), [(1.4, 1.1), (0.7, 0.95)])
@@ -108,24 +119,25 @@ def test_a_pour_where_hypotheses_differ_promises_more_than_one_where_all_is_lost
     model = averaged(asked(displaced, [(0.9, 0.1)]))
     everywhere = np.random.default_rng(0).random((200, 2))
     now = float(model.predict(everywhere)[0].min())
-    slope, plateau = foreseen(model, np.array([(0.6, 0.6), (0.95, 0.05)]), everywhere)
+    slope, plateau = predicted_minimum(model, np.array([(0.6, 0.6), (0.95, 0.05)]), everywhere)
     assert slope < 0.8 * now
     assert plateau == pytest.approx(now, rel=0.05)
 
 
 def test_with_pours_to_follow_the_first_one_goes_where_it_tells_more():
     question = asked(shelf, [], acquisition="least_loss")
-    last, first = propose(replace(question, mismatch=replace(question.mismatch, left=0))), propose(question)
+    last, first = propose(replace(question, discrepancy=replace(question.discrepancy, pours_left=0))), propose(question)
     assert first.means[0] > last.means[0]
     model, everywhere = averaged(question), np.random.default_rng(0).random((200, 2))
-    after_first, after_last = foreseen(model, np.array([first.points[0], last.points[0]]), everywhere)
+    after_first, after_last = predicted_minimum(model, np.array([first.points[0], last.points[0]]), everywhere)
     assert after_first < after_last
 
 
 def test_a_pour_that_is_not_to_look_ahead_goes_where_least_is_lost():
     question = asked(shelf, [], acquisition="least_loss")
     ahead, here = (
-        propose(replace(question, mismatch=replace(question.mismatch, looks_ahead=looks))) for looks in (True, False)
+        propose(replace(question, discrepancy=replace(question.discrepancy, lookahead=looks)))
+        for looks in (True, False)
     )
     assert here.means[0] < ahead.means[0]
     everywhere = tuple((x, y) for x in np.linspace(0, 1, 21) for y in np.linspace(0, 1, 21))
@@ -155,27 +167,27 @@ def test_most_pours_lie_in_the_bands_that_come_with_them():
 def test_with_something_good_in_hand_no_unknown_corner_is_tried():
     poured = [*POURED, (0.35, 0.6)]
     careful = propose(asked(cup, poured, acquisition="least_loss"))
-    daring = propose(asked(cup, poured, "constant", acquisition="lcb", plain=True))
+    daring = propose(MinimumQuery(PLANE, data_of(poured, cup(poured)), plain=True))
     assert cup(careful.points[0])[0] < 0.02 < cup(daring.points[0])[0]
-    assert careful.mismatch.gain < 0.02
+    assert careful.discrepancy.gain < 0.02
 
 
 def test_with_nothing_in_hand_the_pours_that_follow_make_it_worth_looking_elsewhere():
     poured = [(0.1, 0.1), (0.9, 0.1)]
     wrong = asked(lambda x: 1.0 - 0.8 * cup(x), poured, acquisition="least_loss")
-    last = propose(replace(wrong, mismatch=replace(wrong.mismatch, left=0)))
+    last = propose(replace(wrong, discrepancy=replace(wrong.discrepancy, pours_left=0)))
     first = propose(wrong)
-    assert first.mismatch.gain > 0.1
+    assert first.discrepancy.gain > 0.1
     assert first.means[0] > last.means[0]
 
 
 def test_a_limit_is_kept_where_any_action_keeps_it_and_told_where_none_does():
     limit = Limit(0.1, 0.05)
     question = asked(displaced, [*POURED, (0.35, 0.6)], acquisition="least_loss")
-    kept = propose(replace(question, mismatch=replace(question.mismatch, limit=limit))).mismatch
+    kept = propose(replace(question, discrepancy=replace(question.discrepancy, limit=limit))).discrepancy
     assert kept.least_exceedance <= kept.exceedances[0] <= limit.probability
     hopeless = asked(lambda x: 1.0 - 0.8 * cup(x), [(0.1, 0.1)], acquisition="least_loss")
-    told = propose(replace(hopeless, mismatch=replace(hopeless.mismatch, limit=limit))).mismatch
+    told = propose(replace(hopeless, discrepancy=replace(hopeless.discrepancy, limit=limit))).discrepancy
     assert told.least_exceedance > limit.probability
 
 
@@ -187,11 +199,11 @@ def test_simulations_beside_a_pour_are_made_around_what_is_in_doubt():
 
 
 def test_what_was_learnt_with_one_receiver_makes_the_first_prediction_for_the_next_better():
-    learnt = propose(asked(displaced, POURED, count=0)).mismatch.drawn
+    learnt = propose(asked(displaced, POURED, count=0)).discrepancy.drawn
     assert len(learnt) == 64
     assert isinstance(learnt[0], BenchOffset)
     fresh = asked(displaced, [], count=0, predict_at=ASK)
-    told = replace(fresh, mismatch=replace(fresh.mismatch, drawn=learnt))
+    told = replace(fresh, discrepancy=replace(fresh.discrepancy, drawn=learnt))
     assert error(propose(told)) < 0.9 * error(propose(fresh))
 
 
@@ -208,7 +220,7 @@ def test_the_order_of_what_is_known_changes_no_bit():
 
 def test_question_and_answer_survive_the_journal():
     question = asked(displaced, POURED, acquisition="least_loss", count=2)
-    assert from_json(to_json(question, SuggestProblem), SuggestProblem) == question
+    assert from_json(to_json(question, SuggestionQuery), SuggestionQuery) == question
     answer = propose(question)
     text = canonical(to_json(answer, type(answer)))
     assert canonical(to_json(from_json(to_json(answer, type(answer)), type(answer)), type(answer))) == text
@@ -220,7 +232,7 @@ def test_a_cost_in_another_unit_is_the_same_question():
         question,
         data=Data(question.data.points, tuple(200.0 * c for c in question.data.costs)),
         simulated=Data(question.simulated.points, tuple(200.0 * c for c in question.simulated.costs)),
-        mismatch=replace(question.mismatch, worst=200.0),
+        discrepancy=replace(question.discrepancy, worst=200.0),
     )
     assert propose(grams).means[0] == pytest.approx(200.0 * propose(question).means[0], rel=0.05, abs=0.5)
 
@@ -228,9 +240,8 @@ def test_a_cost_in_another_unit_is_the_same_question():
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"mismatch": None}, "needs a mismatch"),
-        ({"mismatch": ModelDiscrepancy(PLAY[:1])}, "axes"),
-        ({"mean": "scaled", "mismatch": ModelDiscrepancy(PLAY)}, "no other mean"),
+        ({"acquisition": "least_loss", "discrepancy": None}, "needs a discrepancy"),
+        ({"discrepancy": ModelDiscrepancy(PRIORS[:1])}, "axes"),
     ],
 )
 def test_a_question_that_makes_no_sense_is_refused(changes, text):

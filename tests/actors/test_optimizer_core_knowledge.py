@@ -12,13 +12,13 @@ from actors.optimizer.gaussian_process import (
     joint_process,
     simulated_mean_process,
 )
-from actors.optimizer.questions import Data, SearchEffort, Suggestion, SuggestProblem
+from actors.optimizer.questions import Data, SearchEffort, SimulationQuery, Suggestion
 from actors.optimizer.suggest import propose
 from orchestrator.journal.codec import from_json, to_json
 from sim_engine.search_space import Axis, Space
 
 PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
-INFORMED = ("simulated", "scaled")
+COUPLINGS = ("residual", "scaled")
 
 
 def points_of(count, seed=0):
@@ -35,20 +35,20 @@ def cup(points, centre=(0.35, 0.6)):
     return 1.0 - np.exp(-((3.0 * np.maximum(radius - 0.15, 0.0)) ** 1.5))
 
 
-def asked(mean="scaled", *, simulations=12, pours=3, **changes):
+def asked(coupling="scaled", *, simulations=12, pours=3, **changes):
     simulated, real = points_of(simulations, 1), points_of(pours, 2)
-    return SuggestProblem(
+    return SimulationQuery(
         PLANE,
         data_of(real, cup(real)),
-        mean=mean,
+        coupling=coupling,
         simulated=data_of(simulated, cup(simulated)),
-        **{"acquisition": "knowledge", "count": 3, **changes},
+        **{"count": 3, **changes},
     )
 
 
-@pytest.mark.parametrize("mean", INFORMED)
-def test_what_simulations_are_worth_is_a_loss_that_can_be_journalled(mean):
-    answer = propose(asked(mean))
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_what_simulations_gain_is_a_loss_that_can_be_journalled(coupling):
+    answer = propose(asked(coupling))
     assert len(answer.points) == len(answer.values) == 3
     assert all(0.0 <= value <= 2.0 for value in (*answer.values, answer.pour_value))
     assert answer.values[0] > 0.0
@@ -56,15 +56,15 @@ def test_what_simulations_are_worth_is_a_loss_that_can_be_journalled(mean):
     assert from_json(to_json(answer, Suggestion), Suggestion) == answer
 
 
-@pytest.mark.parametrize("mean", INFORMED)
-def test_a_simulation_removes_as_much_doubt_as_was_foretold(mean):
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_a_simulation_removes_as_much_doubt_as_was_predicted(coupling):
     """The covariance after one more simulation, hyperparameters kept, is what conditioning says of the one before."""
     simulated, real, ask = points_of(15, 1), points_of(4, 2), points_of(6, 3)
     place = np.array([[0.4, 0.55]])
 
     def fitted(points, costs, thetas=(None, None)):
         searches = [HyperparameterSearch() if theta is None else HyperparameterSearch(theta, 0) for theta in thetas]
-        if mean != "simulated":
+        if coupling == "scaled":
             return joint_process(points, costs, real, cup(real), search=searches[0])
         prior = constant_mean_process(points, costs, search=searches[0])
         process = simulated_mean_process(prior, real, cup(real), search=searches[1])
@@ -72,14 +72,14 @@ def test_a_simulation_removes_as_much_doubt_as_was_foretold(mean):
         return process
 
     before = fitted(simulated, cup(simulated))
-    thetas = (before.prior.theta, before.theta) if mean == "simulated" else (before.theta, None)
+    thetas = (before.prior.theta, before.theta) if coupling == "residual" else (before.theta, None)
     joint = before.joint_covariance(place, ask)
-    foretold = joint[1:, 1:] - np.outer(joint[1:, 0], joint[0, 1:]) / (joint[0, 0] + before.simulated_noise**2)
+    predicted = joint[1:, 1:] - np.outer(joint[1:, 0], joint[0, 1:]) / (joint[0, 0] + before.simulated_noise**2)
     longer = np.concatenate([simulated, place])
     after = fitted(longer, np.append(cup(simulated), 0.3), thetas)
     found = after.covariance(ask, ask) * (before.scale / after.scale) ** 2  # hyperparameters are in units of the scale
-    assert found == pytest.approx(foretold, rel=1e-4, abs=1e-7)
-    assert np.trace(foretold) < 0.999 * np.trace(before.covariance(ask, ask))
+    assert found == pytest.approx(predicted, rel=1e-4, abs=1e-7)
+    assert np.trace(predicted) < 0.999 * np.trace(before.covariance(ask, ask))
 
 
 def test_where_simulations_have_told_all_they_can_only_a_pour_is_worth_anything():
@@ -106,14 +106,11 @@ def test_simulations_go_where_the_best_action_may_be_and_not_onto_the_plateau():
     assert max(cup(np.array(answer.points))) < 0.3
 
 
-def test_knowledge_is_about_simulations():
-    with pytest.raises(ValueError, match="'constant' knows none"):
-        propose(asked("constant"))
-
-
-@pytest.mark.parametrize("mean", INFORMED)
-def test_a_fit_that_goes_on_from_the_last_one_finds_the_same_model_for_less(mean):
-    question = asked(mean, simulations=40, pours=5, count=0, predict_at=((0.3, 0.5), (0.9, 0.1)), effort=SearchEffort())
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_a_fit_that_goes_on_from_the_last_one_finds_the_same_model_for_less(coupling):
+    question = asked(
+        coupling, simulations=40, pours=5, count=0, predict_at=((0.3, 0.5), (0.9, 0.1)), effort=SearchEffort()
+    )
     fresh = propose(question)
     kept = propose(replace(question, effort=SearchEffort(fresh.fitted, 0)))
     assert kept.fitted == fresh.fitted

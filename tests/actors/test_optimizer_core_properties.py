@@ -8,12 +8,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from actors.optimizer.questions import Data, Linear, SearchEffort, SuggestProblem
+from actors.optimizer.questions import Data, Linear, MinimumQuery, PourQuery, SearchEffort, SimulationQuery
 from actors.optimizer.suggest import propose
 from sim_engine.search_space import Axis, Space
 from tests.support.hypothesis_examples import examples
 
-MEANS = ("constant", "zero", "simulated", "scaled")
+MEANS = ("constant", "zero", "simulated")
 axes = st.sampled_from(
     [
         Axis("", 0.0, 1.0),
@@ -48,35 +48,39 @@ def questions(draw):
         axis = space.axes[0]
         middle = axis.decode(0.7)
         constraints = (Linear(((axis.name, 1.0),), middle),)
-    mean = draw(st.sampled_from(MEANS))
-    acquisitions = ["lcb", "posterior_minimum", "random", "sobol"]
-    acquisitions += ["knowledge"] if mean in ("simulated", "scaled") else []
-    return SuggestProblem(
-        space,
-        data(12),
-        pending=tuple(draw(st.lists(point, max_size=3))),
-        count=draw(st.integers(0, 3)),
-        seed=draw(st.integers(0, 2**31)),
-        mean=mean,
-        simulated=data(8),
-        acquisition=draw(st.sampled_from(acquisitions)),
-        pouring=tuple(draw(st.lists(point, max_size=2))),
-        effort=draw(st.sampled_from([None, SearchEffort()])),
-        infeasible=tuple(draw(st.lists(point, max_size=3))),
-        failed=tuple(draw(st.lists(point, max_size=3))),
-        constraints=constraints,
-        noise=draw(st.sampled_from(["constant", "varying"])),
-    )
+    parts = {
+        "pending": tuple(draw(st.lists(point, max_size=3))),
+        "count": draw(st.integers(0, 3)),
+        "seed": draw(st.integers(0, 2**31)),
+        "effort": draw(st.sampled_from([None, SearchEffort()])),
+        "infeasible": tuple(draw(st.lists(point, max_size=3))),
+        "failed": tuple(draw(st.lists(point, max_size=3))),
+        "constraints": constraints,
+        "noise": draw(st.sampled_from(["constant", "varying"])),
+    }
+    kind = draw(st.sampled_from([MinimumQuery, PourQuery, SimulationQuery]))
+    if kind is SimulationQuery:
+        parts["coupling"] = draw(st.sampled_from(["residual", "scaled"]))
+        parts["pouring"] = tuple(draw(st.lists(point, max_size=2)))
+    else:
+        parts["acquisition"] = draw(st.sampled_from(["lcb", "posterior_minimum"]))
+    if kind is MinimumQuery:
+        parts["mean"] = draw(st.sampled_from(["constant", "zero"]))
+    else:
+        parts["simulated"] = data(8)
+    return kind(space, data(12), **parts)
 
 
-SQUARES_TO_ZERO = SuggestProblem(
+def simulations_of(query):
+    return getattr(query, "simulated", Data())
+
+
+SQUARES_TO_ZERO = SimulationQuery(
     Space((Axis("x0", 0.0, 1.0), Axis("x1", 0.0, 1.0))),
     Data((), ()),
     count=0,
     seed=0,
-    mean="simulated",
     simulated=Data(((0.0, 0.0), (0.0, 0.0)), (0.0, 8.64e-207)),
-    acquisition="knowledge",
 )
 """Costs other than zero whose squares are zero as floats."""
 
@@ -85,9 +89,9 @@ SQUARES_TO_ZERO = SuggestProblem(
 @given(question=questions())
 @example(question=SQUARES_TO_ZERO)
 @example(question=replace(SQUARES_TO_ZERO, count=2))
-@example(question=replace(SQUARES_TO_ZERO, mean="scaled", count=1))
+@example(question=replace(SQUARES_TO_ZERO, coupling="scaled", count=1))
 @example(question=replace(SQUARES_TO_ZERO, data=SQUARES_TO_ZERO.simulated, count=1))
-@example(question=replace(SQUARES_TO_ZERO, data=SQUARES_TO_ZERO.simulated, mean="zero", acquisition="lcb", count=1))
+@example(question=MinimumQuery(SQUARES_TO_ZERO.space, SQUARES_TO_ZERO.simulated, mean="zero"))
 def test_proposals_are_finite_and_keep_to_bounds_whole_numbers_and_constraints(question):
     answer = propose(question)
     assert len(answer.points) == question.count
@@ -102,9 +106,9 @@ def test_proposals_are_finite_and_keep_to_bounds_whole_numbers_and_constraints(q
     assert all(map(math.isfinite, (*answer.means, *answer.deviations, *answer.noises, *answer.feasibilities)))
     assert all(s > 0.0 for s in (*answer.deviations, *answer.noises))
     assert all(0.0 <= p <= 1.0 for p in answer.feasibilities)
-    worth = (*answer.values, *(() if answer.pour_value is None else (answer.pour_value,)))
-    most = max(map(abs, (*question.data.costs, *question.simulated.costs, 1.0)))
-    assert all(0.0 <= value <= 20.0 * most for value in worth)
+    gains = (*answer.values, *(() if answer.pour_value is None else (answer.pour_value,)))
+    most = max(map(abs, (*question.data.costs, *simulations_of(question).costs, 1.0)))
+    assert all(0.0 <= value <= 20.0 * most for value in gains)
 
 
 @settings(max_examples=examples(40), deadline=None)
@@ -121,7 +125,7 @@ def test_who_answers_first_changes_nothing(question, shuffle):
     other = replace(
         question,
         data=shuffled(question.data),
-        simulated=shuffled(question.simulated),
+        **({"simulated": shuffled(question.simulated)} if len(simulations_of(question)) else {}),
         pending=tuple(pending),
         infeasible=tuple(refused),
         failed=tuple(failed),
@@ -137,7 +141,7 @@ def test_who_answers_first_changes_nothing(question, shuffle):
 def test_a_number_that_is_none_is_refused_and_never_fitted(question, where, bad):
     places = []
     for name in ("data", "simulated"):
-        data = getattr(question, name)
+        data = getattr(question, name, Data())
         for i in range(len(data)):
             costs = (*data.costs[:i], bad, *data.costs[i + 1 :])
             places.append({name: Data(data.points, costs)})
@@ -147,6 +151,13 @@ def test_a_number_that_is_none_is_refused_and_never_fitted(question, where, bad)
         places += [{name: ((bad,) * question.space.dimension,)}]
     with pytest.raises(ValueError, match=r"cost \d+ is|point \d+"):
         propose(replace(question, **places[where % len(places)]))
+
+
+def query_with(mean, space, data, simulated, **parts):
+    """A query with that prior mean."""
+    if mean == "simulated":
+        return PourQuery(space, data, simulated=simulated, **parts)
+    return MinimumQuery(space, data, mean=mean, **parts)
 
 
 @pytest.mark.parametrize("mean", MEANS)
@@ -159,7 +170,7 @@ def test_the_unit_of_the_cost_changes_no_proposal(mean, scale):
     def answered(unit):
         data = Data(points[:6], tuple(unit * c for c in costs[:6]))
         cheap = Data(points[6:], tuple(unit * c for c in costs[6:]))
-        return propose(SuggestProblem(space, data, mean=mean, simulated=cheap, acquisition="posterior_minimum"))
+        return propose(query_with(mean, space, data, cheap, acquisition="posterior_minimum"))
 
     assert answered(scale).points[0] == pytest.approx(answered(1.0).points[0], abs=0.02)
 
@@ -170,7 +181,7 @@ def test_on_a_plateau_of_noise_not_only_the_faces_of_the_cube_are_tried():
     data = Data()
     inside = 0
     for step in range(20):
-        (point,) = propose(SuggestProblem(space, data, seed=step)).points
+        (point,) = propose(MinimumQuery(space, data, seed=step)).points
         data = data.added(point, min(1.0, 1.0 + 0.12 * rng.standard_normal()))
         inside += step >= 5 and all(0.1 < u < 0.9 for u in point)
     assert inside >= 2
@@ -183,5 +194,5 @@ def test_many_duplicates_and_a_hundred_points_are_no_trouble(dimension):
     points = np.repeat(rng.random((10, dimension)), 10, axis=0)
     data = Data(tuple(map(tuple, points.tolist())), tuple(rng.random(100).tolist()))
     for mean in MEANS:
-        answer = propose(SuggestProblem(space, data, mean=mean, simulated=data, noise="varying"))
+        answer = propose(query_with(mean, space, data, data, noise="varying"))
         assert all(map(math.isfinite, (*answer.means, *answer.deviations)))

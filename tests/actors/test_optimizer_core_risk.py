@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from actors.optimizer.gaussian_process import constant_mean_process
-from actors.optimizer.questions import Data, Disturbance, Risk, SuggestProblem
+from actors.optimizer.questions import Data, Disturbance, MinimumQuery, Risk, RiskQuery
 from actors.optimizer.risk_measures import RiskProcess, conditional_value_at_risk
 from actors.optimizer.suggest import propose
 from sim_engine.search_space import Axis, Space
@@ -89,19 +89,17 @@ def test_the_best_action_bears_the_errors() -> None:
 
     places = np.linspace(0.0, 1.0, 41)
     data = Data(tuple((float(x),) for x in places), tuple(cost(float(x)) for x in places))
-    problem = SuggestProblem(SPACE, data, acquisition="posterior_minimum", seed=1)
+    problem = MinimumQuery(SPACE, data, acquisition="posterior_minimum", seed=1)
     assert abs(propose(problem).points[0][0] - 0.2) < 0.03
     risk = Risk(shifted(np.linspace(-0.12, 0.12, 21)), 0.0)
-    answer = propose(
-        SuggestProblem(SPACE, data, acquisition="posterior_minimum", seed=1, risk=risk, predict_at=data.points)
-    )
+    answer = propose(RiskQuery(SPACE, data, acquisition="posterior_minimum", seed=1, risk=risk, predict_at=data.points))
     assert abs(answer.points[0][0] - 0.7) < 0.1
     assert answer.best_point is not None
     assert abs(answer.best_point[0] - 0.7) < 0.1
     assert answer.risk is not None
     index = data.points.index(answer.best_point)
     assert answer.risk.expected[index] == pytest.approx(answer.best_mean)
-    cvar = propose(SuggestProblem(SPACE, data, count=0, risk=Risk(risk.disturbances, 0.8), predict_at=((0.7,),)))
+    cvar = propose(RiskQuery(SPACE, data, count=0, risk=Risk(risk.disturbances, 0.8), predict_at=((0.7,),)))
     assert cvar.best_mean is not None
     assert cvar.best_mean > answer.risk.expected[index]
     assert cvar.risk is not None
@@ -118,6 +116,6 @@ def test_a_question_about_risk_that_can_not_be_answered_says_why() -> None:
         (Risk((Disturbance((1.0,), (float("nan"),)),)), "not finite"),
     ):
         with pytest.raises(ValueError, match=complaint):
-            propose(SuggestProblem(SPACE, data, risk=risk, predict_at=((0.1,),)))
+            propose(RiskQuery(SPACE, data, risk=risk, predict_at=((0.1,),)))
     with pytest.raises(ValueError, match="predict_at"):
-        propose(SuggestProblem(SPACE, data, risk=good))
+        propose(RiskQuery(SPACE, data, risk=good))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from actors.interfaces import SimulationError
-from actors.simulators.task_transfer import Packer, unpack
+from actors.simulators.ray_worker import Packer, unpack
 from sim_engine.vessel.shapes import MeshShape, VesselSpec
 from sim_engine.vessel.vessel import build_vessel
 

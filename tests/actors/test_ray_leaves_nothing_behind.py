@@ -17,9 +17,8 @@ import pytest
 
 from actors.interfaces import LaboratoryError
 from actors.laboratory_settings import LaboratorySpec
-from actors.runtime import private_ray as ray_private
 from actors.runtime import ray_runtime
-from actors.runtime.child_process import ChildProcess, child_environment
+from actors.runtime.child_process import child_environment
 from tests.support.waiting import PATIENCE
 
 pytestmark = pytest.mark.ray
@@ -160,20 +159,20 @@ def test_clusters_of_dead_programs_are_removed_and_those_of_living_ones_kept(tmp
     )
     try:
         holder.stdout.readline()
-        assert ray_private.prune_clusters(tmp_path) == [dead]
+        assert ray_runtime.prune_clusters(tmp_path) == [dead]
         assert not dead.exists()
         assert alive.exists()
     finally:
         holder.kill()
         holder.communicate()
-    assert ray_private.prune_clusters(tmp_path) == [alive]
+    assert ray_runtime.prune_clusters(tmp_path) == [alive]
 
 
 @pytest.mark.realtime
 def test_a_ray_of_somebody_else_in_this_process_is_neither_taken_over_nor_ended(ray_running, monkeypatch):
     import ray
 
-    monkeypatch.setattr(ray_runtime, "_cluster", None)
+    monkeypatch.setattr(ray_runtime, "_session", None)
     with pytest.raises(LaboratoryError, match="Ray of its own"):
         ray_runtime.start_ray(LaboratorySpec("late"))
     assert ray.is_initialized()
@@ -188,10 +187,7 @@ def test_logs_of_workers_that_are_gone_are_removed_and_those_of_living_ones_kept
              for pid in (gone.pid, os.getpid())}  # fmt: skip
     for name in [*names[gone.pid], *names[os.getpid()], "raylet.out", "python-core-driver-01_1.log"]:
         (logs / name).write_text("a line")
-    warden = ChildProcess(["true"])
-    with (tmp_path / "alive").open("w") as lock:
-        assert ray_private.forget_logs(ray_private.PrivateRay(tmp_path, lock, warden)) == 3
-    warden.close()
+    assert ray_runtime.forget_ray_logs(tmp_path) == 3
     assert {path.name for path in logs.iterdir()} == {
         *names[os.getpid()], "raylet.out", "python-core-driver-01_1.log"
     }  # fmt: skip

@@ -12,6 +12,7 @@ import psutil
 import pytest
 
 from tests.reliability import strikes
+from tests.support.waiting import PATIENCE
 
 pytestmark = pytest.mark.ray
 
@@ -20,9 +21,9 @@ ROOT = Path(__file__).parents[2]
 PROGRAM = """
 import asyncio, json, sys
 from actors.laboratory import open_laboratory
-from actors.optimizer.questions import Data, SuggestProblem
+from actors.optimizer.questions import ()
 from actors.laboratory_settings import LaboratorySpec
-from actors.simulators.shared_pool import WarmSimulators
+from actors.laboratory import WarmSimulators
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
 from sim_engine.scene import PourTask
@@ -41,7 +42,7 @@ async def tell(asked):
     print(json.dumps(answer), flush=True)
 
 async def questions(simulators, optimizer):
-    problem = SuggestProblem(space=Space((Axis("a", 0.0, 1.0),)), data=Data(((0.2,), (0.8,)), (1.0, 2.0)))
+    problem = SuggestionQuery(space=Space((Axis("a", 0.0, 1.0),)), data=Data(((0.2,), (0.8,)), (1.0, 2.0)))
     await simulators.simulate(TASK)
     await optimizer.suggest(problem)
     print(json.dumps("ready"), flush=True)
@@ -95,6 +96,9 @@ def test_whoever_asks_simulators_or_optimiser_is_told_what_ray_has_lost(whose: s
                     process.kill()
             else:
                 assert strikes.cut(p.pid for p in children if p.name() in ("raylet", "gcs_server")) > 2
+                # Ray ends its workers as soon as it notices; until then a quick simulation still has a result.
+                workers = [p for p in children if p.name() in ("ray::SimulatorProcess", "ray::Proposer")]
+                assert psutil.wait_procs(workers, PATIENCE)[1] == []
             program.stdin.write("\n")
             program.stdin.flush()
             simulator, optimiser, closing, said = [json.loads(line) for line in program.stdout if line[0] == '"']

@@ -7,29 +7,31 @@ from typing import Any
 
 import pytest
 
-from actors.simulators.shared_pool import AHEAD, FairPool
+from actors.simulators.pool import Greeting, WorkerPool, WorkerReply
 
 
-class Pool:
-    """Takes as long as the test wants."""
-
-    size = 1
-    separate = True
+class HeldWorker:
+    """A worker whose jobs take as long as the test wants; their result is the task."""
 
     def __init__(self) -> None:
         self.begun: list[Any] = []
-        self.most = self.now = 0
         self.gates: dict[Any, asyncio.Event] = {}
+        self._line = asyncio.Lock()
 
-    async def simulate(self, task: Any) -> Any:
-        self.begun.append(task)
-        self.now += 1
-        self.most = max(self.most, self.now)
-        try:
+    async def start(self) -> Greeting:
+        return Greeting(1)
+
+    async def run(self, number: int, task: Any) -> Any:
+        async with self._line:
+            self.begun.append(task)
             await self.gates.setdefault(task, asyncio.Event()).wait()
-        finally:
-            self.now -= 1
-        return task
+        return WorkerReply(task, 0.0)
+
+    def cancel(self, number: int) -> None:
+        """Go on: the pool discards the result."""
+
+    async def close(self, patience: float) -> None:
+        """Nothing to end."""
 
     def end(self, task: Any) -> None:
         self.gates.setdefault(task, asyncio.Event()).set()
@@ -42,44 +44,37 @@ async def settled() -> None:
 
 def test_one_that_asks_for_much_leaves_every_second_turn_to_the_other() -> None:
     async def work() -> None:
-        pool = Pool()
-        fair = FairPool(pool)  # type: ignore[arg-type]
-        greedy, modest = fair.share(), fair.share()
+        worker = HeldWorker()
+        pool = WorkerPool(1, lambda: worker, ahead=1)
+        await pool.pids()
+        greedy, modest = pool.share(), pool.share()
         jobs = [asyncio.create_task(greedy.simulate(f"g{i}")) for i in range(8)]  # type: ignore[arg-type]
         await settled()
         jobs += [asyncio.create_task(modest.simulate(f"m{i}")) for i in range(3)]  # type: ignore[arg-type]
         await settled()
-        for _ in range(11):
-            pool.end(pool.begun[len([j for j in jobs if j.done()])])
+        for i in range(11):
+            worker.end(worker.begun[i])
             await settled()
         assert sorted(await asyncio.gather(*jobs)) == sorted([f"g{i}" for i in range(8)] + [f"m{i}" for i in range(3)])  # type: ignore[type-var]
-        assert pool.most == AHEAD
-        assert pool.begun[:8] == ["g0", "g1", "g2", "m0", "g3", "m1", "g4", "m2"]
+        assert worker.begun[:8] == ["g0", "g1", "g2", "m0", "g3", "m1", "g4", "m2"]
 
     asyncio.run(work())
 
 
-@pytest.mark.parametrize("when", ["waiting", "turn come", "under way"])
+@pytest.mark.parametrize("when", ["waiting", "sent", "under way"])
 def test_whoever_gives_up_takes_nobody_elses_turn(when: str) -> None:
     async def work() -> None:
-        pool = Pool()
-        share = FairPool(pool).share()  # type: ignore[arg-type]
+        worker = HeldWorker()
+        share = WorkerPool(1, lambda: worker, ahead=1).share()
         jobs = [asyncio.create_task(share.simulate(i)) for i in range(4)]  # type: ignore[arg-type]
         await settled()
-        if when == "waiting":
-            jobs[2].cancel()
-        elif when == "under way":
-            jobs[0].cancel()
-        else:
-            pool.end(0)
-            while not jobs[0].done():
-                await asyncio.sleep(0)
-            jobs[2].cancel()
+        jobs[{"waiting": 2, "sent": 1, "under way": 0}[when]].cancel()
         for i in range(4):
             await settled()
-            pool.end(i)
+            worker.end(i)
         done = await asyncio.gather(*jobs, return_exceptions=True)
         assert [isinstance(one, asyncio.CancelledError) for one in done].count(True) == 1
+        assert worker.begun == ([0, 1, 3] if when == "waiting" else [0, 1, 2, 3])
         assert await asyncio.wait_for(share.simulate(0), 5.0) == 0  # type: ignore[arg-type, comparison-overlap]
 
     asyncio.run(work())

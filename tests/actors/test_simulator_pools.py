@@ -16,12 +16,11 @@ import pytest
 
 from actors.arm.simulated_arm import NumbersSpec, SimulatedArm
 from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
-from actors.runtime.cluster_nodes import versions
+from actors.runtime.ray_cluster import versions
 from actors.runtime.remote_object import RayDevice
-from actors.simulators import process_worker as processes
-from actors.simulators.local_worker import InProcessSimulatorPool
-from actors.simulators.pool import RaySimulatorPool
-from actors.simulators.process_worker import ProcessSimulatorPool
+from actors.simulators import pool as pools
+from actors.simulators.local_worker import process_pool, thread_pool
+from actors.simulators.ray_worker import ray_pool
 from tests.support.waiting import PATIENCE
 
 
@@ -45,22 +44,22 @@ def make_pool(request):
     """All pools, so that one test speaks for each."""
     if request.param == "ray":
         request.getfixturevalue("ray_running")
-        return lambda make: RaySimulatorPool(1, make=make)
+        return lambda make: ray_pool(1, make=make)
     if request.param == "processes":
-        return lambda make: ProcessSimulatorPool(1, make=make)
-    return lambda make: InProcessSimulatorPool(make=make)
+        return lambda make: process_pool(1, make=make)
+    return lambda make: thread_pool(make=make)
 
 
 def test_a_dead_process_is_replaced_and_what_kills_every_one_is_given_up(fake, task, tmp_path):
     log = tmp_path / "log"
 
     async def play():
-        pool = ProcessSimulatorPool(2, make=fake(2.0, log))
+        pool = process_pool(2, make=fake(2.0, log))
         both = [asyncio.create_task(pool.simulate(task(seed=s))) for s in (1, 2)]
         await until(lambda: count(log, "begin") == 2)
         os.kill(int(lines(log)[-1].split()[1]), signal.SIGKILL)
         results = await asyncio.gather(*both)
-        with pytest.raises(SimulationError, match=r"died 3 times over it \(status -9 at last\)"):
+        with pytest.raises(SimulationError, match=r"3 simulators died over this job \(the last one: status -9\)"):
             await pool.simulate(task(name="deadly"))
         await pool.simulate(task(name="quick"))
         await pool.close()
@@ -73,10 +72,10 @@ def test_a_dead_process_is_replaced_and_what_kills_every_one_is_given_up(fake, t
 
 def test_a_process_that_hangs_holds_nobody_up(fake, task, tmp_path, monkeypatch):
     log = tmp_path / "log"
-    monkeypatch.setattr(processes, "DEADLINE", 0.5)
+    monkeypatch.setattr(pools, "DRAIN_DEADLINE", 0.5)
 
     async def play():
-        pool = ProcessSimulatorPool(1, make=fake(60.0, log))
+        pool = process_pool(1, make=fake(60.0, log))
         job = asyncio.create_task(pool.simulate(task()))
         await until(lambda: count(log, "begin") == 1)
         os.kill(int(lines(log)[-1].split()[1]), signal.SIGSTOP)
@@ -93,7 +92,7 @@ def test_simulating_processes_end_with_a_killed_owner(fake, task, tmp_path):
 
     def own() -> None:
         async def play():
-            await ProcessSimulatorPool(1, make=fake(60.0, log)).simulate(task())
+            await process_pool(1, make=fake(60.0, log)).simulate(task())
 
         asyncio.run(play())
 
@@ -201,7 +200,7 @@ def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, task):
 def test_simulators_step_back_behind_an_arm_s_driver_which_does_not(ray_running, fake, task):
     async def play():
         arm = RayDevice("arm", SimulatedArm, NumbersSpec(0.0))
-        pool = RaySimulatorPool(2, make=fake())
+        pool = ray_pool(2, make=fake())
         try:
             await pool.simulate(task())
             return [os.getpriority(os.PRIO_PROCESS, pid) for pid in [await arm.pid(), *await pool.pids()]]
@@ -218,7 +217,7 @@ def test_a_job_whose_simulator_is_killed_is_answered_by_its_replacement(ray_runn
     log = tmp_path / "log"
 
     async def play():
-        pool = RaySimulatorPool(2, make=fake(1.0, log))
+        pool = ray_pool(2, make=fake(1.0, log))
         jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in range(4)]
         await until(lambda: count(log, "begin") == 2)
         victim = int(next(line for line in lines(log) if line.startswith("begin")).split()[1])
@@ -239,7 +238,7 @@ def test_a_job_whose_simulator_is_killed_is_answered_by_its_replacement(ray_runn
 @pytest.mark.ray
 def test_a_job_that_kills_every_simulator_is_given_up_and_the_pool_survives(ray_running, fake, task):
     async def play():
-        pool = RaySimulatorPool(1, make=fake(), retries=1)
+        pool = ray_pool(1, make=fake(), retries=1)
         with pytest.raises(SimulationError, match="2 simulators died over this job"):
             await pool.simulate(task(name="deadly"))
         assert (await pool.simulate(task())).outcome.seed == 1
@@ -253,7 +252,7 @@ def test_a_job_that_kills_every_simulator_is_given_up_and_the_pool_survives(ray_
 @pytest.mark.ray
 def test_a_simulation_that_hangs_past_its_deadline_costs_its_simulator(ray_running, fake, task):
     async def play():
-        pool = RaySimulatorPool(1, make=fake(60.0), deadline=1.0)
+        pool = ray_pool(1, make=fake(60.0), deadline=1.0)
         with pytest.raises(SimulationError, match="no result within 1 s"):
             await pool.simulate(task())
         assert (await pool.simulate(task(name="quick"))).outcome.seed == 1
@@ -268,7 +267,7 @@ def test_a_simulator_goes_on_with_the_next_job_while_the_program_is_held_up(ray_
     log = tmp_path / "log"
 
     async def play():
-        pool = RaySimulatorPool(1, make=fake(0.3, log))
+        pool = ray_pool(1, make=fake(0.3, log))
         jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in range(2)]
         await until(lambda: count(log, "begin") == 1)
         time.sleep(1.2)  # the event loop stands still
@@ -286,7 +285,7 @@ def test_a_job_that_waits_at_a_busy_simulator_is_taken_to_an_idle_one_and_runs_o
     log = tmp_path / "log"
 
     async def play():
-        pool = RaySimulatorPool(2, make=fake(4.0, log))
+        pool = ray_pool(2, make=fake(4.0, log))
         await pool.pids()
         long, other, waiting = (asyncio.create_task(pool.simulate(task(seed=s))) for s in range(3))
         await until(lambda: count(log, "begin") == 2)
@@ -312,7 +311,7 @@ def test_a_simulator_with_other_code_than_this_machine_s_is_not_used_and_named(r
 
     async def play():
         other = dataclasses.replace(versions(), taichi="1.6.0")
-        pool = RaySimulatorPool(1, make=fake(), expected=other, tell=told.append)
+        pool = ray_pool(1, make=fake(), expected=other, tell=told.append)
         with pytest.raises(LaboratoryError, match=r"is not like this machine's: Taichi: 1\.7\.4 there, 1\.6\.0 here"):
             await pool.simulate(task())
         await pool.close()
@@ -327,7 +326,7 @@ def test_a_loss_is_told_with_what_is_repeated(ray_running, fake, task, tmp_path)
     told, log = [], tmp_path / "log"
 
     async def play():
-        pool = RaySimulatorPool(1, make=fake(0.5, log), tell=told.append)
+        pool = ray_pool(1, make=fake(0.5, log), tell=told.append)
         jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in range(2)]
         await until(lambda: count(log, "begin") == 1)
         os.kill((await pool.pids())[0], signal.SIGKILL)
@@ -351,7 +350,7 @@ def test_both_pools_give_the_same_results_bit_for_bit(ray_running, fake, task):
         return results
 
     async def both():
-        return await play(RaySimulatorPool(2, make=fake())), await play(InProcessSimulatorPool(make=fake()))
+        return await play(ray_pool(2, make=fake())), await play(thread_pool(make=fake()))
 
     for ours, twins in zip(*asyncio.run(both()), strict=True):
         assert ours.outcome == twins.outcome
@@ -364,7 +363,7 @@ def test_both_pools_give_the_same_results_bit_for_bit(ray_running, fake, task):
 @pytest.mark.ray
 def test_a_closed_pool_lets_no_process_live_and_says_so(ray_running, fake, task):
     async def play():
-        pool = RaySimulatorPool(2, make=fake())
+        pool = ray_pool(2, make=fake())
         members = await pool.pids()
         await pool.close()
         await until(lambda: not any(psutil.pid_exists(pid) for pid in members))

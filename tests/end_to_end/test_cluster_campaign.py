@@ -186,7 +186,7 @@ def test_a_program_that_loses_its_own_node_ends_with_a_word_whether_ray_lets_it_
 
 CHECK = """
 import sys
-from actors.runtime.cluster_check import check_cluster
+from actors.runtime.ray_cluster import check_cluster
 from actors.interfaces import LaboratoryError
 from actors.laboratory_settings import RaySpec
 try:

@@ -22,18 +22,25 @@ import pytest
 
 from actors.optimizer.questions import (
     BenchOffset,
+    CalibrationQuery,
     Data,
     DesignQuestion,
     Disturbance,
     Limit,
     Linear,
+    MinimumQuery,
     ModelDiscrepancy,
-    Play,
+    OffsetPrior,
     PosteriorQuestion,
+    PourQuery,
+    RegressionQuery,
     Risk,
+    RiskQuery,
     SearchEffort,
+    SimulationQuery,
+    SpaceFillingQuery,
     Suggestion,
-    SuggestProblem,
+    SuggestionQuery,
 )
 from actors.optimizer.suggest import propose
 from orchestrator.journal.codec import to_json
@@ -112,36 +119,37 @@ ASKED = points(5, 50)
 
 POURED, SIMULATED = data(7, 1), data(24, 2, shift=0.08)
 
-PLAIN = SuggestProblem(PLANE, POURED, seed=11, predict_at=ASKED)
+PLAIN = MinimumQuery(PLANE, POURED, seed=11, predict_at=ASKED)
 
-INFORMED = replace(PLAIN, simulated=SIMULATED)
+INFORMED = PourQuery(PLANE, POURED, seed=11, predict_at=ASKED, simulated=SIMULATED)
 
-ADAPTIVE = replace(
-    INFORMED, mean="adaptive", mismatch=ModelDiscrepancy((Play(shift=0.14), Play(factor=0.05, origin=0.2)), left=4)
-)
+SIMULATING = SimulationQuery(PLANE, POURED, seed=11, predict_at=ASKED, simulated=SIMULATED)
 
-CONTEXT = SuggestProblem(THETA, differences(18, 3), seed=12, context=points(6, 4))
+DISCREPANCY = ModelDiscrepancy((OffsetPrior(shift=0.14), OffsetPrior(factor=0.05, origin=0.2)), pours_left=4)
 
-PROBLEMS: dict[str, SuggestProblem] = {
-    "nothing known": SuggestProblem(PLANE, Data(), seed=5, count=4),
-    "random": replace(PLAIN, acquisition="random", count=3),
-    "sobol": replace(PLAIN, acquisition="sobol", count=3),
+ADAPTIVE = replace(INFORMED, discrepancy=DISCREPANCY)
+
+CONTEXT = CalibrationQuery(THETA, differences(18, 3), seed=12, contexts=points(6, 4))
+
+QUERIES: dict[str, SuggestionQuery] = {
+    "nothing known": MinimumQuery(PLANE, Data(), seed=5, count=4),
+    "sobol": SpaceFillingQuery(PLANE, POURED.points, seed=11, count=3),
+    "regression": RegressionQuery(PLANE, POURED, seed=11, predict_at=ASKED, map_resolution=4),
     "lcb, constant mean": replace(PLAIN, count=3, pending=points(2, 7), map_resolution=6),
     "lcb, zero mean, plain": replace(PLAIN, mean="zero", plain=True, kappa=1.5),
-    "lcb, simulated mean": replace(INFORMED, mean="simulated", plain=True),
-    "lcb, scaled mean": replace(INFORMED, mean="scaled"),
+    "lcb, simulated mean": INFORMED,
     "lcb, varying noise": replace(PLAIN, data=data(20, 8), noise="varying"),
     "posterior minimum": replace(PLAIN, acquisition="posterior_minimum", count=2, effort=SearchEffort()),
     "a fit that goes on": replace(PLAIN, effort=SearchEffort(((-1.0, -0.5, -0.5, -3.0),), 3)),
     "refusals and failures": replace(PLAIN, infeasible=points(3, 9), refused=points(2, 10), failed=POURED.points[:1]),
     "a constraint": replace(PLAIN, constraints=(Linear((("x_offset", 1.0), ("angular_velocity", 0.05)), 0.17),)),
-    "knowledge, simulated mean": replace(INFORMED, mean="simulated", acquisition="knowledge", count=2),
-    "knowledge, scaled mean": replace(INFORMED, mean="scaled", acquisition="knowledge"),
+    "knowledge, simulated mean": replace(SIMULATING, count=2),
+    "knowledge, scaled mean": replace(SIMULATING, coupling="scaled"),
     "least loss, adaptive mean": replace(ADAPTIVE, acquisition="least_loss", count=3),
     "least loss within a limit": replace(
         ADAPTIVE,
         acquisition="least_loss",
-        mismatch=replace(ADAPTIVE.mismatch, limit=Limit(0.2, 0.1), drawn=(BenchOffset((1.0, 1.0), (0.05, 0.0)),)),  # type: ignore[type-var]
+        discrepancy=replace(DISCREPANCY, limit=Limit(0.2, 0.1), drawn=(BenchOffset((1.0, 1.0), (0.05, 0.0)),)),
     ),
     "what adaptive pours taught": replace(ADAPTIVE, count=0),
     "context": CONTEXT,
@@ -154,20 +162,27 @@ PROBLEMS: dict[str, SuggestProblem] = {
         posterior=PosteriorQuestion((), (), 0.02, count=20, prior=((0.5, 0.2), (0.5, 0.0))),
         design=DesignQuestion(points(4, 15), points(5, 16)),
     ),
-    "risk, CVaR": replace(
-        PLAIN,
+    "risk, CVaR": RiskQuery(
+        PLANE,
+        POURED,
+        seed=11,
+        predict_at=ASKED,
         risk=Risk(tuple(Disturbance((1.0, 1.0 + 0.02 * i), (0.01 * i, 0.0)) for i in range(-3, 4)), 0.7),
     ),
-    "risk, mean": replace(
-        PLAIN, risk=Risk(tuple(Disturbance((1.0, 1.0), (0.01 * i, 0.0)) for i in range(-3, 4)))
+    "risk, mean": RiskQuery(
+        PLANE,
+        POURED,
+        seed=11,
+        predict_at=ASKED,
+        risk=Risk(tuple(Disturbance((1.0, 1.0), (0.01 * i, 0.0)) for i in range(-3, 4))),
     ),
-}  # fmt: skip
-"""One question for every acquisition, mean and noise, and for every further part of a question."""
+}
+"""Queries of every type, with every acquisition, mean and noise."""
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", QUERIES)
 def test_the_optimiser_gives_the_same_answer(name: str, golden: Golden, here: bool) -> None:
-    answer: dict[str, Any] = to_json(replace(propose(PROBLEMS[name]), seconds=0.0), Suggestion)
+    answer: dict[str, Any] = to_json(replace(propose(QUERIES[name]), seconds=0.0), Suggestion)
     file = "".join(letter if letter.isalnum() else "-" for letter in name).replace("--", "-")
     golden.check_json(f"numbers/{file}.json", compact(answer), rtol=RTOL if here else ELSEWHERE)
 

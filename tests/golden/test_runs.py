@@ -30,7 +30,6 @@ from orchestrator.daemon.event_feed import event_json
 from orchestrator.journal.codec import encode_request, first_difference
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
 from orchestrator.journal.run_record import read_result
-from orchestrator.journal.upgrade import upgraded_request
 from orchestrator.progress.console_progress import ProgressDisplay
 from orchestrator.requests import Request
 from orchestrator.results.console_view import summary_table
@@ -41,7 +40,7 @@ from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.resume import ToldStep, read_history
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import stages_of
-from orchestrator.strategies.deployment.real_pours import Foretold
+from orchestrator.strategies.deployment.real_pours import PredictionCheck
 from orchestrator.strategies.stage_result import StageResult
 from tests.golden import old_runs
 from tests.golden.golden import ROOT, Golden, agree, compact, line, normalised
@@ -244,7 +243,7 @@ def test_old_run_with_a_model_that_is_retired_is_listed_and_reported_but_not_res
     run = decant.open_run(folder)
     assert (run.result.state, run.result.pours, len(run.pours)) == ("finished", 4, 4)
     (found,) = deployments_of(run.result.results).values()
-    assert isinstance(found.trust, Foretold)
+    assert isinstance(found.trust, PredictionCheck)
     (runs / "pooled.yaml").write_text((folder / "resolved.json").read_text(encoding="utf-8"), encoding="utf-8")
     refused = typed(runs, "run", "pooled.yaml", "--resume")
     assert refused.endswith("exit 2\n\n")
@@ -272,7 +271,7 @@ def test_old_run_is_replayed(name: str, runs: Path) -> None:
                 requests = strategy.ask(step.slots)
                 assert len(requests) == len(step.ids)
                 for key, request in zip(step.ids, requests, strict=True):
-                    before, now = _sorted(upgraded_request(history.requests[key])), _sorted(encode_request(request))
+                    before, now = _sorted(encode_request(history.request(key))), _sorted(encode_request(request))
                     assert agree(before, now), f"stage {stage.name}, request {key}:\n- {before}\n+ {now}"
                     open_[key], asked = request, asked + 1
             if history.result is not None:

@@ -10,11 +10,17 @@ from typing import Any
 from actors.interfaces import PourProgress, ProgressCallback
 from actors.optimizer.questions import (
     BenchOffset,
+    CalibrationQuery,
+    Data,
     DiscrepancyFound,
     Posterior,
+    PourQuery,
     RiskAnswer,
+    RiskQuery,
+    SimulationQuery,
+    SpaceFillingQuery,
     Suggestion,
-    SuggestProblem,
+    SuggestionQuery,
     SurrogateMap,
 )
 from orchestrator.requests import (
@@ -61,8 +67,8 @@ LOST, UNFIT = 0.02, 0.03
 def outcome_of(request: Request) -> Outcome:
     """What comes of a request."""
     match request:
-        case Suggest(problem):
-            return Suggested(answer(problem))
+        case Suggest(query):
+            return Suggested(answer(query))
         case Ask():
             return Answered(request.options[0])
         case Simulate():
@@ -106,19 +112,21 @@ def weighed(action: Action, seed: int, load: float) -> PourMeasurement:
     return PourMeasurement(loaded=load, spilled=load * spilled(action, REAL, seed), retained=0.01 * load)
 
 
-def answer(problem: SuggestProblem) -> Suggestion:
+def answer(query: SuggestionQuery) -> Suggestion:
     """Everything that may be asked, answered from the question by arithmetic."""
-    dimension, data = problem.space.dimension, problem.data
-    name = (problem.seed, len(data), problem.mean, problem.acquisition)
-    cost = [*data.costs, *problem.simulated.costs]
-    places = [point[:dimension] for point in (*data.points, *problem.simulated.points)]
+    dimension = query.space.dimension
+    data = Data(query.known, (0.0,) * len(query.known)) if isinstance(query, SpaceFillingQuery) else query.data
+    simulated = query.simulated if isinstance(query, PourQuery | SimulationQuery) else Data()
+    name = (query.seed, len(data), *_words(query))
+    cost = [*data.costs, *simulated.costs]
+    places = [point[:dimension] for point in (*data.points, *simulated.points)]
     best = min(range(len(cost)), key=cost.__getitem__) if cost else None
     centre = places[best] if best is not None else (0.5,) * dimension
     points = tuple(
         tuple(min(max(0.5 * centre[axis] + 0.5 * noise(name, i, axis), 0.0), 1.0) for axis in range(dimension))
-        for i in range(problem.count)
+        for i in range(getattr(query, "count", 0))
     )
-    if len(cost) < 2:
+    if len(cost) < 2 or isinstance(query, SpaceFillingQuery):
         return Suggestion(points)
 
     def mean(point: Sequence[float]) -> float:
@@ -127,12 +135,13 @@ def answer(problem: SuggestProblem) -> Suggestion:
     def answers(at: Sequence[Sequence[float]], about: str) -> tuple[float, ...]:
         return tuple(mean(point) + 0.01 * noise(name, about, i) for i, point in enumerate(at))
 
-    size = problem.map_resolution if dimension > 1 else 0
+    size = query.map_resolution if dimension > 1 else 0
     row = tuple(0.1 + 0.01 * i for i in range(size))
-    grid = SurrogateMap((row,) * size, (row,) * size, problem.space.names[:2], tuple(centre)) if size else None
-    adaptive, valued = problem.mismatch is not None, problem.acquisition == "knowledge"
+    grid = SurrogateMap((row,) * size, (row,) * size, query.space.names[:2], tuple(centre)) if size else None
+    adaptive = isinstance(query, PourQuery) and query.discrepancy is not None
+    valued, calibration = isinstance(query, SimulationQuery), isinstance(query, CalibrationQuery)
     thetas = tuple(tuple(noise(name, "theta", i, axis) for axis in range(dimension)) for i in range(20))
-    asked = len(problem.predict_at)
+    asked = len(query.predict_at)
     return Suggestion(
         points=points,
         means=answers(points, "mean"),
@@ -143,49 +152,59 @@ def answer(problem: SuggestProblem) -> Suggestion:
         hyperparameters={"noise": 0.01, "signal": 0.1},
         surrogate=grid,
         seconds=0.0,
-        predictions=answers(problem.predict_at, "prediction"),
+        predictions=answers(query.predict_at, "prediction"),
         prediction_deviations=tuple(0.01 + 0.01 * noise(name, "far", i) for i in range(asked)),
         noises=tuple(0.01 for _ in points),
         bands=tuple((0.02, 0.12) for _ in points) if adaptive else (),
-        posterior=None if problem.posterior is None else Posterior(thetas, (0.02,) * len(thetas), 15.0),
+        posterior=Posterior(thetas, (0.02,) * len(thetas), 15.0) if calibration and query.posterior else None,
         best_noise=0.01,
-        risk=_risk(problem),
-        values=(0.004 / (1 + len(problem.simulated)),) * len(points) if valued else (),
+        risk=_risk(query) if isinstance(query, RiskQuery) else None,
+        values=(0.004 / (1 + len(simulated)),) * len(points) if valued else (),
         pour_value=0.01 / (1 + len(data)) if valued else None,
-        gains=() if problem.design is None else tuple(
-            noise(name, "gain", i) for i in range(len(problem.design.candidates))
-        ),
-        uncertainty=None if problem.design is None else 1.0 / (1 + len(data)),
-        fitted=((0.1, 0.2, 0.3),) if problem.effort is not None else (),
-        mismatch=_mismatch(problem, dimension) if adaptive else None,
+        gains=tuple(noise(name, "gain", i) for i in range(len(query.design.candidates)))
+        if calibration and query.design
+        else (),
+        uncertainty=1.0 / (1 + len(data)) if calibration and query.design else None,
+        fitted=((0.1, 0.2, 0.3),) if query.effort is not None else (),
+        discrepancy=_discrepancy(query, dimension) if isinstance(query, PourQuery) and adaptive else None,
     )  # fmt: skip
 
 
-def _risk(problem: SuggestProblem) -> RiskAnswer | None:
-    if problem.risk is None:
-        return None
-    asked, draws = len(problem.predict_at), len(problem.risk.disturbances)
-    worst = tuple(tuple(range(min(3, draws))) for _ in range(asked)) if problem.risk.level > 0.0 else ((),) * asked
-    expected = tuple(0.05 + 0.01 * noise("expected", problem.seed, i) for i in range(asked))
+def _words(query: SuggestionQuery) -> tuple[str, str]:
+    """Mean and acquisition of a query, which its answer depends on."""
+    match query:
+        case SpaceFillingQuery():
+            return "constant", "sobol"
+        case PourQuery():
+            return "simulated" if query.discrepancy is None else "adaptive", query.acquisition
+        case SimulationQuery():
+            return "simulated" if query.coupling == "residual" else "scaled", "knowledge"
+    return getattr(query, "mean", "constant"), getattr(query, "acquisition", "lcb")
+
+
+def _risk(query: RiskQuery) -> RiskAnswer:
+    asked, draws = len(query.predict_at), len(query.risk.disturbances)
+    worst = tuple(tuple(range(min(3, draws))) for _ in range(asked)) if query.risk.level > 0.0 else ((),) * asked
+    expected = tuple(0.05 + 0.01 * noise("expected", query.seed, i) for i in range(asked))
     return RiskAnswer(expected, (0.01,) * asked, worst)
 
 
-def _mismatch(problem: SuggestProblem, dimension: int) -> DiscrepancyFound:
-    assert problem.mismatch is not None
-    limited = problem.mismatch.limit is not None
+def _discrepancy(query: PourQuery, dimension: int) -> DiscrepancyFound:
+    assert query.discrepancy is not None
+    limited = query.discrepancy.limit is not None
     drawn = (
         BenchOffset((1.0,) * dimension, (0.05,) * dimension),
         BenchOffset((0.98,) * dimension, (0.0,) * dimension),
     )
     return DiscrepancyFound(
-        ignorance=0.05,
+        uninformative=0.05,
         shifts=(0.05,) * dimension,
         deviations=(0.02,) * dimension,
         factor=1.1,
-        gain=0.02 / (1 + len(problem.data) * len(problem.data)),
-        exceedances=(0.02,) * problem.count if limited else (),
+        gain=0.02 / (1 + len(query.data) * len(query.data)),
+        exceedances=(0.02,) * query.count if limited else (),
         least_exceedance=0.01 if limited else None,
-        drawn=drawn if problem.count == 0 else (),
+        drawn=drawn if query.count == 0 else (),
     )
 
 
@@ -219,9 +238,9 @@ class Bench:
 class Optimizer:
     """Answers by arithmetic."""
 
-    async def suggest(self, problem: SuggestProblem) -> Suggestion:
+    async def suggest(self, query: SuggestionQuery) -> Suggestion:
         """See `answer`."""
-        return answer(problem)
+        return answer(query)
 
 
 class FormulaLaboratory:

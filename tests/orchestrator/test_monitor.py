@@ -12,7 +12,7 @@ import pytest
 from matplotlib.collections import PathCollection, QuadMesh
 
 from actors.interfaces import PourProgress
-from actors.optimizer.questions import Data, SuggestProblem
+from actors.optimizer.questions import Data, MinimumQuery
 from actors.optimizer.suggest import propose, slices
 from actors.runtime.child_process import child_environment
 from orchestrator.config.file_loading import load_campaign
@@ -94,7 +94,7 @@ def test_picture_of_a_surrogate_has_axes_units_data_and_the_next_point() -> None
     assert isinstance(event, RequestFinished)
     assert isinstance(event.request, Suggest)
     assert isinstance(event.outcome, Suggested)
-    figure = surrogate_picture(event.request.problem, event.outcome.suggestion, DISCREPANCY, "θ")
+    figure = surrogate_picture(event.request.query, event.outcome.suggestion, DISCREPANCY, "θ")
     panels = [axes for axes in figure.axes if axes.get_title(loc="left")]
     assert [axes.get_title(loc="left") for axes in panels] == [
         "expected |measured − simulated| spillage [%]",
@@ -116,7 +116,7 @@ def test_what_has_more_than_two_axes_is_cut_through_every_two_of_them() -> None:
     rng = np.random.default_rng(1)
     points = rng.random((20, 3))
     costs = (points[:, 0] - 0.3) ** 2 + points[:, 2]
-    problem = SuggestProblem(box, Data(tuple(map(tuple, points)), tuple(costs)), map_resolution=9)
+    problem = MinimumQuery(box, Data(tuple(map(tuple, points)), tuple(costs)), map_resolution=9)
     answer = propose(problem)
     cuts = slices(problem, answer, resolution=9)
     assert [cut.axes for cut in cuts] == [
@@ -132,7 +132,7 @@ def test_what_has_more_than_two_axes_is_cut_through_every_two_of_them() -> None:
 
 
 def test_two_axes_are_one_picture() -> None:
-    problem = SuggestProblem(example_run.THETA, Data(((0.2, 0.3), (0.7, 0.3)), (0.2, 0.05)), map_resolution=9)
+    problem = MinimumQuery(example_run.THETA, Data(((0.2, 0.3), (0.7, 0.3)), (0.2, 0.05)), map_resolution=9)
     assert slices(problem, propose(problem)) == ()
 
 

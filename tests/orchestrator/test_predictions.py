@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.progress.progress_state import ProgressState
@@ -26,7 +26,7 @@ from orchestrator.runs.stages import deployment_stages, prediction_stages
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.repeated_simulation import RepeatedSimulation
+from orchestrator.strategies.single_action import RepeatedSimulation
 from orchestrator.strategies.strategy import Progress, Strategy
 from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
 from sim_engine.outcome import Loss
@@ -45,8 +45,8 @@ ACTION = SCENE.action({"angular_velocity": 1.0, "x_offset": 0.1})
 class Learning:
     """The real optimiser, in this process."""
 
-    async def suggest(self, problem: SuggestProblem) -> Suggestion:
-        return propose(problem)
+    async def suggest(self, query: SuggestionQuery) -> Suggestion:
+        return propose(query)
 
 
 def learning_laboratory() -> ToyLaboratory:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
 from decant.run_results import open_run
 from orchestrator.config.file_loading import predicts_with_posterior
@@ -48,8 +48,8 @@ PARAMETERS = Space((Axis("cohesion", 0.0, 0.1), Axis("friction", 0.0, 0.5)))
 
 
 class Optimizer:
-    async def suggest(self, problem: SuggestProblem) -> Suggestion:
-        return propose(problem)
+    async def suggest(self, query: SuggestionQuery) -> Suggestion:
+        return propose(query)
 
 
 def laboratory() -> ToyLaboratory:

@@ -185,7 +185,7 @@ def test_what_is_wrong_is_said_as_of_ours(known: dict[str, Any], case: str, mess
 STUDY = """
 import json, sys
 from pathlib import Path
-from orchestrator.study.report.study_page import write_report
+from orchestrator.study.study_page import write_report
 from tests.support.study_files import read, written
 from tests.support.toy_study import run_toy_study
 from orchestrator.study.study_file import load_study

@@ -27,7 +27,7 @@ WHOLE = 0.97
 
 
 class Formula:
-    """See `actors.simulators.simulation_task.Simulator`."""
+    """See `actors.simulators.job_runner.Simulator`."""
 
     def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
         """A spillage by action, θ and seed, in thousandths."""

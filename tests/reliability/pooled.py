@@ -15,7 +15,7 @@ from typing import Any
 from actors.laboratory_settings import LaboratorySpec
 from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
 from actors.runtime.remote_object import DeviceLostError, RayDevice
-from actors.simulators.pool import RaySimulatorPool
+from actors.simulators.ray_worker import ray_pool
 from tests.reliability import strikes
 from tests.reliability.case import CUT, KILLED, STOPPED, Case, Outcome, every, first_and_last, first_of_kind
 from tests.reliability.formula import WORK, Formula
@@ -52,7 +52,7 @@ class PooledRig(Rig):
     @contextlib.asynccontextmanager
     async def laboratory(self, life: Life) -> AsyncIterator[Any]:
         if self._pool is None:
-            self._pool = RaySimulatorPool(SIMULATORS, make=Formula)
+            self._pool = ray_pool(SIMULATORS, make=Formula)
             self._device = RayDevice("optimiser", Proposer, looked_after=True)
         while len(await self._pool.pids()) < SIMULATORS:
             await asyncio.sleep(0.05)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.bench.bench_factory import PouringBench
-from actors.simulators.shared_pool import WarmSimulators
+from actors.laboratory import WarmSimulators
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.daemon.daemon_settings import load_settings

@@ -12,8 +12,8 @@ from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from actors.bench import virtual_operator
-from actors.bench.virtual_operator import VirtualOperator
+from actors.bench import bench_operators
+from actors.bench.bench_operators import VirtualOperator
 from actors.interfaces import OperatorQuestion, OperatorSpec
 from actors.laboratory import InProcessLaboratory
 from orchestrator.journal.journal import Kind
@@ -37,7 +37,7 @@ class WiredRig(Rig):
     process = ""
     """What stands on the command line of what is struck."""
 
-    stand_ins: Any = None
+    emulators: Any = None
     """Of the laboratory that is open, in the program's process."""
 
     def write_campaign(self, folder: Path) -> Path:
@@ -63,11 +63,11 @@ class WiredRig(Rig):
             hurried=True,
             operator=OperatorSpec(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
         )
-        virtual_operator.SCATTER = 0.0  # each refilling is one of chance, and after a restart there is one more
+        bench_operators.SCATTER = 0.0  # each refilling is one of chance, and after a restart there is one more
         async with InProcessLaboratory(spec, Formula, need_bench=True) as opened:
             attend(opened, life)
             assert opened.opened is not None
-            self.stand_ins = opened.opened.stand_ins
+            self.emulators = opened.opened.emulators
             yield _Open(opened)
 
     def pids(self) -> list[int]:
@@ -107,7 +107,7 @@ def attend(laboratory: InProcessLaboratory, life: Life) -> None:
     opened = laboratory.opened
     assert opened is not None
     assert isinstance(opened.operator, VirtualOperator)
-    operator, stand_ins = opened.operator, opened.stand_ins
+    operator, emulators = opened.operator, opened.emulators
     ask = operator.ask
 
     async def attended(question: OperatorQuestion) -> str:
@@ -115,16 +115,16 @@ def attend(laboratory: InProcessLaboratory, life: Life) -> None:
             life.note("heard", question.about)
         if question.problem:
             life.note("told", question.problem)
-            await mend(stand_ins)
+            await mend(emulators)
         return await ask(question)
 
     operator.ask = attended  # type: ignore[method-assign]
 
 
-async def mend(stand_ins: Any) -> None:
+async def mend(emulators: Any) -> None:
     """What a person does about a balance: plug it in again."""
     with contextlib.suppress(Exception):
-        await stand_ins.order("plug")
+        await emulators.order("plug")
 
 
 class WorkerRig(WiredRig):
@@ -144,5 +144,5 @@ class BalanceRig(WiredRig):
         if fault != CUT:
             super().strike(fault, life)
             return
-        task = asyncio.get_running_loop().create_task(self.stand_ins.order("unplug"))
+        task = asyncio.get_running_loop().create_task(self.emulators.order("unplug"))
         self.unplugging = task  # somebody has to hold it

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from sim_engine.fluid.engine import engine
 from sim_engine.fluid.kernels import BULK_BOND, HALF_ATTRACTION
-from sim_engine.fluid.scene_setup import SceneSetup, SolidWalls
-from sim_engine.fluid.strength import RANGE, cohesion_acceleration
+from sim_engine.fluid.scene_setup import RANGE, SceneSetup, SolidWalls, cohesion_acceleration
 from sim_engine.fluid.tension import ALONE, BLUNT, BONDED, CALM
 from sim_engine.fluid.walls import FAR
 from sim_engine.liquids import SimulationParameters

@@ -12,7 +12,7 @@ import numpy as np
 
 from actors.interfaces import PourProgress
 from actors.laboratory_settings import LaboratorySpec
-from actors.optimizer.questions import Data, Suggestion, SuggestProblem, SurrogateMap
+from actors.optimizer.questions import Data, MinimumQuery, Suggestion, SuggestionQuery, SurrogateMap
 from actors.optimizer.suggest import propose
 from orchestrator.requests import (
     Decision,
@@ -42,7 +42,7 @@ from orchestrator.runs.events import (
     StrategyProgressed,
 )
 from orchestrator.strategies.campaign_plan import CampaignPlan, OutputSettings
-from orchestrator.strategies.repeated_simulation import Foreseen
+from orchestrator.strategies.single_action import PredictedPour
 from orchestrator.strategies.strategy import Progress, Strategy
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
@@ -65,7 +65,7 @@ ACTIONS = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset",
 THETA = Space((Axis("particles", 500, 4000, "log", integer=True), Axis("cohesion", 0.0, 0.1)))
 ACTION = Action(angular_velocity=40 * DEG, x_offset=0.09, height=0.05)
 PARTICLES = 300
-LEARNT = Foreseen(scene="narrow cup", simulations=0, simulations_lost=0, thetas=0, touching=0, over_seeds={})
+LEARNT = PredictedPour(scene="narrow cup", simulations=0, simulations_lost=0, thetas=0, touching=0, over_seeds={})
 """For events whose result nobody looks at."""
 
 
@@ -162,7 +162,7 @@ def events(plan: CampaignPlan, *, directory: Path = Path("runs/narrow-cup-1")) -
         )
         yield StrategyProgressed(time=now, stage="calibration", progress=Progress(number, 2), result=LEARNT)
     # As C4 does it: observations carry the action behind θ.
-    question = SuggestProblem(THETA, Data(((0.2, 0.3, 0.5, 0.5), (0.7, 0.3, 0.1, 0.9)), (0.2, 0.05)), map_resolution=9)
+    question = MinimumQuery(THETA, Data(((0.2, 0.3, 0.5, 0.5), (0.7, 0.3, 0.1, 0.9)), (0.2, 0.05)), map_resolution=9)
     yield _answered("calibration", 3, question, now)
     yield StageClosed(time=now, stage="calibration", result=LEARNT)
     yield StageOpened(time=now, stage="narrow cup", index=2, count=2)
@@ -179,7 +179,7 @@ def events(plan: CampaignPlan, *, directory: Path = Path("runs/narrow-cup-1")) -
             time=now, stage="narrow cup", id=10 * number, request=pour, outcome=Poured(measured), seconds=90.0
         )
         points = tuple((0.1 * i, 0.5) for i in range(1, number + 1))
-        question = SuggestProblem(ACTIONS, Data(points, tuple(0.1 for _ in points)), map_resolution=9)
+        question = MinimumQuery(ACTIONS, Data(points, tuple(0.1 for _ in points)), map_resolution=9)
         yield _answered("narrow cup", 10 * number + 1, question, now)
         if number == 1:
             alarm = Decision("after pour 1 the simulator is wrong here", urgent=True)
@@ -195,13 +195,13 @@ def events(plan: CampaignPlan, *, directory: Path = Path("runs/narrow-cup-1")) -
 def three_parameters() -> Iterator[Event]:
     """An answer about three parameters, mapped over particles and friction."""
     box = Space((*THETA.axes, Axis("friction", 0.0, 0.5)))
-    question = SuggestProblem(box, Data(((0.2, 0.9, 0.3, 0.5, 0.5),), (0.2,)), map_resolution=9)
+    question = MinimumQuery(box, Data(((0.2, 0.9, 0.3, 0.5, 0.5),), (0.2,)), map_resolution=9)
     cut = replace(surrogate(), axes=("particles", "friction"), at=(0.3, 0.4, 0.7))
     answer = Suggestion(((0.3, 0.4, 0.7),), (0.1,), (0.02,), surrogate=cut)
     yield RequestFinished(time=1e6, stage="calibration", id=1, request=Suggest(question), outcome=Suggested(answer))
 
 
-def _answered(stage: str, key: int, question: SuggestProblem, now: float) -> RequestFinished:
+def _answered(stage: str, key: int, question: SuggestionQuery, now: float) -> RequestFinished:
     answer = Suggestion(((0.5, 0.5),), (0.1,), (0.02,), surrogate=surrogate())
     return RequestFinished(time=now, stage=stage, id=key, request=Suggest(question), outcome=Suggested(answer))
 

@@ -45,7 +45,7 @@ class LocalCluster:
             self.address = f"127.0.0.2:{free.getsockname()[1]}"
         self._raylets: list[psutil.Process] = []
         self._warden = subprocess.Popen(
-            [sys.executable, "-m", "actors.runtime.ray_cleanup", str(self.folder)],
+            [sys.executable, "-m", "actors.runtime.ray_cleanup", "folder", str(self.folder)],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -99,7 +99,7 @@ class LocalCluster:
             timeout=START_DEADLINE,
         )
         assert done.returncode == 0, done.stdout + done.stderr
-        mine = [psutil.Process(pid) for pid in cluster_processes(self.folder)]
+        mine = cluster_processes(self.folder)
         (raylet,) = [p for p in mine if p.name() == "raylet" and p.pid not in known]
         self._raylets.append(raylet)
         return number

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
 from actors.arm.arm_settings import UrArmSpec
-from actors.arm.planning.transfer_motion import follow
+from actors.arm.planning.trajectory import follow
 from orchestrator.config.file_loading import load_vessel
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid

@@ -10,10 +10,14 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
 from tests.support.waiting import PATIENCE
+
+PROMPT = "> "
+"""Ends every prompt of the commands."""
 
 
 class Terminal:
@@ -38,7 +42,7 @@ class Terminal:
         )
         os.close(theirs)
         self.screen = ""
-        self._seen = 0
+        self._seen = self._typed = 0
 
     def __enter__(self) -> Terminal:
         return self
@@ -61,17 +65,34 @@ class Terminal:
         os.kill(self.process.pid, signal.SIGHUP)
         os.close(self._keys)
 
-    def expect(self, text: str, patience: float = PATIENCE) -> None:
-        """Read until the screen shows it, after what was expected before."""
-        end = time.monotonic() + patience
-        while text not in self.screen[self._seen :]:
+    def expect(self, text: str, patience: float = PATIENCE) -> str:
+        """Read until the screen shows a text after the one that was expected before; returns all from there to here."""
+        begin, end = self._seen, time.monotonic() + patience
+        while text not in self.screen[begin:]:
             if time.monotonic() > end or not self._read(0.2):
                 raise AssertionError(f"'{text}' did not come; the screen:\n{self.screen}")
-        self._seen = self.screen.index(text, self._seen) + len(text)
+        self._seen = self.screen.index(text, begin) + len(text)
+        return self.screen[begin : self._seen]
+
+    def wait_for(self, condition: Callable[[], bool], *, unless: str) -> None:
+        """Read until a condition holds that the screen doesn't show; fails once the screen shows another text.
+
+        Args:
+            condition: polled fifty times a second.
+            unless: what the screen shows if the condition will never hold, for example the next prompt.
+        """
+        end = time.monotonic() + PATIENCE
+        while not condition():
+            if unless in self.screen[self._seen :] or time.monotonic() > end or not self._read(0.02):
+                raise AssertionError(f"what was waited for did not happen; the screen:\n{self.screen}")
 
     def type(self, text: str) -> None:
-        """Type a line; keys typed before the program reads are thrown away, so expect its prompt first."""
-        time.sleep(0.15)
+        """Type a line once a prompt has come since the last one: what is typed before a prompt is discarded."""
+        end = time.monotonic() + PATIENCE
+        while PROMPT not in self.screen[self._typed :]:
+            if time.monotonic() > end or not self._read(0.2):
+                raise AssertionError(f"no prompt came for '{text}'; the screen:\n{self.screen}")
+        self._typed = len(self.screen)
         os.write(self._keys, text.encode() + b"\n")
 
     def interrupt(self) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from actors.interfaces import PourProgress, ProgressCallback
 from actors.laboratory_settings import LaboratorySpec
-from actors.optimizer.questions import Data, Suggestion, SuggestProblem
+from actors.optimizer.questions import Data, MinimumQuery, Suggestion, SuggestionQuery
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.journal.run_record import CampaignResult
 from orchestrator.journal.stage_results import Results, result_of
@@ -162,15 +162,15 @@ class ToyOptimizer:
     fails: Callable[[], Exception | None] = lambda: None
     asked: int = 0
 
-    async def suggest(self, problem: SuggestProblem) -> Suggestion:
+    async def suggest(self, query: SuggestionQuery) -> Suggestion:
         self.asked += 1
         await asyncio.sleep(self.pauses())
         if (error := self.fails()) is not None:
             raise error
-        rng = np.random.default_rng(problem.seed)
-        data = problem.data
+        rng = np.random.default_rng(query.seed)
+        data = getattr(query, "data", Data())
         centre = np.array(data.points[int(np.argmin(data.costs))]) if len(data) else np.full(2, 0.5)
-        points = 0.5 * centre + 0.5 * rng.random((problem.count, 2))
+        points = 0.5 * centre + 0.5 * rng.random((query.count, 2))
         return Suggestion(tuple(tuple(float(u) for u in p) for p in points), seconds=random.random())
 
 
@@ -237,7 +237,7 @@ class ToyStrategy:
                 return []
             self._suggesting = True
             self.decisions.append(Decision("new ideas are needed", {"data": float(len(self._data))}))
-            return [Suggest(SuggestProblem(SPACE, self._data, count=3, seed=self._seed()))]
+            return [Suggest(MinimumQuery(SPACE, self._data, count=3, seed=self._seed()))]
         requests: list[Request] = []
         prior_done = self._asked_simulations >= self._simulations and (
             self._asked_pours or not any(isinstance(r, Simulate) for r in self._waiting)

@@ -17,11 +17,10 @@ import numpy as np
 from actors.laboratory_settings import LaboratorySpec
 from actors.optimizer.suggest import propose
 from orchestrator.run_service import RunResources
-from orchestrator.study.cell_process import work
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import opened
 from orchestrator.study.study_plan import StudyPlan
-from orchestrator.study.study_runner import CellStatus, run_cells
+from orchestrator.study.study_runner import CellStatus, run_cells, work
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome, SimulatedPour

@@ -1,6 +1,44 @@
-"""How long a test waits for what should happen: long enough for any machine, as waiting is free."""
+"""How tests wait: for a condition, with a limit that only a defect reaches."""
 
 from __future__ import annotations
 
+import asyncio
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+T = TypeVar("T")
+
 PATIENCE = 600.0
-"""Seconds until a test that waits for an event gives up. Only a defect takes so long."""
+"""Seconds until a test that waits for an event gives up: long enough for any machine, as waiting is free."""
+
+POLL = 0.01
+"""Interval at which a condition is tested [s]."""
+
+
+def wait_for(found: Callable[[], T], what: str = "", patience: float = PATIENCE, poll: float = POLL) -> T:
+    """Wait until a function returns something true, and return that.
+
+    Args:
+        found: polled; fails the test where it raises.
+        what: names what is waited for in the error.
+        patience: longest wait [s].
+        poll: interval [s]; longer where a look is expensive.
+
+    Raises:
+        AssertionError: the time is over.
+    """
+    end = time.monotonic() + patience
+    while not (value := found()):
+        assert time.monotonic() < end, f"after {patience:g} s there was no {what or 'change'}"
+        time.sleep(poll)
+    return value
+
+
+async def wait_async(found: Callable[[], T], what: str = "", patience: float = PATIENCE, poll: float = POLL) -> T:
+    """As `wait_for`, within an event loop, which goes on meanwhile."""
+    end = time.monotonic() + patience
+    while not (value := found()):
+        assert time.monotonic() < end, f"after {patience:g} s there was no {what or 'change'}"
+        await asyncio.sleep(poll)
+    return value

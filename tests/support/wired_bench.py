@@ -15,9 +15,8 @@ import numpy as np
 from actors.balance.balance_settings import SerialBalanceSpec
 from actors.balance.weighing_plan import Placement
 from actors.bench.bench_factory import PouringBench
-from actors.bench.device_emulators import DeviceEmulators
-from actors.bench.virtual_bench import FollowedBench, VirtualBench
-from actors.bench.virtual_operator import BenchContents, VirtualOperator
+from actors.bench.bench_operators import BenchContents, VirtualOperator
+from actors.bench.virtual_bench import DeviceEmulators, FollowedBench, VirtualBench
 from actors.interfaces import Notice, OperatorQuestion, OperatorSpec
 from actors.laboratory import InProcessLaboratory
 from actors.laboratory_settings import LaboratorySpec
@@ -94,7 +93,7 @@ class Stage:
     bench: PouringBench = field(init=False)
     site: DeviceEmulators = field(init=False)
     operator: VirtualOperator = field(init=False)
-    things: BenchContents = field(init=False)
+    contents: BenchContents = field(init=False)
     notices: list[Notice] = field(default_factory=list)
     before: dict[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
     """Done before the next question about something is answered."""
@@ -110,11 +109,11 @@ class Stage:
         """Stand beside the operator, and look at the controller whenever it is asked something."""
         opened = self.laboratory.opened
         assert opened is not None
-        assert opened.stand_ins is not None
-        assert isinstance(opened.bench.nature, VirtualBench)
+        assert opened.emulators is not None
+        assert isinstance(opened.bench.ground_truth, VirtualBench)
         assert isinstance(opened.operator, VirtualOperator)
-        self.bench, self.site, self.operator = opened.bench, opened.stand_ins, opened.operator
-        self.things = opened.bench.nature.things
+        self.bench, self.site, self.operator = opened.bench, opened.emulators, opened.operator
+        self.contents = opened.bench.ground_truth.contents
         ask = self.operator.ask
 
         async def attended(question: OperatorQuestion) -> str:
@@ -131,7 +130,7 @@ class Stage:
 
     async def _seen(self) -> dict[str, Any]:
         """What the controller knows of itself; an arm without one never runs a program."""
-        if not isinstance(self.bench.nature, FollowedBench):
+        if not isinstance(self.bench.ground_truth, FollowedBench):
             return {"runtime_state": "STOPPED", "speeds": [0.0], "time": 0.0}
         return await self.site.fault("state")
 

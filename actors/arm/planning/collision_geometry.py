@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.planning.frames import cell_transforms
+from actors.arm.planning.kinematics import cell_transforms
 from actors.arm.planning.trajectory import SampledPath
 from sim_engine.collision import clearance, thinned, way_of
 from sim_engine.vessel.distance_grid import MARGIN

@@ -18,10 +18,18 @@ from actors.arm.arm_interface import PathReport
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.collision_geometry import Nearest, hull, nearest_links, nearest_to_receiver
-from actors.arm.planning.frames import cell_transforms, flange_poses, flange_transforms, pourer_transforms
-from actors.arm.planning.kinematics import MODELS, beyond_reach, inverse, posture, singularities
-from actors.arm.planning.trajectory import SampledPath
-from actors.arm.planning.transfer_motion import RacingJointError
+from actors.arm.planning.kinematics import (
+    MODELS,
+    beyond_reach,
+    cell_transforms,
+    flange_poses,
+    flange_transforms,
+    inverse,
+    posture,
+    pourer_transforms,
+    singularities,
+)
+from actors.arm.planning.trajectory import RacingJointError, SampledPath
 from actors.interfaces import InvalidActionError
 from sim_engine.vessel.distance_grid import MARGIN
 from sim_engine.vessel.vessel import Vessel

@@ -22,13 +22,17 @@ from actors.arm.planning.path_checks import (
     refusal,
     report,
 )
-from actors.arm.planning.trajectory import STEEPEST, Phases, SampledPath, followable, pour_times
-from actors.arm.planning.transfer_motion import (
+from actors.arm.planning.trajectory import (
+    STEEPEST,
     STEP,
     OutOfReachError,
+    Phases,
     RacingJointError,
+    SampledPath,
     follow,
+    followable,
     home_pose,
+    pour_times,
     routes,
     travel,
 )

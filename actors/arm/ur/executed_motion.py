@@ -13,8 +13,7 @@ import numpy as np
 
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath
-from actors.arm.planning.frames import cell_transforms, pourer_motion
-from actors.arm.planning.kinematics import MODELS, forward
+from actors.arm.planning.kinematics import MODELS, cell_transforms, forward, pourer_motion
 from actors.arm.ur.worker_messages import MotionOutcome, Sample
 
 LONGEST_LAG = 0.3

@@ -18,8 +18,14 @@ from actors.arm.arm_geometry import JOINT_NAMES, Joints
 from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath, PourPath
-from actors.arm.planning.frames import cell_transforms, flange_transforms, pourer_transforms
-from actors.arm.planning.kinematics import MODELS, forward, inverse
+from actors.arm.planning.kinematics import (
+    MODELS,
+    cell_transforms,
+    flange_transforms,
+    forward,
+    inverse,
+    pourer_transforms,
+)
 from actors.arm.planning.path_checks import outside
 from actors.arm.ur.urscript_writer import checked
 from actors.arm.ur.worker_messages import MotionOutcome

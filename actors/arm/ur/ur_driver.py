@@ -29,8 +29,7 @@ from actors.arm.arm_interface import (
 )
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planned_pour import ExecutedPath, PourPath
-from actors.arm.planning.frames import cell_transforms
-from actors.arm.planning.kinematics import MODELS, forward
+from actors.arm.planning.kinematics import MODELS, cell_transforms, forward
 from actors.arm.planning.path_checks import recheck
 from actors.arm.ur.dashboard import DashboardError, stop_program
 from actors.arm.ur.executed_motion import Stops, StopTimes, executed_path

@@ -26,8 +26,8 @@ class Kcp(status_lines.StatusLines):
         """See `Dialect.likeness`."""
         return 3 if status_lines.is_kern(said) else 1  # default of the two: its query interval suits both dialects
 
-    def voices(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
-        """See `Dialect.voices`."""
+    def encoders(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
+        """See `Dialect.encoders`."""
         return {self.name: lambda: status_lines.StatusLineEncoder(self, '"01" "1.1.2" "1.1.2"', "KERN VIRTUAL 6200-2")}
 
 

@@ -93,8 +93,8 @@ class KernSwt(Dialect):
             raise ValueError(f"no line of this dialect says '{reading.status}'")
         return text.encode("ascii") + END
 
-    def voices(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
-        """See `Dialect.voices`."""
+    def encoders(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
+        """See `Dialect.encoders`."""
         return {self.name: KernSwtEncoder, f"{self.name}-short": lambda: KernSwtEncoder(short=True)}
 
 

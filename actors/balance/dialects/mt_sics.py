@@ -43,8 +43,8 @@ class MtSics(status_lines.StatusLines):
         """See `Dialect.likeness`."""
         return 2 if status_lines.levels_of_sics(said) else 0
 
-    def voices(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
-        """See `Dialect.voices`."""
+    def encoders(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
+        """See `Dialect.encoders`."""
         return {self.name: lambda: MtSicsVoice(self, '"01" "2.30" "2.22"', "VIRTUAL")}
 
 

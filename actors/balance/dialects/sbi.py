@@ -107,8 +107,8 @@ class Sbi(Dialect):
             raise ValueError(f"no line of this dialect says '{status}'")
         return ((f"{label:<6}" if self.identified else "") + text).encode("ascii") + END
 
-    def voices(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
-        """See `Dialect.voices`."""
+    def encoders(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
+        """See `Dialect.encoders`."""
         return {
             self.name: SbiEncoder,
             f"{self.name}-identified": lambda: SbiEncoder(identified=True),

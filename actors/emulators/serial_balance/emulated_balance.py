@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from actors.balance.dialect_registry import voices
+from actors.balance.dialects.dialect import encoders
 from actors.balance.dialects.protocol_encoder import Cancel, Follow, PendingReply, Repeat, weight_line
 from actors.balance.readings import Reading, ReadingStatus
 from actors.balance.simulated_balance import EmulatedScale, Load, ScaleSettings
@@ -136,7 +136,7 @@ class Emulation:
     """A balance with a dialect.
 
     Args:
-        dialect: one of `actors.balance.dialect_registry.voices`.
+        dialect: one of `actors.balance.dialects.dialect.encoders`.
         settings: of its scale.
         time_scale: bench seconds per second of the clock; 0: bench time passes by command only.
         latency: time between query and reply [s of the clock].
@@ -146,7 +146,7 @@ class Emulation:
     def __init__(
         self, dialect: str, settings: ScaleSettings, time_scale: float, latency: float, seed: tuple[int, ...]
     ) -> None:
-        self._encoder = voices()[dialect]()
+        self._encoder = encoders()[dialect]()
         self._scale = EmulatedScale(settings, seed)
         self._display = FaultyDisplay(self._scale)
         self._time_scale, self._latency = time_scale, latency

@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from actors.arm.arm_settings import UrArmSpec
-from actors.bench.device_emulators import History
+from actors.bench.virtual_bench import History
 from actors.emulators.ur_controller.controller_process import VirtualController, VirtualControllerError
 from actors.interfaces import LaboratoryError
 

@@ -89,7 +89,9 @@ class Uploads:
     async def _translate_in_process(self, text: str) -> Translated:
         asked = question(text, self._controller.known_commands)
         try:
-            answer = await run_async(python_module("actors.emulators.ur_controller.urscript"), asked, timeout=PATIENCE)
+            answer = await run_async(
+                python_module("actors.emulators.ur_controller.urscript.translator"), asked, timeout=PATIENCE
+            )
         except TimeoutError:
             answer = b""
         except OSError as error:

@@ -16,8 +16,16 @@ from actors.arm.ur import robot_models as models
 from actors.arm.ur.robot_models import Joints, RobotModel
 from actors.emulators.ur_controller.motion.motion_lines import KinematicArm
 from actors.emulators.ur_controller.motion.mover import Mover, ViolationError
-from actors.emulators.ur_controller.poses import IDENTITY, Transform, Vector, compose, distance, pose_of, transform_of
-from actors.emulators.ur_controller.robot_kinematics import Kinematics
+from actors.emulators.ur_controller.robot_kinematics import (
+    IDENTITY,
+    Kinematics,
+    Transform,
+    Vector,
+    compose,
+    distance,
+    pose_of,
+    transform_of,
+)
 from actors.emulators.ur_controller.safety_system import SafetyConfiguration
 
 TRACKING_LAG = 0.004

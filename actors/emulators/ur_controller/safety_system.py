@@ -15,7 +15,7 @@ from math import degrees
 
 from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.ur.robot_models import Joints, RobotModel
-from actors.emulators.ur_controller.poses import Vector
+from actors.emulators.ur_controller.robot_kinematics import Vector
 
 UNLOCK_DELAY = 5.0
 """Minimum time between a protective stop and its unlocking [s of controller time]."""

@@ -1,7 +1,7 @@
 """Active design of calibration pours: each pour is chosen by its expected information about deployment.
 
 `ActivePours` is the strategy; `joint_contexts` builds the space of its surrogate. The variance reduction is calculated
-in `actors.optimizer.experimental_design`.
+in `actors.optimizer.theta_posterior`.
 """
 
 from __future__ import annotations
@@ -10,23 +10,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from actors.optimizer.questions import (
+    CalibrationQuery,
     Data,
     DesignQuestion,
     Linear,
     Point,
     PosteriorQuestion,
     Suggestion,
-    SuggestProblem,
 )
 from orchestrator.requests import Decision, Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest
-from orchestrator.strategies.calibration.action_prior import actions_of_prior
+from orchestrator.strategies.calibration.action_prior import Contexts, actions_of_prior
 from orchestrator.strategies.calibration.posterior_summary import unit_prior
-from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.calibration.pour_design import DesignedPours, DesignPoured, SimulatedPoint, Stratum
 from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan, NormalPrior
-from orchestrator.strategies.optimizer_queries import OptimizerQueries
 from orchestrator.strategies.strategy import Progress, is_sound
-from orchestrator.strategies.trials import Trial, Trials
+from orchestrator.strategies.trials import OptimizerQueries, Trial, Trials
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import normalised_spillage
@@ -70,7 +68,7 @@ class ActivePours(DesignedPours):
 
     A candidate whose pour fails is removed. A failed pour yields no data, and the design loses one point.
 
-    Source: as `actors.optimizer.experimental_design`; Kennedy & O'Hagan 2001 for the model.
+    Source: as `actors.optimizer.theta_posterior`; Kennedy & O'Hagan 2001 for the model.
     Limitations: the surrogate is not improved between pours; the order of magnitude of a pour's scatter is assumed.
     """
 
@@ -155,17 +153,17 @@ class ActivePours(DesignedPours):
             DRAWS,
             unit_prior(self._plan),
         )
-        problem = SuggestProblem(
+        query = CalibrationQuery(
             self._plan.parameters,
             Data(data.points, tuple(-cost for cost in data.costs)),  # difference to zero, because no pour belongs to it
             count=0,
-            context=(self._targets[0].point,),
+            contexts=(self._targets[0].point,),
             posterior=weighed,
             design=DesignQuestion(
                 tuple(place.point for place in self._candidates), tuple(place.point for place in self._targets)
             ),
         )
-        self._questions.put(problem, "design", self._choose)
+        self._questions.put(query, "design", self._choose)
 
     def _choose(self, suggestion: Suggestion) -> None:
         best = max(range(len(self._candidates)), key=lambda i: suggestion.gains[i])

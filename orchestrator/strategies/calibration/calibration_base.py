@@ -18,10 +18,9 @@ from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulate
 from orchestrator.run_errors import LearningError
 from orchestrator.strategies.calibration.posterior_summary import PosteriorFound
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
-from orchestrator.strategies.optimizer_queries import OptimizerQueries
 from orchestrator.strategies.stage_result import DisplayedMap, ResultPart, StageResult, displayed_map
 from orchestrator.strategies.strategy import Progress, is_sound
-from orchestrator.strategies.trials import SeedStream, Trial, Trials
+from orchestrator.strategies.trials import OptimizerQueries, SeedStream, Trial, Trials
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import MINIMUM_POURED, normalised_spillage
 from sim_engine.settings.model import MOST_SIMULATIONS, PositiveSimulationCount, Problems

@@ -22,8 +22,8 @@ import numpy as np
 from pydantic import Field
 
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
+from orchestrator.strategies.calibration.action_prior import Contexts
 from orchestrator.strategies.calibration.pointwise_calibration import LEAST_DEFINED
-from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.campaign_plan import MeasuredPour
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from orchestrator.strategies.strategy import Progress, is_sound

@@ -7,12 +7,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
-from actors.optimizer.questions import Data, Point, Posterior, PosteriorQuestion, Suggestion, SuggestProblem
+from actors.optimizer.questions import (
+    CalibrationQuery,
+    Data,
+    MinimumQuery,
+    Point,
+    Posterior,
+    PosteriorQuestion,
+    RegressionQuery,
+    SpaceFillingQuery,
+    Suggestion,
+)
 from orchestrator.requests import Decision, Simulate
 from orchestrator.run_errors import LearningError
+from orchestrator.strategies.calibration.action_prior import Contexts
 from orchestrator.strategies.calibration.calibration_base import (
     THETA_MAP_RESOLUTION,
     Calibration,
@@ -28,7 +38,6 @@ from orchestrator.strategies.calibration.posterior_summary import (
     posterior_found,
     unit_prior,
 )
-from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
 from orchestrator.strategies.strategy import Strategy
 from orchestrator.strategies.trials import Trial
@@ -163,7 +172,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             poured = poured.added(point, pour.poured)
             if pour.spillage is not None:
                 spillage = spillage.added(point, pour.spillage)
-        problem = SuggestProblem(contexts.space, spillage, count=0, predict_at=everywhere)
+        query = RegressionQuery(contexts.space, spillage, predict_at=everywhere)
 
         def with_poured(regression: Suggestion, likely: Suggestion | None) -> None:
             keep = [
@@ -192,10 +201,10 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             if len(self._usable) == len(self._train):
                 with_poured(regression, None)
             else:
-                where_defined = SuggestProblem(contexts.space, poured, count=0, predict_at=sequence)
+                where_defined = RegressionQuery(contexts.space, poured, predict_at=sequence)
                 self._questions.put(where_defined, "regress", lambda likely: with_poured(regression, likely))
 
-        self._questions.put(problem, "regress", with_spillage)
+        self._questions.put(query, "regress", with_spillage)
 
     def _ask_parameters(self) -> None:
         """Query the next θ, or θ* once the budget is spent."""
@@ -204,17 +213,16 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             if self._trials.idle and self._knows_actions:
                 self._ask_posterior()
             elif self._trials.idle:
-                problem = self._problem(
-                    everything=True, acquisition="posterior_minimum", resolution=THETA_MAP_RESOLUTION
+                query = self._query(
+                    everything=True, acquisition="posterior_minimum", map_resolution=THETA_MAP_RESOLUTION
                 )
-                self._questions.put(problem, "conclude", self._settle_at_minimum)
+                self._questions.put(query, "conclude", self._settle_at_minimum)
             return
         if len(self._trials) == 0:
             count = min(max(self._settings.initial, 1), remaining)
-            problem = SuggestProblem(self._plan.parameters, Data(), acquisition="sobol", count=count)
-            self._questions.put(problem, "start", self._queue)
+            self._questions.put(SpaceFillingQuery(self._plan.parameters, count=count), "start", self._queue)
         elif self._trials.ready:
-            self._questions.put(self._problem(resolution=self._live_resolution()), "calibrate", self._queue)
+            self._questions.put(self._query(map_resolution=self._live_resolution()), "calibrate", self._queue)
 
     def _ask_posterior(self) -> None:
         """Query draws of θ given the training pours; first predict the regression at them, which the differences
@@ -235,17 +243,12 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
                 for spillage, expected in zip(weighed, regression.predictions, strict=True)
             )
             noise = (regression.hyperparameters or {}).get("noise", 0.0)
-            problem = replace(
-                self._problem(everything=True),
-                count=0,
-                posterior=PosteriorQuestion(places, offsets, noise, prior=unit_prior(self._plan)),
-            )
-            self._questions.put(problem, "posterior", drawn)
+            weighed_pours = PosteriorQuestion(places, offsets, noise, prior=unit_prior(self._plan))
+            query = self._query(everything=True, count=0, posterior=weighed_pours)
+            self._questions.put(query, "posterior", drawn)
 
         data = Data(places, weighed)
-        self._questions.put(
-            SuggestProblem(self._contexts.space, data, count=0, predict_at=places), "regress", regressed
-        )
+        self._questions.put(RegressionQuery(self._contexts.space, data, predict_at=places), "regress", regressed)
 
     def _ask_expected(self, point: Point) -> None:
         """Query the expected discrepancy of θ* and the map through it."""
@@ -254,8 +257,10 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             self._final = suggestion
             self._settle(point, suggestion.predictions[0], suggestion.prediction_deviations[0])
 
-        problem = self._problem(everything=True, resolution=THETA_MAP_RESOLUTION)
-        self._questions.put(replace(problem, count=0, predict_at=(point,), map_at=point), "conclude", settle)
+        query = self._query(
+            everything=True, count=0, predict_at=(point,), map_at=point, map_resolution=THETA_MAP_RESOLUTION
+        )
+        self._questions.put(query, "conclude", settle)
 
     def _live_resolution(self) -> int:
         """Resolution of the map that the next answer carries for the live view; mostly 0, for no map."""
@@ -264,20 +269,14 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         self._mapped = len(self._trials)
         return LIVE_MAP_RESOLUTION
 
-    def _problem(self, *, everything: bool = False, acquisition: str = "lcb", resolution: int = 0) -> SuggestProblem:
+    def _query(self, *, everything: bool = False, **parts: Any) -> CalibrationQuery | MinimumQuery:
+        """A query about O2, with further parts of it; `everything` uses all closed trials and no pending ones."""
         data = self._trials.data(everything=everything)
-        if self._knows_actions:
-            data = Data(self._before.points + data.points, self._before.costs + data.costs)
-        return SuggestProblem(
-            self._plan.parameters,
-            data,
-            pending=() if everything else self._trials.pending(),
-            acquisition=acquisition,  # type: ignore[arg-type]
-            kappa=self._settings.kappa,
-            map_resolution=resolution,
-            context=self._actions[:CONTEXT_SIZE] if self._knows_actions else (),
-            plain=not self._knows_actions,
-        )
+        parts |= {"kappa": self._settings.kappa, "pending": () if everything else self._trials.pending()}
+        if not self._knows_actions:
+            return MinimumQuery(self._plan.parameters, data, plain=True, **parts)
+        data = Data(self._before.points + data.points, self._before.costs + data.costs)
+        return CalibrationQuery(self._plan.parameters, data, contexts=self._actions[:CONTEXT_SIZE], **parts)
 
     # -- outcomes --------------------------------------------------------------------------------------------------
 

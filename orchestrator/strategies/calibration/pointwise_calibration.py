@@ -16,7 +16,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar, Literal, Self, TypeVar
 
-from actors.optimizer.questions import Data, Point, Suggestion, SuggestProblem
+from actors.optimizer.questions import Data, MinimumQuery, Point, RegressionQuery, SpaceFillingQuery, Suggestion
 from orchestrator.requests import Decision, Simulate
 from orchestrator.strategies.calibration.calibration_base import (
     THETA_MAP_RESOLUTION,
@@ -138,8 +138,8 @@ class BestOfDesign(DiscrepancyOverPours[S]):
         self._settle(best.point, mean, math.sqrt(variance / len(known)))
         if 2 <= len(scored) <= MOST_MAPPED:
             data = Data(tuple(trial.point for _, trial in scored), tuple(score for score, _ in scored))
-            problem = SuggestProblem(self._plan.parameters, data, count=0, map_resolution=THETA_MAP_RESOLUTION)
-            self._questions.put(problem, "map", self._mapped)
+            query = RegressionQuery(self._plan.parameters, data, map_resolution=THETA_MAP_RESOLUTION)
+            self._questions.put(query, "map", self._mapped)
 
     def _mapped(self, suggestion: Suggestion) -> None:
         self._final = suggestion
@@ -309,22 +309,21 @@ class BayesianCalibration(DiscrepancyOverPours[C3Settings]):
         tried = len(self._trials)
         if tried == 0:
             count = min(max(self._settings.initial, 1), self._settings.thetas)
-            problem = SuggestProblem(self._plan.parameters, Data(), acquisition="sobol", count=count)
-            self._questions.put(problem, "start", self._queue)
+            self._questions.put(SpaceFillingQuery(self._plan.parameters, count=count), "start", self._queue)
         elif tried < self._settings.thetas:
             if self._trials.ready:
-                problem = SuggestProblem(
+                query = MinimumQuery(
                     self._plan.parameters, self._observed(), pending=self._trials.pending(), kappa=self._settings.kappa
                 )
-                self._questions.put(problem, "calibrate", self._queue)
+                self._questions.put(query, "calibrate", self._queue)
         elif self._trials.idle:
-            problem = SuggestProblem(
+            query = MinimumQuery(
                 self._plan.parameters,
                 self._observed(everything=True),
                 acquisition="posterior_minimum",
                 map_resolution=THETA_MAP_RESOLUTION,
             )
-            self._questions.put(problem, "conclude", self._settle_at_minimum)
+            self._questions.put(query, "conclude", self._settle_at_minimum)
 
     def _queue(self, suggestion: Suggestion) -> None:
         for i, point in enumerate(suggestion.points):

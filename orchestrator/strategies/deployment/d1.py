@@ -15,7 +15,15 @@ from dataclasses import replace
 from statistics import NormalDist
 from typing import Any, ClassVar, Literal
 
-from actors.optimizer.questions import Data, Point, Risk, Suggestion, SuggestProblem
+from actors.optimizer.questions import (
+    Data,
+    MinimumQuery,
+    Point,
+    RegressionQuery,
+    Risk,
+    RiskQuery,
+    Suggestion,
+)
 from orchestrator.requests import Decision, Failed, Outcome, Prediction, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.campaign_plan import DeploymentPlan, Draw, Premises
 from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, MAX_REFUSED, Deployment, SearchSettings
@@ -160,25 +168,30 @@ class OneShotPlanning(Deployment[D1Settings]):
                 self._finish()
         elif len(self._trials) == 0:
             count = min(max(self._settings.initial, 1), max(wanted - 1, 1))
-            self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
+            self._questions.put(self._space_filling(count=count), "start", simulate)
         elif done < wanted - 1:
             if self._trials.ready:
-                self._questions.put(self._model(), "plan", simulate)
+                self._questions.put(self._search(), "plan", simulate)
         elif done < wanted:
             if self._trials.idle:
-                self._questions.put(self._model(everything=True, acquisition="posterior_minimum"), "plan", simulate)
+                self._questions.put(self._search(everything=True, acquisition="posterior_minimum"), "plan", simulate)
         elif self._trials.idle:
             self._recommend_again()
 
     def _recommend_again(self) -> None:
-        problem = self._model(everything=True, count=0, map_resolution=MAP_RESOLUTION)
-        self._questions.put(problem, "conclude", self._recommend)
+        self._questions.put(self._regression(map_resolution=MAP_RESOLUTION), "conclude", self._recommend)
 
-    def _model(self, *, everything: bool = False, **changes: Any) -> SuggestProblem:
-        self._compromise.weigh(exploring=not everything)
-        data = self._simulated(everything=everything)
+    def _search(self, *, everything: bool = False, **parts: Any) -> MinimumQuery | RiskQuery:
+        """A query for the next action to simulate."""
+        self._scalarization.weigh(exploring=not everything)
         pending = self._trials.pending(everything=everything)
-        return self._problem(data, everything=everything, pending=pending, **changes)
+        data = self._simulated(everything=everything)
+        return self._query(MinimumQuery, data, everything=everything, pending=pending, **parts)
+
+    def _regression(self, **parts: Any) -> RegressionQuery | RiskQuery:
+        """A query about all simulations, without a proposal."""
+        self._scalarization.weigh(exploring=False)
+        return self._query(RegressionQuery, self._simulated(everything=True), **parts)
 
     def _recommend(self, suggestion: Suggestion) -> None:
         self._final, self._searched = suggestion, list(self._trials.all)
@@ -189,9 +202,8 @@ class OneShotPlanning(Deployment[D1Settings]):
         else:
             tolerated = self._tolerated(self._settings.window.tolerated)
             window = SafeWindow(self._plan.actions, suggestion.best_point, tolerated)
-            problem = replace(self._model(everything=True, count=0), predict_at=window.places)
-
-            self._questions.put(problem, "window", lambda outline: self._outlined(window, problem, outline))
+            query = replace(self._regression(), predict_at=window.places)
+            self._questions.put(query, "window", lambda outline: self._outlined(window, query, outline))
 
     def _use(self, suggestion: Suggestion) -> None:
         """Pour the recommended action, or finish if no pour is planned."""
@@ -220,7 +232,7 @@ class OneShotPlanning(Deployment[D1Settings]):
         assert all_spilled is not None
         return share * all_spilled
 
-    def _outlined(self, window: SafeWindow, problem: SuggestProblem, outline: Suggestion) -> None:
+    def _outlined(self, window: SafeWindow, query: RegressionQuery | RiskQuery, outline: Suggestion) -> None:
         """Continue with checks when the surrogate's answer for the window's places has arrived."""
         window.outline(outline.predictions, () if outline.risk is None else outline.risk.worst)
         self._window = window
@@ -276,7 +288,7 @@ class OneShotPlanning(Deployment[D1Settings]):
         return Progress(answered, self._settings.rounds * repeats + checks, self._counted, pours)
 
     def _spillage(self, point: Point) -> SampleStatistics | None:
-        """Statistics over seeds that took part in the selection; `orchestrator.strategies.repeated_simulation` uses new
+        """Statistics over seeds that took part in the selection; `orchestrator.strategies.single_action` uses new
         ones."""
         tried = [trial for trial in self._searched if trial.point == point]
         return SampleStatistics.of(
@@ -332,18 +344,18 @@ class RobustPlanning(OneShotPlanning):
         begin, self._used = self._used, self._used + repeats - 1
         return self._under(action, purpose, [self._disturbances.nominal, *self._sequence[begin : self._used]])
 
-    def _outlined(self, window: SafeWindow, problem: SuggestProblem, outline: Suggestion) -> None:
+    def _outlined(self, window: SafeWindow, query: RegressionQuery | RiskQuery, outline: Suggestion) -> None:
         """For the mean, the surrogate's expectation over the draws of the checks is needed, too."""
-        if problem.risk is None or problem.risk.level > 0.0:
-            super()._outlined(window, problem, outline)
+        if not isinstance(query, RiskQuery) or query.risk.level > 0.0:
+            super()._outlined(window, query, outline)
             return
         few = tuple(self._disturbances.disturbance(draw) for draw in self._check_draws)
 
         def known(expected: Suggestion) -> None:
             window.allow_for(outline.predictions, expected.predictions)
-            super(RobustPlanning, self)._outlined(window, problem, outline)
+            super(RobustPlanning, self)._outlined(window, query, outline)
 
-        self._questions.put(replace(problem, risk=Risk(few)), "window", known)
+        self._questions.put(replace(query, risk=Risk(few)), "window", known)
 
     @property
     def _checks(self) -> int:
@@ -378,12 +390,21 @@ class RobustPlanning(OneShotPlanning):
                     data = data.added(self._disturbances.executed(trial.point, self._draws[request]), cost)
         return data
 
-    def _model(self, *, everything: bool = False, **changes: Any) -> SuggestProblem:
-        problem = super()._model(everything=everything, **changes)
-        if len(problem.data) == 0:
-            return problem
-        places = self._allowed(everything=everything) or (problem.data.points[0][: self._plan.actions.dimension],)
-        return replace(problem, risk=self._disturbances.risk, predict_at=places)
+    def _search(self, *, everything: bool = False, **parts: Any) -> MinimumQuery | RiskQuery:
+        pending = self._trials.pending(everything=everything)
+        risk = self._risk_query(everything=everything, pending=pending, **parts)
+        return risk or super()._search(everything=everything, **parts)
+
+    def _regression(self, **parts: Any) -> RegressionQuery | RiskQuery:
+        return self._risk_query(everything=True, count=0, **parts) or super()._regression(**parts)
+
+    def _risk_query(self, *, everything: bool, **parts: Any) -> RiskQuery | None:
+        """A query about the risk measure; None before any observation."""
+        data = self._simulated(everything=everything)
+        if len(data) == 0:
+            return None
+        parts["predict_at"] = self._allowed(everything=everything) or (data.points[0][: self._plan.actions.dimension],)
+        return self._query(RiskQuery, data, everything=everything, risk=self._disturbances.risk, **parts)
 
     def _allowed(self, *, everything: bool) -> tuple[Point, ...]:
         """Tried actions that may be recommended: they have a cost, and the cups do not touch as planned."""

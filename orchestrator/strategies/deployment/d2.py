@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from actors.optimizer.questions import Data, Suggestion, SuggestProblem
+from actors.optimizer.questions import Data, MinimumQuery, RegressionQuery, Suggestion
 from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
 from orchestrator.strategies.strategy import Strategy
@@ -40,23 +40,24 @@ class RealOnly(Deployment[D2Settings]):
     def _next(self, free_simulations: int) -> None:
         if self._pouring is not None:
             return
-        self._compromise.weigh(exploring=self._pours_left)
+        self._scalarization.weigh(exploring=self._pours_left)
         if self._pours_left:
             made = [p for p in self._pours if p.status != "refused"]
             known = [*(point for point, _ in self._former), *(p.point for p in made)]
             if len(known) < min(self._settings.initial, self._plan.pours):
                 # one Sobol sequence, point by point, each far from the points already poured
-                tried = Data(tuple(known), tuple(0.0 for _ in known))
-                self._questions.put(self._problem(tried, acquisition="sobol"), "start", self._start)
+                self._questions.put(self._space_filling(known=tuple(known)), "start", self._start)
             else:
-                problem = self._problem(self._real(), mean=self._settings.mean, map_resolution=MAP_RESOLUTION)
-                self._questions.put(problem, "pour", self._pour_first)
+                self._questions.put(self._about(MinimumQuery), "pour", self._pour_first)
         else:
-            problem = self._problem(self._real(), mean=self._settings.mean, count=0, map_resolution=MAP_RESOLUTION)
-            self._questions.put(problem, "conclude", self._conclude)
+            self._questions.put(self._about(RegressionQuery), "conclude", self._conclude)
 
-    def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
-        return self._problem(poured, mean=self._settings.mean)
+    def _about(self, kind: type[MinimumQuery | RegressionQuery]) -> MinimumQuery | RegressionQuery:
+        """A query about the real cost."""
+        return self._query(kind, self._real(), mean=self._settings.mean, map_resolution=MAP_RESOLUTION)
+
+    def _front_query(self, simulated: Data, poured: Data) -> RegressionQuery:
+        return self._query(RegressionQuery, poured, mean=self._settings.mean)
 
     def _start(self, suggestion: Suggestion) -> None:
         self._pour(suggestion.points[0], None)

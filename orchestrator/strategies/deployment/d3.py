@@ -1,8 +1,8 @@
-"""D3: real pours around what simulation expects, while simulation goes on.
+"""D3: real pours with simulations as the prior, and further simulations while the arm pours.
 
-The settings of D3.
-
-D3 with a pool that never waits for the arm, nor the arm for the optimiser: simulations where they pay.
+- `D3Settings` holds the settings and selects the strategy.
+- `Hybrid` runs a fixed number of simulations between two pours.
+- `FreeHybrid` runs simulations as long as they are worth their time.
 """
 
 from __future__ import annotations
@@ -12,18 +12,19 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from actors.optimizer.questions import (
-    AcquisitionName,
     Data,
     Limit,
+    MinimumQuery,
     ModelDiscrepancy,
     Point,
+    PourQuery,
     SearchEffort,
+    SimulationQuery,
     Suggestion,
-    SuggestProblem,
+    SuggestionQuery,
 )
 from orchestrator.requests import Answered, Ask, Decision, Outcome, Pour, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.campaign_plan import DeploymentPlan, Premises
-from orchestrator.strategies.deployment.bench_offset import play_of, thinned
 from orchestrator.strategies.deployment.costing import Prices, PricesSettings
 from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
 from orchestrator.strategies.deployment.deployment_result import Deployed
@@ -34,8 +35,10 @@ from orchestrator.strategies.deployment.model_monitoring import (
     Rules,
     StopSettings,
     Trust,
+    offset_priors,
+    subsampled,
 )
-from orchestrator.strategies.deployment.real_pours import Foretold, PourTrial
+from orchestrator.strategies.deployment.real_pours import PourTrial, PredictionCheck
 from orchestrator.strategies.strategy import Progress, Strategy
 from sim_engine.action import described
 from sim_engine.liquids import SimulationParameters
@@ -89,41 +92,41 @@ class D3Settings(SearchSettings):
 
     @property
     def beside(self) -> int | None:
-        """Simulations told between two pours; None: for as long as a pour takes."""
+        """Number of simulations between two pours; None: as many as fit into the duration of a pour."""
         return None if self.per_pour == "free" else int(self.per_pour)
 
     @property
     def adaptive(self) -> bool:
-        """Whether it averages over the ways in which the simulator may be wrong."""
+        """Whether the surrogate averages over the ways in which the simulator may be wrong."""
         return self.model == "adaptive"
 
     @property
     def order(self) -> Order:
-        """Only where simulations go on for as long as a pour takes does the clock decide what is asked for."""
+        """Order of outcomes: completion order only if simulations run for the duration of a pour."""
         return "completion" if self.beside is None else "logical"
 
     @property
     def simulations(self) -> int:
-        """Those before the first pour and beside all."""
+        """Number of simulations before the first pour and during all pours."""
         return self.prior_simulations + (self.pours or 0) * self.simulations_beside
 
     @property
     def simulations_before(self) -> int:
-        """Those of the prior."""
+        """Number of simulations for the prior."""
         return self.prior_simulations
 
     @property
     def simulations_beside(self) -> int:
-        """Those told between two pours."""
+        """Number of simulations between two pours; 0 if it is not fixed."""
         return self.beside or 0
 
     @property
     def spending(self) -> str:
-        """What it spends into one receiver, in words."""
+        """The budget per receiver, as text."""
         return f"{self.prior_simulations} simulations, then {self.pours} pours with {self.per_pour} beside each"
 
     def check(self, premises: Premises, complaints: Problems) -> None:
-        """Prices decide only where simulations go on for as long as they are worth it."""
+        """Check that each key belongs to the selected model and number of simulations."""
         super().check(premises, complaints)
         if self.prices is not None and self.beside is not None:
             text = f"decides nothing with 'per_pour: {self.per_pour}'; write 'per_pour: free', or remove it"
@@ -134,11 +137,11 @@ class D3Settings(SearchSettings):
 
     @property
     def learns_of_benches(self) -> bool:
-        """What is known of the bench beforehand enters its hypotheses."""
+        """Whether earlier knowledge of the bench enters the hypotheses."""
         return self.adaptive
 
     def rules(self, worst: float) -> Rules:
-        """What follows on what the pours say of the simulator, in units of a loss whose largest value is given."""
+        """Rules for the consequences of pours, in units of a loss with the given largest value."""
         limit = None if self.risk_limit is None else Limit(worst * self.risk_limit.loss, self.risk_limit.probability)
         return Rules(
             ignorance=self.ignorance or DiscrepancyPolicySettings(),
@@ -149,23 +152,23 @@ class D3Settings(SearchSettings):
         )
 
     def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
-        """The strategy itself."""
+        """Build the strategy."""
 
         return (FreeHybrid if self.beside is None else Hybrid)(plan, scene, parameters, seed)
 
 
 class Hybrid(Deployment[D3Settings]):
-    """D3: as D2, but the surrogate's prior mean is learnt from m2 simulations, and goes on learning between pours.
+    """D3: as D2, but the surrogate's prior mean comes from m2 simulations, and from further ones between pours.
 
     First, Bayesian optimisation in simulation chooses m2 actions. Their surrogate becomes the prior of the real
     cost, f_r(a) = f_s(a) + δ(a): its posterior mean is the prior mean, its posterior covariance adds to δ's. The first
     pour is the minimiser of the prior mean; every further one minimises m(a) − κ s(a) given the weighed pours.
 
-    With `per_pour = k`, one question answers with the next pour and k places where a simulation would matter
-    most, which are simulated beside the pour and enter the prior: learning from real trials interleaved with planning
-    in a model (Dyna). With `per_pour = 'free'`, simulations go on for as long as the pour takes.
+    With `per_pour = k`, one query returns the next pour and the k most informative actions. These are simulated during
+    the pour and enter the prior: learning from real trials interleaved with planning in a model (Dyna). With `per_pour
+    = 'free'`, simulations continue as long as the pour takes.
 
-    `model` says how simulations enter the surrogate. The above is 'residual', the paper's, which always believes the
+    `model` defines how simulations enter the surrogate. The above is 'residual', the paper's, which always trusts the
     simulator; 'adaptive' averages over the ways in which it may be wrong, and weighs them by every pour.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D3; m2 = 37, 15 pours).
@@ -181,17 +184,17 @@ class Hybrid(Deployment[D3Settings]):
         self._unasked: Ask | None = None
         self._asked: Ask | None = None
 
-    # -- asking and listening --------------------------------------------------------------------------------------
+    # -- requests and outcomes --------------------------------------------------------------------------------------
 
     def ask(self, slots: Slots) -> list[Request]:
-        """As every deployment; nothing new while a person has to decide."""
+        """As in the base class; no new requests while the operator has to decide."""
         if self._unasked is not None:
             self._asked, self._unasked = self._unasked, None
             return [self._asked]
         return [] if self._asked is not None else super().ask(slots)
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """As every deployment, or how to go on with a simulator that is wrong."""
+        """As in the base class; in addition, the operator's answer about a wrong simulator."""
         if not isinstance(request, Ask):
             super().tell(request, outcome)
             return
@@ -209,7 +212,7 @@ class Hybrid(Deployment[D3Settings]):
         elif self._pours_left:
             self._next_pour()
         else:
-            self._questions.put(self._hybrid(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
+            self._questions.put(self._pour_query(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
 
     def _next_prior(self) -> None:
         def simulate(suggestion: Suggestion) -> None:
@@ -217,17 +220,17 @@ class Hybrid(Deployment[D3Settings]):
 
         if len(self._trials) == 0:
             count = min(max(self._settings.initial, 1), self._settings.prior_simulations)
-            self._questions.put(self._problem(Data(), acquisition="sobol", count=count), "start", simulate)
+            self._questions.put(self._space_filling(count=count), "start", simulate)
         elif self._trials.ready:
-            self._compromise.weigh(exploring=True)
+            self._scalarization.weigh(exploring=True)
             # in the paper κ is constant, and no simulation only fills space
             known, pending, plain = self._simulated(), self._trials.pending(), not self._settings.adaptive
-            problem = self._problem(known, everything=False, pending=pending, plain=plain)
-            self._questions.put(problem, "prior", simulate)
+            query = self._query(MinimumQuery, known, everything=False, pending=pending, plain=plain)
+            self._questions.put(query, "prior", simulate)
 
     def _next_pour(self) -> None:
-        """The next pour, and with it the simulations that run beside it."""
-        problem = self._hybrid(
+        """Query the next pour, and the simulations that run during it."""
+        query = self._pour_query(
             count=1 + self._settings.simulations_beside,
             acquisition=self._acquisition,
             map_resolution=MAP_RESOLUTION,
@@ -237,22 +240,22 @@ class Hybrid(Deployment[D3Settings]):
             self._pour_first(suggestion)
             self._simulate(suggestion, "refine", first=1)
 
-        self._questions.put(problem, "pour", lambda suggestion: self._judged(suggestion, pour))
+        self._questions.put(query, "pour", lambda suggestion: self._judged(suggestion, pour))
 
     def _judged(self, suggestion: Suggestion, pour: Callable[[Suggestion], None]) -> None:
-        """Say what the latest pour has told of the simulator; then the next one is made, or it is not."""
-        if self._trust is None or suggestion.mismatch is None:
+        """Record the conclusions about the simulator, and make the next pour if they allow it."""
+        if self._trust is None or suggestion.discrepancy is None:
             pour(suggestion)
             return
-        self._trust.hear(suggestion.mismatch, self._pours)
+        self._trust.record(suggestion.discrepancy, self._pours)
         verdict = self._trust.judge(suggestion, self._pours, self._plan.pours - self._counted)
-        self._said()
+        self._take_decisions()
         if verdict.ask is not None:
 
             def answered(answer: str) -> None:
                 assert self._trust is not None
                 end = self._trust.answer(answer, limit=verdict.limit)
-                self._said()
+                self._take_decisions()
                 if end:
                     self._end(end)
                 else:
@@ -264,19 +267,19 @@ class Hybrid(Deployment[D3Settings]):
         else:
             pour(suggestion)
 
-    def _said(self) -> None:
+    def _take_decisions(self) -> None:
         assert self._trust is not None
         self.decisions += self._trust.decisions
         self._trust.decisions.clear()
 
     def _end(self, why: str) -> None:
-        """No further pour: conclude with what is known."""
+        """Make no further pour; conclude with the data so far."""
         self._ended = why
 
     def _concluded(self, suggestion: Suggestion) -> None:
-        if self._trust is not None and suggestion.mismatch is not None:
-            self._trust.hear(suggestion.mismatch, self._pours)
-            self._said()
+        if self._trust is not None and suggestion.discrepancy is not None:
+            self._trust.record(suggestion.discrepancy, self._pours)
+            self._take_decisions()
         self._conclude(suggestion)
 
     @property
@@ -284,45 +287,41 @@ class Hybrid(Deployment[D3Settings]):
         return super()._pours_left and self._ended is None
 
     @property
-    def _acquisition(self) -> AcquisitionName:
-        """What chooses the next pour."""
-        if self._settings.adaptive and not self._compromise.exploring:
+    def _acquisition(self) -> str:
+        """Acquisition of the next pour."""
+        if self._settings.adaptive and not self._scalarization.exploring:
             return "least_loss"
         return "lcb" if self._pours or self._former else "posterior_minimum"
 
-    def _hybrid(self, **changes: Any) -> SuggestProblem:
-        self._compromise.weigh(exploring=changes.get("count") != 0)
-        return self._informed(self._real(), self._simulated(everything=True), **changes)
+    def _pour_query(self, **parts: Any) -> PourQuery:
+        """A query for the next pour; with a count of 0, about the real cost only."""
+        self._scalarization.weigh(exploring=parts.get("count") != 0)
+        return self._informed(self._real(), self._simulated(everything=True), **parts)
 
-    def _informed(self, poured: Data, simulated: Data, **changes: Any) -> SuggestProblem:
-        """A question about the real cost, with what the simulations say of it."""
-        if not self._settings.adaptive:
-            changes["mean"] = "simulated"
-        elif changes.get("acquisition") == "knowledge":  # what one more simulation is worth beside a pour
-            changes["mean"] = "scaled"
-        else:
-            changes |= {"mean": "adaptive", "mismatch": self._mismatch}
-        return self._problem(poured, simulated=simulated, **changes)
+    def _informed(self, poured: Data, simulated: Data, **parts: Any) -> PourQuery:
+        return self._query(PourQuery, poured, simulated=simulated, discrepancy=self._discrepancy, **parts)
 
     @property
-    def _mismatch(self) -> ModelDiscrepancy:
-        """How the simulator may be wrong."""
+    def _discrepancy(self) -> ModelDiscrepancy | None:
+        """The ways in which the simulator may be wrong; None with the paper's model."""
+        if not self._settings.adaptive:
+            return None
         left = max(self._plan.pours - self._counted - 1, 0)
         limit = self._rules.limit
         if limit is not None and not any(p.cost is not None and p.cost <= limit.loss for p in self._pours):
-            limit = None  # nothing good is in hand that could be poured again
+            limit = None  # no poured action keeps it and could be repeated
         return ModelDiscrepancy(
-            play_of(self._plan.actions),
+            offset_priors(self._plan.actions),
             self._plan.bench,
             worst=self._costing.worst,
-            left=left,
+            pours_left=left,
             limit=limit,
-            # a first pour for what it tells may end in a corner, and a limit keeps those that follow there
-            looks_ahead=self._rules.limit is None or limit is not None,
+            # an informative first pour may end in a corner, and a limit would keep the following pours there
+            lookahead=self._rules.limit is None or limit is not None,
         )
 
-    def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
-        return self._informed(poured, simulated)
+    def _front_query(self, simulated: Data, poured: Data) -> PourQuery:
+        return self._informed(poured, simulated, count=0)
 
     @property
     def _warned(self) -> bool:
@@ -330,53 +329,54 @@ class Hybrid(Deployment[D3Settings]):
 
     # -- results ---------------------------------------------------------------------------------------------------
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> Foretold | Believed:
+    def _trusted(self, weighed: Sequence[PourTrial]) -> PredictionCheck | Believed:
         return super()._trusted(weighed) if self._trust is None else self._trust.result()
 
     def result(self) -> Deployed:
-        """What was learnt so far, of the bench too."""
+        """The result so far, with the conclusions about the bench."""
         bench = None if self._trust is None else self._trust.bench()
         return super().result().model_copy(update={"ended": self._ended, "bench": bench})
 
     def progress(self) -> Progress:
-        """Simulations and pours done, and in all (those beside the pours count only where their number is fixed)."""
+        """Simulations and pours done, and their totals; simulations during pours count only if their number is
+        fixed."""
         simulations = self._settings.prior_simulations + self._plan.pours * self._settings.simulations_beside
         answered = self._trials.answered - self._unspent
         done = min(answered, simulations) if self._settings.beside is None else answered
-        if self._ended is not None:  # those that will not be made any more
+        if self._ended is not None:  # no further ones will be made
             simulations = done
         pours = self._counted if self._ended is not None else self._plan.pours
         return Progress(done, simulations, min(self._counted, pours), pours)
 
 
 MOST_SIMULATIONS = 200
-"""Simulations that one question carries: more would keep the arm waiting."""
+"""Largest number of simulations in one query; with more, the arm would wait for the answer."""
 
 FRESH_FITS = 40
-"""Observations up to which hyperparameters are looked for afresh: it is quick, and the last ones may be a bad start."""
+"""Number of observations up to which hyperparameters are fitted from scratch, which is quick."""
 
 STEPS = 4
-"""Steps by which they follow the data in every question above that."""
+"""Number of optimiser steps per fit above that."""
 
 LOST_IN_A_ROW = 20
-"""Simulations that may come to nothing one after the other before no more are tried beside a pour."""
+"""Number of consecutive failed simulations after which no more are requested during a pour."""
 
 
 class FreeHybrid(Hybrid):
-    """D3 whose simulations are chosen, and ended, by what they are worth: Dyna with prices.
+    """D3 that chooses and ends simulations by their value of information: Dyna with costs.
 
-    Every simulation is made where one more of them would lower the least expected real cost most (the acquisition
-    'knowledge'). Before the first pour that is set against the value of a pour, each by the seconds it costs; the pour
-    comes as soon as it is worth more per second, after `prior_simulations` at the latest. Beside a pour, simulations
-    cost the arm no time: they go on until as many as fit beside it are worth next to nothing, that is when only pours
-    can tell what is still in doubt. Then the pool rests until something new is known.
+    Every simulation is made where it reduces the least expected real cost most (a `SimulationQuery`). Before the first
+    pour, its value per second is compared with that of a pour. The pour is made as soon as it has the higher value per
+    second, after `prior_simulations` at the latest. During a pour, simulations take no time of the arm. They continue
+    until all that fit into the pour have a negligible value together, because only pours can reduce the remaining
+    uncertainty. Then the pool is idle until the next outcome.
 
-    Nobody waits. The next simulations are chosen ahead, so that a slot that falls free has one at once. Questions
-    carry the hyperparameters of the last answer and a limited number of simulations; with each, the fit follows the
-    data by a few steps. The picture of the surrogate is asked for beside a pour.
+    Arm and pool do not wait for the optimiser. The next simulations are chosen in advance, so that a free slot has one
+    immediately. Queries contain the hyperparameters of the last answer and a limited number of simulations, and each
+    fit takes a few steps only. The map of the surrogate is requested during a pour.
 
-    Limitations: in completion order the clock decides what is asked for; only the journal repeats a run. A front is
-    looked for without prices, with fits afresh.
+    Limitations: in completion order the requests depend on timing; only the journal repeats a run. A Pareto front is
+    searched without costs, with fits from scratch.
     """
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
@@ -385,26 +385,26 @@ class FreeHybrid(Hybrid):
         self._out: set[str] = set()
         self._awaited: int | None = None
         self._rested_at: int | None = None
-        self._told_of_rest = -1
+        self._reported_idle_at = -1
         self._map_due = False
         self._fitted: dict[tuple[str, bool], tuple[tuple[float, ...], ...]] = {}
         self._around: Point | None = None
 
-    # -- listening -------------------------------------------------------------------------------------------------
+    # -- outcomes -------------------------------------------------------------------------------------------------
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """As D3, and learn what a simulation costs."""
+        """As in D3; in addition, record the duration of a simulation."""
         super().tell(request, outcome)
         if isinstance(request, Simulate) and isinstance(outcome, Simulated):
             self._prices.learn(outcome.outcome.cpu_s)
         if isinstance(request, Pour):
             self._rested_at = None
 
-    # -- what to ask next ------------------------------------------------------------------------------------------
+    # -- the next requests ------------------------------------------------------------------------------------------
 
     @property
     def _may_think(self) -> bool:
-        return True  # several questions may be out; each kind is asked once
+        return True  # several queries may be pending, one of each purpose
 
     def _next(self, free_simulations: int) -> None:
         if self._pouring is None:
@@ -417,7 +417,7 @@ class FreeHybrid(Hybrid):
 
     @property
     def _may_pour(self) -> bool:
-        """It was decided to pour, and what was simulated for it has been answered."""
+        """Whether the pour was decided, and the simulations before it are answered."""
         if self._pours:
             return True
         return self._awaited is not None and all(trial.closed for trial in self._trials.all[: self._awaited])
@@ -425,10 +425,10 @@ class FreeHybrid(Hybrid):
     def _wind_up(self) -> None:
         self._trials.withdraw()
         if self._trials.idle and not self._out:
-            self._put(self._hybrid(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
+            self._put(self._pour_query(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
 
     def _look_ahead(self) -> None:
-        """Choose simulations before there is a slot for them."""
+        """Choose simulations before a slot is free."""
         if self._out & {"start", "prior", "refine"}:
             return
         if self._awaited is None and not self._pours:
@@ -440,14 +440,13 @@ class FreeHybrid(Hybrid):
         settings, trials = self._settings, self._trials
         if len(trials) == 0 and settings.prior_simulations > 0:
             count = min(max(settings.initial, trials.width), settings.prior_simulations)
-            question = self._problem(Data(), acquisition="sobol", count=count)
-            self._put(question, "start", lambda suggestion: self._simulate(suggestion, "prior"))
+            self._put(self._space_filling(count=count), "start", lambda suggestion: self._simulate(suggestion, "prior"))
         elif len(trials) >= settings.prior_simulations:
             self._decide_to_pour("all prior simulations are asked for")
         elif trials.answered >= min(2, len(trials)) and trials.waiting < trials.width:
 
             def weighed(suggestion: Suggestion) -> None:
-                if suggestion.values and suggestion.pour_value is not None and not self._compromise.exploring:
+                if suggestion.values and suggestion.pour_value is not None and not self._scalarization.exploring:
                     one, pour = suggestion.values[0], suggestion.pour_value
                     if self._prices.prefers_pour(one, pour, trials.width):
                         self._decide_to_pour(self._comparison(one, pour), one, pour)
@@ -462,16 +461,16 @@ class FreeHybrid(Hybrid):
         self.decisions.append(Decision(text, {"simulation_value": one, "pour_value": pour}))
 
     def _refine(self, count: int) -> None:
-        """More simulations beside the pour, as long as they promise anything."""
+        """Query more simulations during the pour, as long as they have a value."""
 
         def weighed(suggestion: Suggestion) -> None:
             if not self._pours_left and self._pouring is None:
-                return  # the last pour has come in meanwhile
+                return  # the last pour has finished meanwhile
             if suggestion.surrogate is not None:
                 self._latest_map = suggestion
             one, pour = (suggestion.values or (0.0,))[0], suggestion.pour_value or 0.0
             exhausted = bool(suggestion.values) and self._prices.is_idle(one, self._trials.width)
-            if exhausted and not self._compromise.exploring:
+            if exhausted and not self._scalarization.exploring:
                 self._rest(f"what is left to learn, only pours tell: {self._comparison(one, pour)}", one, pour)
             elif self._trials.lost_in_a_row >= LOST_IN_A_ROW:
                 self._rest(f"the last {LOST_IN_A_ROW} simulations came to nothing", one, pour)
@@ -484,37 +483,49 @@ class FreeHybrid(Hybrid):
     def _rest(self, why: str, one: float, pour: float) -> None:
         self._rested_at = self._trials.answered
         asked = len(self._trials) - self._trials.waiting
-        if asked != self._told_of_rest:  # once, unless something was simulated since
+        if asked != self._reported_idle_at:  # once, unless there were simulations since
             values = {"pool_rests": 1.0, "simulation_value": one, "pour_value": pour}
             self.decisions.append(Decision(f"the pool rests: {why}", values))
-        self._told_of_rest = asked
+        self._reported_idle_at = asked
 
     def _next_pour(self) -> None:
-        """The next pour alone: what runs beside it is asked for once the arm is under way."""
+        """Query the next pour alone; the simulations during it are queried once the arm moves."""
 
         def pour(suggestion: Suggestion) -> None:
             self._pour_first(suggestion)
             self._rested_at, self._map_due = None, True
 
-        acquisition = self._acquisition
-        self._ask_quickly("pour", lambda answer: self._judged(answer, pour), count=1, acquisition=acquisition)
+        query = self._pour_query(count=1, acquisition=self._acquisition)
+        self._ask_quickly(query, "pour", lambda answer: self._judged(answer, pour))
 
-    # -- questions -------------------------------------------------------------------------------------------------
+    # -- queries -------------------------------------------------------------------------------------------------
 
-    def _ask_knowledge(self, count: int, purpose: str, then: Callable[[Suggestion], None], **changes: object) -> None:
-        trials = self._trials
-        pouring = tuple(pour.point for pour in self._pours[-1:] if pour.status == "pouring")
-        changes |= {"count": count, "pending": trials.pending(everything=True), "pouring": pouring}
-        self._ask_quickly(purpose, then, acquisition="knowledge", **changes)
+    def _ask_knowledge(
+        self, count: int, purpose: str, then: Callable[[Suggestion], None], map_resolution: int = 0
+    ) -> None:
+        self._scalarization.weigh(exploring=True)
+        query = self._query(
+            SimulationQuery,
+            self._real(),
+            simulated=self._simulated(everything=True),
+            count=count,
+            pending=self._trials.pending(everything=True),
+            pouring=tuple(pour.point for pour in self._pours[-1:] if pour.status == "pouring"),
+            coupling="scaled" if self._settings.adaptive else "residual",
+            map_resolution=map_resolution,
+        )
+        self._ask_quickly(query, purpose, then)
 
-    def _ask_quickly(self, purpose: str, then: Callable[[Suggestion], None], **changes: object) -> None:
-        """Put a question that starts from the last fit."""
-        problem = self._hybrid(**changes)
-        key = (problem.mean, len(problem.simulated) >= 2)
-        effort = SearchEffort()
-        if len(problem.data) + len(problem.simulated) > FRESH_FITS and not self._compromise.wanted:
-            # noise that varies with the cost is fitted afresh: what it depends on is found in two steps
-            effort = SearchEffort(self._fitted.get(key, ()) if problem.noise == "constant" else (), STEPS)
+    def _ask_quickly(
+        self, query: PourQuery | SimulationQuery, purpose: str, then: Callable[[Suggestion], None]
+    ) -> None:
+        """Put a query whose fit starts from the last one of the same model."""
+        adaptive = isinstance(query, PourQuery) and query.discrepancy is not None
+        model = query.coupling if isinstance(query, SimulationQuery) else "adaptive" if adaptive else "residual"
+        key, effort = (model, len(query.simulated) >= 2), SearchEffort()
+        if len(query.data) + len(query.simulated) > FRESH_FITS and not self._scalarization.wanted:
+            # noise that varies with the cost is fitted from scratch, because its fit has two stages
+            effort = SearchEffort(self._fitted.get(key, ()) if query.noise == "constant" else (), STEPS)
 
         def answered(suggestion: Suggestion) -> None:
             if suggestion.fitted:
@@ -522,20 +533,20 @@ class FreeHybrid(Hybrid):
             self._around = suggestion.best_point or self._around
             then(suggestion)
 
-        self._put(replace(problem, effort=effort), purpose, answered)
+        self._put(replace(query, effort=effort), purpose, answered)
 
-    def _put(self, problem: SuggestProblem, purpose: str, then: Callable[[Suggestion], None]) -> None:
+    def _put(self, query: SuggestionQuery, purpose: str, then: Callable[[Suggestion], None]) -> None:
         def answered(suggestion: Suggestion) -> None:
             self._out.discard(purpose)
             then(suggestion)
 
         self._out.add(purpose)
-        self._questions.put(problem, purpose, answered)
+        self._questions.put(query, purpose, answered)
 
     def _simulated(self, *, everything: bool = False) -> Data:
-        """All that are in: beside a pour there is no order to keep."""
+        """All answered simulations: during a pour their order does not matter."""
         around = [pour.point for pour in self._pours[-2:]] + ([self._around] if self._around is not None else [])
-        return thinned(super()._simulated(everything=True), around, MOST_SIMULATIONS)
+        return subsampled(super()._simulated(everything=True), around, MOST_SIMULATIONS)
 
     # -- results ---------------------------------------------------------------------------------------------------
 
@@ -552,7 +563,7 @@ class FreeHybrid(Hybrid):
         self.decisions.append(Decision(text, {"simulation_value": one, "pour_value": pour}))
 
     def progress(self) -> Progress:
-        """As D3; simulations that were not worth their time count as made."""
+        """As in D3; simulations that were not needed count as made."""
         simulations = self._settings.prior_simulations
         begun = self._awaited is not None or bool(self._pours)
         done = simulations if begun else min(self._trials.answered, simulations)

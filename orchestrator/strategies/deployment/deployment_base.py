@@ -1,7 +1,4 @@
-"""What the deployment strategies share: asking, pouring, counting, reporting.
-
-What the settings of deployments share that look for the best action by a surrogate.
-"""
+"""Base of the deployment strategies D1, D2 and D3: requests, pours, counts and results, and their common settings."""
 
 from __future__ import annotations
 
@@ -9,7 +6,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Generic, TypeVar, cast
 
-from actors.optimizer.questions import Data, Point, Suggestion, SuggestProblem
+from actors.optimizer.questions import (
+    Data,
+    Point,
+    PourQuery,
+    RegressionQuery,
+    SpaceFillingQuery,
+    Suggestion,
+    SurrogateQuery,
+)
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Prediction, Request, Simulate, Slots, Suggest
 from orchestrator.strategies.calibration.calibration_base import Kappa
 from orchestrator.strategies.campaign_plan import DeploymentPlan, DeploymentSettings
@@ -17,13 +22,12 @@ from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Deployed, Recommended, RiskFound, SimulatedAction
 from orchestrator.strategies.deployment.model_monitoring import Believed
 from orchestrator.strategies.deployment.objectives import Vector
-from orchestrator.strategies.deployment.real_pours import Foretold, PourTrial, expecting, former_pours, trust
+from orchestrator.strategies.deployment.real_pours import PourTrial, PredictionCheck, expecting, former_pours, trust
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from orchestrator.strategies.deployment.scalarization import Scalarization
-from orchestrator.strategies.optimizer_queries import OptimizerQueries
 from orchestrator.strategies.stage_result import displayed_map
 from orchestrator.strategies.strategy import Progress
-from orchestrator.strategies.trials import SeedStream, Trial, Trials
+from orchestrator.strategies.trials import OptimizerQueries, SeedStream, Trial, Trials
 from sim_engine.action import Action, described
 from sim_engine.liquids import SimulationParameters
 from sim_engine.prediction_band import SampleStatistics
@@ -42,21 +46,24 @@ class SearchSettings(DeploymentSettings):
 
 
 MAX_REFUSED = 20
-"""Actions that may be refused (touching vessels, out of reach) free of charge: pours before a strategy gives up, and as
-many simulations before others count against the budget."""
+"""Number of refused actions (touching vessels, out of reach) that are free: pours before a strategy gives up, and
+simulations before further ones count against the budget."""
 
 MAP_RESOLUTION = 25
 
 S = TypeVar("S", bound=DeploymentSettings)
 """Settings of a deployment."""
 
+Q = TypeVar("Q", bound=SurrogateQuery)
+"""Type of a query."""
+
 
 class Deployment(ABC, Generic[S]):
-    """Base of D1, D2 and D3 in one scene. Subclasses say what to ask next (`_next`) and what to conclude.
+    """Base of D1, D2 and D3 in one scene. Subclasses choose the next query (`_next`) and conclude.
 
-    An action that can't be made, because the vessels touch or the arm can't reach, is refused before anything is
-    simulated or moved. It has no cost; the optimiser is given the place, and keeps away from where another refusal is
-    likely. A refusal does not count against a budget, but only so many are free. A pour that failed after something had
+    An impossible action, because the vessels touch or the arm can't reach it, is refused before anything is simulated
+    or moved. It has no cost. The optimiser is given the place, and avoids places where another refusal is likely. A
+    refusal does not count against a budget; at most `MAX_REFUSED` are free. A pour that failed after something had
     moved counts, and enters the data with the worst cost (`on_failed_pour: penalise`) or not at all (`ignore`).
     """
 
@@ -68,7 +75,7 @@ class Deployment(ABC, Generic[S]):
         self._parameters = parameters
         self._costing = Costing.of(plan, scene, parameters)
         self._seeds = SeedStream(seed, f"{plan.strategy} {scene.name}")
-        self._compromise = Scalarization(self._costing, self._seeds.rng)
+        self._scalarization = Scalarization(self._costing, self._seeds.rng)
         self._questions = OptimizerQueries(self._seeds)
         self._trials = Trials()
         self._width_known = False
@@ -85,15 +92,15 @@ class Deployment(ABC, Generic[S]):
             text = f"{len(self._former)} former pours enter the data ({path.parent.name}/{path.name})"
             self.decisions.append(Decision("; left out: ".join([text, *self._data.left_out])))
 
-    # -- asking and listening --------------------------------------------------------------------------------------
+    # -- requests and outcomes --------------------------------------------------------------------------------------
 
     @property
     def finished(self) -> bool:
-        """Nothing more to ask, nothing more to wait for."""
+        """Whether nothing is left to request and nothing is pending."""
         return self._finished and self._pouring is None and self._trials.idle
 
     def ask(self, slots: Slots) -> list[Request]:
-        """What is queued, and a question about what comes next as soon as its premises are known."""
+        """Return the queued requests, and the next query as soon as the data it depends on is complete."""
         if not self._width_known and slots.simulations > 0:
             self._trials.width, self._width_known = slots.simulations, True
         simulations = self._trials.issue(slots.simulations)
@@ -101,7 +108,7 @@ class Deployment(ABC, Generic[S]):
         if not self._finished and self._may_think and self._queued_pour is None:
             self._next(slots.simulations - len(simulations))
             pours += self._issued_pour(slots)
-        # questions come first: where outcomes are told in the order of asking, they then wait for no simulation
+        # queries come first: with outcomes in request order, a query then does not wait for simulations
         return [*self._questions.issue(), *pours, *simulations]
 
     def _issued_pour(self, slots: Slots) -> list[Pour]:
@@ -112,7 +119,7 @@ class Deployment(ABC, Generic[S]):
         return [self._pouring]
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """What came of a question, a simulation or a pour."""
+        """Record the outcome of a query, a simulation or a pour."""
         if isinstance(request, Suggest):
             self._questions.answer(request, outcome)
         elif isinstance(request, Simulate):
@@ -121,7 +128,7 @@ class Deployment(ABC, Generic[S]):
                 self._trials.settle(request, None, refused=True)
             else:
                 vector = self._costing.simulated(outcome, request.action)
-                self._trials.settle(request, self._compromise.note(request, vector))
+                self._trials.settle(request, self._scalarization.note(request, vector))
         elif request == self._pouring:
             self._pouring = None
             trial = self._pours[-1]
@@ -133,12 +140,12 @@ class Deployment(ABC, Generic[S]):
 
     @property
     def _may_think(self) -> bool:
-        """Nothing is queued and no question is out, so that it can be said what comes next."""
+        """Whether nothing is queued and no query is pending, so that the next query can be made."""
         return not self._questions.out and not self._trials.queued
 
     @abstractmethod
     def _next(self, free_simulations: int) -> None:
-        """Put the next question, or finish. Called where `_may_think` and no pour is queued."""
+        """Put the next query, or finish. It is called if `_may_think` and no pour is queued."""
 
     # -- pieces for subclasses -------------------------------------------------------------------------------------
 
@@ -166,10 +173,10 @@ class Deployment(ABC, Generic[S]):
         self.decisions.append(Decision(text) if prediction is None else expecting(text, prediction))
 
     def _pour_first(self, suggestion: Suggestion) -> None:
-        """Queue a pour of the first suggested point, with the surrogate's prediction where there is one."""
+        """Queue a pour of the first suggested point, with the surrogate's prediction if there is one."""
         self._latest_map = suggestion if suggestion.surrogate is not None else self._latest_map
         known = None
-        if suggestion.means and not self._compromise.exploring:
+        if suggestion.means and not self._scalarization.exploring:
             noise = suggestion.noises[0] if suggestion.noises else None
             known = Prediction(
                 suggestion.means[0],
@@ -184,21 +191,23 @@ class Deployment(ABC, Generic[S]):
         simulation from seed to seed, as fitted; None without a surrogate.
 
         Args:
-            noise: what the answer says of the place; None: what it says of all places.
+            noise: of the answer at this point; None: the noise of the whole surrogate.
         """
         return (suggestion.hyperparameters or {}).get("noise") if noise is None else noise
 
     def _real(self) -> Data:
-        """Observations of the real cost, those of before the campaign first."""
+        """Observations of the real cost; those from before the campaign come first."""
         poured = self._poured
-        return self._compromise.data(poured, [*poured, *self._compromise.of(self._trials.counting(everything=True))])
+        return self._scalarization.data(
+            poured, [*poured, *self._scalarization.of(self._trials.counting(everything=True))]
+        )
 
     def _simulated(self, *, everything: bool = False) -> Data:
         """Observations of the simulated cost."""
-        if not self._compromise.exploring:
+        if not self._scalarization.exploring:
             return self._trials.data(everything=everything)
-        observed = self._compromise.of(self._trials.counting(everything=everything))
-        return self._compromise.data(observed, [*self._poured, *observed])
+        observed = self._scalarization.of(self._trials.counting(everything=everything))
+        return self._scalarization.data(observed, [*self._poured, *observed])
 
     @property
     def _poured(self) -> list[tuple[Point, Vector]]:
@@ -212,7 +221,7 @@ class Deployment(ABC, Generic[S]):
 
     @property
     def _warned(self) -> bool:
-        """Pours that went wrong are warnings of more near them; in the paper they are pours that lost everything."""
+        """Whether failed pours indicate more failures near them; in the paper they are pours that lost everything."""
         return True
 
     @property
@@ -221,7 +230,7 @@ class Deployment(ABC, Generic[S]):
 
     @property
     def _spent(self) -> int:
-        """Simulated trials before any pour that count against their budget, as far as the next choice may know."""
+        """Simulated trials before any pour that count against their budget, as known to the next choice."""
         return len(self._trials) - self._unspent
 
     @property
@@ -238,70 +247,76 @@ class Deployment(ABC, Generic[S]):
         self._finish()
 
     def _finish(self) -> None:
-        """The end, once the front is known where one is looked for: a regression of each objective."""
-        if not self._compromise.wanted or self._compromise.front is not None:
+        """Finish; if a front is searched, first regress each objective."""
+        if not self._scalarization.wanted or self._scalarization.front is not None:
             self._finished = True
             return
-        simulated = self._compromise.of(self._trials.counting(everything=True))
-        self._compromise.look_for_front(
-            simulated, self._poured, self._plan.actions, self._front_problem, self._questions, self._finish
+        simulated = self._scalarization.of(self._trials.counting(everything=True))
+        self._scalarization.look_for_front(
+            simulated, self._poured, self._plan.actions, self._front_query, self._questions, self._finish
         )
 
-    def _front_problem(self, simulated: Data, poured: Data) -> SuggestProblem:
+    def _front_query(self, simulated: Data, poured: Data) -> RegressionQuery | PourQuery:
         """How one objective is regressed: of the simulations, unless a strategy pours."""
-        return self._problem(simulated)
+        return self._query(RegressionQuery, simulated)
 
     def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
         text = f"{what}  {described(values)}"
         if not suggestion.means:
             found = Decision(f"{text}  (no surrogate yet)")
-        elif self._compromise.exploring:
-            found = Decision(f"{text}  (a compromise under random weights)")
+        elif self._scalarization.exploring:
+            found = Decision(f"{text}  (a scalarization under random weights)")
         else:
             found = expecting(text, Prediction(suggestion.means[index], suggestion.deviations[index]))
         self.decisions.append(found)
 
-    def _problem(self, data: Data, *, everything: bool = True, **changes: Any) -> SuggestProblem:
-        """A question about the loss.
+    def _query(self, kind: type[Q], data: Data, *, everything: bool = True, **parts: Any) -> Q:
+        """A query about the loss.
 
         Args:
+            kind: its type.
+            data: observations of the loss.
             everything: use all refusals of simulations; else those that the next choice may know.
-            changes: fields of the problem.
+            parts: further fields of the query.
         """
-        trials = self._trials.counting(everything=everything)
         if isinstance(self._settings, SearchSettings):
-            changes = {"kappa": self._settings.kappa} | changes
-        return SuggestProblem(
-            self._plan.actions,
-            data,
-            constraints=self._plan.constraints,
-            infeasible=tuple(trial.point for trial in trials if trial.refused),
-            refused=tuple(p.point for p in self._pours if p.status == "refused"),
-            failed=tuple(p.point for p in self._pours if p.mishap and p.cost is not None) if self._warned else (),
-            noise=self._settings.noise,
-            **changes,
-        )
+            parts["kappa"] = self._settings.kappa
+        return kind(self._plan.actions, data, noise=self._settings.noise, **self._limits(everything), **parts)
+
+    def _space_filling(self, **parts: Any) -> SpaceFillingQuery:
+        """A query for points that fill the space of actions."""
+        return SpaceFillingQuery(self._plan.actions, **self._limits(everything=True), **parts)
+
+    def _limits(self, everything: bool) -> dict[str, Any]:
+        """Constraints, refusals and failures, as fields of a query."""
+        trials = self._trials.counting(everything=everything)
+        return {
+            "constraints": self._plan.constraints,
+            "infeasible": tuple(trial.point for trial in trials if trial.refused),
+            "refused": tuple(p.point for p in self._pours if p.status == "refused"),
+            "failed": tuple(p.point for p in self._pours if p.mishap and p.cost is not None) if self._warned else (),
+        }
 
     # -- results ---------------------------------------------------------------------------------------------------
 
     @property
     def best_values(self) -> dict[str, float] | None:
-        """The action to use from now on, by posterior mean [SI]; None before the end, or if nothing was learnt."""
+        """The recommended action, by posterior mean [SI]; None before the end, and without any usable outcome."""
         if self._final is None or self._final.best_point is None:
             return None
         return self._plan.actions.decode(self._final.best_point)
 
     def progress(self) -> Progress:
-        """Steps done, steps in all."""
+        """Requests done, and their total number."""
         return Progress(pours=min(self._counted, self._plan.pours), of_pours=self._plan.pours)
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> Foretold | Believed:
-        """How far the first pours bore out what was predicted."""
+    def _trusted(self, weighed: Sequence[PourTrial]) -> PredictionCheck | Believed:
+        """Compare the pours with their predictions."""
         return trust(weighed)
 
     def result(self) -> Deployed:
-        """What was learnt so far."""
-        names, front = self._compromise.names, self._compromise.front
+        """The result so far."""
+        names, front = self._scalarization.names, self._scalarization.front
         latest = self._final or self._latest_map
         return Deployed(
             strategy=self._plan.strategy,
@@ -336,18 +351,18 @@ class Deployment(ABC, Generic[S]):
         return f"{self._refused} pours were refused as invalid; the action space hardly allows any"
 
     def _recommended(self, final: Suggestion) -> Recommended | None:
-        """What the last answer recommends, and what to expect of it."""
+        """The recommendation of the last answer, with its prediction."""
         spillage = None if final.best_point is None else self._spillage(final.best_point)
         return Recommended.of(final, self._plan.actions, self._scatter(final, final.best_noise), spillage)
 
     def _spillage(self, point: Point) -> SampleStatistics | None:
-        """r = spilled / poured over the simulations of an action, where they are kept."""
+        """Statistics of r = spilled / poured over the simulations of an action, if they are recorded."""
         return None
 
     def _risk_found(self, final: Suggestion) -> RiskFound | None:
-        """What errors of execution do to the recommended action."""
+        """Effect of execution errors on the recommended action, if it was planned under them."""
         return None
 
     def _window_found(self) -> WindowFound | None:
-        """How far the recommended action may be missed."""
+        """The safe window around the recommended action, if it was searched."""
         return None

@@ -1,4 +1,4 @@
-"""What a deployment has learnt: D1, D2 and D3 alike, with what only some of them look for."""
+"""Result of a deployment: the same class for D1, D2 and D3, with optional parts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Literal
 
 from actors.optimizer.questions import Suggestion
 from orchestrator.strategies.deployment.model_monitoring import Believed, BenchFound
-from orchestrator.strategies.deployment.real_pours import Foretold, PourRow
+from orchestrator.strategies.deployment.real_pours import PourRow, PredictionCheck
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from orchestrator.strategies.stage_result import DisplayedMap, ResultPart, StageResult, displayed_action
 from sim_engine.prediction_band import SampleStatistics
@@ -15,7 +15,7 @@ from sim_engine.search_space import Space
 
 
 class Recommended(ResultPart):
-    """The action to use from now on, and what to expect of it."""
+    """The recommended action with its prediction."""
 
     action: dict[str, float | None]
     """Searched dimensions in display units."""
@@ -24,13 +24,13 @@ class Recommended(ResultPart):
     """The same in SI."""
 
     predicted_loss: float
-    """Expected, in the loss' own unit."""
+    """Expected loss, in its own unit."""
 
     predicted_deviation: float
-    """How well that mean is known."""
+    """Standard deviation of the expected loss."""
 
     predicted_scatter: float | None
-    """How much a single pour differs from it; None where nobody knows."""
+    """Scatter of a single pour around it; None if unknown."""
 
     predicted_spillage: float | None = None
     """D1: mean r = spilled / poured of its simulations, whose seeds took part in choosing it."""
@@ -45,13 +45,13 @@ class Recommended(ResultPart):
     def of(
         cls, final: Suggestion, actions: Space, scatter: float | None, spillage: SampleStatistics | None
     ) -> Recommended | None:
-        """What the last answer recommends; None if it does not.
+        """The recommendation of the last answer; None if there is none.
 
         Args:
             final: the answer.
             actions: space that was searched.
             scatter: of a single pour.
-            spillage: r of its simulations, where they are kept.
+            spillage: r of its simulations, if they are recorded.
         """
         if final.best_point is None or final.best_mean is None or final.best_deviation is None:
             return None
@@ -69,13 +69,13 @@ class Recommended(ResultPart):
 
 
 class RiskFound(ResultPart):
-    """What errors of execution and θ that fit do to the recommended action."""
+    """The recommended action under execution errors and posterior θ."""
 
     measure: Literal["expected", "cvar"]
-    """What was minimised."""
+    """Minimised measure."""
 
     level: float
-    """Share of the worst cases that a CVaR is the mean of."""
+    """Fraction of the worst cases that the CVaR averages."""
 
     value: float
     """The measure, in the loss' own unit."""
@@ -87,11 +87,11 @@ class RiskFound(ResultPart):
     """Standard deviation over them."""
 
     thetas: int
-    """θ of a posterior among them; 0 where θ is one."""
+    """Number of posterior θ among them; 0 with a single θ."""
 
 
 class ParetoAction(ResultPart):
-    """An action that no other one beats in all objectives."""
+    """An action of the Pareto front: no other action is better in all objectives."""
 
     action: dict[str, float | None]
     """Searched dimensions in display units."""
@@ -100,93 +100,93 @@ class ParetoAction(ResultPart):
     """The same in SI."""
 
     objectives: dict[str, float]
-    """Expected, by name."""
+    """Expected objectives, by name."""
 
     deviations: dict[str, float]
-    """How well each is known."""
+    """Standard deviation of each."""
 
 
 class SimulatedAction(ResultPart):
-    """An action that was simulated, and what came of it."""
+    """A simulated action with its loss."""
 
     action_si: dict[str, float]
     """Searched dimensions [SI]."""
 
     loss: float
-    """Mean over its simulations, in the loss' own unit."""
+    """Mean over its simulations, in the unit of the loss."""
 
 
 class Deployed(StageResult):
-    """What a deployment has learnt in one scene."""
+    """Result of a deployment in one scene."""
 
     kind: Literal["deployment"] = "deployment"
 
     strategy: str
-    """'D1' to 'D3', or another one's name."""
+    """'D1' to 'D3', or the name of another strategy."""
 
     scene: str
     """Name of the scene."""
 
     loss: str
-    """Name of what is minimised."""
+    """Name of the minimised loss."""
 
     simulations: int
-    """Those that were answered."""
+    """Number of simulations with an answer."""
 
     simulations_lost: int
-    """Those of them that could not be used."""
+    """Number of answered simulations that could not be used."""
 
     simulations_refused: int
-    """Actions that were refused before anything was simulated."""
+    """Number of actions refused before the simulation."""
 
     pours: tuple[PourRow, ...]
-    """All that are over, in the order made."""
+    """All completed pours, in the order made."""
 
     simulated: tuple[SimulatedAction, ...]
-    """Actions whose simulations gave a loss, in the order of asking."""
+    """Actions whose simulations yielded a loss, in request order."""
 
     former_pours: int
-    """Pours of before the campaign that it learnt from."""
+    """Number of pours from before the campaign among the data."""
 
     refused_pours: int
-    """Actions that were refused before anything moved."""
+    """Number of pours refused before anything moved."""
 
     failed_pours: int
-    """Pours that went wrong."""
+    """Number of failed pours."""
 
-    trust: Foretold | Believed
-    """How far the first pours were from what was predicted, or what all of them say of the simulator."""
+    trust: PredictionCheck | Believed
+    """Deviation of the first pours from their predictions, or the conclusions of all pours about the simulator."""
 
     gave_up: str | None = None
-    """Why it ended early."""
+    """Reason of an early end, after too many refusals."""
 
     ended: str | None = None
-    """Why it ended before all pours were made: nothing more to gain, or a limit."""
+    """Reason of an end before all pours were made: no further gain, or a limit."""
 
     bench: BenchFound | None = None
-    """How the bench differs from the simulator, for the next receiver."""
+    """Deviation of the bench from the simulator, for the next receiver."""
 
     objectives: tuple[str, ...] = ()
     """Names of several objectives; empty with a plain loss."""
 
     front: tuple[ParetoAction, ...] | None = None
-    """What nothing beats, where that was looked for."""
+    """The Pareto front, if it was searched."""
 
     map: DisplayedMap | None = None
-    """The loss over the two dimensions that matter most."""
+    """The loss over the two most important dimensions."""
 
     recommended: Recommended | None = None
-    """None before the end, or if nothing was learnt."""
+    """The recommended action; None before the end, and without any usable outcome."""
 
     risk: RiskFound | None = None
-    """What was found where one plans under errors."""
+    """The risk measure, if the action was planned under errors."""
 
     window: WindowFound | None = None
-    """How far the recommended action may be missed, where that was asked for."""
+    """The safe window around the recommended action, if it was searched."""
 
     @property
     def weighed(self) -> Sequence[PourRow]:
-        """The pours that were weighed and gave a loss."""
+        """Weighed pours with a loss."""
         return [pour for pour in self.pours if pour.status == "weighed" and pour.loss is not None]
 
     @property

@@ -1,4 +1,9 @@
-"""What every pour says about the simulator, in words; when a deployment ends, asks, or can't keep a limit."""
+"""The simulator judged by pours: its deviation from the bench, in words, and the rules that follow from it.
+
+- `Trust` records the optimiser's conclusions after every pour and decides whether the next pour is made.
+- `offset_priors` and `displacement` describe how a bench may deviate from its simulator.
+- `subsampled` selects the observations that a query carries.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
-from actors.optimizer.questions import BenchOffset, DiscrepancyFound, Limit, Suggestion
+import numpy as np
+
+from actors.optimizer.questions import BenchOffset, Data, DiscrepancyFound, Limit, OffsetPrior, Point, Suggestion
 from orchestrator.requests import Ask, Decision
 from orchestrator.strategies.deployment.real_pours import PourTrial
 from orchestrator.strategies.stage_result import ResultPart
-from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.action import ACTION_DIMENSIONS, DEG
+from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
 from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
@@ -23,10 +31,10 @@ STOP: Final = "stop"
 OPTIONS = (GO_ON, STOP)
 
 DOUBT = 0.3
-"""From this ignorance on a simulator is in doubt."""
+"""Probability of an uninformative simulator from which it is in doubt."""
 
 WORDS = ((0.05, "is borne out"), (DOUBT, "is borne out so far"), (0.7, "is in doubt"), (0.95, "is probably wrong here"))
-"""The words for a simulator whose ignorance is below each of these; above all of them it is wrong here."""
+"""Description of the simulator below each probability of being uninformative; above all, it is wrong here."""
 
 
 class DiscrepancyPolicySettings(Settings):
@@ -62,58 +70,58 @@ class StopSettings(Settings):
 
 
 class Belief(ResultPart):
-    """What was known of the simulator after a pour."""
+    """Conclusions about the simulator after a pour."""
 
     pour: int
-    """Its number; 0: before the first one."""
+    """Number of the pour; 0: before the first one."""
 
     ignorance: float
-    """Probability that the simulator says nothing of this bench."""
+    """Probability that the simulator contains no information about this bench."""
 
     gain: float | None
-    """What one more pour was expected to save, in the loss' own unit."""
+    """Expected saving of one more pour, in the unit of the loss."""
 
 
 class Displaced(ResultPart):
-    """By how much a dimension of what the simulator does differs from what is commanded."""
+    """Difference between the simulated and the commanded value of a dimension."""
 
     mean: float
-    """In the middle of the searched range [SI]."""
+    """Mean in the middle of the searched range [SI]."""
 
     deviation: float
-    """How well it is known [SI]."""
+    """Standard deviation [SI]."""
 
 
 class Believed(ResultPart):
-    """How far the simulator is to be trusted, pour by pour."""
+    """Conclusions about the simulator, pour by pour."""
 
     after: tuple[Belief, ...]
-    """Each pour that told something."""
+    """State after each pour that changed it."""
 
     displaced: dict[str, Displaced]
-    """By dimension."""
+    """Differences by dimension."""
 
     factor: float
-    """Real over simulated loss."""
+    """Ratio of real to simulated loss."""
 
     limit: float
-    """Ignorance from which the policy follows."""
+    """Probability of an uninformative simulator from which the policy applies."""
 
     policy: str
-    """What follows."""
+    """The policy."""
 
     followed: str | None
-    """What did; None below the limit."""
+    """The applied policy; None below the limit."""
 
     alarm: bool
-    """Ignorance is at or above the limit."""
+    """Whether the probability is at or above the limit."""
 
     text: str
-    """The last state in a sentence."""
+    """The last state as a sentence."""
 
 
 class BenchFound(ResultPart):
-    """Draws of how the bench differs from the simulator, for the next receiver."""
+    """Draws of the deviation of the bench from the simulator, for the next receiver."""
 
     axes: tuple[str, ...]
     """Searched dimensions, in order."""
@@ -125,18 +133,18 @@ class BenchFound(ResultPart):
     """The shift of each draw in each dimension, on the unit interval."""
 
     def displacements(self) -> tuple[BenchOffset, ...]:
-        """As questions carry them."""
+        """The draws as bench offsets of a query."""
         return tuple(BenchOffset(*pair) for pair in zip(self.scales, self.shifts, strict=True))
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What follows from an answer before its pour is made.
+    """Consequence of an answer before its pour is made.
 
     Attributes:
-        ask: a question to a person; None: nothing to ask.
-        end: why no pour follows; empty: one does.
-        limit: whether it is about the limit of a pour's loss.
+        ask: question to the operator; None: no question.
+        end: reason why no pour follows; empty if one does.
+        limit: whether it concerns the limit of a pour's loss.
     """
 
     ask: Ask | None = None
@@ -146,7 +154,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Rules:
-    """What a user has set; losses are in the loss' own unit."""
+    """Rules from the settings; losses in their own unit."""
 
     ignorance: DiscrepancyPolicySettings
     limit: Limit | None
@@ -156,7 +164,7 @@ class Rules:
 
 
 class Trust:
-    """Keeps what every answer says about the simulator, and judges whether the pour that it proposes is made."""
+    """Records the conclusions about the simulator, and decides whether a proposed pour is made."""
 
     def __init__(self, rules: Rules, actions: Space, worst: float) -> None:
         self._rules, self._actions, self._worst = rules, actions, worst
@@ -168,24 +176,24 @@ class Trust:
 
     # -- what is logged --------------------------------------------------------------------------------------------
 
-    def hear(self, found: DiscrepancyFound, pours: Sequence[PourTrial]) -> None:
-        """Take in an answer, and say in words what the latest pour changed."""
+    def record(self, found: DiscrepancyFound, pours: Sequence[PourTrial]) -> None:
+        """Record the conclusions of an answer, and log those of the latest pour."""
         known = [pour for pour in pours if pour.cost is not None]
         number = known[-1].number if known else 0
         self._latest = found
         if self._after and self._after[-1].pour == number:
             return
-        self._after.append(Belief(pour=number, ignorance=found.ignorance, gain=found.gain))
+        self._after.append(Belief(pour=number, ignorance=found.uninformative, gain=found.gain))
         if number:
-            values = {"ignorance": found.ignorance} | ({} if found.gain is None else {"gain": found.gain})
+            values = {"ignorance": found.uninformative} | ({} if found.gain is None else {"gain": found.gain})
             self.decisions.append(Decision(f"after pour {number} {self.text}", values, urgent=True))
 
     @property
     def text(self) -> str:
-        """'the simulator is borne out: 2 % that it says nothing of this bench; …'."""
+        """The latest conclusions: 'the simulator is borne out: 2 % that it says nothing of this bench; …'."""
         if self._latest is None:
             return ""
-        share = self._latest.ignorance
+        share = self._latest.uninformative
         word = next((word for limit, word in WORDS if share < limit), "is wrong here")
         text = f"the simulator {word}: {_percent(share)} that it says nothing of this bench"
         if share >= WORDS[-2][0]:
@@ -205,17 +213,17 @@ class Trust:
         pairs = zip(self._actions.axes, self._latest.shifts, self._latest.deviations, strict=True)
         return [_in_si(axis, shift, deviation) for axis, shift, deviation in pairs]
 
-    # -- what follows ----------------------------------------------------------------------------------------------
+    # -- decisions ----------------------------------------------------------------------------------------------
 
     def judge(self, suggestion: Suggestion, pours: Sequence[PourTrial], left: int) -> Verdict:
-        """Whether the proposed pour is made.
+        """Decide whether the proposed pour is made.
 
         Args:
-            suggestion: the answer with it.
-            pours: those made.
-            left: pours that the budget still has.
+            suggestion: the answer that proposes it.
+            pours: pours made so far.
+            left: number of pours left in the budget.
         """
-        found, rules = suggestion.mismatch, self._rules
+        found, rules = suggestion.discrepancy, self._rules
         if found is None:
             return Verdict()
         weighed = [pour.cost for pour in pours if pour.status == "weighed" and pour.cost is not None]
@@ -226,7 +234,7 @@ class Trust:
             if rules.gain_below is not None and found.gain is not None and found.gain < rules.gain_below:
                 why = f"no further pour is worth it: one more is expected to save {self._share(found.gain)}"
                 return self._saved(left, f"{why}, the best action to lose {self._share(best)}")
-        if found.ignorance >= rules.ignorance.limit and self._followed is None and weighed:
+        if found.uninformative >= rules.ignorance.limit and self._followed is None and weighed:
             return self._by(rules.ignorance.policy, self.text, "the simulator counts for as little as that")
         limit = rules.limit
         if limit is None or not any(cost <= limit.loss for cost in weighed) or not found.exceedances:
@@ -244,7 +252,7 @@ class Trust:
         return self._by(rules.otherwise, why, "the least risky action is poured", limit=True)
 
     def answer(self, answer: str, *, limit: bool) -> str:
-        """What a person decided; why nothing follows, or nothing."""
+        """Record the operator's answer; return the reason to end, or an empty text."""
         if limit:
             self._accepted = answer == GO_ON
         else:
@@ -275,8 +283,8 @@ class Trust:
     # -- results ---------------------------------------------------------------------------------------------------
 
     def result(self) -> Believed:
-        """All that was logged."""
-        ignorance = self._after[-1].ignorance if self._after else 0.0
+        """All conclusions so far."""
+        share = self._after[-1].ignorance if self._after else 0.0
         displaced = {} if self._latest is None else dict(zip(self._actions.names, self._shifts(), strict=True))
         return Believed(
             after=tuple(self._after),
@@ -285,12 +293,12 @@ class Trust:
             limit=self._rules.ignorance.limit,
             policy=self._rules.ignorance.policy,
             followed=self._followed,
-            alarm=ignorance >= self._rules.ignorance.limit,
+            alarm=share >= self._rules.ignorance.limit,
             text=self.text,
         )
 
     def bench(self) -> BenchFound | None:
-        """For the next receiver."""
+        """Deviation of the bench for the next receiver; None if no query requested it."""
         if self._latest is None or not self._latest.drawn:
             return None
         drawn = self._latest.drawn
@@ -302,7 +310,7 @@ class Trust:
 
 
 def _in_si(axis: Axis, shift: float, deviation: float) -> Displaced:
-    """A shift on the unit interval in the axis' own unit, taken in the middle of its range."""
+    """A shift on the unit interval in the unit of the axis, at the middle of its range."""
     if axis.scale == "log":
         middle, width = axis.decode(0.5), math.log(axis.upper / axis.lower)
         return Displaced(mean=middle * math.expm1(shift * width), deviation=middle * deviation * width)
@@ -324,3 +332,93 @@ def _percent(share: float) -> str:
     if percent < 0.05:
         return "less than 0.1 %"
     return f"{percent:.1f} %" if percent < 9.95 else f"{percent:.0f} %"
+
+
+LENGTH = 0.010
+"""Standard deviation of a position [m]; receivers are placed by hand."""
+
+ANGLE = 2.0 * DEG
+"""Standard deviation of a tilt [rad]."""
+
+CLOCK = 0.05
+"""Relative standard deviation of a speed, an acceleration or a time."""
+
+UNKNOWN = 0.1
+"""Standard deviation of a dimension with any other unit, as a fraction of the searched range."""
+
+
+def offset_priors(actions: Space) -> tuple[OffsetPrior, ...]:
+    """Assumed deviation of each searched dimension."""
+    return tuple(_offset_prior(axis) for axis in actions.axes)
+
+
+def displacement(believed: SimulationParameters, bench: SimulationParameters, actions: Space) -> BenchOffset:
+    """Offset at which a simulator with one set of nuisances behaves like a bench with another set.
+
+    Nuisances of dimensions that are not searched are left to the rest of the model.
+
+    Args:
+        believed: parameters of the simulator.
+        bench: possible parameters of the bench.
+    """
+    scales, shifts = [], []
+    moved = {
+        "x_offset": bench.receiver_x - believed.receiver_x,
+        "y_offset": believed.receiver_y - bench.receiver_y,  # the receiver moves, which shifts the pourer the other way
+        "height": believed.receiver_z - bench.receiver_z,
+        "max_angle": bench.tilt_zero - believed.tilt_zero,
+    }
+    for axis in actions.axes:
+        factor = bench.speed_factor / believed.speed_factor if axis.name == "angular_velocity" else 1.0
+        if axis.scale == "log":
+            middle = axis.decode(0.5)
+            factor *= max(1.0 + moved.get(axis.name, 0.0) / middle, 0.1)
+            scales.append(1.0)
+            shifts.append(math.log(factor) / math.log(axis.upper / axis.lower))
+        else:
+            width = axis.upper - axis.lower
+            scales.append(factor)
+            shifts.append(((factor - 1.0) * axis.lower + moved.get(axis.name, 0.0)) / width)
+    return BenchOffset(tuple(scales), tuple(shifts))
+
+
+def _offset_prior(axis: Axis) -> OffsetPrior:
+    dimension = ACTION_DIMENSIONS.get(axis.name)
+    unit = "" if dimension is None else dimension.unit
+    if axis.scale == "log":  # a factor is a shift on a logarithmic axis
+        return OffsetPrior(shift=CLOCK / math.log(axis.upper / axis.lower) if unit not in ("m", "rad", "") else UNKNOWN)
+    width = axis.upper - axis.lower
+    match unit:
+        case "m":
+            return OffsetPrior(shift=LENGTH / width)
+        case "rad":
+            return OffsetPrior(shift=ANGLE / width)
+        case "":
+            return OffsetPrior(shift=UNKNOWN)
+        case _:
+            return OffsetPrior(factor=CLOCK, origin=axis.lower / width)
+
+
+def subsampled(data: Data, around: Sequence[Point], most: int) -> Data:
+    """Select at most `most` observations: half of them nearest to `around`, the others spread over the rest.
+
+    The selection depends on the points and never on the costs. Leaving out high costs would bias the remaining
+    observations towards low costs.
+    """
+    if len(data) <= most:
+        return data
+    points = np.array(data.points)
+    kept: list[int] = []
+    if around:
+        near = np.linalg.norm(points[:, None, :] - np.array(around)[None, :, :], axis=2).min(axis=1)
+        kept = [int(i) for i in np.argsort(near, kind="stable")[: most // 2]]
+    distance = np.full(len(points), np.inf)
+    for i in kept:
+        distance = np.minimum(distance, np.linalg.norm(points - points[i], axis=1))
+    while len(kept) < most:
+        distance[kept] = -1.0
+        farthest = int(np.argmax(distance))
+        kept.append(farthest)
+        distance = np.minimum(distance, np.linalg.norm(points - points[farthest], axis=1))
+    kept.sort()
+    return Data(tuple(data.points[i] for i in kept), tuple(data.costs[i] for i in kept))

@@ -86,7 +86,7 @@ class PourRow(ResultPart):
     """The same as a volume [ml], from the liquid's density."""
 
 
-class Foretold(ResultPart):
+class PredictionCheck(ResultPart):
     """Deviation of the first pours from their predictions."""
 
     z_scores: tuple[float, ...]
@@ -196,7 +196,7 @@ def former_pours(
     return tuple(found)
 
 
-def trust(weighed: Sequence[PourTrial]) -> Foretold:
+def trust(weighed: Sequence[PourTrial]) -> PredictionCheck:
     """Compare the first pours with their predictions, in predicted standard deviations (noise included).
 
     An inaccurate simulator makes D3 worse than no prior at all. The user is therefore warned.
@@ -207,4 +207,4 @@ def trust(weighed: Sequence[PourTrial]) -> Foretold:
             spread = math.hypot(trial.predicted.deviation, trial.noise)
             scores.append((trial.cost - trial.predicted.mean) / max(spread, 1e-9))
     mean = sum(map(abs, scores)) / len(scores) if scores else None
-    return Foretold(z_scores=tuple(scores), alarm=len(scores) >= 3 and mean is not None and mean > TRUST_LIMIT)
+    return PredictionCheck(z_scores=tuple(scores), alarm=len(scores) >= 3 and mean is not None and mean > TRUST_LIMIT)

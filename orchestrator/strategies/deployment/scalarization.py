@@ -14,14 +14,13 @@ from functools import partial
 
 import numpy as np
 
-from actors.optimizer.questions import Data, Point, Suggestion, SuggestProblem
+from actors.optimizer.questions import Data, Point, PourQuery, RegressionQuery, Suggestion
 from orchestrator.requests import Simulate
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import ParetoAction
 from orchestrator.strategies.deployment.objectives import Vector
-from orchestrator.strategies.optimizer_queries import OptimizerQueries
 from orchestrator.strategies.stage_result import displayed_action
-from orchestrator.strategies.trials import Trial
+from orchestrator.strategies.trials import OptimizerQueries, Trial
 from sim_engine.search_space import Space
 
 AUGMENTATION = 0.05
@@ -139,14 +138,14 @@ class Scalarization:
         simulated: Observed,
         poured: Observed,
         actions: Space,
-        problem: Callable[[Data, Data], SuggestProblem],
+        query: Callable[[Data, Data], RegressionQuery | PourQuery],
         questions: OptimizerQueries,
         then: Callable[[], None],
     ) -> None:
         """Put a query for each objective at the tried actions; the answers define the front.
 
         Args:
-            problem: builds the query of one objective from its simulated and its poured data.
+            query: builds the query of one objective from its simulated and its poured data, without a proposal.
             then: called when the front is known.
         """
         candidates = self._candidates([*simulated, *poured])
@@ -159,8 +158,8 @@ class Scalarization:
                 then()
 
         for j in range(len(self.names)):
-            question = replace(problem(_one(simulated, j), _one(poured, j)), count=0, predict_at=tuple(candidates))
-            questions.put(question, "front", partial(answered, j))
+            about_one = replace(query(_one(simulated, j), _one(poured, j)), predict_at=tuple(candidates))
+            questions.put(about_one, "front", partial(answered, j))
 
     def _candidates(self, observed: Observed) -> list[Point]:
         """Tried actions that can belong to the front: those that delivered enough."""

@@ -9,8 +9,15 @@ import pytest
 
 from actors.arm.arm_geometry import Mount, RobotCell
 from actors.arm.arm_settings import UrArmSpec
-from actors.arm.planning.frames import cell_transforms, flange_poses, pourer_motion, pourer_transforms
-from actors.arm.planning.kinematics import MODELS, inverse, singularities
+from actors.arm.planning.kinematics import (
+    MODELS,
+    cell_transforms,
+    flange_poses,
+    inverse,
+    pourer_motion,
+    pourer_transforms,
+    singularities,
+)
 from actors.arm.planning.path_checks import check_limits
 from actors.arm.planning.pour_planner import plan_path
 from actors.interfaces import InvalidActionError

@@ -14,12 +14,10 @@ from hypothesis import strategies as st
 from actors.arm.arm_geometry import Plane
 from actors.arm.arm_settings import UrArmSpec
 from actors.arm.planned_pour import JointPath, PourPath
-from actors.arm.planning.frames import cell_transforms, pourer_motion, pourer_transforms
-from actors.arm.planning.kinematics import MODELS, forward
+from actors.arm.planning.kinematics import MODELS, cell_transforms, forward, pourer_motion, pourer_transforms
 from actors.arm.planning.path_checks import recheck
 from actors.arm.planning.pour_planner import plan_path
-from actors.arm.planning.trajectory import STEEPEST
-from actors.arm.planning.transfer_motion import TOOL_ACCELERATION
+from actors.arm.planning.trajectory import STEEPEST, TOOL_ACCELERATION
 from actors.interfaces import InvalidActionError
 from orchestrator.config.file_loading import load_campaign
 from sim_engine.action import DEG

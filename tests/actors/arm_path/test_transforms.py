@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from actors.arm.arm_geometry import Pose
-from actors.arm.planning.frames import flange_poses, pourer_motion, pourer_transforms, quaternions
-from actors.arm.planning.kinematics import MODELS, inverse
+from actors.arm.planning.kinematics import MODELS, flange_poses, inverse, pourer_motion, pourer_transforms, quaternions
 from actors.arm.planning.pour_planner import plan_path
 from sim_engine.action import DEG
 from sim_engine.collision import rotations

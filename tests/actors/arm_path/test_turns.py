@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation, Slerp
 
 from actors.arm.planning.collision_geometry import hull
-from actors.arm.planning.frames import about, between, from_vector, to_quaternions
+from actors.arm.planning.kinematics import about, between, from_vector, to_quaternions
 from tests.support.hypothesis_examples import examples
 from tests.support.planning_cell import vessel
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from actors.arm.arm_interface import ArmLostError
 from actors.arm.planned_pour import ExecutedPath, PourPath
-from actors.arm.planning.frames import pourer_motion
+from actors.arm.planning.kinematics import pourer_motion
 from actors.arm.planning.pour_planner import plan_path
 from actors.arm.ur.ur_driver import UrArm
 from actors.contract_tests.arm_contract import ArmBench, ArmContract

@@ -148,7 +148,7 @@ def test_missed_packages_show_as_a_gap() -> None:
 
 
 def test_a_step_of_the_tool_is_straight_and_keeps_its_orientation() -> None:
-    from actors.arm.planning.frames import pourer_transforms
+    from actors.arm.planning.kinematics import pourer_transforms
 
     spec = settings()
     path = jog_path(spec, HOME, "y", 0.04, 0.08)  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ import pytest
 from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
 from actors.arm.arm_interface import ArmStoppedError
 from actors.arm.arm_settings import UrArmSpec
-from actors.arm.planning.frames import pourer_motion
+from actors.arm.planning.kinematics import pourer_motion
 from actors.arm.planning.pour_planner import plan_path
 from actors.arm.ur.motion_segments import leans
 from actors.arm.ur.ur_driver import UrArm

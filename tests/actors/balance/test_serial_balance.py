@@ -9,14 +9,14 @@ import pytest
 
 from actors.balance.balance_interface import BalanceFaultError, CommandError, NotStableError, OutOfRangeError, UnitError
 from actors.balance.balance_settings import SettlingRule
-from actors.balance.dialect_registry import voices
+from actors.balance.dialects.dialect import encoders
 from actors.balance.simulated_balance import Load
 
 from .conftest import SOON
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("voice", voices())
+@pytest.mark.parametrize("voice", encoders())
 def test_a_tared_balance_weighs_what_is_added(driver, voice):
     far, balance = driver(voice)
     far.put(0.35)

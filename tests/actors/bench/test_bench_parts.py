@@ -10,9 +10,17 @@ import pytest
 
 from actors.arm.planned_pour import ExecutedPath, pack, unpack
 from actors.balance.weighing_plan import Placement, weighings
-from actors.bench.operator_questions import NoAnswerError, OperatorQuestions
+from actors.bench.bench_operators import (
+    POURER,
+    RECEIVER,
+    TRAY,
+    BenchContents,
+    Hands,
+    NoAnswerError,
+    OperatorQuestions,
+    PlayedOperator,
+)
 from actors.bench.virtual_bench import LONGEST_REST, executed_pour
-from actors.bench.virtual_operator import POURER, RECEIVER, TRAY, BenchContents, Hands, PlayedOperator
 from actors.interfaces import Notice, OperatorQuestion, OperatorSpec
 
 STEP = 0.008
@@ -140,30 +148,30 @@ def test_a_person_can_play_on_a_virtual_bench_and_reads_weights_off_the_question
             return question.text.split("shows ")[1].rstrip(".)") if question.wants == "weight" else "done"
 
     async def play() -> tuple[BenchContents, str]:
-        things = BenchContents(Placement.TRAY)
-        hands = Hands(things, onto)
+        contents = BenchContents(Placement.TRAY)
+        hands = Hands(contents, onto)
         hands.prepare(0.2, (1,))
         played = PlayedOperator(Reader(0.0), hands)
         await played.ask(OperatorQuestion("Wipe the tray.", "done", about="tray_wiped"))
         await played.ask(OperatorQuestion("Fill the pourer.", "done", about="pourer_full"))
-        return things, await played.ask(OperatorQuestion("Weigh the tray.", "weight", about="tray_before"))
+        return contents, await played.ask(OperatorQuestion("Weigh the tray.", "weight", about="tray_before"))
 
-    things, typed = asyncio.run(play())
+    contents, typed = asyncio.run(play())
     assert put == [pytest.approx(TRAY), pytest.approx(TRAY + POURER + 0.2, abs=5e-3)]
     assert typed == f"{1e3 * TRAY:.1f} g"
-    assert things.in_pourer == pytest.approx(0.2, abs=5e-3)
+    assert contents.in_pourer == pytest.approx(0.2, abs=5e-3)
 
 
 @pytest.mark.parametrize("placement", Placement)
 def test_every_step_of_a_pour_puts_on_the_balance_what_it_says(placement):
-    things, carried = BenchContents(placement), {}
+    contents, carried = BenchContents(placement), {}
     for step in weighings(placement):
         if step.do == "pour":
-            things.receive(spilled=0.004, retained=0.016)
+            contents.receive(spilled=0.004, retained=0.016)
             continue
-        things.do(step.key or step.about, fill=0.2)
-        carried[step.key or step.about] = things.carried
-    assert things.in_receiver == pytest.approx(0.18)
+        contents.do(step.key or step.about, fill=0.2)
+        carried[step.key or step.about] = contents.carried
+    assert contents.in_receiver == pytest.approx(0.18)
     match placement:
         case Placement.TRAY:
             assert carried["pourer_full"] - carried["tray_wiped"] == pytest.approx(POURER + 0.2)
@@ -178,4 +186,4 @@ def test_every_step_of_a_pour_puts_on_the_balance_what_it_says(placement):
             assert carried["poured"] - carried["set_up"] == pytest.approx(0.184)
             assert carried["receiver_gone"] - carried["set_up"] == pytest.approx(0.004 - RECEIVER)
         case Placement.MANUAL:
-            assert things.typed("tray_after", 1e-4) == f"{1e3 * (TRAY + 0.004):.1f} g"
+            assert contents.typed("tray_after", 1e-4) == f"{1e3 * (TRAY + 0.004):.1f} g"

@@ -19,8 +19,8 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.arm.planning.frames import pourer_motion
-from actors.bench.virtual_operator import VirtualOperator
+from actors.arm.planning.kinematics import pourer_motion
+from actors.bench.bench_operators import VirtualOperator
 from actors.interfaces import LaboratoryError, NotPouredError, OperatorSpec, UnknownPourError
 from sim_engine.action import DEG
 from sim_engine.outcome import PourMeasurement
@@ -233,7 +233,7 @@ def test_a_fault_of_the_arm(open_stage, name, phase):
     if phase == "weigh":
         # The pour was over: what is asked next invites hands in only once it is seen that nothing can move.
         assert isinstance(outcome, PourMeasurement), outcome
-        assert outcome.spilled == pytest.approx(stage.things.on_tray, abs=3e-4)
+        assert outcome.spilled == pytest.approx(stage.contents.on_tray, abs=3e-4)
         assert np.max(np.ptp(tale.joints, axis=0)) < 1e-3
         return
     check_nothing_moved_without_consent(tale)
@@ -246,7 +246,7 @@ def test_a_fault_of_the_arm(open_stage, name, phase):
     if phase == "approach":
         assert isinstance(outcome, NotPouredError), outcome
         assert stage.heard.index("recover") < stage.heard.index("home")
-        assert stage.things.on_tray == 0.0
+        assert stage.contents.on_tray == 0.0
         assert "Nothing was poured" in str(outcome)
         return
     assert isinstance(outcome, UnknownPourError), outcome
@@ -258,7 +258,7 @@ def test_a_fault_of_the_arm(open_stage, name, phase):
     for key in ("pourer_full", "spilled", "pourer_after"):
         assert f"weighed, {key}:" in stage.said("note")
         assert key in str(outcome)
-    loaded = stage.things.in_receiver + stage.things.on_tray + stage.things.in_pourer
+    loaded = stage.contents.in_receiver + stage.contents.on_tray + stage.contents.in_pourer
     assert f"{1e3 * loaded:.1f}"[:4] in str(outcome)
 
 
@@ -272,8 +272,8 @@ def test_a_fault_of_the_balance(open_stage, name, phase):
     assert "recover" not in stage.heard
     asked = [q for q in stage.operator.heard if q.problem]
     assert asked, "the operator is told what is wrong with the balance"
-    assert outcome.spilled == pytest.approx(stage.things.on_tray, abs=3e-4)
-    assert outcome.retained == pytest.approx(stage.things.in_pourer, abs=3e-4)
+    assert outcome.spilled == pytest.approx(stage.contents.on_tray, abs=3e-4)
+    assert outcome.retained == pytest.approx(stage.contents.in_pourer, abs=3e-4)
 
 
 @pytest.mark.realtime

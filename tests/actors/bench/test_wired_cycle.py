@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from actors.arm.planned_pour import unpack
-from actors.arm.planning.frames import pourer_motion
+from actors.arm.planning.kinematics import pourer_motion
 from actors.balance.weighing_plan import Placement
-from actors.bench.device_emulators import History
+from actors.bench.virtual_bench import History
 from actors.interfaces import InvalidActionError, NotPouredError, OperatorSpec, PourProgress
 from sim_engine.outcome import PourMeasurement
 from tests.support.wired_bench import ACTION, SCENE, Stage, opened_stage, reach, wired_spec
@@ -30,15 +30,15 @@ def test_wherever_the_balance_stands_what_was_executed_is_what_is_measured(open_
     async def play():
         async with open_stage(placement=placement) as stage:
             measured = await stage.pour()
-            return measured, stage.things, stage.unsafe
+            return measured, stage.contents, stage.unsafe
 
-    measured, things, unsafe = asyncio.run(play())
+    measured, contents, unsafe = asyncio.run(play())
     step = 1e-4
     # 90° of the 100° that empty the pourer, and a twentieth beside the receiver; the grip's errors are some tenths.
     assert measured.retained / measured.loaded == pytest.approx(1.0 / 7.0, abs=0.02)
     assert measured.loaded == pytest.approx(0.2, abs=5e-3)
-    assert measured.spilled == pytest.approx(things.on_tray, abs=3 * step)
-    assert measured.retained == pytest.approx(things.in_pourer, abs=3 * step)
+    assert measured.spilled == pytest.approx(contents.on_tray, abs=3 * step)
+    assert measured.retained == pytest.approx(contents.in_pourer, abs=3 * step)
     assert unsafe == []
 
 
@@ -146,7 +146,7 @@ def test_no_consent_no_movement(open_stage):
             with pytest.raises(NotPouredError, match=r"did not let the arm move.*Nothing was poured"):
                 await stage.pour()
             moved = await stage.moved(since)
-            return moved, stage.things.in_pourer, (await stage.pour()).loaded
+            return moved, stage.contents.in_pourer, (await stage.pour()).loaded
 
     moved, left, loaded = asyncio.run(play())
     assert moved < 1e-6
@@ -192,7 +192,7 @@ def test_a_mistyped_weight_is_asked_for_again(open_stage):
 
     stage, measured = asyncio.run(play())
     assert stage.heard.count("tray_after") == 3
-    assert measured.spilled == pytest.approx(stage.things.on_tray, abs=3e-4)
+    assert measured.spilled == pytest.approx(stage.contents.on_tray, abs=3e-4)
 
 
 @pytest.mark.realtime

@@ -48,7 +48,7 @@ def test_a_stop_and_the_death_of_the_driver_are_told_and_the_bench_pours_on(labo
         notices: list[Notice] = []
         async with laboratory as opened:
             opened.listen(notices.append)
-            site, operator = opened.opened.stand_ins, opened.opened.operator
+            site, operator = opened.opened.emulators, opened.opened.operator
 
             first, _ = await stopped(opened, slow, lambda: site.fault("protective_stop"))
             asked = next(question for question in operator.heard if question.about == "recover")

@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 
 from actors.emulators.ur_controller import VirtualController
-from actors.emulators.ur_controller.poses import compose, pose_of, transform_of
 from actors.emulators.ur_controller.robot import MODELS
-from actors.emulators.ur_controller.robot_kinematics import Kinematics
+from actors.emulators.ur_controller.robot_kinematics import Kinematics, compose, pose_of, transform_of
 from tests.support.loopback import free_address
 
 from .conftest import observe

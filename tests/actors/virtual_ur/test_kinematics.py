@@ -10,8 +10,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from actors.arm.ur.robot_models import RobotModel
-from actors.emulators.ur_controller.poses import (
+from actors.emulators.ur_controller.robot import HOME, MODELS, UR10E, Robot
+from actors.emulators.ur_controller.robot_kinematics import (
     IDENTITY,
+    Kinematics,
     angle_between,
     compose,
     distance,
@@ -23,8 +25,6 @@ from actors.emulators.ur_controller.poses import (
     transform_of,
     transpose,
 )
-from actors.emulators.ur_controller.robot import HOME, MODELS, UR10E, Robot
-from actors.emulators.ur_controller.robot_kinematics import Kinematics
 from actors.emulators.ur_controller.safety_system import SafetyConfiguration
 
 angles = st.floats(-math.pi, math.pi)

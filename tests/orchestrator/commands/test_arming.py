@@ -129,7 +129,7 @@ def test_what_will_move_is_shown_the_name_arms_one_run_and_its_questions_come_to
         terminal.expect("nothing moves before that")
         terminal.expect("> ")
         terminal.type("give up")
-        code = terminal.end(60.0)
+        code = terminal.end()
     assert "given up by the operator" in terminal.screen
     assert code == 3
     assert joints(controller) == before
@@ -144,7 +144,7 @@ def test_settings_that_were_changed_since_stop_a_run_before_anybody_is_asked(
     with Terminal("run", str(campaign), "--enable-motion", "--in-process", cwd=str(campaign.parent)) as terminal:
         terminal.expect("> ")
         terminal.type("rig")
-        code = terminal.end(60.0)
+        code = terminal.end()
     assert code != 0
     assert "safety settings have changed" in terminal.screen
     assert "accepted was 0BADC0DE" in terminal.screen

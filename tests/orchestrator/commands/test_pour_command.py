@@ -7,7 +7,6 @@ import contextlib
 import json
 import os
 import signal
-import time
 from collections.abc import Callable, Iterator
 from math import degrees, radians
 from pathlib import Path
@@ -31,7 +30,7 @@ from tests.support import hardware_laboratory, small_campaign
 from tests.support.loopback import free_address
 from tests.support.terminal import Terminal
 from tests.support.toy_campaign import ToyBench, ToyLaboratory
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, wait_for
 
 ACTION = ("--set", "angular_velocity=30", "--set", "x_offset=80")
 
@@ -189,9 +188,7 @@ def answered(terminal: Terminal, before_start: Callable[[], object] = lambda: No
     """Answer all questions of a pour, as a person beside the bench would; returns what was asked to be allowed."""
     weights, consents = list(WEIGHTS), []
     while weights:
-        begin = len(terminal.screen)
-        terminal.expect("> ", 60.0)
-        asked = terminal.screen[begin:].rpartition("\a")[2]
+        asked = terminal.expect("> ").rpartition("\a")[2]
         if "weight with its unit" in asked:
             terminal.type(weights.pop(0))
         elif "'yes' or 'no'" in asked:
@@ -217,7 +214,7 @@ def test_whole_pour_on_hardware_is_asked_for_confirmed_made_and_weighed(
         terminal.type("rig")
         terminal.expect("mode hardware")
         consents = answered(terminal)
-        assert terminal.end(60.0) == 0
+        assert terminal.end() == 0
     assert len(consents) == 1
     assert "Hands out of the cell" in consents[0]
     assert "spilled 3.2 g, retained 1.5 g" in terminal.screen
@@ -239,7 +236,7 @@ def test_protective_stop_in_a_pour_is_mended_by_consent_weighed_and_left_for_a_p
         terminal.expect("> ")
         terminal.type("rig")
         consents = answered(terminal, lambda: controller.fault("protective_stop", after=6.5))
-        assert terminal.end(60.0) == 3
+        assert terminal.end() == 3
     assert [("made ready" in c, "upright" in c) for c in consents[1:]] == [(True, False), (False, True)]
     assert "protective stop during tilt" in terminal.screen
     joints = controller.fault("state")["joints"]
@@ -262,9 +259,9 @@ def test_terminal_that_is_closed_in_a_pour_leaves_the_arm_at_home_and_the_pour_u
         terminal.expect("> ")
         terminal.type("yes")
         terminal.expect("now")
-        wait_until(lambda: bool(controller.fault("state")["program"]))
+        wait_for(lambda: controller.fault("state")["program"], "program on the controller")
         terminal.close()
-        assert terminal.process.wait(90) != 0
+        assert terminal.process.wait(PATIENCE) != 0
     finally:
         terminal.__exit__(None, None, None)
     assert controller.fault("state")["joints"] == pytest.approx(
@@ -272,10 +269,3 @@ def test_terminal_that_is_closed_in_a_pour_leaves_the_arm_at_home_and_the_pour_u
     )
     with JournalReader(next((tmp_path / "runs").glob("*/journal.sqlite"))) as journal:
         assert journal.state() is State.UNKNOWN
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from actors.bench.bench_operators import OperatorQuestions
 from actors.bench.consent import stopped_question
-from actors.bench.operator_questions import OperatorQuestions
 from actors.interfaces import LaboratoryError, Notice, OperatorQuestion, OperatorSpec
 from orchestrator.cli.terminal_operator import TerminalOperator
 from orchestrator.progress.console_progress import ProgressDisplay

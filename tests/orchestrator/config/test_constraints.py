@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from actors.optimizer.questions import Data, Linear, SuggestProblem
+from actors.optimizer.questions import Data, Linear, RegressionQuery
 from actors.optimizer.suggest import propose
 from orchestrator.config.action_assignments import parse_constraint
 from orchestrator.config.campaign_checks import check_campaign
@@ -173,8 +173,8 @@ def test_calibration_weighs_and_simulates_no_others() -> None:
 
 def test_the_best_of_former_data_is_not_proposed_where_it_is_not_allowed_any_more() -> None:
     data = Data(((0.1, 0.05), (0.2, 0.9), (0.7, 0.95), (0.4, 0.1)), (0.01, 0.4, 0.5, 0.02))
-    free = propose(SuggestProblem(ACTIONS, data, count=0))
-    bound = propose(SuggestProblem(ACTIONS, data, count=0, constraints=(SLOPE,)))
+    free = propose(RegressionQuery(ACTIONS, data))
+    bound = propose(RegressionQuery(ACTIONS, data, constraints=(SLOPE,)))
     assert free.best_point is not None
     assert bound.best_point is not None
     assert not allowed(SCENE.action(ACTIONS.decode(free.best_point)))

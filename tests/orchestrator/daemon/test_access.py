@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.catalogue.catalogue_index import Catalogue
+from orchestrator.catalogue.catalogue import Catalogue
 from orchestrator.catalogue.run_registry import enter
 from orchestrator.daemon.access_control import (
     DRAIN,

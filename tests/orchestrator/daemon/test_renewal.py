@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from actors.simulators.shared_pool import WarmSimulators
+from actors.laboratory import WarmSimulators
 from orchestrator.daemon import server_process, supervisor
 from orchestrator.daemon.server_process import MOST, RENEWED, DaemonRestart, RayWatch
 from tests.support.toy_daemon import held, run, serving

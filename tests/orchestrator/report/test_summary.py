@@ -16,8 +16,8 @@ from orchestrator.results.run_summary import NotSimulated, PoolUse, RunSummary, 
 from orchestrator.results.summarise import summarise
 from orchestrator.results.wording import advice
 from orchestrator.strategies.deployment.model_monitoring import Belief, Believed
-from orchestrator.strategies.deployment.real_pours import Foretold
-from orchestrator.strategies.repeated_simulation import Foreseen
+from orchestrator.strategies.deployment.real_pours import PredictionCheck
+from orchestrator.strategies.single_action import PredictedPour
 from sim_engine.prediction_band import SampleStatistics
 from tests.support import example_run
 from tests.support.example_results import changed, shown
@@ -83,7 +83,7 @@ def test_summary_file_is_what_its_schema_says(results: dict[str, Any], tmp_path:
 def test_summary_warns_of_an_untrustworthy_simulator_failed_pours_and_dropped_events(
     results: dict[str, Any],
 ) -> None:
-    trust = Foretold(z_scores=(9.0, 9.0, 9.0), alarm=True)
+    trust = PredictionCheck(z_scores=(9.0, 9.0, 9.0), alarm=True)
     pours = [*results["narrow cup"].pours]
     for index, why in ((1, "pour_failed: the gripper slipped"), (2, "pour_unknown: declared lost by the operator")):
         pours[index] = changed(pours[index], status="failed", reason=why)
@@ -128,7 +128,7 @@ def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(re
     for pour in deployed.weighed:
         assert pour.delivered_g == pytest.approx(1e3 * liquid.mass - pour.spilled_g - pour.retained_g, abs=1e-9)
         assert pour.delivered_ml == pytest.approx(pour.delivered_g / liquid.density * 1e3)
-    foreseen = Foreseen(
+    foreseen = PredictedPour(
         scene="narrow cup",
         simulations=2,
         simulations_lost=0,

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from actors.optimizer.questions import SuggestProblem
+from actors.optimizer.questions import MinimumQuery, SuggestionQuery
 from orchestrator.cli.campaign_commands import run
 from orchestrator.cli.console import RefusalError
 from orchestrator.config.file_loading import load_campaign
@@ -21,15 +21,14 @@ from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import D3Settings, Hybrid
 from orchestrator.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, StrategyHarness
-from orchestrator.study.cell_process import run_cell
-from orchestrator.study.report.calibration_figures import draw_calibrations
-from orchestrator.study.report.cell_results import gather
-from orchestrator.study.report.deployment_figures import draw_deployments
-from orchestrator.study.report.figure_panels import colour
-from orchestrator.study.report.study_tables import tables
+from orchestrator.study.calibration_figures import colour, draw_calibrations
+from orchestrator.study.deployment_figures import draw_deployments
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import finished_results, read_result
+from orchestrator.study.study_page import tables
 from orchestrator.study.study_plan import StudyPlan, cells_of
+from orchestrator.study.study_runner import run_cell
+from orchestrator.study.study_statistics import gather
 from tests.support.campaign_files import CAMPAIGN, DEPLOYED, report, write
 from tests.support.study_files import read, written
 from tests.support.toy_spillage import calibration_spill, narrow_cup, narrow_cup_biased, weighed
@@ -41,10 +40,10 @@ def campaign(folder: Path, keys: str) -> CampaignPlan:
     return load_campaign(write(folder, "campaign.yaml", DEPLOYED.replace("strategy: D3", keys)))
 
 
-def questions(strategy: RealOnly | Hybrid, purpose: str) -> list[SuggestProblem]:
+def questions(strategy: RealOnly | Hybrid, purpose: str) -> list[SuggestionQuery]:
     """What the optimiser is asked for a purpose in a whole campaign."""
     asked = StrategyHarness(narrow_cup_biased, narrow_cup).run(strategy).asked
-    return [request.problem for request in asked if isinstance(request, Suggest) and request.purpose == purpose]
+    return [request.query for request in asked if isinstance(request, Suggest) and request.purpose == purpose]
 
 
 def on_the_toy(plan: DeploymentPlan | None) -> DeploymentPlan:
@@ -60,8 +59,8 @@ def test_the_simulations_before_the_first_pour_keep_kappa_in_the_papers_model_al
     plan = on_the_toy(campaign(folder, f"strategy: D3\n  {keys}").deployment)
     asked = questions(Hybrid(plan, SCENE, THETA, 1), "prior")
     assert len(asked) > 2
-    assert {problem.mean for problem in asked} == {"constant"}
-    assert {problem.plain for problem in asked} == {plain}
+    assert {query.mean for query in asked} == {"constant"}
+    assert {query.plain for query in asked} == {plain}
 
 
 # -- C4 ----------------------------------------------------------------------------------------------------------------
@@ -82,10 +81,10 @@ def test_c4_as_in_the_paper_takes_the_actions_influence_for_noise(folder: Path, 
     for stage in calibration_stages(plan)[:2]:
         played = StrategyHarness(calibration_spill, weighed).run(strategy := stage.build(results, 3))
         results[stage.name] = strategy.result()
-    asked = [r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose in ("calibrate", "conclude")]
+    asked = [r.query for r in played.asked if isinstance(r, Suggest) and r.purpose in ("calibrate", "conclude")]
     assert len(asked) > 3
-    assert {problem.plain for problem in asked} == {paper}
-    assert {len(problem.data.points[0]) for problem in asked} == ({2} if paper else {4})
+    assert {isinstance(query, MinimumQuery) and query.plain for query in asked} == {paper}
+    assert {len(query.data.points[0]) for query in asked} == ({2} if paper else {4})
     assert all(cost >= 0.0 for cost in asked[-1].data.costs) is paper
     assert (results["calibration"].found.posterior is None) is paper
 

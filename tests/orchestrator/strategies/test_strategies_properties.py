@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.questions import Data, Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
 from orchestrator.journal.stage_results import encode_result
 from orchestrator.requests import Outcome, Pour, Poured, Request, Suggest
@@ -111,8 +111,8 @@ def test_the_order_in_which_simulations_return_changes_no_request(
     first = StrategyHarness(spill(name), slots=slots).run(make(name, seed))
     other = Shuffled(spill(name), slots=slots, shuffle=shuffle).run(make(name, seed))
     assert (other.simulations, other.pours) == (first.simulations, first.pours)
-    assert [r.problem for r in other.asked if isinstance(r, Suggest)] == [
-        r.problem for r in first.asked if isinstance(r, Suggest)
+    assert [r.query for r in other.asked if isinstance(r, Suggest)] == [
+        r.query for r in first.asked if isinstance(r, Suggest)
     ]
     assert replay(make(name, seed), first) == first.asked
 
@@ -133,11 +133,12 @@ def test_whatever_fails_every_question_has_numbers_and_the_end_is_an_answer_or_a
     except LearningError as error:
         reason = str(error)
     assert strategy.finished or (name in CALIBRATIONS and "gave no discrepancy" in reason)
-    questions = [request.problem for request in played.asked if isinstance(request, Suggest)]
-    assert all(math.isfinite(cost) for q in questions for cost in (*q.data.costs, *q.simulated.costs))
-    assert all(math.isfinite(u) for q in questions for point in q.data.points for u in point)
+    queries = [request.query for request in played.asked if isinstance(request, Suggest)]
+    entered = [getattr(query, part, Data()) for query in queries for part in ("data", "simulated")]
+    assert all(math.isfinite(cost) for data in entered for cost in data.costs)
+    assert all(math.isfinite(u) for data in entered for point in data.points for u in point)
     if name != "D1, risk":  # what was executed may lie beside the box
-        assert all(0.0 <= u <= 1.0 for q in questions for point in q.data.points for u in point)
+        assert all(0.0 <= u <= 1.0 for data in entered for point in data.points for u in point)
     json.dumps(encode_result(strategy.result()), allow_nan=False)
 
 
@@ -158,8 +159,8 @@ GRID = {"grid": {"cohesion": 2, "friction": 2}}
 
 
 class Optimizer:
-    async def suggest(self, problem: SuggestProblem) -> Suggestion:
-        return propose(problem)
+    async def suggest(self, query: SuggestionQuery) -> Suggestion:
+        return propose(query)
 
 
 def campaign(directory: Path, name: str) -> CampaignPlan:

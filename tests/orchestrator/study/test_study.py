@@ -18,14 +18,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from actors.runtime.cluster_nodes import sources
-from actors.simulators.local_worker import InProcessSimulatorPool
+from actors.simulators.local_worker import thread_pool
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.requests import Failed, Poured, Slots
 from orchestrator.run_service import RunResources
 from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.study.cell_process import run_cell
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import (
     RESULT,
@@ -34,16 +32,18 @@ from orchestrator.study.study_folder import (
     StudyError,
     check_settings,
     code_now,
+    code_warning,
     finished_results,
     is_finished,
     opened,
     run_folder,
-    warning,
 )
 from orchestrator.study.study_plan import StudyPlan, cells_of, study_fingerprint
+from orchestrator.study.study_runner import run_cell
 from orchestrator.study.study_strategies import FinalPour
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement
+from sim_engine.solver_fingerprint import folder_digest
 from tests.support import toy_study
 from tests.support.fake_simulator import make_fake
 from tests.support.study_files import ROOT, read, small, without, written
@@ -222,7 +222,7 @@ def test_the_cells_of_a_worker_share_a_simulator_and_none_of_them_closes_it(tmp_
     changes = {"deployment": deployment, "mismatch": read("quick")["mismatch"][:1], "confirm": 1}
     study = small(tmp_path, **changes, calibration=None)
     log = tmp_path / "simulator.log"
-    simulators = InProcessSimulatorPool(make=make_fake(log=log))
+    simulators = thread_pool(make=make_fake(log=log))
     resources = RunResources(in_process=True, simulators=simulators)
     pours = [run_cell(study, cell, study.folder, resources).pours for cell in cells_of(study)]
     assert len(pours) > 1
@@ -236,7 +236,7 @@ def test_the_cells_of_a_worker_share_a_simulator_and_none_of_them_closes_it(tmp_
 def test_an_action_that_can_not_be_poured_and_none_at_all_have_the_worst_loss(tmp_path: Path) -> None:
     plan = small(tmp_path).deployment("D2").plan
     scene = plan.scenes[0]
-    costing = Costing.of(replace(plan, loss=replace(plan.loss, retained_weight=3.0)), scene, SimulationParameters())
+    costing = Costing.of(replace(plan, loss=plan.loss.with_values(retained_weight=3.0)), scene, SimulationParameters())
     none = FinalPour(costing, None, 1)
     assert none.finished
     assert (none.ask(Slots(1, 1)), none.result().loss, none.result().made) == ([], 3.0, False)
@@ -258,15 +258,16 @@ def test_an_action_that_can_not_be_poured_and_none_at_all_have_the_worst_loss(tm
 def test_other_code_than_that_of_finished_cells_is_named_once_and_is_no_error(tmp_path: Path) -> None:
     same = CellResult(results={}, simulations=0, pours=0, cpu_s=0.0, seconds=0.0, expected=(), code=code_now())
     older = same.model_copy(update={"code": {**code_now(), "strategies": "0123456789ab"}})
-    assert warning({}) is None
-    assert warning({"a": same, "b": same}) is None
-    text = warning({"a": same, "b": older, "c": same}) or ""
+    assert code_warning({}) is None
+    assert code_warning({"a": same, "b": same}) is None
+    text = code_warning({"a": same, "b": older, "c": same}) or ""
     assert "1 finished by other code (strategies: changed since)" in text
     assert "\n" not in text
+    assert folder_digest(tmp_path / "nothing") not in code_now().values(), "a folder of the code has moved"
     (tmp_path / "a.py").write_text("x = 1", encoding="utf-8")
-    before = sources(tmp_path)
+    before = folder_digest(tmp_path)
     (tmp_path / "a.py").write_text("x = 2", encoding="utf-8")
-    assert sources(tmp_path) != before
+    assert folder_digest(tmp_path) != before
 
 
 def test_two_commands_can_not_run_one_study(tmp_path: Path) -> None:

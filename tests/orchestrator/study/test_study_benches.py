@@ -14,11 +14,11 @@ from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
 from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.calibration.calibration_scores import Scores
 from orchestrator.strategies.calibration.pour_design import DesignPoured
-from orchestrator.study.report.cell_results import RANDOM, gather
-from orchestrator.study.report.study_page import write_report
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import finished_results
+from orchestrator.study.study_page import write_report
 from orchestrator.study.study_plan import StudyPlan, cells_of
+from orchestrator.study.study_statistics import RANDOM, gather
 from sim_engine.scene import PourTask
 from sim_engine.simulator import InvalidSceneError, PourSimulator
 from tests.support.study_files import STUDIES, read, written

@@ -17,18 +17,15 @@ from orchestrator.results.figure_style import new_figure
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta, TriedOnPours
 from orchestrator.strategies.calibration.calibration_scores import ScoredPair, Scores
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.deployment.real_pours import Foretold, PourRow
+from orchestrator.strategies.deployment.real_pours import PourRow, PredictionCheck
 from orchestrator.strategies.stage_result import DisplayedMap
-from orchestrator.study.report.calibration_figures import draw_calibrations
-from orchestrator.study.report.cell_results import at_pour, gather, running_least
-from orchestrator.study.report.deployment_figures import draw_deployments, draw_finals, means
-from orchestrator.study.report.figure_panels import Drawn, look
-from orchestrator.study.report.statistics import Estimate, effect, estimate
-from orchestrator.study.report.study_page import write_report
-from orchestrator.study.report.study_tables import pours_needed, tables
+from orchestrator.study.calibration_figures import Drawn, draw_calibrations, series_style
+from orchestrator.study.deployment_figures import draw_deployments, means
 from orchestrator.study.study_file import load_study
-from orchestrator.study.study_folder import CellResult, code_now, run_folder, told, write_result
+from orchestrator.study.study_folder import CellResult, code_now, code_summary, run_folder, write_result
+from orchestrator.study.study_page import pours_needed, tables, write_report
 from orchestrator.study.study_plan import StudyCell, StudyPlan, cells_of
+from orchestrator.study.study_statistics import Estimate, at_pour, effect, estimate, gather, running_least
 from orchestrator.study.study_strategies import FinalPoured
 from sim_engine.liquids import SimulationParameters
 from tests.support.example_results import strays
@@ -141,7 +138,7 @@ def poured(arm: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
         former_pours=0,
         refused_pours=1,
         failed_pours=0,
-        trust=Foretold(z_scores=(), alarm=False),
+        trust=PredictionCheck(z_scores=(), alarm=False),
     )
 
 
@@ -171,7 +168,7 @@ def test_every_figure_is_drawn_with_its_numbers_and_the_page_needs_nothing_else(
     assert not re.search(r'(src|href)="(?!data:)', page), "the page refers to something beside it"
     assert "A repetition resamples the pours" in page
     assert "Student&#39;s t over repetitions" in page
-    assert "nothing tells" in page or " is better than " in page
+    assert "do not separate" in page or " is better than " in page
     assert "below 5 no difference is tested" in page
     assert "test pours recur between repetitions" in page
     assert "Code: 1 different for" in page
@@ -199,19 +196,22 @@ def test_every_figure_is_drawn_with_its_numbers_and_the_page_needs_nothing_else(
 
 def test_no_two_arms_of_a_figure_look_alike() -> None:
     arms = ["D1-5", "D1-15", "D1-10", "D2", "D2-paper", "D3", "D3-paper"]
-    looks = [look(arm, arms) for arm in arms]
+    looks = [series_style(arm, arms) for arm in arms]
     assert len({one.colour for one in looks}) == len(arms)
-    planned = [look(arm, arms) for arm in ("D1-5", "D1-10", "D1-15")]
+    planned = [series_style(arm, arms) for arm in ("D1-5", "D1-10", "D1-15")]
     assert len({one.marker for one in planned}) == len({one.line for one in planned}) == 3, (
         "in print without colours too"
     )
     brightness = [sum(bytes.fromhex(one.colour[1:])) for one in planned]
     assert brightness == sorted(brightness, reverse=True), "darker with more iterations, whatever the order of the arms"
     for name in ("C4", "D2", "D3"):
-        ours, theirs = look(name, [name, f"{name}-paper"]), look(f"{name}-paper", [name, f"{name}-paper"])
+        ours, theirs = (
+            series_style(name, [name, f"{name}-paper"]),
+            series_style(f"{name}-paper", [name, f"{name}-paper"]),
+        )
         assert ours.colour != theirs.colour
         assert (theirs.line, theirs.filled, theirs.marker) == ("--", False, ours.marker)
-    assert len({look(arm, ["D1-5", "D2", "D3"]).marker for arm in ("D1-5", "D2", "D3")}) == 3
+    assert len({series_style(arm, ["D1-5", "D2", "D3"]).marker for arm in ("D1-5", "D2", "D3")}) == 3
 
 
 def test_small_losses_can_be_told_apart_and_none_is_drawn_at_the_floor(study: StudyPlan) -> None:
@@ -232,7 +232,7 @@ def test_small_losses_can_be_told_apart_and_none_is_drawn_at_the_floor(study: St
 
 def all_drawn(study: StudyPlan) -> list[Drawn]:
     found = gather(study, {cell.id: made_up(cell) for cell in cells_of(study)})
-    return [*draw_calibrations(study, found), *draw_deployments(study, found), *draw_finals(study, found)]
+    return [*draw_calibrations(study, found), *draw_deployments(study, found)]
 
 
 @pytest.mark.slow
@@ -297,7 +297,7 @@ def test_the_page_tells_by_how_many_codes_the_cells_were_made(study: StudyPlan) 
         return CellResult(results={}, simulations=0, pours=0, cpu_s=0.0, seconds=0.0, expected=(), code=code)
 
     old, new = made_with({**code_now(), "solver": "another"}), made_with(code_now())
-    text = told({"a": old, "b": new, "c": new})
+    text = code_summary({"a": old, "b": new, "c": new})
     assert text.startswith("Code: 2 different for 3 cells: 2 of decant ")
     assert f"solver {code_now()['solver']}" in text
     assert text.endswith("solver another.")

@@ -11,6 +11,7 @@ from decant.plugins import (
     Deployment,
     DeploymentPlan,
     DeploymentSettings,
+    RegressionQuery,
     Scene,
     SimulationParameters,
     Strategy,
@@ -55,5 +56,5 @@ class Hypercube(Deployment[HypercubeSettings]):
         if self._points and self._pours_left:
             self._pour(self._points.pop(0), None)
         else:
-            problem = self._problem(self._real(), count=0, map_resolution=MAP_RESOLUTION)
-            self._questions.put(problem, "conclude", self._conclude)
+            query = self._query(RegressionQuery, self._real(), map_resolution=MAP_RESOLUTION)
+            self._questions.put(query, "conclude", self._conclude)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from actors.emulators.ur_controller.commands.command_arguments import six
-from actors.emulators.ur_controller.poses import (
+from actors.emulators.ur_controller.robot_kinematics import (
     Matrix,
     compose,
     distance,

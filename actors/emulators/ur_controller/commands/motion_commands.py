@@ -17,7 +17,14 @@ from actors.emulators.ur_controller.commands.command_arguments import (
 from actors.emulators.ur_controller.motion.motion_actions import MotionAction
 from actors.emulators.ur_controller.motion.motion_lines import JointLine, Line, ToolLine, UnreachableError
 from actors.emulators.ur_controller.motion.mover import ControlledElsewhereError
-from actors.emulators.ur_controller.poses import Transform, compose, distance, norm3, rotation_between, transform_of
+from actors.emulators.ur_controller.robot_kinematics import (
+    Transform,
+    compose,
+    distance,
+    norm3,
+    rotation_between,
+    transform_of,
+)
 from actors.emulators.ur_controller.urscript.lexer import ScriptError
 from actors.emulators.ur_controller.urscript.program import Command, Steps
 from actors.emulators.ur_controller.urscript.script_values import number

@@ -13,8 +13,8 @@ from actors.arm.ur.robot_models import Joints
 from actors.emulators.ur_controller.commands.command_arguments import ControllerAccess, is_pose, positive, six, whole
 from actors.emulators.ur_controller.motion.motion_actions import Path
 from actors.emulators.ur_controller.motion.motion_lines import KinematicArm, ToolLine, UnreachableError
-from actors.emulators.ur_controller.poses import pose_of, transform_of
 from actors.emulators.ur_controller.registers import REGISTERS
+from actors.emulators.ur_controller.robot_kinematics import pose_of, transform_of
 from actors.emulators.ur_controller.urscript.lexer import ScriptError
 from actors.emulators.ur_controller.urscript.program import Command
 from actors.emulators.ur_controller.urscript.script_values import UrPose, number, numbers, show

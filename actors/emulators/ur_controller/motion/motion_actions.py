@@ -11,7 +11,7 @@ from typing import Protocol
 
 from actors.arm.ur.robot_models import Joints
 from actors.emulators.ur_controller.motion.motion_lines import Corner, KinematicArm, Line, Profile, UnreachableError
-from actors.emulators.ur_controller.poses import Transform, multiply, norm3, rotation_matrix
+from actors.emulators.ur_controller.robot_kinematics import Transform, multiply, norm3, rotation_matrix
 
 STILL = 1e-9
 """Joint speed below which a joint counts as still [rad/s]."""

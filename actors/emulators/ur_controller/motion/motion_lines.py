@@ -10,7 +10,8 @@ from math import inf, sqrt
 from typing import Protocol
 
 from actors.arm.ur.robot_models import Joints
-from actors.emulators.ur_controller.poses import (
+from actors.emulators.ur_controller.robot_kinematics import (
+    Kinematics,
     Transform,
     Vector,
     compose,
@@ -21,7 +22,6 @@ from actors.emulators.ur_controller.poses import (
     rotation_between,
     rotation_matrix,
 )
-from actors.emulators.ur_controller.robot_kinematics import Kinematics
 
 
 class UnreachableError(Exception):

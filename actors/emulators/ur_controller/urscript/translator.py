@@ -424,7 +424,7 @@ def read_answer(data: bytes) -> Translated:
 
 
 def main() -> None:
-    """Translate the program on standard input: `python -m actors.emulators.ur_controller.urscript`."""
+    """Translate the program on standard input: `python -m actors.emulators.ur_controller.urscript.translator`."""
     import os
     import resource
 
@@ -438,3 +438,7 @@ def main() -> None:
     except ScriptError as error:
         answer = (error.text, error.line)
     sys.stdout.buffer.write(marshal.dumps(answer))
+
+
+if __name__ == "__main__":
+    main()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.optimizer.questions import Data, DesignQuestion, PosteriorQuestion, SuggestProblem
+from actors.optimizer.questions import CalibrationQuery, Data, DesignQuestion, PosteriorQuestion
 from actors.optimizer.suggest import propose
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -34,7 +34,7 @@ def slope(space: Space, made: tuple[tuple[float, ...], ...] = ()) -> Any:
     candidates = tuple((float(a),) for a in np.linspace(0.0, 1.0, 11))
     weighed = PosteriorQuestion(made, tuple(0.4 * a for (a,) in made), 0.02, 64)
     design = DesignQuestion(candidates, ((0.8,), (0.9,)))
-    return propose(SuggestProblem(space, data, count=0, context=((0.9,),), posterior=weighed, design=design))
+    return propose(CalibrationQuery(space, data, count=0, contexts=((0.9,),), posterior=weighed, design=design))
 
 
 def test_a_pour_is_worth_most_where_it_tells_theta_and_little_where_one_was_made() -> None:
@@ -90,7 +90,7 @@ def test_what_it_simulated_is_not_thrown_away(played: tuple[ActivePours, Strateg
     play = StrategyHarness(spilled).run(calibration)
     assert len(play.simulations) == 30
     first = next(r for r in play.asked if getattr(r, "purpose", "") == "calibrate" and not isinstance(r, Simulate))
-    assert len(first.problem.data) >= 20
+    assert len(first.query.data) >= 20
     low, high = calibration.result().found.posterior.region["receiver_x"]
     assert low <= TRUTH.receiver_x <= high
 

@@ -13,8 +13,8 @@ from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.requests import Simulate
 from orchestrator.runs.stages import POURS, measured_pours, scenes_of
+from orchestrator.strategies.calibration.action_prior import Contexts
 from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.calibration.pour_design import DesignedPours
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, SCENE, StrategyHarness
 from sim_engine.action import Action

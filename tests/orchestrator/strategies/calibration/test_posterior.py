@@ -26,7 +26,7 @@ from orchestrator.strategies.calibration.posterior_summary import (
 )
 from orchestrator.strategies.campaign_plan import MeasuredPour
 from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.repeated_simulation import RepeatedSimulation
+from orchestrator.strategies.single_action import RepeatedSimulation
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness
 from sim_engine.action import DEG
 from sim_engine.liquids import SimulationParameters

@@ -7,6 +7,7 @@ import pytest
 from orchestrator.requests import Failed, Simulate, Simulated, Suggest, Suggested
 from orchestrator.run_errors import LearningError
 from orchestrator.runs.stages import POURS, measured_pours
+from orchestrator.strategies.calibration.action_prior import Contexts
 from orchestrator.strategies.calibration.calibration_scores import (
     JUSTIFIED,
     NOT_JUSTIFIED,
@@ -20,7 +21,6 @@ from orchestrator.strategies.calibration.calibration_scores import (
     regression_discrepancy,
 )
 from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.pour_contexts import Contexts
 from orchestrator.strategies.calibration.pour_design import DesignedPours, choose_holdout, stratified
 from orchestrator.strategies.campaign_plan import MeasuredPour
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness, outcome_of, replay
@@ -169,7 +169,7 @@ def test_failed_and_leaking_simulations_never_reach_the_fit():
 
     strategy = ContinuousBayesianCalibration(calibration_plan(simulations=40), measured(), 1)
     played = StrategyHarness(calibration_spill, answer=unlucky).run(strategy)
-    final = [r for r in played.asked if isinstance(r, Suggest)][-1].problem
+    final = [r for r in played.asked if isinstance(r, Suggest)][-1].query
     assert lost
     assert len(final.data) == 40 - len(lost)
     assert all(map(math.isfinite, final.data.costs))
@@ -198,7 +198,7 @@ def test_test_pours_are_not_used_for_fitting():
     strategy = ContinuousBayesianCalibration(calibration_plan(simulations=4), pours, 1)
     regression = StrategyHarness(calibration_spill).run(strategy).asked[0]
     assert isinstance(regression, Suggest)
-    assert len(regression.problem.data) == 28
+    assert len(regression.query.data) == 28
 
 
 @pytest.mark.slow

@@ -114,7 +114,7 @@ def test_theta_star_of_c1_is_the_grid_point_with_the_least_mean_discrepancy():
 
 def test_c3_learns_from_every_theta_before_the_next_one():
     played = StrategyHarness(calibration_spill, slots=2).run(make("C3", iterations=12))
-    questions = [r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "calibrate"]
+    questions = [r.query for r in played.asked if isinstance(r, Suggest) and r.purpose == "calibrate"]
     assert [len(q.data) for q in questions] == [8, 9, 10, 11]
 
 

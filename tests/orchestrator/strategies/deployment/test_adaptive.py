@@ -14,7 +14,6 @@ from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Suggest
 from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.stages import DEPLOYMENT, with_bench
-from orchestrator.strategies.deployment.bench_offset import displacement, play_of
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_monitoring import (
@@ -22,6 +21,8 @@ from orchestrator.strategies.deployment.model_monitoring import (
     DiscrepancyPolicySettings,
     RiskLimitSettings,
     StopSettings,
+    displacement,
+    offset_priors,
 )
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
@@ -163,10 +164,10 @@ def test_a_limit_is_kept_by_every_pour_after_the_first_good_one(seed: int) -> No
 @pytest.mark.parametrize("limit", [None, RiskLimitSettings()])
 def test_with_a_limit_pours_are_made_for_what_they_tell_once_one_has_kept_it(limit: Any) -> None:
     play = StrategyHarness(narrow_cup).run(adaptive(pours=3, risk_limit=limit))
-    asked = [one.problem.mismatch for one in play.asked if isinstance(one, Suggest) and one.purpose == "pour"]
+    asked = [one.query.discrepancy for one in play.asked if isinstance(one, Suggest) and one.purpose == "pour"]
     problems = [one for one in asked if one is not None]
-    assert [one.looks_ahead for one in problems] == [limit is None or one.limit is not None for one in problems]
-    assert (problems[0].looks_ahead, problems[-1].looks_ahead) == (limit is None, True)
+    assert [one.lookahead for one in problems] == [limit is None or one.limit is not None for one in problems]
+    assert (problems[0].lookahead, problems[-1].lookahead) == (limit is None, True)
 
 
 @pytest.mark.parametrize("otherwise", ["stop", "go on"])
@@ -202,7 +203,7 @@ def test_rules_of_one_model_are_refused_with_another() -> None:
 
 
 def test_how_far_a_bench_may_be_off_follows_from_units() -> None:
-    speed, offset = play_of(ACTIONS)
+    speed, offset = offset_priors(ACTIONS)
     assert offset.shift == pytest.approx(0.010 / 0.07)
     assert (speed.shift, speed.factor) == (0.0, 0.05)
     assert speed.origin == pytest.approx(15 / 105)
@@ -229,9 +230,9 @@ def test_what_was_learnt_with_one_receiver_is_known_for_the_next() -> None:
     assert len(told.bench) == 64
     second = Hybrid(told, SCENE, THETA, 2)
     played = StrategyHarness(narrow_cup_biased, narrow_cup).run(second)
-    pour = next(r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour")
-    assert pour.mismatch is not None
-    assert pour.mismatch.drawn == told.bench
+    pour = next(r.query for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour")
+    assert pour.discrepancy is not None
+    assert pour.discrepancy.drawn == told.bench
     assert with_bench(replace(plan, settings=plan.settings.model_copy(update={"model": "residual"})),
                       {DEPLOYMENT + "first": again}, THETA).bench == ()  # fmt: skip
 

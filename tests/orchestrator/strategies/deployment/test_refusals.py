@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors.optimizer.questions import Data
 from orchestrator.config.campaign_checks import touch
 from orchestrator.journal.stage_results import encode_result
 from orchestrator.requests import Failed, Outcome, Pour, Request, Simulate, Suggest
@@ -41,7 +42,7 @@ def touching(action: Action, theta: SimulationParameters, rng: np.random.Generat
 
 
 def questions(played: StrategyHarness) -> list[Any]:
-    return [request.problem for request in played.asked if isinstance(request, Suggest)]
+    return [request.query for request in played.asked if isinstance(request, Suggest)]
 
 
 @pytest.mark.parametrize("name", STRATEGIES)
@@ -54,8 +55,8 @@ def test_a_refusal_has_no_cost_takes_no_budget_and_its_place_is_told(name: str) 
     last = questions(played)[-1]
     told = np.array([*last.infeasible, *last.refused])
     assert len({tuple(np.round(place, 9)) for place in refused}) == len({tuple(np.round(place, 9)) for place in told})
-    entered = [ACTIONS.decode(point)["x_offset"] for q in questions(played) for point in q.data.points]
-    entered += [ACTIONS.decode(point)["x_offset"] for q in questions(played) for point in q.simulated.points]
+    data = [getattr(q, name, Data()) for q in questions(played) for name in ("data", "simulated")]
+    entered = [ACTIONS.decode(point)["x_offset"] for one in data for point in one.points]
     assert not [x for x in entered if x < NEAREST]
     made = [r for r, o in played.told if isinstance(r, Simulate) and not isinstance(o, Failed)]
     assert sum(r.purpose != "refine" for r in made) == {"D1": 16, "D2": 0, "D3": 12}[name]

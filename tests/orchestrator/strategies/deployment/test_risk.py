@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors.optimizer.questions import RiskQuery
 from orchestrator.journal.codec import decode_request, encode_request
 from orchestrator.journal.stage_results import decode_result, encode_result
 from orchestrator.requests import Failed, Simulate, Suggest
@@ -16,7 +17,7 @@ from orchestrator.runs.stages import with_posterior
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning, RobustPlanning
 from orchestrator.strategies.deployment.disturbances import Disturbances, RiskSettings
-from orchestrator.strategies.repeated_simulation import RepeatedSimulation
+from orchestrator.strategies.single_action import RepeatedSimulation
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, executed, replay
 from sim_engine.action import DEG
 from sim_engine.liquids import SimulationParameters
@@ -86,7 +87,7 @@ def test_each_action_is_simulated_as_planned_and_under_errors_within_the_budget(
 
 def test_all_actions_are_compared_under_the_same_errors() -> None:
     played = StrategyHarness(two_valleys).run(risky(iterations=6))
-    asked = {r.problem.risk for r in played.asked if isinstance(r, Suggest) and r.problem.risk is not None}
+    asked = {r.query.risk for r in played.asked if isinstance(r, Suggest) and isinstance(r.query, RiskQuery)}
     assert len(asked) == 1
 
 
@@ -136,7 +137,8 @@ def test_cups_that_touch_under_an_error_are_a_risk_and_those_that_touch_as_plann
     assert strategy.best_values["x_offset"] > 0.1 + 0.8 * ERRORS.x
     told = [(r, o) for r, o in played.told if isinstance(r, Simulate) and isinstance(o, Failed)]
     assert any(r.pose_error is not None and r.action.x_offset > 0.1 for r, _ in told)
-    costs = [c for r in played.asked if isinstance(r, Suggest) for c in r.problem.data.costs]
+    queries = [r.query for r in played.asked if isinstance(r, Suggest) and isinstance(r.query, RiskQuery)]
+    costs = [c for query in queries for c in query.data.costs]
     assert max(costs) == 1.0
     plain = OneShotPlanning(deployment_plan(strategy="D1", pours=0, iterations=20), SCENE, THETA, 0)
     StrategyHarness(touching_below(0.1)).run(plain)

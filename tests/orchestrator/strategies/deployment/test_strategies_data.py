@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -63,8 +63,8 @@ calibration:
 
 
 class Optimizer:
-    async def suggest(self, problem: SuggestProblem) -> Suggestion:
-        return propose(problem)
+    async def suggest(self, query: SuggestionQuery) -> Suggestion:
+        return propose(query)
 
 
 def load(folder: Path, text: str) -> CampaignPlan:
@@ -95,8 +95,8 @@ def strategy(plan: DeploymentPlan) -> Any:
     return {"D2": RealOnly, "D3": Hybrid}[plan.strategy](plan, plan.scenes[0], THETA, 1)
 
 
-def questions(played: StrategyHarness) -> list[SuggestProblem]:
-    return [request.problem for request in played.asked if isinstance(request, Suggest)]
+def questions(played: StrategyHarness) -> list[SuggestionQuery]:
+    return [request.query for request in played.asked if isinstance(request, Suggest)]
 
 
 def test_a_run_goes_on_from_the_pours_of_a_former_one_and_pours_its_own_budget(tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_a_hybrid_pours_first_where_the_former_pours_and_the_simulations_say(tmp
     text = CAMPAIGN.replace("D2", "D3") + "  prior_simulations: 6\n  data: {from: pours.csv}\n"
     hybrid = strategy(deployment(tmp_path, text))
     played = StrategyHarness(narrow_cup).run(hybrid)
-    first = next(r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour")
+    first = next(r.query for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour")
     assert (len(first.data), len(first.simulated), first.acquisition) == (3, 6, "least_loss")
     assert hybrid.result().former_pours == 3
 

@@ -4,6 +4,7 @@ import math
 import numpy as np
 import pytest
 
+from actors.optimizer.questions import Data
 from orchestrator.journal.stage_results import encode_result
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Suggest
 from orchestrator.strategies.deployment.costing import Costing
@@ -132,7 +133,7 @@ def test_d3_asks_for_a_pour_and_the_simulations_beside_it_together():
     assert [r.purpose for r in played.simulations] == ["prior"] * 20 + ["refine"] * 8
     pour = next(i for i, r in enumerate(played.asked) if isinstance(r, Pour))
     assert [type(r) for r in played.asked[pour : pour + 3]] == [Pour, Simulate, Simulate]
-    questions = [r.problem for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour"]
+    questions = [r.query for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour"]
     assert [len(q.simulated) for q in questions] == [20, 22, 24, 26]
     assert [len(q.data) for q in questions] == [0, 1, 2, 3]
 
@@ -143,7 +144,8 @@ def test_failed_simulations_and_pours_never_poison_a_fit():
 
     for name in STRATEGIES:
         played = StrategyHarness(flaky).run(make(name, 2, pours=6))
-        costs = [c for r in played.asked if isinstance(r, Suggest) for c in r.problem.data.costs]
+        queries = [r.query for r in played.asked if isinstance(r, Suggest)]
+        costs = [c for query in queries for c in getattr(query, "data", Data()).costs]
         assert all(math.isfinite(c) and c <= 1.0 for c in costs)
 
 
@@ -156,7 +158,7 @@ def test_a_failed_pour_counts_and_enters_the_data_as_told(policy, entered):
     strategy = make("D2", pours=4, on_failed_pour=policy)
     played = StrategyHarness(narrow_cup, answer=second_fails).run(strategy)
     assert [r.number for r in played.pours] == [1, 2, 3, 4]
-    final = [r for r in played.asked if isinstance(r, Suggest)][-1].problem
+    final = [r for r in played.asked if isinstance(r, Suggest)][-1].query
     assert len(final.data) == (4 if entered else 3)
     row = strategy.result().pours[1]
     assert (row.status, row.loss) == ("failed", entered)
@@ -181,7 +183,7 @@ def test_a_pour_that_went_wrong_is_a_warning_of_more_near_it_but_not_in_the_pape
     played = StrategyHarness(narrow_cup, answer=second_touches_third_is_not_weighed).run(strategy)
     assert [pour.status for pour in strategy.result().pours].count("failed") == 2
     second = ACTIONS.encode(played.pours[1].action.values())
-    last = [request for request in played.asked if isinstance(request, Suggest)][-1].problem
+    last = [request for request in played.asked if isinstance(request, Suggest)][-1].query
     assert [pytest.approx(point) for point in last.failed] == ([second] if warns else [])
 
 

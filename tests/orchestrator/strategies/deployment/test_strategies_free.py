@@ -17,10 +17,9 @@ from actors.optimizer.questions import Data
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
 from orchestrator.results.pool_occupancy import RESTS, Occupancy, occupancies
-from orchestrator.strategies.deployment.bench_offset import thinned
 from orchestrator.strategies.deployment.costing import Prices, PricesSettings
 from orchestrator.strategies.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
-from orchestrator.strategies.deployment.model_monitoring import DiscrepancyPolicySettings
+from orchestrator.strategies.deployment.model_monitoring import DiscrepancyPolicySettings, subsampled
 from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
 from tests.orchestrator.test_stages import campaign, laboratory
 from tests.support.killed_runs import die_at, finished_times
@@ -173,7 +172,7 @@ def test_the_next_pour_is_asked_for_with_one_quick_question() -> None:
 def test_thinning_keeps_what_is_near_and_covers_the_rest_whatever_it_cost() -> None:
     points = np.random.default_rng(0).random((500, 2))
     data = Data(tuple(map(tuple, points.tolist())), tuple(map(float, range(500))))
-    kept = thinned(data, [(0.2, 0.2)], 100)
+    kept = subsampled(data, [(0.2, 0.2)], 100)
     assert len(kept) == 100
     assert kept.points == tuple(p for p in data.points if p in set(kept.points))
     near = sorted(data.points, key=lambda p: math.dist(p, (0.2, 0.2)))[:50]
@@ -181,8 +180,8 @@ def test_thinning_keeps_what_is_near_and_covers_the_rest_whatever_it_cost() -> N
     gaps = np.linalg.norm(points[:, None] - np.array(kept.points)[None], axis=2).min(axis=1)
     assert gaps.max() < 0.15
     other = replace(data, costs=tuple(-c for c in data.costs))
-    assert thinned(other, [(0.2, 0.2)], 100).points == kept.points
-    assert thinned(data, [], 500) == data
+    assert subsampled(other, [(0.2, 0.2)], 100).points == kept.points
+    assert subsampled(data, [], 500) == data
 
 
 # -- again from the journal ------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.optimizer.questions import Suggestion, SuggestProblem
+from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
 from orchestrator.requests import Failed, Simulate
 from orchestrator.results.campaign_figures import draw_figures
@@ -181,9 +181,9 @@ def test_the_window_is_told_and_drawn(tmp_path: Path) -> None:
 class ProposingOptimizer(toy_campaign.ToyOptimizer):
     """The real optimiser, without an actor."""
 
-    async def suggest(self, problem: SuggestProblem) -> Suggestion:
+    async def suggest(self, query: SuggestionQuery) -> Suggestion:
         self.asked += 1
-        return propose(problem)
+        return propose(query)
 
 
 def run_risk(directory: Path, *, resume: bool = False) -> Any:

@@ -1,21 +1,118 @@
-"""The operator of a virtual bench: carries out the requested steps, takes a person's time for them, and answers.
+"""The operator of a bench: questions with reminders, a deadline and a log, and the operators of a virtual bench.
 
-`BenchContents` holds the objects and the liquid on the bench; the load on the balance follows from it. `Hands` changes
-it on request. `VirtualOperator` answers by itself; `PlayedOperator` passes the questions to a person. `BenchContents`
-has no side effects outside itself.
+- `OperatorQuestions` forwards questions to one operator and records each answer as an `AnsweredQuestion`.
+- `VirtualOperator` carries out the requested steps, takes a person's time for them, and answers by itself.
+- `PlayedOperator` passes the questions to a person, and virtual hands carry out the steps.
+- `Hands` changes the `BenchContents`: the objects and the liquid on a virtual bench. The load on the balance follows
+  from them.
+
+The wording of the questions belongs to `actors.bench.consent` and `actors.balance.weighing_plan`.
 """
 
 from __future__ import annotations
 
 import asyncio
 import math
+import time
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from actors.balance.weighing_plan import Placement
-from actors.interfaces import LaboratoryError, Operator, OperatorQuestion
+from actors.interfaces import LaboratoryError, Notice, Operator, OperatorQuestion, OperatorSpec
+
+
+class NoAnswerError(LaboratoryError):
+    """The deadline of a question has passed."""
+
+
+@dataclass(frozen=True)
+class AnsweredQuestion:
+    """A question and its answer.
+
+    Attributes:
+        about: subject of the question.
+        answer: as given; '' if none was.
+        after: time until the answer [s of the clock].
+        problem: why the question was repeated; '' the first time.
+    """
+
+    about: str
+    answer: str
+    after: float
+    problem: str = ""
+
+
+class OperatorQuestions:
+    """Asks one operator.
+
+    Args:
+        operator: answers the questions.
+        spec: reminder and deadline.
+        tell: receives notices for the journal: questions, answers, missing answers, and problems as warnings. The
+            operator's own screen shows questions with their problems, and reminders.
+        time_scale: bench seconds per second of the clock; for a virtual operator the times of `spec` are divided by it.
+    """
+
+    def __init__(
+        self, operator: Operator, spec: OperatorSpec, tell: Callable[[Notice], None], time_scale: float = 1.0
+    ) -> None:
+        self._operator, self._notify = operator, tell
+        self._on_screen = spec.answers == "person"
+        pace = time_scale if spec.answers == "virtual" else 1.0
+        self._reminder, self._deadline = spec.reminder / pace, spec.deadline / pace
+        self.log: list[AnsweredQuestion] = []
+
+    async def ask(self, question: OperatorQuestion) -> str:
+        """Ask a question and wait for the answer.
+
+        Raises:
+            NoAnswerError: no answer came before the deadline.
+            LaboratoryError: the operator gave up.
+        """
+        if question.problem:
+            self._notify(Notice("warning", question.problem, asked=self._on_screen))
+        begun, answer = time.monotonic(), ""
+        answering = asyncio.ensure_future(self._operator.ask(question))
+        try:
+            answer = await self._await(answering, question, begun)
+            return answer
+        finally:
+            answering.cancel()
+            await asyncio.wait({answering})
+            if not answering.cancelled():
+                answering.exception()
+            after = time.monotonic() - begun
+            self.log.append(AnsweredQuestion(question.about, answer, after, question.problem))
+            reply = f"'{answer}' after {after:.1f} s" if answer else f"no answer within {after:.1f} s"
+            self._notify(Notice("note", f"operator ({question.about}): {question.text} → {reply}"))
+
+    async def announce(self, text: str, seconds: float) -> None:
+        """Announce that something moves after the given time [s of the clock]."""
+        self._notify(Notice("note", f"operator told: {text}"))
+        await self._operator.announce(text, seconds)
+
+    def take_log(self) -> list[dict[str, Any]]:
+        """Return the questions and answers since the last call, JSON-ready."""
+        log, self.log = self.log, []
+        return [
+            {k: round(v, 3) if isinstance(v, float) else v for k, v in asdict(one).items() if v != ""} for one in log
+        ]
+
+    async def _await(self, answering: asyncio.Future[str], question: OperatorQuestion, begun: float) -> str:
+        while True:
+            left = begun + self._deadline - time.monotonic()
+            done, _ = await asyncio.wait({answering}, timeout=max(min(self._reminder, left), 0.0))
+            if done:
+                return answering.result()
+            waited = time.monotonic() - begun
+            if waited >= self._deadline:
+                raise NoAnswerError(f"nobody answered within {self._deadline:g} s: '{question.text}'")
+            unseen: Literal["note", "warning"] = "note" if self._on_screen else "warning"
+            self._notify(Notice(unseen, f"still waiting, for {waited:.0f} s now: {question.text}"))
+
 
 POURER, RECEIVER, TRAY = 0.312, 0.186, 0.428
 """Dry masses [kg] of glass beakers and a steel tray; all differ, so that no error cancels by chance."""
@@ -136,12 +233,12 @@ class Hands:
     """Moves objects on a virtual bench.
 
     Args:
-        things: the bench contents.
+        contents: the bench contents.
         put: changes the mass on the balance; None without a balance.
     """
 
-    def __init__(self, things: BenchContents, put: Put | None) -> None:
-        self.things, self._put = things, put
+    def __init__(self, contents: BenchContents, put: Put | None) -> None:
+        self.contents, self._put = contents, put
         self._rng = np.random.default_rng(0)
         self._load = 0.0
 
@@ -156,9 +253,9 @@ class Hands:
 
     async def do(self, question: OperatorQuestion) -> None:
         """Carry out the step of a question."""
-        self.things.do(question.about, self._load + float(self._rng.normal(0.0, SCATTER)))
+        self.contents.do(question.about, self._load + float(self._rng.normal(0.0, SCATTER)))
         if self._put is not None and question.wants == "done":
-            await self._put(self.things.carried)
+            await self._put(self.contents.carried)
 
 
 class VirtualOperator:
@@ -208,7 +305,7 @@ class VirtualOperator:
         await self._hands.do(question)
         match question.wants:
             case "weight":
-                return self._hands.things.typed(about, TYPED_STEP)
+                return self._hands.contents.typed(about, TYPED_STEP)
             case "done":
                 return "done"
         return "yes"
@@ -233,7 +330,7 @@ class PlayedOperator:
         """See `Operator.ask`."""
         if question.wants == "weight":  # the person has no scale to read
             await self._hands.do(question)
-            shown = self._hands.things.typed(question.about, TYPED_STEP)
+            shown = self._hands.contents.typed(question.about, TYPED_STEP)
             question = replace(question, text=f"{question.text} (The virtual scale shows {shown}.)")
             return await self._person.ask(question)
         answer = await self._person.ask(question)

@@ -1,6 +1,5 @@
-"""One simulator as the pools use it.
+"""One simulator as a worker uses it: `JobRunner` runs the pool's tasks on the engine and translates its errors.
 
-`JobRunner` runs tasks of the laboratory on the engine. `PoolStatistics` and `Account` count the work of a pool.
 `give_back` returns freed memory to the system.
 """
 
@@ -9,7 +8,6 @@ from __future__ import annotations
 import ctypes
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Protocol
 
 from actors.interfaces import InvalidActionError, SimulationError
@@ -20,10 +18,6 @@ from sim_engine.scene import PourTask
 LONG_FIRST_JOB = 5.0
 """CPU time [s] of a process's first job above which its kernels may have been compiled. Loading them from the cache
 takes a second or two; compiling takes six to eight."""
-
-
-RETRIES = 2
-"""Number of repetitions of a job in other processes after one died during it."""
 
 
 class JobCancelledError(Exception):
@@ -124,63 +118,3 @@ def give_back() -> bool:
     except (AttributeError, OSError):
         return False
     return bool(trim(0))
-
-
-@dataclass(frozen=True)
-class PoolStatistics:
-    """Statistics of a pool.
-
-    Attributes:
-        jobs: finished, including refused ones.
-        cancelled: given up because the result was not needed any more.
-        deaths: workers lost and replaced.
-        busy_s: wall-clock time that workers worked, summed [s]; by their own clocks if they report it.
-        busy_fraction: fraction of the workers' time since the pool was opened.
-    """
-
-    jobs: int
-    cancelled: int
-    deaths: int
-    busy_s: float
-    busy_fraction: float
-
-
-@dataclass
-class Account:
-    """Counts a pool's statistics."""
-
-    size: int
-    jobs: int = 0
-    cancelled: int = 0
-    deaths: int = 0
-    _busy: float = 0.0
-    _available: float = 0.0
-    _resized: float = field(default_factory=time.monotonic)
-    _since: dict[int, float] = field(default_factory=dict)
-
-    def begin(self, member: int) -> None:
-        """Record that a worker was given a job."""
-        self._since[member] = time.monotonic()
-
-    def end(self, member: int, worked: float | None = None) -> None:
-        """Record that a worker is idle again or lost.
-
-        Args:
-            member: its number.
-            worked: by its own clock [s]; else the time since `begin`.
-        """
-        elapsed = time.monotonic() - self._since.pop(member, time.monotonic())
-        self._busy += elapsed if worked is None else worked
-
-    def resize(self, size: int) -> None:
-        """Change the number of workers from now on."""
-        now = time.monotonic()
-        self._available += (now - self._resized) * self.size
-        self.size, self._resized = size, now
-
-    def statistics(self) -> PoolStatistics:
-        """Statistics up to now, including running jobs."""
-        now = time.monotonic()
-        busy = self._busy + sum(now - since for since in self._since.values())
-        available = max(self._available + (now - self._resized) * self.size, 1e-9)
-        return PoolStatistics(self.jobs, self.cancelled, self.deaths, busy, busy / available)

@@ -1,0 +1,364 @@
+"""The catalogue of this machine's runs: one SQLite file with the tables `run`, `pour`, `tag` and `note`.
+
+- `CatalogueClient` is the interface for the command line, the HTTP API and the library. `Catalogue` implements it on
+  this machine, and the daemon's client implements it for another one.
+- The file is an index over the runs' folders and may be deleted at any time. `Catalogue.refresh` reads the runs that
+  changed since they were last read.
+- Several processes may use it at the same time: runs are read without a lock, and each is entered in a transaction.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sqlite3
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+from orchestrator.catalogue.annotations import ANNOTATIONS_NAME, annotate
+from orchestrator.catalogue.export import write_tables
+from orchestrator.catalogue.queries import condition_sql, differing_settings, outcomes
+from orchestrator.catalogue.run_reading import TABLES, UNREADABLE, Column, RunRead, read_run, unreadable
+from orchestrator.catalogue.run_registry import known, make_state_directory, state_directory
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.journal_check import has_begun
+from orchestrator.journal.run_record import Row
+from orchestrator.run_errors import RunError
+from orchestrator.states import RESTING
+
+INDEX_NAME = "catalogue.sqlite"
+
+FORMAT = 3
+"""Version of the index's content; an index of another version is rebuilt."""
+
+
+class CatalogueError(RunError):
+    """The catalogue can't fulfil a request; the text gives the reason and a correct form."""
+
+
+class NoSuchRunError(CatalogueError):
+    """The catalogue has no such run."""
+
+
+class CatalogueClient(Protocol):
+    """A catalogue with JSON-ready results. Every call may raise RunError, whose text gives the reason.
+
+    Conditions are those of `queries.condition_sql`, and 'limit', the maximum number of rows. A run is named by its
+    folder, the folder's name, or an unambiguous prefix of the name.
+    """
+
+    def runs(self, conditions: Mapping[str, Any]) -> list[Row]:
+        """Runs, the newest first; see `run_reading.RUNS`. Raises ValueError for an invalid condition."""
+
+    def pours(self, conditions: Mapping[str, Any]) -> list[Row]:
+        """Pours, the oldest first; see `run_reading.POURS`. Raises ValueError for an invalid condition."""
+
+    def run(self, name: str) -> Row:
+        """One run, with its notes (time, by, text) and its pours under 'list_of_pours'."""
+
+    def compare(self, names: Sequence[str]) -> Row:
+        """'runs' (their folders), the differing 'settings', and the 'outcomes' of each run."""
+
+    def tag(self, name: str, add: Sequence[str], remove: Sequence[str]) -> Row:
+        """Change a run's tags; returns 'run' and 'tags'."""
+
+    def note(self, name: str, text: str) -> Row:
+        """Add a note to a run; returns 'run' and 'notes'."""
+
+    def export(self, folder: Path, conditions: Mapping[str, Any], formats: Sequence[str]) -> Row:
+        """Write runs and pours into files.
+
+        Returns 'files' and the numbers of 'runs' and 'pours'. Raises MissingExtraError, OSError.
+        """
+
+
+@dataclass
+class Refreshed:
+    """Result of a refresh.
+
+    Attributes:
+        missing: number of known folders without a run.
+        problems: reasons why runs can't be read.
+    """
+
+    missing: int = 0
+    problems: list[str] = field(default_factory=list)
+
+
+class Catalogue:
+    """The `CatalogueClient` of this machine. Open it, call `refresh`, then query it.
+
+    Args:
+        state: the state directory, if not the default.
+
+    Attributes:
+        warning: why the index is kept in memory only, if it can't be written; empty otherwise.
+    """
+
+    def __init__(self, state: Path | None = None) -> None:
+        self.state = state_directory() if state is None else state
+        self.warning = ""
+        path = self.state / INDEX_NAME
+        try:
+            make_state_directory(self.state)
+            try:
+                self._connection = _opened(str(path))
+            except sqlite3.DatabaseError as error:
+                if isinstance(error, sqlite3.OperationalError):
+                    raise  # a folder that can't be written, a full disk: not an error of the index
+                for suffix in ("", "-wal", "-shm"):  # damaged: all of its content is in the runs
+                    path.with_name(path.name + suffix).unlink(missing_ok=True)
+                self._connection = _opened(str(path))
+        except (OSError, sqlite3.OperationalError) as error:
+            self.warning = f"{path}: can't be written ({error}); the runs are read again each time"
+            self._connection = _opened(":memory:")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file. May be called twice."""
+        self._connection.close()
+
+    def refresh(self, progress: Callable[[int, int], None] | None = None, *, rebuild: bool = False) -> Refreshed:
+        """Read the runs that were written since they were last read.
+
+        Args:
+            progress: called with the number of runs read so far, and their total.
+            rebuild: read all runs, and remove missing ones from the index.
+
+        Raises:
+            CatalogueError: the list of runs or the index can't be read or written.
+        """
+        try:
+            stamps = dict(self._connection.execute("select path, stamp from run").fetchall())
+            folders = {str(path): _stamp(path) for path in dict.fromkeys((*known(self.state), *map(Path, stamps)))}
+            changed = [path for path, stamp in folders.items() if stamp and (rebuild or stamp != stamps.get(path))]
+            missing = [path for path, stamp in folders.items() if not stamp and path in stamps]
+            gone = "delete from run" if rebuild else "update run set stamp = ''"
+            self._connection.executemany(f"{gone} where path = ?", [[path] for path in missing])
+            for number, path in enumerate(changed, start=1):
+                if progress is not None:
+                    progress(number, len(changed))
+                self._read(path, folders[path])
+            query = "select reason from run where state = ? and stamp != '' order by path"
+            problems = [row[0] for row in self._connection.execute(query, [UNREADABLE])]
+        except (OSError, sqlite3.Error) as error:
+            raise CatalogueError(
+                f"{self.state}: the catalogue can't be brought up to date ({error}); correct that, or name another "
+                "state directory with --state"
+            ) from None
+        return Refreshed(0 if rebuild else len(missing), problems)
+
+    def runs(self, conditions: Mapping[str, Any]) -> list[Row]:
+        """See `CatalogueClient`."""
+        return self._rows("run", *condition_sql("run", conditions), "begun desc, path", conditions.get("limit"))
+
+    def pours(self, conditions: Mapping[str, Any]) -> list[Row]:
+        """See `CatalogueClient`."""
+        newest = self._rows(
+            "pour", *condition_sql("pour", conditions), "time desc, path desc, id desc", conditions.get("limit")
+        )
+        return newest[::-1]
+
+    def run(self, name: str) -> Row:
+        """See `CatalogueClient`."""
+        found = self._find(name)
+        notes = self._connection.execute("select time, by, text from note where path = ?", [found["path"]]).fetchall()
+        written = [dict(zip(("time", "by", "text"), note, strict=True)) for note in notes]
+        return {**found, "notes": written, "list_of_pours": self.pours({"run": found["path"]})}
+
+    def compare(self, names: Sequence[str]) -> Row:
+        """See `CatalogueClient`."""
+        found, plans = [self._find(name) for name in names], []
+        for run in found:
+            with JournalReader(Path(run["path"]) / JOURNAL_NAME) as journal:
+                plans.append(journal.header.fingerprint)
+        results = [outcomes(run) for run in found]
+        return {"runs": [run["path"] for run in found], "settings": differing_settings(plans), "outcomes": results}
+
+    def tag(self, name: str, add: Sequence[str], remove: Sequence[str]) -> Row:
+        """See `CatalogueClient`."""
+        found = self._find(name)
+        return {"run": found["run"], "tags": annotate(Path(found["path"]), add=add, remove=remove).tags}
+
+    def note(self, name: str, text: str, by: str | None = None) -> Row:
+        """See `CatalogueClient`.
+
+        Args:
+            by: author of the note; the user of this process unless given.
+        """
+        found = self._find(name)
+        notes = annotate(Path(found["path"]), note=text, by=by).notes
+        return {"run": found["run"], "notes": [note.model_dump() for note in notes]}
+
+    def export(self, folder: Path, conditions: Mapping[str, Any], formats: Sequence[str]) -> Row:
+        """See `CatalogueClient`."""
+        tables = {"run": self.runs(conditions), "pour": self.pours(conditions)}
+        files = write_tables(tables, folder, formats)
+        return {"files": [str(path) for path in files], **{f"{name}s": len(rows) for name, rows in tables.items()}}
+
+    def _find(self, name: str) -> Row:
+        path = str(Path(name).absolute())
+        runs = self._rows("run", "path = ?", [path])
+        runs = runs or self._rows("run", "run = ?", [name])
+        runs = runs or self._rows("run", "substr(run, 1, length(?)) = ?", [name, name], "run")
+        if len(runs) == 1:
+            return runs[0]
+        if not runs:
+            raise NoSuchRunError(
+                f"{name}: no such run in the catalogue; `decant runs` lists the newest, `decant runs add FOLDER` "
+                "enters runs that it doesn't know"
+            )
+        places = "\n  ".join(row["path"] for row in runs[:10])
+        raise CatalogueError(f"{name}: {len(runs)} runs are called so; name one by its folder:\n  {places}")
+
+    def _rows(
+        self, table: str, where: str, values: Sequence[Any], order: str = "path", limit: int | None = None
+    ) -> list[Row]:
+        columns = TABLES[table]
+        names = ", ".join(column.name for column in columns)
+        query = f"select {names} from {_SOURCES[table]} where {where} order by {order} limit ?"
+        rows = self._connection.execute(query, [*values, -1 if limit is None else limit]).fetchall()
+        return [{c.name: _value(c, stored) for c, stored in zip(columns, row, strict=True)} for row in rows]
+
+    def _read(self, path: str, stamp: str) -> None:
+        read = read_run(Path(path))
+        try:
+            self._enter(path, stamp, read)
+        except (sqlite3.Error, OverflowError, TypeError, ValueError) as error:
+            if isinstance(error, sqlite3.OperationalError):
+                raise  # a full disk, a locked index: not an error of the run
+            # Its content doesn't fit the columns: it is damaged, or exceeds the limits of SQLite.
+            problem = f"{path}: its journal has values that can't be entered ({error}); see `decant runs check`"
+            self._enter(path, stamp, unreadable(Path(path), problem, read.annotations))
+
+    def _enter(self, path: str, stamp: str, read: RunRead) -> None:
+        """Replace the rows of a run. The previous folder of a moved run, with the same name and start, is removed."""
+        run, annotations = read.run, read.annotations
+        with _transaction(self._connection):
+            query = "delete from run where path = ? or (run = ? and begun = ? and stamp = '')"
+            self._connection.execute(query, [path, run.get("run"), run.get("begun")])
+            self._insert("run", [[*_stored("run", run), stamp]])
+            self._insert("pour", [_stored("pour", pour) for pour in read.pours])
+            self._insert("tag", [[path, tag] for tag in annotations.tags])
+            self._insert("note", [[path, note.time, note.by, note.text] for note in annotations.notes])
+
+    def _insert(self, table: str, rows: Sequence[Sequence[Any]]) -> None:
+        if rows:
+            self._connection.executemany(f"insert into {table} values ({', '.join('?' * len(rows[0]))})", rows)
+
+
+_TYPES = {"text": "text", "texts": "text", "integer": "integer", "number": "real", "time": "real", "values": "text"}
+_ANNOTATIONS = {"tags": "tag", "notes": "note"}
+"""Columns of runs that are tables of their own."""
+
+_SOURCES = {"run": "runs", "pour": "pour"}
+"""Sources of the rows of `TABLES`. The view `runs` adds tags, notes and the present state to the table."""
+
+_BELONGS = "path text references run on delete cascade"
+
+
+def _layout() -> Iterator[str]:
+    """The statements that create the tables."""
+    own = {name: [c for c in columns if c.name not in _ANNOTATIONS] for name, columns in TABLES.items()}
+    declared = {name: ", ".join(f"{c.name} {_TYPES[c.type]}" for c in columns) for name, columns in own.items()}
+    yield "drop view if exists runs"
+    for table in ("note", "tag", "pour", "run"):
+        yield f"drop table if exists {table}"
+    yield f"create table run ({declared['run'].replace('path text', 'path text primary key')}, stamp text) strict"
+    yield f"create table pour ({declared['pour'].replace('path text', _BELONGS)}) strict"
+    yield f"create table tag ({_BELONGS}, tag text) strict"
+    yield f"create table note ({_BELONGS}, time real, by text, text text) strict"
+    for table in ("pour", "tag", "note"):
+        yield f"create index {table}_by_path on {table} (path)"
+    columns = [f"state_now(state, path) as {c.name}" if c.name == "state" else c.name for c in own["run"]]
+    for name, text in (("tags", "tag"), ("notes", "text")):
+        table = _ANNOTATIONS[name]
+        columns.append(f"(select json_group_array({text}) from {table} where {table}.path = run.path) as {name}")
+    yield f"create view runs as select {', '.join(columns)} from run"
+
+
+def _opened(path: str) -> sqlite3.Connection:
+    connection = sqlite3.connect(path, isolation_level=None, timeout=10.0, check_same_thread=False)
+    try:
+        connection.create_function("state_now", 2, _state_now)
+        # A power cut may lose the latest rows: the next refresh reads those runs again.
+        connection.executescript("pragma journal_mode = wal; pragma synchronous = normal; pragma foreign_keys = on")
+        if not _has_format(connection):
+            with _transaction(connection):
+                if not _has_format(connection):  # another process may have created the tables
+                    for statement in (*_layout(), f"pragma user_version = {FORMAT}"):
+                        connection.execute(statement)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _has_format(connection: sqlite3.Connection) -> bool:
+    return bool(connection.execute("pragma user_version").fetchone()[0] == FORMAT)
+
+
+@contextlib.contextmanager
+def _transaction(connection: sqlite3.Connection) -> Iterator[None]:
+    connection.execute("begin immediate")
+    try:
+        yield
+    except BaseException:
+        connection.execute("rollback")
+        raise
+    connection.execute("commit")
+
+
+def _stamp(run: Path) -> str:
+    """A text that changes with every write to a run; empty if there is no run."""
+    marks = []
+    for name in (JOURNAL_NAME, f"{JOURNAL_NAME}-wal", ANNOTATIONS_NAME):
+        try:
+            found = (run / name).stat()
+            marks.append(f"{found.st_mtime_ns}:{found.st_size}")
+        except OSError:
+            if name == JOURNAL_NAME and not has_begun(run / JOURNAL_NAME):
+                return ""
+            marks.append("")
+    return " ".join(marks)
+
+
+def _stored(table: str, row: Row) -> list[Any]:
+    """The values of a row, without those that are tables of their own."""
+    stored = []
+    for column in TABLES[table]:
+        if column.name not in _ANNOTATIONS:
+            value = row.get(column.name)
+            is_json = column.type in ("texts", "values") and value is not None
+            stored.append(json.dumps(value, ensure_ascii=False) if is_json else value)
+    return stored
+
+
+def _value(column: Column, stored: Any) -> Any:
+    if column.type in ("texts", "values"):
+        return ([] if column.type == "texts" else {}) if stored is None else json.loads(stored)
+    return stored
+
+
+def _state_now(state: str | None, path: str) -> str:
+    """The state in the journal; 'interrupted' for an active state if no process holds the journal."""
+    busy = state not in (None, "", UNREADABLE, *RESTING)
+    return "interrupted" if busy and not _held(Path(path) / JOURNAL_NAME) else state or ""
+
+
+def _held(journal: Path) -> bool:
+    """Whether a process holds a journal's lock, from the system's list of locks; trying the lock would block others."""
+    try:
+        lock = journal.with_suffix(".lock").stat().st_ino
+        lines = Path("/proc/locks").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return True  # unknown: the state in the journal is used
+    return any(len(part := line.split()) > 5 and part[-3].rpartition(":")[2] == str(lock) for line in lines)

@@ -1,1 +1,0 @@
-"""Report of a study: figures, tables and an HTML page."""

@@ -1,0 +1,437 @@
+"""The report of a study: figure and table files, and one self-contained HTML page.
+
+- `write_report` writes all files from the finished cells; an unfinished study is allowed.
+- `tables` makes the tables: discrepancies of the calibrations, losses of the deployments, effects, pours to the same
+  loss.
+- `plain_words` describes the differences between strategies in sentences: which one is better, by how much, and where
+  the data does not decide.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orchestrator.results import html_page as page
+from orchestrator.results.html_report import minutes
+from orchestrator.results.loss_units import deployment_unit
+from orchestrator.strategies.calibration.calibration_base import Calibrated
+from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED
+from orchestrator.study.calibration_figures import Drawn, draw_calibrations, is_ours, level_words, write_csv
+from orchestrator.study.deployment_figures import CAPTION, Losses, draw_deployments
+from orchestrator.study.study_folder import code_summary, finished_results, write_whole
+from orchestrator.study.study_plan import Level, StudyPlan, cells_of
+from orchestrator.study.study_statistics import (
+    ALL,
+    FEWEST,
+    RANDOM,
+    SHARE,
+    Effect,
+    Estimate,
+    Gathered,
+    Key,
+    at_pour,
+    effect,
+    estimate,
+    gather,
+    mean,
+    statistic,
+    tests_of,
+)
+
+TABLE_POURS = (1, 3, 15)
+
+_PAIRED = (
+    "Mean differences, paired by repetition, level and receiver [95 % t interval of these differences]; below 0 the "
+    "first is better. C1 to C4 of a repetition share its weighed pours and the seeds that they are scored with. "
+    "Deployments share the bench's systematic errors, and all but D2 the θ* of the repetition; the chance errors of "
+    "their pours are drawn for each, but final actions' pours share them one by one. Probability: that chance alone "
+    "gives such a difference (sign changes of the repetitions' differences); '—' below five repetitions. Many rows "
+    "are tested: one in twenty is below 0.05 by chance."
+)
+_EFFECT_COLUMNS = ("compared", "of", "mismatch", "receiver", "repetitions", "difference", "better in", "probability")
+_NEEDED = (
+    "The loss that both D2 and D3 reach: the larger of their mean least losses after the last pour. Pours until the "
+    "mean of the least loss so far is there, with 95 % intervals: percentile bootstraps over the repetitions, too "
+    "narrow with ten or fewer; a resampled mean that never gets there counts as one pour more than there were."
+)
+
+
+TableRow = list[str | int | float | Estimate]
+
+
+@dataclass(frozen=True)
+class StudyTable:
+    """A table. Its cells are texts, numbers, or estimates (three columns in CSV)."""
+
+    name: str
+    title: str
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[TableRow]
+
+    def flat(self) -> tuple[list[str], list[list[object]]]:
+        """Header and rows for CSV."""
+        header: list[str] = []
+        for i, name in enumerate(self.header):
+            wide = any(isinstance(row[i], Estimate) for row in self.rows)
+            header += [name, f"{name}, low", f"{name}, high"] if wide else [name]
+        rows: list[list[object]] = []
+        for row in self.rows:
+            flat: list[object] = []
+            for value in row:
+                flat += [value.mean, value.low, value.high] if isinstance(value, Estimate) else [value]
+            rows.append(flat)
+        return header, rows
+
+
+def tables(study: StudyPlan, found: Gathered) -> list[StudyTable]:
+    """All tables for which there is data."""
+    made = []
+    if found.calibrated:
+        made.append(_calibrations(study, found))
+    if rows := [*_calibration_effects(study, found), *_deployment_effects(study, found)]:
+        made.append(StudyTable("table-effects", "Who gains how much", _PAIRED, _EFFECT_COLUMNS, rows))
+    if found.finals:
+        made.append(_finals(found, Losses(study, found, final=True)))
+    if found.losses:
+        losses = Losses(study, found)
+        made.append(_deployments(found, losses))
+        if rows := _needed(found, losses):
+            header = ("mismatch", "receiver", "loss", "D2", "D3")
+            made.append(StudyTable("table-pours", "Pours to the same loss", _NEEDED, header, rows))
+    return made
+
+
+def _calibrations(study: StudyPlan, found: Gathered) -> StudyTable:
+    rows: list[TableRow] = []
+    for name, one in found.calibrated.items():
+        spent = "0" if name in (UNCALIBRATED, RANDOM) else f"{mean([float(n) for n in one.simulations]):.0f}"
+        if name == "C1":
+            spent += " (scored from one grid)"
+        values = [mean(test) for test in one.test]
+        trained = [mean(train) for train in one.train]
+        rows.append(
+            [
+                name,
+                spent,
+                len(one.test),
+                estimate(trained, SHARE).scaled(100),
+                estimate(values, SHARE).scaled(100),
+                _thetas(one.results),
+            ]
+        )
+    return StudyTable(
+        "table-calibration",
+        "Discrepancy of the calibrated simulators",
+        f"Mean |measured − simulated| of the normalised spillage, mean over repetitions [95 % t interval], at "
+        f"{study.compared} mismatch. Uncalibrated: searched parameters at their defaults. Repetitions weigh the same "
+        f"{study.pour_count} actions again, and keep {study.holdout} of them for testing: test pours recur between "
+        "repetitions. C1's share one simulated grid, too: its interval has the chance of pours, and none of the grid's "
+        "simulations.",
+        ("strategy", "simulations", "repetitions", "training pours [%]", "test pours [%]", "θ*, mean ± deviation"),
+        rows,
+    )
+
+
+PAIRS = (
+    ("C4", "C3"),
+    ("C4", "C2"),
+    ("C4", "C1"),
+    ("C4", "C4-paper"),
+    ("C4", UNCALIBRATED),
+    ("C4", RANDOM),
+    ("C4-active", "C4"),
+    ("C4-paper", "C3"),
+    ("C3", "C2"),
+)
+"""Pairs of calibrations whose test discrepancies are compared; calibrations of packages are compared with C4."""
+
+ARMS = (("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"), ("D3-paper", "D2-paper"), ("D2", "D2-paper"))
+"""Pairs of deployments whose losses are compared; deployments of packages are compared with D2."""
+
+FINAL_PAIRS = (("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"), ("D3", "D1"))
+"""Pairs whose recommended actions are compared, as `ARMS`; D1 is the one with the most iterations."""
+
+
+def _calibration_effects(study: StudyPlan, found: Gathered) -> list[TableRow]:
+    rows: list[TableRow] = []
+    for first, second in (*PAIRS, *((name, "C4") for name in found.calibrated if not is_ours(name))):
+        if first in found.calibrated and second in found.calibrated:
+            one = effect(tests_of(found, first), tests_of(found, second), SHARE)
+            rows.append(_effect_row(f"{first} − {second}", "test discrepancy [%]", study.compared, "—", one, 100.0))
+    return rows
+
+
+def _deployment_effects(study: StudyPlan, found: Gathered) -> Iterator[TableRow]:
+    for final, pairs in ((False, ARMS), (True, FINAL_PAIRS)):
+        if not (found.finals if final else found.losses):
+            continue
+        losses = Losses(study, found, final=final)
+        longest = max((arm for arm in losses.arms if arm.startswith("D1-")), key=lambda arm: int(arm[3:]), default="")
+        known = [(first, longest if second == "D1" else second) for first, second in pairs]
+        known += [(arm, "D2") for arm in losses.arms if not is_ours(arm)]
+        shown: list[tuple[str, Callable[[str, Sequence[str], str], Mapping[int, float]]]] = [
+            (f"least {losses.unit.label} after {pour}", functools.partial(losses.after, pour=pour))
+            for pour in losses.checkpoints(TABLE_POURS)
+        ]
+        if final:
+            shown = [(f"{losses.unit.label} of the final action", losses.final)]
+        groups = {name: [name] for name in losses.receivers}
+        if len(groups) > 1:
+            groups[ALL] = losses.receivers
+        for (first, second), level, (of, values), (name, group) in itertools.product(
+            known, losses.levels, shown, groups.items()
+        ):
+            if first in losses.arms and second in losses.arms:
+                one = effect(values(level, group, first), values(level, group, second), losses.range)
+                if one.difference.count:
+                    yield _effect_row(f"{first} − {second}", of, level, name, one, losses.unit.factor)
+
+
+def _effect_row(compared: str, of: str, level: str, receiver: str, one: Effect, factor: float) -> TableRow:
+    chance = "—" if one.probability is None else f"{one.probability:.3f}"
+    count = one.difference.count
+    return [compared, of, level, receiver, count, one.difference.scaled(factor), f"{one.better} of {count}", chance]
+
+
+def _thetas(results: Sequence[Calibrated]) -> str:
+    texts, found = [], [one.found for one in results if one.found is not None]
+    for name in found[0].searched if found else ():
+        values = [getattr(one.theta, name) for one in found]
+        texts.append(f"{name} {np.mean(values):.3g} ± {np.std(values):.2g}")
+    return ", ".join(texts)
+
+
+def _deployments(found: Gathered, losses: Losses) -> StudyTable:
+    pours = losses.checkpoints(TABLE_POURS)
+    rows: list[TableRow] = []
+    for place in itertools.product(losses.levels, losses.receivers, losses.arms):
+        if curves := found.best_so_far(Key(*place)):
+            rows.append([*place, len(curves), *(losses.mean(at_pour(curves, pour)) for pour in pours)])
+    return StudyTable(
+        "table-deployment",
+        f"Least {losses.unit.label} so far",
+        "Mean over repetitions [95 % t interval]. D1 pours once: its number stays, while the least of several pours, "
+        "each with its chance, is partly luck.",
+        ("mismatch", "receiver", "strategy", "repetitions", *(f"after {n} pour{'s' * (n > 1)}" for n in pours)),
+        rows,
+    )
+
+
+def _finals(found: Gathered, losses: Losses) -> StudyTable:
+    rows: list[TableRow] = []
+    for level, receiver, arm in itertools.product(losses.levels, losses.receivers, losses.arms):
+        if by_repetition := found.finals.get(Key(level, receiver, arm)):
+            pours = [pour for some in by_repetition.values() for pour in some]
+            spilled = estimate([mean([pour.spillage for pour in some]) for some in by_repetition.values()], SHARE)
+            loss = losses.mean(list(losses.final(level, [receiver], arm).values()))
+            lost = f"{sum(not pour.made for pour in pours)} of {len(pours)}"
+            rows.append([level, receiver, arm, len(by_repetition), loss, spilled.scaled(100.0), lost])
+    header = ("mismatch", "receiver", "strategy", "repetitions", losses.unit.label, "spilled / poured [%]", "not made")
+    return StudyTable("table-final", "The recommended action, poured again", CAPTION, header, rows)
+
+
+def _needed(found: Gathered, losses: Losses) -> list[TableRow]:
+    rows: list[TableRow] = []
+    for level, receiver in itertools.product(losses.levels, losses.receivers):
+        curves = {
+            arm: [
+                [math.inf if math.isnan(v) else v for v in (at_pour([curve], n)[0] for n in range(1, losses.pours + 1))]
+                for curve in found.best_so_far(Key(level, receiver, arm))
+                if curve
+            ]
+            for arm in ("D2", "D3")
+        }
+        if all(curves.values()):
+            loss = max(float(np.mean([curve[-1] for curve in each])) for each in curves.values())
+            rows.append([level, receiver, losses.unit.text(loss), *(pours_needed(c, loss) for c in curves.values())])
+    return rows
+
+
+def pours_needed(curves: Sequence[Sequence[float]], loss: float) -> Estimate:
+    """Number of pours until the mean of the curves is at most `loss`; one more than available if it is never
+    reached."""
+
+    def first(data: NDArray[np.float64]) -> NDArray[np.float64]:
+        reached = data.mean(axis=-2) <= loss + 1e-12
+        ever = reached.any(axis=-1)
+        first_place: NDArray[np.float64] = np.where(ever, 1.0 + reached.argmax(axis=-1), data.shape[-1] + 1.0)
+        return first_place
+
+    return statistic(curves, first)
+
+
+def plain_words(shown: Sequence[StudyTable]) -> list[str]:
+    """Write a sentence for each pair of strategies at each level: over all receivers, after the last pour in the
+    table."""
+    rows = [row for table in shown if table.name == "table-effects" for row in table.rows]
+    last: dict[tuple[str, str, str, str], tuple[str, Estimate, str]] = {}
+    for compared, of, level, receiver, _, difference, better, _ in rows:
+        assert isinstance(difference, Estimate)
+        kind = str(of).partition(" after ")[0]
+        last[str(compared), kind, str(level), str(receiver)] = (str(of), difference, str(better))
+    everywhere = {(compared, kind, level) for compared, kind, level, receiver in last if receiver == ALL}
+    return [
+        _sentence(compared, of, level, receiver, difference, better)
+        for (compared, kind, level, receiver), (of, difference, better) in last.items()
+        if receiver == ALL or (compared, kind, level) not in everywhere
+    ]
+
+
+def _sentence(compared: str, of: str, level: str, receiver: str, difference: Estimate, better: str) -> str:
+    first, _, second = compared.partition(" − ")
+    into = {ALL: ", over all receivers", "—": ""}.get(receiver, f", into {receiver}")
+    where = f"At {level_words(level)}{into}, {of}{' pours' if of[-1:].isdigit() else ''}"
+    size = f"{compared}: {difference.text()}, better in {better}"
+    if math.isnan(difference.low):
+        return f"{where}: there are too few repetitions for an interval ({size})."
+    if difference.low <= 0.0 <= difference.high:
+        return f"{where}: the data do not separate {first} from {second} ({size})."
+    return f"{where}: {first} is {'better' if difference.high < 0.0 else 'worse'} than {second} ({size})."
+
+
+REPORT, PAGE = "report", "index.html"
+
+_RESAMPLED = (
+    "A repetition resamples the pours: errors of grip and placement, the liquid's initial positions and the balance's "
+    "noise; which of the calibration's actions are kept for testing; and the strategies' own seeds. Actions of the "
+    "calibration pours are the same in every repetition, so that C1's grid is simulated once and scored for each. "
+    "C1 to C4 of a repetition share its pours; D1 and D3 simulate with the θ* that C4 found in it. Intervals of means "
+    "are Student's t over repetitions, those of differences Student's t of the repetitions' differences: they cover "
+    "95 % where repetitions scatter about normally, and those of shares end at 0 and 100 %."
+)
+
+_AS_IN_THE_PAPER = {
+    "C4-paper": ". As in the paper: the surrogate is over θ alone, and takes the action's influence for noise",
+    "D2-paper": ". As in the paper: the surrogate has a zero mean",
+    "D3-paper": ". As in the paper: a surrogate of the residual around the simulations' mean, always trusted",
+}
+
+
+def write_report(study: StudyPlan, folder: Path) -> Path:
+    """Write figures, tables and the page of all finished cells.
+
+    Args:
+        folder: folder of the study.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        StudyError: a result can't be read.
+    """
+    results = finished_results(folder, cells_of(study))
+    found = gather(study, results)
+    report = folder / REPORT
+    report.mkdir(parents=True, exist_ok=True)
+    drawn = [*draw_calibrations(study, found), *draw_deployments(study, found)]
+    for one in drawn:
+        one.save(report)
+    shown = tables(study, found)
+    for table in shown:
+        write_csv(report / f"{table.name}.csv", *table.flat())
+    path = report / PAGE
+    write_whole(path, _page(study, found, code_summary(results), drawn, shown, report))
+    return path
+
+
+def _page(
+    study: StudyPlan, found: Gathered, code: str, drawn: Sequence[Drawn], shown: Sequence[StudyTable], report: Path
+) -> str:
+    return page.render(
+        "study.html.j2",
+        title=f"Study {study.name}",
+        kicker="Report of a study: strategies side by side, repeated",
+        heading=f"Study {study.name}",
+        unfinished=f"Unfinished: {found.finished} of {found.cells} cells are there." * (found.finished < found.cells),
+        lead=_summary(study, found),
+        words=plain_words(shown),
+        open=_unknown(study, found),
+        tables=[(one.name, one.title, one.caption, _table(one)) for one in shown],
+        figures=[
+            (one.name, one.title, page.Picture.of(report / f"{one.name}.png", one.title, _caption(one), wide=True))
+            for one in drawn
+        ],
+        resampled=_RESAMPLED,
+        settings=[*_settings(study), code],
+        footer="Every number of every figure and table is in a CSV file next to this page, the figures as PNG and SVG.",
+    )
+
+
+def _caption(one: Drawn) -> str:
+    counterpart = f"Counterpart of the paper's figure {one.number}. " if one.number else ""
+    return f"{one.caption} {counterpart}Numbers: {one.name}.csv."
+
+
+def _unknown(study: StudyPlan, found: Gathered) -> list[str]:
+    """Limitations that a reader must consider."""
+    counts = [arm.repetitions for arm in study.calibrations] + [arm.repetitions for arm in study.deployments]
+    notes = ["All benches are VIRTUAL: what a real robot, cup and liquid would do is not in these numbers."]
+    if counts and min(counts) < FEWEST:
+        notes.append(
+            f"Some strategies have {min(counts)} repetitions: below {FEWEST} no difference is tested, and intervals "
+            "are wide or missing. Such numbers show that everything works, and nothing more."
+        )
+    if found.finished < found.cells:
+        notes.append("Cells are missing: what is compared may change when they are there.")
+    receivers = sorted({scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes})
+    if receivers:
+        notes.append(f"It holds for these receivers ({', '.join(receivers)}), this liquid and these ranges of actions.")
+    return notes
+
+
+def _summary(study: StudyPlan, found: Gathered) -> str:
+    losses = (
+        "" if not study.deployments else f" Deployments minimise: {deployment_unit(study.deployments[0].plan).label}."
+    )
+    return (
+        f"{found.simulations:,} simulations and {found.pours:,} pours on virtual benches, {minutes(found.cpu_s)} of "
+        f"CPU time of simulation, {minutes(found.seconds)} of all cells one after the other. Nothing of this was "
+        f"poured by a physical robot.{losses}"
+    )
+
+
+def _settings(study: StudyPlan) -> list[str]:
+    lines = [f"Seed {study.seed}; {study.pour_count} calibration pours, {study.holdout} of them for testing."]
+    train = study.pour_count - study.holdout
+    for arm in study.calibrations:
+        axes = ", ".join(f"{axis.name} {axis.lower:g} to {axis.upper:g}" for axis in arm.plan.parameters.axes)
+        lines.append(
+            f"{arm.label}: {arm.plan.settings.simulations_on(train)} simulations, {arm.repetitions} repetitions, "
+            f"searching {axes}; at {level_words(*arm.levels)}{_AS_IN_THE_PAPER.get(arm.label, '')}."
+        )
+    for each in study.deployments:
+        paper = _AS_IN_THE_PAPER.get(each.label, "")
+        lines.append(
+            f"{each.label}: {each.plan.settings.spending}; {each.repetitions} repetitions into each receiver{paper}."
+        )
+    if study.confirm and study.deployments:
+        lines.append(f"Each deployment's recommended action is poured {study.confirm} more times.")
+    return [*lines, *(_level(level) for level in study.levels)]
+
+
+def _level(level: Level) -> str:
+    liquid = ", ".join(f"{name} {value:g}" for name, value in level.bench.liquid.of_the_solver().items())
+    error, noise = level.bench.pose_error, level.bench.pose_noise
+    off = ", ".join(f"{1e3 * value:g}" for value in (error.x, error.y, error.z))
+    scatter = ", ".join(f"{1e3 * value:g}" for value in (noise.x, noise.y, noise.z))
+    return (
+        f"Mismatch '{level.name}': hidden θ {liquid}; receiver off by {off} mm (x, y, height), tilt by "
+        f"{error.tilt:.3g} rad, speed × {error.speed_factor:g}; from pour to pour ± {scatter} mm, "
+        f"{noise.tilt:.3g} rad, × {noise.speed_factor:g}."
+    )
+
+
+def _table(one: StudyTable) -> page.HtmlTable:
+    cells = [[v.text() if isinstance(v, Estimate) else str(v) for v in row] for row in one.rows]
+    columns = range(len(one.header))
+    numbers = frozenset(i for i in columns if any(isinstance(row[i], int | float | Estimate) for row in one.rows))
+    return page.HtmlTable(one.title, one.header, [page.Row(row) for row in cells], numbers)
