@@ -134,7 +134,7 @@ The recommended θ is written to runs/ID/theta.json in SI units (cohesion in N/m
 def calibration_json(result: CampaignResult, published: Published) -> dict[str, Any]:
     """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see
     `CalibrationEvaluation`."""
-    from orchestrator.journal.stage_results import result_of
+    from orchestrator.journal.codec import result_of
     from orchestrator.results.stage_views import rival_scores
     from orchestrator.runs.stages import CALIBRATION, EVALUATION, calibrated_theta, deployed_theta
     from orchestrator.strategies.calibration.calibration_base import Calibrated
@@ -195,7 +195,7 @@ def plan(
         run_in_front_of_people,
     )
     from orchestrator.cli.simulate_command import prediction_inputs
-    from orchestrator.journal.stage_results import result_of
+    from orchestrator.journal.codec import result_of
     from orchestrator.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
     from orchestrator.strategies.deployment.deployment_result import Deployed

@@ -26,7 +26,7 @@ from orchestrator.runs.motion_approval import SafetyRecordError, required_checks
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm, ArmFacts, Executed, PlannedPour
-    from actors.laboratory_settings import LaboratorySpec
+    from actors.laboratory_settings import LaboratorySettings
     from orchestrator.runs.stages import StageDefinition
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
@@ -36,7 +36,7 @@ FARTHEST = {"deg": 10.0, "mm": 50.0}
 SPEEDS = {"deg": 5.0, "mm": 20.0}
 """Speed of every step [deg/s], [mm/s]."""
 
-ANNOUNCEMENT = 1.0
+WARNING_TIME = 1.0
 """Time between the confirmation of a step and its motion [s]."""
 
 _STEP = re.compile(r"(?P<axis>j[1-6]|[xyz]|r[xyz])\s*(?P<amount>[+−-]?\s*\d+(?:[.,]\d+)?)")
@@ -93,7 +93,7 @@ def enable_campaign_motion(
     return checksum
 
 
-def require_flag(laboratory: LaboratorySpec, *, enabled: bool, again: str) -> None:
+def require_flag(laboratory: LaboratorySettings, *, enabled: bool, again: str) -> None:
     """Refuse to move hardware without `--enable-motion`.
 
     Raises:
@@ -118,7 +118,7 @@ def announce(laboratory: str, arm: str, lines: Sequence[str], lasting: str = "")
     )
 
 
-def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
+def confirm(laboratory: LaboratorySettings, lines: Sequence[str]) -> None:
     """Print what hardware will do, and require the laboratory's name to be typed.
 
     Raises:
@@ -141,7 +141,7 @@ def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
 
 
 @contextlib.contextmanager
-def connected(spec: LaboratorySpec, accepted: str | None) -> Iterator[tuple[Arm, ArmFacts]]:
+def connected(spec: LaboratorySettings, accepted: str | None) -> Iterator[tuple[Arm, ArmFacts]]:
     """The arm's driver, connected and locked; it is stopped and let go of in any case.
 
     Args:

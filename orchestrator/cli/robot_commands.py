@@ -22,7 +22,7 @@ from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, p
 if TYPE_CHECKING:
     from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
     from actors.interfaces import DeviceCheck
-    from actors.laboratory_settings import LaboratorySpec
+    from actors.laboratory_settings import LaboratorySettings
 
 
 _MARKS = {"ok": ("ok", "green"), "warn": ("warn", "yellow"), "fail": ("FAIL", "bold red")}
@@ -49,7 +49,7 @@ def doctor(
     Nothing moves and no setting is changed. For a virtual laboratory, controller and balance are started for the check.
     Exit code 1 if a check fails.
     """
-    from actors.balance.balance_settings import look_at_balance
+    from actors.balance.balance_settings import balance_diagnostics
     from actors.interfaces import DeviceCheck, LaboratoryError
     from actors.laboratory import check_bench_packages, reached
     from orchestrator.installed_plugins import broken
@@ -77,11 +77,11 @@ def doctor(
         check_bench_packages(spec)
     with Refused(LaboratoryError, code=FAILED), reached(spec) as ready:
         assert ready.arm is not None
-        look = ready.arm.look()
+        look = ready.arm.diagnostics()
         if accept_safety and not virtual:
             record = _accept(laboratory, look)
         checks = look.checks(record, accept=f"decant doctor {laboratory} --accept-safety", virtual=virtual)
-        checks += look_at_balance(ready.balance, tare=tare)
+        checks += balance_diagnostics(ready.balance, tare=tare)
     checks += _packages(spec)
     checks += [DeviceCheck("plug-in", "warn", str(one), f"mend or remove {one.package}") for one in broken()]
     failed = [check for check in checks if check.state == "fail"]
@@ -95,25 +95,25 @@ def doctor(
     print_message("ready" if all(check.state == "ok" for check in checks) else "ready, with warnings")
 
 
-def _packages(spec: LaboratorySpec) -> list[DeviceCheck]:
+def _packages(spec: LaboratorySettings) -> list[DeviceCheck]:
     """Check the packages that a run needs, with the run's own check."""
     from actors.interfaces import DeviceCheck, LaboratoryError
     from actors.laboratory import check_laboratory
 
     try:
-        check_laboratory(dataclasses.replace(spec, ray=None), need_bench=True)
+        check_laboratory(spec.with_values(ray=None), need_bench=True)
     except LaboratoryError as error:
         return [DeviceCheck("packages", "fail", str(error), "install them into the environment that Decant runs in")]
     return []
 
 
-def without_arm(path: Path, spec: LaboratorySpec, asked: str) -> RefusalError:
+def without_arm(path: Path, spec: LaboratorySettings, asked: str) -> RefusalError:
     """Return the refusal for a laboratory without an arm, with a suggestion.
 
     Args:
         asked: the command's purpose, as part of the message.
     """
-    has = "its bench is made of numbers" if spec.bench is not None else "it has no bench"
+    has = "its bench is simulated" if spec.bench is not None else "it has no bench"
     return RefusalError(
         f"{path}: laboratory {spec.name} has no 'arm', {has}: {asked}. Name a laboratory that has one, for example "
         "laboratories/virtual.yaml",
@@ -121,7 +121,7 @@ def without_arm(path: Path, spec: LaboratorySpec, asked: str) -> RefusalError:
     )
 
 
-def read_laboratory(path: Path) -> LaboratorySpec:
+def read_laboratory(path: Path) -> LaboratorySettings:
     """Load a laboratory's file.
 
     Raises:
@@ -193,7 +193,7 @@ def jog(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
     """
     from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
-    from orchestrator.cli.motion_control import ANNOUNCEMENT, Jogging, confirm, connected, require_flag, typed_line
+    from orchestrator.cli.motion_control import WARNING_TIME, Jogging, confirm, connected, require_flag, typed_line
     from orchestrator.runs.motion_approval import SafetyRecordError, accepted_checksum
 
     spec = read_laboratory(laboratory)
@@ -210,7 +210,8 @@ def jog(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
         print_message(f"laboratory {spec.name}, virtual: nothing moves but numbers")
     with Refused(LaboratoryError, code=FAILED), reached(spec) as ready:
         assert ready.arm is not None
-        with connected(dataclasses.replace(ready, arm=ready.arm.announced(ANNOUNCEMENT)), accepted) as (driver, facts):
+        soon = ready.with_values(arm=ready.arm.with_values(warning_time=WARNING_TIME))
+        with connected(soon, accepted) as (driver, facts):
             print_message(
                 f"{facts.model} {facts.serial}, {spec.mode}; nothing moves before a step is typed and confirmed"
             )

@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from actors.arm.arm_settings import ArmSpec
-from actors.bench.bench_factory import needs_person
+from actors.arm.arm_settings import ArmSettings
 from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.laboratory import WarmSimulators
 from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -24,16 +23,15 @@ from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, DesiredSta
 from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.remote_operator import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.run_readout import prune_recordings
-from orchestrator.daemon.submissions import CAMPAIGN, THETA, load_confined
-from orchestrator.journal.disk_reserve import MB, free_space
-from orchestrator.journal.journal_file import JournalError
+from orchestrator.daemon.submissions import run_request
+from orchestrator.journal.journal_file import MB, JournalError, free_space
 from orchestrator.journal.run_record import CampaignResult
 from orchestrator.live_view.live_server import LiveView, recorder_of
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
 from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState
 from orchestrator.results.publishing import not_simulated
 from orchestrator.run_errors import RunError
-from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService, read_theta, task_request
+from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService
 from orchestrator.runs.events import CampaignStateChanged, StageOpened
 from orchestrator.runs.request_executor import PourUnknownError, RequestExecutorError
 from orchestrator.runs.resume import OperatorNeededError
@@ -54,23 +52,6 @@ class SharedServices:
     asking: Asking
     warm: WarmSimulators
     live: LiveView | None = None
-
-
-def run_request(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunRequest:
-    """The run of a submitted campaign, from its snapshot. Takes a moment, and no event loop.
-
-    Raises:
-        ConfigError, RunTaskError, JournalError: it can't be used.
-    """
-    folder = settings.snapshots / item.id
-    plan = load_confined(folder / CAMPAIGN, [folder.resolve()], rig.source)
-    given = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
-    # A daemon never repeats a pour by itself: whoever is there is asked, whatever the campaign says.
-    plan = replace(plan, on_unknown="ask", outputs=plan.outputs.model_copy(update={"directory": str(settings.runs)}))
-    request = task_request(plan, item.task, given=given)  # type: ignore[arg-type]  # written by us
-    if item.run is None:
-        return request
-    return replace(request, folder=settings.runs / item.run, resume="if begun")
 
 
 def _prepared(request: RunRequest) -> tuple[RunRequest, list[str]]:
@@ -142,7 +123,7 @@ class Running:
         asking, key, rig = self._shared.asking, self.item.id, self._rig.name
         plan, live = request.campaign, self._shared.live
         load = next(iter(scenes_of(plan).values())).liquid.mass  # a campaign has one liquid
-        asks = request.pours and needs_person(plan.laboratory)
+        asks = request.pours and plan.laboratory.needs_person
         assert self._progress is not None
 
         def recorder(plan: CampaignPlan, run: Path) -> RerunMonitor | None:
@@ -283,7 +264,7 @@ class ArmStatus:
     time: float
 
 
-def _readiness(arm: ArmSpec) -> DeviceCheck | None:
+def _readiness(arm: ArmSettings) -> DeviceCheck | None:
     try:
         return arm.readiness()
     except (LaboratoryError, OSError, ValueError) as error:

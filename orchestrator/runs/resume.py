@@ -19,12 +19,12 @@ from orchestrator.journal.codec import (
     canonical,
     decode_outcome,
     decode_request,
+    decode_result,
     encode_outcome,
     encode_request,
     first_difference,
 )
 from orchestrator.journal.journal import Draft, Journal, JournalReader, Kind
-from orchestrator.journal.stage_results import decode_result
 from orchestrator.requests import Answered, Ask, Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import RequestFinished

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 
-from orchestrator.journal.stage_results import Results
+from orchestrator.journal.codec import Results
 from orchestrator.requests import Ask, Failed, Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest
 from orchestrator.runs.stages import StageDefinition, calibrated_theta, stage_seed
 from orchestrator.strategies.stage_result import StageResult

@@ -134,17 +134,17 @@ def _balance(loaded: Any, name: str) -> Dialect | type[Any]:
     found: Dialect | type[Any]
     if isinstance(loaded, Dialect):
         found, called = loaded, loaded.name
-    elif isinstance(loaded, type) and callable(getattr(loaded, "device", None)) and hasattr(loaded, "model_fields"):
+    elif isinstance(loaded, type) and callable(getattr(loaded, "driver", None)) and hasattr(loaded, "model_fields"):
         found, called = loaded, loaded.model_fields["kind"].default
     else:
-        raise TypeError("should be an instance of a Dialect, or a section of settings with a method 'device'")
+        raise TypeError("should be an instance of a Dialect, or a class of settings with a method 'driver'")
     if called != name:
         raise ValueError(f"it calls itself '{called}', which should be the name that it is registered under")
     return found
 
 
 BALANCES: PluginRegistry[Dialect | type[Any]] = PluginRegistry("decant.balances", "balance", _balance)
-"""All installed balances: instances of dialects, and settings classes that create a `BalanceDevice`."""
+"""All installed balances: instances of dialects, and subclasses of `BalanceSettings`."""
 
 
 def dialects() -> dict[str, Dialect]:

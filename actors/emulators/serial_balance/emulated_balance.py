@@ -16,7 +16,7 @@ import numpy as np
 from actors.balance.dialects.dialect import encoders
 from actors.balance.dialects.protocol_encoder import Cancel, Follow, PendingReply, Repeat, weight_line
 from actors.balance.readings import Reading, ReadingStatus
-from actors.balance.simulated_balance import EmulatedScale, Load, ScaleSettings
+from actors.balance.scale_model import EmulatedScale, Load, ScaleSettings
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +99,7 @@ def test_an_arm_is_not_read_during_a_run_and_no_run_begins_during_a_reading(tmp_
     laboratory = tmp_path / "numbers.yaml"
     laboratory.write_text("{name: numbers, bench: {liquid: {particles: 400}, time_scale: 0}}\n")
     arm = ArmThatIsRead()
-    spec = replace(load_laboratory(laboratory), mode="hardware", arm=arm)  # type: ignore[arg-type]
+    spec = load_laboratory(laboratory).model_copy(update={"mode": "hardware", "arm": arm})
 
     async def work() -> None:
         async with serving(tmp_path, held, rigs=(Rig("north", laboratory, spec),), arm_interval=0.0) as served:
