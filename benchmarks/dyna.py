@@ -168,7 +168,7 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
             parallel_simulations=asked.slots,
         )
         begun = time.thread_time()
-        result = run(run_campaign(plan, bench, Path(folder) / "run", watchers=[bench.watch]))
+        result = run(run_campaign(plan, bench, Path(folder) / "run", subscribers=[bench.watch]))
     bench.occupancy.finish()
     (stage,) = result.results.values()
     assert isinstance(stage, Deployed)

@@ -146,7 +146,7 @@ def campaign(study: StudyPlan, arm: DeploymentPlan, seed: int, fluid: Fluid, ask
             outputs=OutputSettings(directory=folder, recording=False, figures=False, frame_rate=0.0),
             parallel_simulations=asked.slots,
         )
-        result = run(run_campaign(plan, fluid, Path(folder) / "run", watchers=[fluid.watch]))
+        result = run(run_campaign(plan, fluid, Path(folder) / "run", subscribers=[fluid.watch]))
     fluid.occupancy.finish()
     (stage,) = result.results.values()
     assert isinstance(stage, Deployed)

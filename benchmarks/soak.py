@@ -36,7 +36,7 @@ from ruamel.yaml import YAML
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client, DaemonError
-from orchestrator.daemon.submission_bundle import Files, pack
+from orchestrator.daemon.submissions import Files, pack
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.results import figure_style as style
 
@@ -139,7 +139,7 @@ def one(client: Client, kind: str, sent: tuple[str, Files]) -> str:
     """Have a campaign run to its end, whatever is done to it on the way; the state that it ends in."""
     last = client.get("/status")["last_event"]
     verb = "plan" if kind == "plan" else "run"
-    key = client.post("/campaigns", {"text": sent[0], "files": sent[1], "verb": verb})["id"]
+    key = client.post("/campaigns", {"text": sent[0], "files": sent[1], "task": verb})["id"]
     done = False
     for told in client.events(last, key):
         match told.type:

@@ -23,7 +23,7 @@ from actors.arm.arm_geometry import ArmLimits, RobotCell
 from actors.arm.arm_settings import ARMS, UrArmSettings
 from actors.interfaces import OperatorSettings
 from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
-from orchestrator.cli.solver_report import kept_records
+from orchestrator.cli.physics_command import kept_records
 from orchestrator.config import campaign_file as campaign
 from orchestrator.config import vessel_file as vessel
 from orchestrator.config.scene_builder import DEFAULTS, NEEDED

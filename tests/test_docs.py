@@ -18,7 +18,7 @@ from orchestrator.cli import foreground_run as common
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign, load_vessel
 from orchestrator.journal.journal import Kind
-from orchestrator.runs.unknown_pours import OperatorNeededError
+from orchestrator.runs.resume import OperatorNeededError
 from sim_engine import model_validity as regimes
 from sim_engine.action import DEG, Action
 from sim_engine.lip_flow import EDGE

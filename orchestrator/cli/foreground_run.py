@@ -26,8 +26,8 @@ from orchestrator.cli.console import (
     Refused,
     WaitingIndicator,
     is_quiet,
-    mention,
-    say,
+    print_message,
+    print_note,
     stdout_for_results,
 )
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from orchestrator.live_view.rerun_subscriber import RerunMonitor
     from orchestrator.results.publishing import Published
     from orchestrator.run_service import RunHandle, RunRequest, RunResources
-    from orchestrator.runs.unknown_pours import AskOperator
+    from orchestrator.runs.resume import AskOperator
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
 
@@ -67,7 +67,7 @@ def check_campaign_can_run(request: RunRequest) -> None:
     with WaitingIndicator() as doing:
         report = RunService().check(request, doing=doing)
     for text in report.warnings:
-        mention(f"warning: {text}")
+        print_note(f"warning: {text}")
     with Refused(RunTaskError):
         report.require()
 
@@ -83,7 +83,7 @@ def check_laboratory_answers(request: RunRequest, resources: RunResources) -> No
 
     laboratory = resources.settings(request.campaign)
     if laboratory.ray is not None and not laboratory.in_process:
-        mention(f"looking at the Ray cluster at {laboratory.ray.address} …")
+        print_note(f"looking at the Ray cluster at {laboratory.ray.address} …")
     with Refused(LaboratoryError):
         RunService().check_laboratory(request, resources)
 
@@ -162,15 +162,15 @@ def run_in_front_of_people(
 
     plan, directory = request.campaign, request.folder
     assert directory is not None
-    mention(f"run {directory}  ({plan.laboratory.mode} bench)" if request.pours else f"run {directory}")
+    print_note(f"run {directory}  ({plan.laboratory.mode} bench)" if request.pours else f"run {directory}")
     if request.resume == "no":
-        for line in not_simulated(plan, say):
-            mention(line)
+        for line in not_simulated(plan, print_message):
+            print_note(line)
 
     def recorder(plan: CampaignPlan, run: Path) -> RerunMonitor | None:
         if live is not None and can_record(plan):
-            mention(f"live view: {live.open()}")
-        return recorder_of(plan, run, say, live)
+            print_note(f"live view: {live.open()}")
+        return recorder_of(plan, run, print_message, live)
 
     handle: RunHandle | None = None
     result: CampaignResult | None = None
@@ -209,7 +209,7 @@ def run_in_front_of_people(
         if result is None:
             _close(handle, live)
             if (page := report_of_what_stands(plan, directory)) is not None:
-                mention(f"report of what stands  {page}")
+                print_note(f"report of what stands  {page}")
     try:
         _close(handle, live)
         published = handle.publish()
@@ -217,7 +217,7 @@ def run_in_front_of_people(
     except KeyboardInterrupt:
         raise RefusalError(f"interrupted{finished_without_report(directory)}", INTERRUPTED) from None
     if published.report is not None:
-        mention(f"report  {published.report}")
+        print_note(f"report  {published.report}")
     return result, published
 
 
@@ -247,12 +247,12 @@ async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], *, res
         asked += 1
         if asked == 1:
             doing = "pausing" if resumable else "ending"
-            say(f"\n{doing}: {begun} is finished and weighed first; once more to give it up")
+            print_message(f"\n{doing}: {begun} is finished and weighed first; once more to give it up")
         else:
             left = (
                 "will have to be accounted for on resume" if resumable else "stays unknown: weigh by hand what can be"
             )
-            say(f"\nstopping now; {begun} {left}")
+            print_message(f"\nstopping now; {begun} {left}")
         task.cancel()
 
     loop = asyncio.get_running_loop()
@@ -390,5 +390,5 @@ def asked_about_unknown_pours(answer: str | None) -> AskOperator | None:
 
 
 async def _ask_on_terminal(question: str, options: Sequence[str]) -> str:
-    say(f"\n{question}\n  answer with one of: {' | '.join(options)}")
+    print_message(f"\n{question}\n  answer with one of: {' | '.join(options)}")
     return (await asyncio.to_thread(input, "> ")).strip()

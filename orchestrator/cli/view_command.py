@@ -16,18 +16,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import LiveAt, Quiet, call, examples
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, say
+from orchestrator.cli.command_options import LiveAt, Quiet
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_message, print_note
 
 if TYPE_CHECKING:
     from orchestrator.live_view.live_server import LiveView
     from orchestrator.strategies.campaign_plan import CampaignPlan
-
-EXAMPLES = examples(
-    "decant view quickstart-20300131-1                    # a run of the folder runs/",
-    "decant view runs/first runs/second                   # side by side",
-    "decant view runs/first --pour 7 --particles 5000     # simulate pour 7 again with 5000 particles",
-)
 
 
 def view(
@@ -60,18 +54,6 @@ def view(
     Several runs are shown side by side, on the timeline of simulated time. With --pour, the liquid of one pour is
     simulated again from the journal; -o keeps that recording.
     """
-    call(_view, recordings, pour=pour, particles=particles, stage=stage, output=output, at=at)
-
-
-def _view(
-    recordings: list[Path],
-    *,
-    pour: int | None,
-    particles: int | None,
-    stage: str | None,
-    output: Path | None,
-    at: str | None,
-) -> None:
     from orchestrator.cli.foreground_run import check_output
     from sim_engine.resources import installed
 
@@ -90,7 +72,7 @@ def _view(
         else:
             shown = _recording_of(recordings[0])
         if output is not None:
-            mention(f"recording  {shown}")
+            print_note(f"recording  {shown}")
             return
         _serve(shown, at)
 
@@ -108,7 +90,7 @@ def _serve(shown: Path, at: str | None) -> None:
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with LiveView(address=address, web_port=port, shown=(shown,)) as live:
-            say(f"{live.url}\nCtrl-C ends it.")
+            print_message(f"{live.url}\nCtrl-C ends it.")
             while not stopped and live.alive:
                 time.sleep(0.2)
             if not stopped:
@@ -142,7 +124,7 @@ def _again(what: Path, number: int, particles: int | None, stage: str | None, pa
     assert pour.measured is not None
     weighed = f"{1e3 * pour.measured.spilled:.1f} g spilled when it was poured"
     title = f"pour {pour.request.number} of {pour.stage}, simulated again ({weighed})"
-    mention(f"{title}; {said}, {result.outcome.particles} particles")
+    print_note(f"{title}; {said}, {result.outcome.particles} particles")
     return simulation_rrd(path, task, result, title)
 
 

@@ -32,7 +32,7 @@ class SubmissionIn(_In):
     path: str = Field(default="", max_length=1000)
     """Instead of `text` and `files`: a file in one of the folders that the daemon's settings list as roots."""
 
-    verb: Literal["run", "calibrate", "plan"] = "run"
+    task: Literal["run", "calibrate", "plan"] = "run"
     rig: str = Field(default="", max_length=60)
     """Rig to run on; '' selects the matching one."""
 
@@ -56,7 +56,7 @@ class MoveIn(_In):
     priority: int | None = Field(default=None, ge=-1000, le=1000)
 
 
-class ArmIn(_In):
+class EnableIn(_In):
     """Enables motion in the coming part of a run."""
 
     laboratory: str = Field(max_length=80)
@@ -116,7 +116,7 @@ class CampaignOut(_Out):
 
     id: str
     name: str
-    verb: str
+    task: str
     rig: str
     mode: str
     """'virtual', 'hardware', or 'none' if nothing is poured."""
@@ -127,8 +127,8 @@ class CampaignOut(_Out):
     stopped, withdrawn.
     """
 
-    wish: str
-    """Desired state: run, pause, stop, abort."""
+    desired_state: str
+    """run, pause, stop or abort."""
 
     reason: str
     by: str
@@ -138,9 +138,9 @@ class CampaignOut(_Out):
     run: str | None
     """Name of its run's folder."""
 
-    armed: bool
-    needs_arming: bool
-    """The campaign uses hardware and waits for `decant arm` to enable motion."""
+    motion_enabled: bool
+    needs_enabling: bool
+    """The campaign uses hardware and waits for `decant enable` to enable motion."""
 
     progress: ProgressOut | None
     """Progress while the campaign runs."""
@@ -159,7 +159,7 @@ class CampaignDetailOut(CampaignOut):
     summary: dict[str, Any] | None
     """`summary.json` of its run, after publication."""
 
-    deeds: list[dict[str, Any]]
+    audit: list[dict[str, Any]]
     """Audit entries of the campaign, newest first."""
 
 
@@ -201,6 +201,20 @@ class EmergencyOut(_Out):
     reason: str
 
 
+class ArmStatusOut(_Out):
+    """Whether an arm can move, with the text that a run or `decant doctor` would give."""
+
+    state: Literal["ok", "warn", "fail"]
+    """'ok': it can move; 'fail': it can't; 'warn': the controller doesn't report it."""
+
+    text: str
+    advice: str
+    """Remedy; '' if none is needed."""
+
+    time: float
+    """Time since which it has been so."""
+
+
 class RigOut(_Out):
     """A laboratory that one campaign at a time leases."""
 
@@ -214,6 +228,9 @@ class RigOut(_Out):
 
     emergency: EmergencyOut | None
     """Emergency stop of this rig alone; the stop of all rigs is part of the status."""
+
+    arm: ArmStatusOut | None
+    """Last reading while no campaign used the rig; null during a run and without hardware."""
 
 
 class WhatMovesOut(_Out):

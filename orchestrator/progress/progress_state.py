@@ -20,10 +20,10 @@ from orchestrator.runs.events import (
     CampaignOpened,
     CampaignStateChanged,
     Event,
-    MadeAhead,
     PourProgressed,
     RequestFinished,
     RequestStarted,
+    SpeculationProgressed,
     StageClosed,
     StageOpened,
     StrategyProgressed,
@@ -107,7 +107,7 @@ class ProgressState:
     simulators: int = 0
     stages: dict[str, StageProgressState] = field(default_factory=dict)
     running: set[int] = field(default_factory=set)
-    ahead: MadeAhead = field(default_factory=lambda: MadeAhead(running=0, waiting=0))
+    ahead: SpeculationProgressed = field(default_factory=lambda: SpeculationProgressed(running=0, waiting=0))
     simulations: int = 0
     failed_simulations: int = 0
     simulation_seconds: float = 0.0
@@ -153,7 +153,7 @@ class ProgressState:
                 self._started(event)
             case RequestFinished():
                 self._finished(event)
-            case MadeAhead():
+            case SpeculationProgressed():
                 self.ahead = event
             case PourProgressed() if self.pour is not None:
                 self.pour.progress = event.progress

@@ -92,7 +92,7 @@ class RequestExecutor:
         self._frame_rate = frame_rate
         self._real = asyncio.Lock()
         self._optimiser = asyncio.Lock()
-        self.ahead = SpeculativeExecution(self._speculate, laboratory.simulators.size)
+        self.speculation = SpeculativeExecution(self._speculate, laboratory.simulators.size)
 
     async def _speculate(self, request: Simulate) -> Outcome:
         return (await self._simulated(request))[0]
@@ -106,13 +106,13 @@ class RequestExecutor:
             record: whether frames are kept; does not affect the outcome. Speculative simulations have no frames.
             started: called when the simulation is handed to the pool.
         """
-        if not record and self.ahead.knows(request):
+        if not record and self.speculation.knows(request):
             started()
-            if (speculated := await self.ahead.take(request)) is not None:
+            if (speculated := await self.speculation.take(request)) is not None:
                 return speculated, None
         else:
             started()
-        with self.ahead.asked_for():
+        with self.speculation.asked_for():
             return await self._simulated(request, record=record)
 
     async def _simulated(self, request: Simulate, *, record: bool = False) -> tuple[Outcome, RecordedFrames | None]:
@@ -195,7 +195,11 @@ class RequestExecutor:
         return Poured(measurement)
 
     async def suggest(
-        self, request: Suggest, *, started: Callable[[], None], retrying: Callable[[str], None]
+        self,
+        request: Suggest,
+        *,
+        started: Callable[[], None] = lambda: None,
+        retrying: Callable[[str], None] = lambda text: None,
     ) -> Outcome:
         """Query the optimiser, up to `SUGGESTIONS` times. No layer below repeats a query.
 

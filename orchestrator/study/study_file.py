@@ -422,9 +422,9 @@ def _searched(file: StudyFile, base: CampaignPlan, root: Place, report: Report) 
 
 
 HARDWARE = (
-    "laboratory '{}' is hardware. An arm moves only for one run, after '--arm' and with a person next to it; the cells "
-    "of a study run in processes of their own, which ask no operator. Pour there with 'decant run', and name a "
-    "virtual laboratory here"
+    "laboratory '{}' is hardware. An arm moves only for one run, after '--enable-motion' and with a person next to it; "
+    "the cells of a study run in processes of their own, which ask no operator. Pour there with 'decant run', and "
+    "name a virtual laboratory here"
 )
 
 BUDGETS = (

@@ -37,7 +37,7 @@ from orchestrator.results.publishing import publish
 from orchestrator.results.stage_views import deployments_of
 from orchestrator.runs.events import Event, PourProgressed, StrategyProgressed
 from orchestrator.runs.fingerprint import fingerprint
-from orchestrator.runs.replay import ToldStep, read_history
+from orchestrator.runs.resume import ToldStep, read_history
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import stages_of
 from orchestrator.strategies.deployment.real_pours import PredictionCheck
@@ -122,7 +122,7 @@ def test_a_run_writes_and_shows_the_same(golden: Golden, tmp_path: Path) -> None
     )
     events: list[Event] = []
     display = ProgressDisplay(plan, quiet=True)
-    work = run_campaign(plan, FormulaLaboratory(), folder, watchers=[events.append, display])
+    work = run_campaign(plan, FormulaLaboratory(), folder, subscribers=[events.append, display])
     result = replace(asyncio.run(work), seconds=12.0)
 
     passing = [

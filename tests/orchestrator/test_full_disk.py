@@ -121,7 +121,9 @@ def test_what_finds_no_room_even_in_the_reserve_is_on_the_screen(disk: Path) -> 
     with pytest.raises(
         JournalError, match=r"Pour 1 was made and weighed.*200.0 g loaded, \d.*answer: weighed [\d.]+ 1.0"
     ):
-        run(disk / "run", TellingLaboratory(bench=bench), stages=one_stage(Script(pour(1))), watchers=[events.append])
+        run(
+            disk / "run", TellingLaboratory(bench=bench), stages=one_stage(Script(pour(1))), subscribers=[events.append]
+        )
     shown = [event.text[:50] for event in events if isinstance(event, LogLine)]
     assert sum("weighed, " in text and "can't be written down" in text for text in shown) == 3
 

@@ -24,7 +24,7 @@ from orchestrator.results.publishing import publish
 from orchestrator.results.summarise import summarise
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import Event, RequestFinished
-from orchestrator.runs.motion_envelope import pour_count
+from orchestrator.runs.motion_approval import pour_count
 from orchestrator.runs.stages import deployed_theta, scenes_of, stages_of
 from orchestrator.strategies.campaign_plan import (
     CalibrationPlan,
@@ -99,7 +99,7 @@ def run(directory: Path, plan: CampaignPlan, **arguments: Any) -> Any:
 
 def test_a_whole_campaign_calibrates_and_then_pours_with_what_it_found(tmp_path: Path) -> None:
     events: list[Event] = []
-    result = run(tmp_path / "run", campaign(tmp_path), watchers=[events.append])
+    result = run(tmp_path / "run", campaign(tmp_path), subscribers=[events.append])
     assert list(result.results) == ["pours", "calibration", "evaluation", "deployment:cup", "deployment:narrow"]
     theta = result.results["calibration"].found.theta
     assert (theta.particles, theta.xsph_rate) == (700, 4.0)
@@ -127,7 +127,7 @@ def test_a_theta_that_the_pours_do_not_justify_is_not_deployed_and_everything_pu
     # the toy's simulations do not depend on θ, so that no θ fits the pours better than another one
     plan = campaign(tmp_path, calibration=calibration(random_baseline=0))
     events: list[Event] = []
-    result = run(tmp_path / "run", plan, watchers=[events.append])
+    result = run(tmp_path / "run", plan, subscribers=[events.append])
     evaluation = result.results["evaluation"]
     gain = evaluation.gain
     assert (gain.recommended, gain.pours) == ("uncalibrated", 5)
@@ -177,7 +177,7 @@ def test_what_is_recommended_is_poured_again_after_each_deployment(tmp_path: Pat
     assert plan.deployment is not None
     plan = replace(plan, deployment=replace(plan.deployment, confirm=2))
     events: list[Event] = []
-    result = run(tmp_path / "run", plan, watchers=[events.append])
+    result = run(tmp_path / "run", plan, subscribers=[events.append])
     assert list(result.results) == ["deployment:cup", "confirmation:cup", "deployment:narrow", "confirmation:narrow"]
     assert pour_count(plan, stages_of(plan)) == 2 * (2 + 2)
     for scene in (SCENE, NARROW):
@@ -206,7 +206,7 @@ def test_the_real_strategies_resume_as_if_nothing_had_happened(tmp_path: Path) -
     directory, resume = tmp_path / "run", False
     for fraction in (0.15, 0.4, 0.6, 0.75, 0.9):
         with pytest.raises(asyncio.CancelledError):
-            run(directory, campaign(tmp_path), resume=resume, watchers=[Stopper(int(fraction * len(told)))])
+            run(directory, campaign(tmp_path), resume=resume, subscribers=[Stopper(int(fraction * len(told)))])
         resume = True
         assert logical_record(directory) == expected[: len(logical_record(directory))]
     run(directory, campaign(tmp_path), resume=True)
@@ -247,7 +247,7 @@ def test_records_take_the_place_of_pours(tmp_path: Path) -> None:
 def test_the_calibrated_and_the_random_meet_the_same_seeds(tmp_path: Path) -> None:
     events: list[Event] = []
     plan = calibration(pour_count=0, records=records("train", SCENE, 4), transfer=records("transfer", NARROW, 3))
-    result = run(tmp_path / "run", campaign(tmp_path, calibration=plan, deployment=None), watchers=[events.append])
+    result = run(tmp_path / "run", campaign(tmp_path, calibration=plan, deployment=None), subscribers=[events.append])
     thetas = result.results["evaluation"].thetas
     drawn = [canonical(theta.model_dump()) for label, theta in thetas.items() if label.startswith("posterior ")]
     seeds: dict[str, set[tuple[Any, int]]] = {}
@@ -295,7 +295,7 @@ def test_free_simulations_fill_the_time_of_a_pour(tmp_path: Path) -> None:
     assert room.bench is not None
     room.bench.pauses = lambda: 0.3
     events: list[Event] = []
-    asyncio.run(run_toy(tmp_path / "run", room, plan=plan, stages=None, watchers=[events.append]))
+    asyncio.run(run_toy(tmp_path / "run", room, plan=plan, stages=None, subscribers=[events.append]))
     finished = [e.request for e in events if isinstance(e, RequestFinished)]
     first = next(i for i, request in enumerate(finished) if isinstance(request, Pour))
     assert sum(isinstance(request, Simulate) for request in finished[:first]) > 3

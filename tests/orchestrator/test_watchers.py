@@ -32,7 +32,7 @@ def test_a_watcher_that_raises_is_reported_once_and_changes_nothing(tmp_path: Pa
         calls.append(event)
         raise OSError("disk full")
 
-    run(tmp_path / "run", watchers=[broken, events.append])
+    run(tmp_path / "run", subscribers=[broken, events.append])
     assert len(calls) == 1
     complaints = [e for e in events if isinstance(e, LogLine) and "broken can't watch any longer: OSError" in e.text]
     assert len(complaints) == 1
@@ -41,7 +41,7 @@ def test_a_watcher_that_raises_is_reported_once_and_changes_nothing(tmp_path: Pa
 
 def test_watchers_see_the_whole_run(tmp_path: Path) -> None:
     events: list[Event] = []
-    result = run(tmp_path / "run", watchers=[events.append])
+    result = run(tmp_path / "run", subscribers=[events.append])
     started = {e.id: e.request for e in events if isinstance(e, RequestStarted)}
     finished = {e.id: e.request for e in events if isinstance(e, RequestFinished)}
     assert started == finished
@@ -65,7 +65,7 @@ def test_recorded_simulations_bring_frames_and_the_same_outcomes(tmp_path: Path)
         return laboratory
 
     events: list[Event] = []
-    run(tmp_path / "run", recording(ToyLaboratory()), watchers=[events.append])
+    run(tmp_path / "run", recording(ToyLaboratory()), subscribers=[events.append])
     for stage in ("first", "second"):
         done = [e for e in events if isinstance(e, RequestFinished) and e.stage == stage]
         simulated = sorted((e.id, e.frames is not None) for e in done if isinstance(e.request, Simulate))

@@ -21,7 +21,7 @@ from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.daemon.daemon_settings import load_settings
 from orchestrator.daemon.server_process import serve
-from orchestrator.daemon.submission_bundle import pack
+from orchestrator.daemon.submissions import pack
 from tests.reliability import strikes
 from tests.reliability.case import (
     AHEAD,

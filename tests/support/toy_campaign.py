@@ -170,7 +170,7 @@ class ToyOptimizer:
         rng = np.random.default_rng(query.seed)
         data = getattr(query, "data", Data())
         centre = np.array(data.points[int(np.argmin(data.costs))]) if len(data) else np.full(2, 0.5)
-        points = 0.5 * centre + 0.5 * rng.random((query.count, 2))
+        points = 0.5 * centre + 0.5 * rng.random((getattr(query, "count", 1), 2))
         return Suggestion(tuple(tuple(float(u) for u in p) for p in points), seconds=random.random())
 
 

@@ -26,7 +26,7 @@ from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.emulators.ur_controller.safety_system import SafetyConfiguration
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_laboratory
-from orchestrator.runs.safety_approval import SafetyRecordError, accepted_checksum, read_record, record_path
+from orchestrator.runs.motion_approval import SafetyRecordError, accepted_checksum, read_record, record_path
 from tests.support import hardware_laboratory
 from tests.support.loopback import free_address
 from tests.support.waiting import wait_for

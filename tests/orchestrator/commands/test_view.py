@@ -15,7 +15,7 @@ import pytest
 from actors.arm.arm_settings import UrArmSettings
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.cli.console import RefusalError
-from orchestrator.cli.view_command import _recording_of, _view
+from orchestrator.cli.view_command import _recording_of, view
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.journal.codec import encode_outcome, encode_request
 from orchestrator.journal.journal import JOURNAL_NAME, Header, Journal, Kind
@@ -120,4 +120,4 @@ def test_what_is_not_there_is_refused_with_what_is(recording: Path, tmp_path: Pa
     with pytest.raises(RefusalError, match="is not the folder of a run"):
         _recording_of(tmp_path / "nowhere")
     with pytest.raises(RefusalError, match="--particles and --stage go with --pour"):
-        _view([recording], pour=None, particles=500, stage=None, output=None, at=None)
+        view([recording], particles=500)

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from actors.optimizer.questions import MinimumQuery, SuggestionQuery
-from orchestrator.cli.campaign_commands import RunOptions, run
+from orchestrator.cli.campaign_commands import run
 from orchestrator.cli.console import RefusalError
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -109,7 +109,7 @@ def test_noise_makes_no_draws_of_theta_for_a_deployment_under_risk(folder: Path)
     text = DEPLOYED.replace("strategy: D3", keys).replace("pours: 15", "pours: 1")
     path = write(folder, "campaign.yaml", text.replace("simulations: 20", "simulations: 20\n  averaging: noise"))
     with pytest.raises(RefusalError, match="draws of θ, which no surrogate makes that takes actions for noise"):
-        run(path, RunOptions(in_process=True))
+        run(path, in_process=True)
 
 
 # -- studies -----------------------------------------------------------------------------------------------------------

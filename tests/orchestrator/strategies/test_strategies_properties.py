@@ -215,7 +215,7 @@ def test_an_interrupted_run_on_a_slow_laboratory_asks_for_what_an_undisturbed_on
     clock, resume = random.Random(1), False
     for outcomes in (3, 7):
         with pytest.raises(asyncio.CancelledError):
-            run("run", slow_laboratory(0.004, clock), resume=resume, watchers=[Stopper(outcomes)])
+            run("run", slow_laboratory(0.004, clock), resume=resume, subscribers=[Stopper(outcomes)])
         resume = True
         assert logical_record(tmp_path / "run") == expected[: len(logical_record(tmp_path / "run"))]
     run("run", slow_laboratory(0.004, clock), resume=True)

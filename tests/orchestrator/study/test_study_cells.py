@@ -141,7 +141,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "no mismatch left": (lambda d: {**without(d, "compared"), "mismatch": []}, "mismatch: is empty"),
     "hardware": (
         lambda d: {**d, "laboratory": str(ROOT / "configs/laboratories/ur10-kern.yaml")},
-        "laboratory 'ur10-kern' is hardware. An arm moves only for one run, after '--arm'",
+        "laboratory 'ur10-kern' is hardware. An arm moves only for one run, after '--enable-motion'",
     ),
     "nothing to confirm": (lambda d: without({**d, "confirm": 1}, "deployment"), "confirm: there is no deployment"),
     "unknown level": (lambda d: {**d, "compared": "huge"}, "compared: no such level; there are small, large"),

@@ -12,8 +12,8 @@ import pytest
 
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Suggest
+from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.stages import DEPLOYMENT, with_bench
-from orchestrator.runs.unknown_pours import OperatorNeededError
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_monitoring import (
@@ -324,7 +324,7 @@ def test_an_answer_is_replayed_exactly(tmp_path: Path) -> None:
         plan = asking(directory)
         task = asyncio.create_task(
             run_toy(directory, wrong_laboratory(), plan=plan, stages=None, resume=True,
-                    ask_operator=answering("go on"), watchers=[watch])
+                    ask_operator=answering("go on"), subscribers=[watch])
         )  # fmt: skip
         with pytest.raises(asyncio.CancelledError):
             await task
