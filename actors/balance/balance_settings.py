@@ -15,7 +15,8 @@ from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from actors.balance.balance_interface import BalanceDriver
-from actors.balance.dialects.dialect import Dialect, LineSettings, dialects
+from actors.balance.dialect_registry import dialects
+from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.simulated_balance import PATIENCE, BalanceSettings, ScaleSettings, VirtualBalance
 from actors.balance.weighing_plan import Placement
 from actors.interfaces import DeviceCheck, LaboratoryError
@@ -253,7 +254,7 @@ class SerialBalanceSpec(BalanceDevice):
 
     Attributes:
         port: device; under `/dev/serial/by-id/` it keeps its name when it is plugged in again.
-        dialect: one of `actors.balance.dialects.dialect.dialects`, or 'auto'.
+        dialect: one of `actors.balance.dialect_registry.dialects`, or 'auto'.
         baud: bits per second; None: detected.
         format: bits, parity and stop bits, as '8N1'; None: detected.
         handshake: how the balance may pause the line: by characters (Xon/Xoff), by wires (CTS), or not at all.

@@ -22,7 +22,7 @@ from actors.balance.balance_settings import (
     SettlingRule,
     parse_format,
 )
-from actors.balance.dialects.dialect import BALANCES, dialects, kinds
+from actors.balance.dialect_registry import BALANCES, dialects, kinds
 from actors.balance.simulated_balance import BalanceSettings, ScaleSettings
 from actors.balance.weighing_plan import Placement
 from orchestrator.config.yaml.yaml_source import Place, Report
