@@ -2,7 +2,7 @@
 
 - `SimulatorPool`, `Bench` and `Optimizer` are the parts of a `Laboratory`. Hardware, the virtual bench and in-process
   replacements for tests implement them. All are asynchronous.
-- `Operator` answers an `OperatorQuestion` at the bench; `OperatorSpec` holds its settings.
+- `Operator` answers an `OperatorQuestion` at the bench; `OperatorSettings` are its settings.
 - `Notice` is a message from a laboratory, `DeviceCheck` one line of `decant doctor`.
 
 None of these depends on strategies.
@@ -12,12 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from sim_engine.errors import DecantError
 from sim_engine.outcome import PourMeasurement, RecordedFrames, SimulatedPour
 from sim_engine.scene import PourTask, Scene
+from sim_engine.settings.model import Problems, Settings
+from sim_engine.settings.quantity import Quantity
 
 
 class LaboratoryError(DecantError):
@@ -240,21 +242,38 @@ class OperatorQuestion:
     details: Mapping[str, float | str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class OperatorSpec:
-    """The source of answers, and their time limits.
+Patience = Annotated[float, Quantity("s", "30 min", 0.0, 7 * 86400.0, positive=True)]
 
-    Attributes:
-        answers: 'person', at the terminal; or 'virtual', on a virtual bench only.
-        time: of a virtual operator for refilling, placing, wiping [s of bench time].
-        reminder: time after which the question is repeated [s].
-        deadline: time after which the question is given up [s]; nothing moves then, and nothing is lost.
-    """
 
-    answers: Literal["person", "virtual"] = "person"
-    time: float = 85.0
-    reminder: float = 120.0
-    deadline: float = 1800.0
+class OperatorSettings(Settings):
+    """The operator, who refills, wipes and places the vessels, and confirms each step."""
+
+    answers: Literal["person", "virtual"] | None = None
+    """A 'person' at the terminal, or a 'virtual' operator; unless given, it follows from the laboratory's mode."""
+
+    time: Annotated[float, Quantity("s", "85 s", 0.0, 3600.0)] = 85.0
+    """Total time of a virtual operator for one pour, in bench time."""
+
+    reminder: Patience = 120.0
+    """Time after which an open question is repeated."""
+
+    deadline: Patience = 1800.0
+    """Time after which an open question is abandoned: nothing moves then, and the campaign pauses."""
+
+    def check_values(self, problems: Problems) -> None:
+        """See `Settings.check_values`."""
+        if self.reminder > self.deadline:
+            problems.add("comes after the deadline; it should be shorter", "reminder")
+
+    def check_hardware(self, problems: Problems) -> None:
+        """Add a problem for each key of a virtual operator, who cannot stand next to a real arm."""
+        if self.answers == "virtual":
+            problems.add(
+                "where an arm moves, a person has to say that no hand is in its way; write 'person', or remove the key",
+                "answers",
+            )
+        if "time" in self.model_fields_set:
+            problems.add("is a virtual operator's; a person takes the time that it takes; remove the key", "time")
 
 
 class Operator(Protocol):

@@ -9,12 +9,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from actors.balance.balance_settings import SerialBalanceSpec
-from actors.bench.bench_factory import MakeDevice, OpenBench, needs_person, open_bench
+from actors.balance.balance_settings import SerialBalanceSettings
+from actors.bench.bench_factory import MakeDevice, OpenBench, open_bench
 from actors.bench.virtual_bench import BenchEmulators
 from actors.interfaces import (
     Bench,
@@ -26,7 +25,7 @@ from actors.interfaces import (
     Optimizer,
     SimulatorPool,
 )
-from actors.laboratory_settings import LaboratorySpec, simulator_count
+from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
 from actors.runtime.ray_cluster import JoinedCluster, check_cluster, versions
 from actors.runtime.ray_runtime import forget_ray_logs, open_ray, ray_lost, stop_ray, watch_ray
@@ -38,7 +37,7 @@ from actors.simulators.ray_worker import ray_pool
 from sim_engine.resources import EXTRAS, PACKAGES, installed
 
 
-def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = False) -> None:
+def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool = False) -> None:
     """Check that everything a laboratory needs on this machine and others is available. Leaves nothing running.
 
     Args:
@@ -65,7 +64,7 @@ def check_laboratory(spec: LaboratorySpec, *, need_bench: bool, brief: bool = Fa
         check_cluster(spec.ray, need_bench=need_bench)
 
 
-def check_bench_packages(spec: LaboratorySpec) -> None:
+def check_bench_packages(spec: LaboratorySettings) -> None:
     """Check that the packages are installed that control, or emulate, the arm and the balance of a laboratory.
 
     Raises:
@@ -74,7 +73,7 @@ def check_bench_packages(spec: LaboratorySpec) -> None:
     if spec.arm is None or (spec.arm.emulator == "" and spec.arm.missing() is None and spec.balance is None):
         return
     needed = ["psutil"] if spec.mode == "virtual" and spec.arm.emulator else []
-    if spec.balance is not None and isinstance(spec.balance.device, SerialBalanceSpec):
+    if spec.balance is not None and not spec.balance.typed and isinstance(spec.balance, SerialBalanceSettings):
         needed.append("serial")
     missing = [module for module in needed if not installed(module)]
     if missing:
@@ -86,7 +85,7 @@ def check_bench_packages(spec: LaboratorySpec) -> None:
 
 
 @contextlib.contextmanager
-def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
+def reached(spec: LaboratorySettings) -> Iterator[LaboratorySettings]:
     """A laboratory with its addresses: on hardware its own, else those of what is started for as long as this.
 
     Raises:
@@ -97,24 +96,21 @@ def reached(spec: LaboratorySpec) -> Iterator[LaboratorySpec]:
         yield spec
         return
     assert spec.arm is not None
-    emulators = BenchEmulators(spec.arm, None if spec.balance is None else spec.balance.device)
+    emulators = BenchEmulators(spec.arm, spec.balance)
     try:
         where = emulators.found()
         emulators.install()
-        balance = spec.balance
-        if balance is not None:
-            balance = replace(balance, device=where.balance)
-        yield replace(spec, arm=where.arm, balance=balance)
+        yield spec.with_values(arm=where.arm, balance=where.balance)
     finally:
         emulators.close()
 
 
-def _without_ray(spec: LaboratorySpec, *, need_bench: bool, brief: bool) -> bool:
+def _without_ray(spec: LaboratorySettings, *, need_bench: bool, brief: bool) -> bool:
     return spec.in_process or (brief and spec.ray is None and not need_bench)
 
 
 def open_laboratory(
-    spec: LaboratorySpec,
+    spec: LaboratorySettings,
     *,
     need_bench: bool,
     brief: bool = False,
@@ -143,13 +139,13 @@ def open_laboratory(
         raise LaboratoryError(f"laboratory {spec.name}: mode '{spec.mode}' is not known; 'virtual' and 'hardware' are")
     if need_bench and not spec.pours:
         raise LaboratoryError(f"laboratory {spec.name} has no bench, but the campaign pours: add a 'bench' to it")
-    if need_bench and operator is None and needs_person(spec):
+    if need_bench and operator is None and spec.needs_person:
         raise LaboratoryError(
             f"laboratory {spec.name} needs a person beside it who answers questions; run the campaign in a terminal"
         )
     kind: Callable[..., InProcessLaboratory | RayLaboratory]
     if _without_ray(spec, need_bench=need_bench, brief=brief):
-        kind = partial(InProcessLaboratory, processes=0 if spec.in_process else simulator_count(spec))
+        kind = partial(InProcessLaboratory, processes=0 if spec.in_process else spec.simulator_count)
     else:
         kind = RayLaboratory
         if spec.ray is not None:
@@ -170,7 +166,7 @@ class _OpenLaboratory:
 
     def __init__(
         self,
-        spec: LaboratorySpec,
+        spec: LaboratorySettings,
         make: Callable[[], Simulator] = pour_simulator,
         *,
         need_bench: bool = False,
@@ -341,7 +337,7 @@ class RayLaboratory(_OpenLaboratory):
             self._report(Notice("warning", text))
 
         if self._cluster is None:
-            return ray_pool(simulator_count(self._spec), self._make, tell=tell)
+            return ray_pool(self._spec.simulator_count, self._make, tell=tell)
         pool = ray_pool(
             self._spec.simulators or self._cluster.cpus,
             self._make,
@@ -407,7 +403,7 @@ class WarmSimulators:
         make: Callable[[], Simulator] = pour_simulator,
         tell: Callable[[str], None] = lambda text: None,
     ) -> None:
-        self._spec = LaboratorySpec("shared", simulators=simulators, in_process=in_process)
+        self._spec = LaboratorySettings(name="shared", simulators=simulators, in_process=in_process)
         self._make, self._report = make, tell
         self._laboratory: Laboratory | None = None
         self._opening = asyncio.Lock()

@@ -1,99 +1,275 @@
-"""Settings of a laboratory: the pool of simulators, the Ray cluster, and the bench if there is one. Plain values.
+"""Settings of a laboratory: the pool of simulators, the Ray cluster, arm, balance and operator, and the virtual bench.
 
-`LaboratorySpec` contains `RaySpec` and `VirtualBenchSpec`. Settings of arm and balance are in their own packages.
+`LaboratorySettings` is the whole file. `RaySettings` and `BenchSettings` are sections of it; the settings of arm,
+balance and operator are in their own modules. The hidden θ of a virtual bench is part of the file; calibration never
+reads it.
 """
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
-from typing import Annotated
+import re
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from actors.arm.arm_settings import ArmSpec
-from actors.balance.balance_settings import BalanceSpec
-from actors.interfaces import OperatorSpec
+from pydantic import AfterValidator, Field, Strict, create_model, field_validator
+from pydantic_core import PydanticCustomError
+
+from actors.arm.arm_geometry import RobotCell
+from actors.arm.arm_settings import ARMS, ArmSettings
+from actors.balance.balance_settings import BalanceSettings
+from actors.balance.dialects.dialect import kinds
+from actors.balance.scale_model import Drift
+from actors.interfaces import OperatorSettings
 from sim_engine.liquids import SimulationParameters
-from sim_engine.scene import PoseError
-from sim_engine.settings.model import NOT_IN_FINGERPRINT
+from sim_engine.scene import PoseErrorSettings, PoseNoise
+from sim_engine.settings.model import (
+    MADE,
+    NOT_IN_FINGERPRINT,
+    SET_BY_PROGRAM,
+    Count,
+    Example,
+    Name,
+    OneOf,
+    Problems,
+    Settings,
+    Switch,
+)
+from sim_engine.settings.quantity import Quantity
 
 
-@dataclass(frozen=True)
-class VirtualBenchSpec:
-    """The virtual bench: the ground truth hidden from calibration, and its time scale.
-
-    Attributes:
-        liquid: hidden θ of the 'real' liquid.
-        pose_error: systematic error of grip and placement.
-        pose_noise: standard deviation of the same, drawn for each pour.
-        time_scale: bench seconds per wall-clock second; 0 skips all waits.
-        operator_time: refilling, placing, wiping [s of bench time].
-        balance_resolution, balance_noise, balance_drift: [kg], [kg], [kg/s]; settling_time [s].
-    """
-
-    liquid: SimulationParameters
-    pose_error: PoseError = field(default_factory=PoseError)
-    pose_noise: PoseError = field(default_factory=lambda: PoseError(speed_factor=0.0))
-    time_scale: float = 30.0
-    operator_time: float = 85.0
-    balance_resolution: float = 1e-4
-    balance_noise: float = 1e-4
-    balance_drift: float = 0.0
-    settling_time: float = 1.5
-
-
-@dataclass(frozen=True)
-class RaySpec:
-    """A Ray cluster that is already running.
-
-    Attributes:
-        address: of its head, host:port.
-        bench_resource: custom resource of the node on which arm, balance and bench run.
-    """
-
-    address: str
-    bench_resource: str = "decant_bench"
-
-
-@dataclass(frozen=True)
-class LaboratorySpec:
-    """Settings of the laboratory in which a campaign runs.
-
-    Settings of the machine or the operator do not affect a campaign's results.
-
-    Attributes:
-        simulators: size of the pool; 0: one per core, of this machine or of the cluster.
-        bench: ground truth of a virtual bench; None on hardware, and if the laboratory cannot pour.
-        mode: 'virtual' or 'hardware'.
-        in_process: everything in threads of one process, without Ray.
-        object_store_mb: a private Ray's shared memory for results [MiB]; Ray needs at least 80.
-        ray: the cluster to join; None for a private Ray on this machine.
-        arm: of any kind, virtual or not; None for a simulated bench, or none.
-        balance: of the bench with the arm; its time scale is the bench's.
-        operator: of the bench with the arm.
-        accepted_checksum: of the accepted safety settings of the hardware; '' if none are accepted. Filled in for a
-            run, not part of a file.
-    """
-
-    name: str
-    simulators: Annotated[int, NOT_IN_FINGERPRINT] = 0
-    bench: VirtualBenchSpec | None = None
-    mode: str = "virtual"
-    in_process: Annotated[bool, NOT_IN_FINGERPRINT] = False
-    object_store_mb: Annotated[int, NOT_IN_FINGERPRINT] = 160
-    ray: Annotated[RaySpec | None, NOT_IN_FINGERPRINT] = None
-    arm: ArmSpec | None = None
-    balance: BalanceSpec | None = None
-    operator: Annotated[OperatorSpec, NOT_IN_FINGERPRINT] = field(
-        default_factory=lambda: OperatorSpec(answers="virtual")
+def _address(text: str) -> str:
+    host, colon, port = text.rpartition(":")
+    if colon and re.fullmatch(r"[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]", host) and port.isdigit() and 0 < int(port) < 65536:
+        return text
+    raise PydanticCustomError(
+        "ray_address",
+        "{text} should be host:port of the cluster's head as 'ray start --head' prints it, e.g. 10.0.0.1:6379",
+        {"text": repr(text)},
     )
-    accepted_checksum: Annotated[str, NOT_IN_FINGERPRINT] = ""
+
+
+class RaySettings(Settings):
+    """An existing Ray cluster; Decant connects to it and does not stop it."""
+
+    address: Annotated[str, Strict(), AfterValidator(_address), Example("10.0.0.1:6379")]
+    """Address of its head node, host:port."""
+
+    bench_resource: Name = "decant_bench"
+    """Custom resource of the node that runs arm, balance and bench; set it with 'ray start --resources'."""
+
+
+Duration = Annotated[float, Quantity("s", "85 s", 0.0, 3600.0)]
+Mass = Annotated[float, Quantity("kg", "0.1 g", 0.0, 0.01)]
+
+
+class BenchBalance(Settings):
+    """The virtual balance."""
+
+    resolution: Mass = 1e-4
+    """Smallest step of the display."""
+
+    noise: Mass = 1e-4
+    """Standard deviation of a reading."""
+
+    drift: Drift = 0.0
+    """Drift of the zero."""
+
+    settling_time: Duration = 1.5
+    """Time constant until a reading is stable."""
+
+
+class HiddenLiquidBase(Settings):
+    """θ of the 'real' liquid of the virtual bench. Hidden: calibration never reads it."""
+
+    def parameters(self) -> SimulationParameters:
+        """The hidden θ."""
+        return SimulationParameters.from_values(self.model_dump())
+
+
+def _hidden_liquid() -> type[HiddenLiquidBase]:
+    """The settings with one key per parameter of the solver; the nuisances of a bench are its `pose_error`."""
+    fields: Any = {
+        name: (
+            Annotated[float, info.quantity, AfterValidator(round)] if info.integer else Annotated[float, info.quantity],
+            Field(default=info.default, description=info.meaning or None),
+        )
+        for name, info in SimulationParameters.info().items()
+        if not info.nuisance
+    }
+    model: type[HiddenLiquidBase] = create_model(
+        "HiddenLiquid",
+        __base__=HiddenLiquidBase,
+        __doc__=HiddenLiquidBase.__doc__,
+        __module__=__name__,
+        __cls_kwargs__=MADE,
+        **fields,
+    )
+    return model
+
+
+HiddenLiquid: Any = _hidden_liquid()
+
+
+class BenchSettings(Settings):
+    """Ground truth of a virtual bench: a liquid that differs from the simulator's, execution errors, and the speed of
+    time."""
+
+    liquid: Annotated[HiddenLiquid, Example("{particles: 4000, cohesion: 0.05 N/m}")]
+    """Hidden θ of the 'real' liquid; calibration never reads it."""
+
+    pose_error: PoseErrorSettings = PoseErrorSettings()
+    """Systematic error of grip and placement."""
+
+    pose_noise: PoseNoise = PoseNoise()
+    """Random error of grip and placement, drawn for each pour."""
+
+    balance: BenchBalance = BenchBalance()
+    """The balance of a simulated bench; a laboratory with an arm has a separate section for it."""
+
+    time_scale: Annotated[float, Quantity("1", "30", 0.0, 1e6)] = 30.0
+    """Bench seconds per wall second; 0 means no waiting (not with an arm)."""
+
+    operator_time: Duration = 85.0
+    """Time to refill, place and wipe between two pours, in bench time; with an arm see 'operator'."""
+
+    @field_validator("liquid", mode="before")
+    @classmethod
+    def _from_parameters(cls, value: Any) -> Any:
+        """A program may also give the θ itself."""
+        return HiddenLiquid(**value.of_the_solver()) if isinstance(value, SimulationParameters) else value
+
+    @property
+    def theta(self) -> SimulationParameters:
+        """The hidden θ."""
+        found: SimulationParameters = self.liquid.parameters()
+        return found
+
+
+class LaboratorySettings(Settings):
+    """The laboratory in which a campaign runs."""
+
+    recorded_as_given: ClassVar[bool] = True
+
+    name: Annotated[Name, Example("virtual")]
+    """Its name in journals and banners."""
+
+    mode: Literal["virtual", "hardware"] = "virtual"
+    """'virtual' moves nothing, 'hardware' moves an arm."""
+
+    simulators: Annotated[Count, Field(le=10_000), NOT_IN_FINGERPRINT] = 0
+    """Number of simulators in the pool; 0: one per core of this machine or of the cluster."""
+
+    in_process: Annotated[Switch, NOT_IN_FINGERPRINT] = False
+    """Run everything in one process (slow, for debugging)."""
+
+    object_store: Annotated[float, Quantity("MB", "160 MB", 80.0, 100_000.0), NOT_IN_FINGERPRINT] = 160.0
+    """Shared memory for simulators' results, without a cluster."""
+
+    ray: Annotated[RaySettings | None, NOT_IN_FINGERPRINT] = None
+    """The Ray cluster to run on; unless given, a private Ray on this machine."""
+
+    arm: Annotated[ArmSettings, OneOf(lambda: ARMS.all)] | None = None
+    """The arm that holds the pourer, virtual or real; `kind` is one of the installed kinds."""
+
+    cell: RobotCell | None = None
+    """Objects around the arm."""
+
+    balance: Annotated[BalanceSettings, OneOf(kinds)] | None = None
+    """The balance next to the arm."""
+
+    operator: Annotated[OperatorSettings, NOT_IN_FINGERPRINT] = OperatorSettings()
+    """The operator next to the arm."""
+
+    bench: BenchSettings | None = None
+    """Ground truth of a virtual bench. Without bench and arm, the laboratory only simulates and plans."""
+
+    accepted_checksum: Annotated[str, SET_BY_PROGRAM] = ""
+    """Checksum of the accepted safety settings of the hardware; '' if none are accepted."""
 
     @property
     def pours(self) -> bool:
         """Whether there is a bench."""
         return self.arm is not None or self.bench is not None
 
+    @property
+    def needs_person(self) -> bool:
+        """Whether the laboratory needs a person who answers questions."""
+        return self.arm is not None and self.operator.answers == "person"
 
-def simulator_count(spec: LaboratorySpec) -> int:
-    """Size of the pool on this machine: as stated, or one per core."""
-    return spec.simulators or os.cpu_count() or 1
+    @property
+    def simulator_count(self) -> int:
+        """Size of the pool on this machine: as stated, or one per core."""
+        return self.simulators or os.cpu_count() or 1
+
+    def ready(self) -> Self:
+        """The laboratory of a file as a program uses it.
+
+        The arm knows its cell, arm and balance the time scale of the bench, and the operator who answers.
+        """
+        scale = 1.0 if self.bench is None else self.bench.time_scale
+        answers = "virtual" if self.arm is None or self.mode == "virtual" else "person"
+        return self.with_values(
+            arm=None if self.arm is None else self.arm.in_laboratory(self.cell, scale),
+            balance=None if self.balance is None else self.balance.with_values(time_scale=scale),
+            operator=self.operator.with_values(answers=self.operator.answers or answers),
+        )
+
+    # ---- rules between the sections
+
+    def check_values(self, problems: Problems) -> None:
+        """See `Settings.check_values`."""
+        if self.mode == "hardware":
+            self._check_hardware(problems)
+        if self.arm is None:
+            self._check_without_arm(problems)
+        else:
+            self._check_with_arm(problems)
+            self.arm.check_laboratory(problems, mode=self.mode, cell=self.cell)
+            if self.balance is not None:
+                inner = problems.within("balance")
+                if self.balance.typed:
+                    self.balance.check_manual(inner)
+                self.balance.check_laboratory(inner, mode=self.mode)
+
+    def _check_hardware(self, problems: Problems) -> None:
+        self.operator.check_hardware(problems.within("operator"))
+        if self.bench is not None:
+            problems.add(
+                "is what a virtual bench hides, and how fast its time runs; hardware hides its own, and its time is "
+                "the clock's. Remove the section, or write 'mode: virtual'",
+                "bench",
+            )
+        if self.arm is None:
+            text = "a laboratory of hardware needs its arm; add an 'arm' and a 'cell' section"
+            problems.add(text, key=True, of="arm")
+
+    def _check_without_arm(self, problems: Problems) -> None:
+        for key in ("cell", "balance", "operator"):
+            if key in self.model_fields_set:
+                meant = "; a simulated bench has 'bench: {balance: …, operator_time: …}'" if key != "cell" else ""
+                text = f"belongs to an arm, and there is none; add 'arm', or remove it{meant}"
+                problems.add(text, key, of="arm")
+
+    def _check_with_arm(self, problems: Problems) -> None:
+        if self.balance is None:
+            text = "an arm that pours needs a balance; add 'balance: {placement: tray, …}', or 'placement: manual'"
+            problems.add(text, of="balance")
+        if self.mode == "hardware":
+            return
+        if self.bench is None:
+            text = "a virtual arm pours a hidden liquid; add 'bench: {liquid: {…}}', or 'mode: hardware'"
+            problems.add(text, of="bench")
+            return
+        bench, inner = self.bench, problems.within("bench")
+        for key, other in (("balance", "the section 'balance'"), ("operator_time", "'time' in the section 'operator'")):
+            if key in bench.model_fields_set:
+                inner.add(f"is of a bench without wires; with an arm write it into {other}", key)
+        if bench.pose_error.speed_factor != 1.0 or bench.pose_noise.speed_factor != 0.0:
+            inner.add(
+                "an arm over its wires moves as fast as it is told; its own lag is in what it reads back. Remove the "
+                "key",
+                "pose_error" if bench.pose_error.speed_factor != 1.0 else "pose_noise",
+                "speed_factor",
+            )
+        if bench.time_scale < 1.0:
+            inner.add("an arm takes its time: 1 or more, and at most some 50", "time_scale")

@@ -14,15 +14,14 @@ import contextlib
 import statistics
 import threading
 import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from machine import describe, say, show
 
-from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
+from actors.arm.arm_geometry import ArmLimits, Box, Centre, JointAngles, Point, Pose, RobotCell
 from actors.arm.arm_interface import ArmStoppedError
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import PourPath
 from actors.arm.planning.pour_planner import plan_path
 from actors.arm.ur.ur_driver import UrArm
@@ -42,17 +41,22 @@ CYCLES = {"ur10e": 500.0, "ur10": 125.0}
 POURER = build_vessel(cylinder("cup", inner_radius=0.040, inner_height=0.100))
 RECEIVER = build_vessel(cylinder("receiver", inner_radius=0.045, inner_height=0.090))
 
-SPEC = UrArmSpec(
+SPEC = UrArmSettings(
     model="ur10e",
-    limits=ArmLimits((0.2, -0.7, 0.0), (1.1, 0.5, 1.0), joint_speed=170 * DEG, tilt_speed=155 * DEG, clearance=3e-3),
-    cell=RobotCell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
-    home=(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
+    limits=ArmLimits(
+        box=Box(low=Point.of(0.2, -0.7, 0.0), high=Point.of(1.1, 0.5, 1.0)),
+        joint_speed=170 * DEG,
+        tilt_speed=155 * DEG,
+        clearance=3e-3,
+    ),
+    cell=RobotCell(receiver=Point.of(0.75, 0.0, 0.06), direction=90 * DEG),
+    home=JointAngles.of(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
     tool=Pose(z=0.17),
     grip=Pose(y=-0.06, rx=-90 * DEG),
     payload=0.9,
-    payload_centre=(0.0, 0.0, 0.08),
-    untilt_speed=60 * DEG,
-    announcement=0.0,
+    payload_centre=Centre.of(0.0, 0.0, 0.08),
+    upright_speed=60 * DEG,
+    warning_time=0.0,
 )
 """The gripper holds the cup from its side, so that the last joint tilts it. Un-tilting is fast: nobody stands by."""
 
@@ -60,7 +64,7 @@ HIGHEST_TILT = 110.0
 """[deg]"""
 
 
-def pour(spec: UrArmSpec, speed: float) -> PourPath:
+def pour(spec: UrArmSettings, speed: float) -> PourPath:
     """A pour at a tilting speed [deg/s]: as far as it gets in six seconds."""
     angle = min(HIGHEST_TILT, 6.0 * speed)
     action = Action(
@@ -76,7 +80,7 @@ def pour(spec: UrArmSpec, speed: float) -> PourPath:
     return plan_path(plan_motion(scene, action, POURER, RECEIVER), spec, POURER, RECEIVER)
 
 
-def follow(arm: UrArm, spec: UrArmSpec, speed: float) -> dict[str, Any]:
+def follow(arm: UrArm, spec: UrArmSettings, speed: float) -> dict[str, Any]:
     """One pour, and what it was followed with."""
     path = pour(spec, speed)
     arm.release()
@@ -130,7 +134,7 @@ def _stopped(arm: UrArm, path: PourPath) -> None:
         arm.execute(path)
 
 
-def stops(arm: UrArm, controller: VirtualController, spec: UrArmSpec, speed: float, count: int) -> dict[str, Any]:
+def stops(arm: UrArm, controller: VirtualController, spec: UrArmSettings, speed: float, count: int) -> dict[str, Any]:
     """Several stops at a tilting speed [deg/s]."""
     path = pour(spec, speed)
     seen = [stop(arm, controller, path, 0.35 + 0.4 * k / count) for k in range(count)]
@@ -143,8 +147,8 @@ def stops(arm: UrArm, controller: VirtualController, spec: UrArmSpec, speed: flo
 
 def measure(model: str, speeds: list[float], stop_speeds: list[float], count: int) -> dict[str, Any]:
     """Everything about one model."""
-    with VirtualController.start(ADDRESS, model, 1.0, CYCLES[model], joints=SPEC.home) as controller:
-        spec = replace(SPEC, model=model, address=ADDRESS)  # type: ignore[arg-type]
+    with VirtualController.start(ADDRESS, model, 1.0, CYCLES[model], joints=SPEC.home.angles) as controller:
+        spec = SPEC.with_values(model=model, address=ADDRESS)  # type: ignore[arg-type]
         arm = UrArm(spec)
         try:
             arm.connect()

@@ -29,7 +29,7 @@ from machine import describe, run_self, say, show, single_threaded
 from standard_pour import check_particles, short_task, standard_task
 
 from actors.laboratory import RayLaboratory
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.simulators.pool import WorkerPool
 from sim_engine.outcome import PourOutcome, SimulatedPour
 from sim_engine.scene import PourTask
@@ -167,7 +167,7 @@ def _cpu(processes: list[psutil.Process]) -> float:
 async def throughput(options: argparse.Namespace) -> dict[str, Any]:
     """Pool and plain processes in turns, and the pool's overhead with tiny pours."""
     plain = Plain(options.workers)
-    spec = LaboratorySpec("benchmark", simulators=options.workers)
+    spec = LaboratorySettings(name="benchmark", simulators=options.workers)
     async with RayLaboratory(spec) as laboratory:
         pool = cast(WorkerPool, laboratory.simulators)
         await pour_in_pool(pool, TINY, 2 * options.workers)
@@ -211,7 +211,7 @@ async def nothing(options: argparse.Namespace) -> dict[str, Any]:
     import ray
 
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
-    spec = LaboratorySpec("benchmark", simulators=options.workers)
+    spec = LaboratorySettings(name="benchmark", simulators=options.workers)
     async with RayLaboratory(spec, make=Nothing) as laboratory:
         pool = cast(WorkerPool, laboratory.simulators)
         await pour_in_pool(pool, TINY, 10 * options.workers)
@@ -236,7 +236,7 @@ async def first_answer(particles: int, begun: float) -> dict[str, float]:
         begun: `time.monotonic()` when the process was started, by its parent's clock.
     """
     marks = {"program": time.monotonic()}
-    async with RayLaboratory(LaboratorySpec("benchmark", simulators=1)) as laboratory:
+    async with RayLaboratory(LaboratorySettings(name="benchmark", simulators=1)) as laboratory:
         marks["ray"] = time.monotonic()
         pool = cast(WorkerPool, laboratory.simulators)
         await pool.pids()

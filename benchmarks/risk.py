@@ -29,7 +29,7 @@ from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning, RobustPlanning
 from orchestrator.strategies.deployment.deployment_result import Recommended
-from orchestrator.strategies.deployment.disturbances import PoseNoiseSection, RiskSettings
+from orchestrator.strategies.deployment.disturbances import PoseNoise, RiskSettings
 from sim_engine.action import DEG, described
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseError, PourTask, Scene
@@ -39,7 +39,7 @@ Floats = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parents[1]
 ERRORS = PoseError(x=3e-3, y=3e-3, tilt=0.5 * DEG, speed_factor=0.02)
-DEVIATIONS = PoseNoiseSection(**asdict(ERRORS))
+DEVIATIONS = PoseNoise(**asdict(ERRORS))
 WAYS: dict[str, RiskSettings | None] = {
     "D1 as planned": None,
     "D1, expected": RiskSettings(pose_error=DEVIATIONS),

@@ -29,7 +29,7 @@ from orchestrator.requests import Outcome, Request, Simulate, Simulated, Slots, 
 from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning, RobustPlanning
 from orchestrator.strategies.deployment.deployment_result import Recommended
-from orchestrator.strategies.deployment.disturbances import PoseNoiseSection, RiskSettings
+from orchestrator.strategies.deployment.disturbances import PoseNoise, RiskSettings
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import Loss, PourOutcome
@@ -43,7 +43,7 @@ SPACE = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0
 BEAKER, CUP = (cylinder(name, inner_radius=0.04, inner_height=0.1) for name in ("beaker", "cup"))
 SCENE = Scene("toy", BEAKER, CUP, Liquid(mass=0.2), fixed={"height": 0.05})
 ERRORS = PoseError(x=3e-3, y=2e-3, tilt=1 * DEG, speed_factor=0.05)
-DEVIATIONS = PoseNoiseSection(**asdict(ERRORS))
+DEVIATIONS = PoseNoise(**asdict(ERRORS))
 
 
 def cup(v: Floats, x: Floats, y: Floats, tilt: Floats) -> Floats:

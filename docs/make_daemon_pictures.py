@@ -38,8 +38,8 @@ VESSELS = {"beaker": (30, 70), "narrow": (20, 90)}
 LABORATORY = """\
 name: bench
 simulators: 1
-arm: {kind: numbers}
-balance: {kind: numbers}
+arm: {kind: simulated}
+balance: {kind: simulated}
 operator: {answers: person}
 bench: {liquid: {particles: 400, cohesion: 0.05 N/m}, pose_error: {x: 1 mm}, time_scale: 2}
 """

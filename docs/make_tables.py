@@ -18,16 +18,14 @@ from typing import Any, Literal
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from actors import laboratory_settings as laboratory
+from actors.arm.arm_geometry import ArmLimits, RobotCell
+from actors.arm.arm_settings import ARMS, UrArmSettings
+from actors.interfaces import OperatorSettings
 from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.cli.solver_report import kept_records
-from orchestrator.config import arm_file as arm_sections
-from orchestrator.config import arm_file as cell
 from orchestrator.config import campaign_file as campaign
-from orchestrator.config import laboratory_file as cluster
-from orchestrator.config import laboratory_file as laboratory
-from orchestrator.config import laboratory_file as operator
 from orchestrator.config import vessel_file as vessel
-from orchestrator.config.arm_file import ARMS
 from orchestrator.config.scene_builder import DEFAULTS, NEEDED
 from orchestrator.config.weighed_pours import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.yaml.section_validation import sections_in
@@ -35,7 +33,6 @@ from orchestrator.daemon import daemon_settings as daemon
 from orchestrator.daemon.notifications import NotifySection
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import OutputSettings
-from orchestrator.strategies.deployment import disturbances as pose
 from orchestrator.strategies.deployment.costing import PricesSettings
 from orchestrator.strategies.deployment.disturbances import RiskSettings
 from orchestrator.strategies.deployment.model_monitoring import (
@@ -50,6 +47,7 @@ from orchestrator.study import study_file as study
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquids import KNOWN, ROOM, LiquidSettings, SimulationParameters
 from sim_engine.outcome import Loss
+from sim_engine.scene import PoseErrorSettings
 from sim_engine.settings.model import Choice, Settings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.validation import sensitivity
@@ -78,15 +76,15 @@ SECTIONS: dict[str, type[Settings]] = {
     "liquid": LiquidSettings,
     "vessel": vessel.VesselFile,
     "profile": ProfileShape,
-    "laboratory": laboratory.LaboratoryFile,
-    "ray": cluster.RaySection,
-    "arm": arm_sections.UrArmSection,
-    "limits": arm_sections.LimitsSection,
-    "cell": cell.CellSection,
-    "operator": operator.OperatorSection,
-    "bench": laboratory.BenchSection,
-    "balance": laboratory.BalanceSection,
-    "pose-error": pose.PoseErrorSection,
+    "laboratory": laboratory.LaboratorySettings,
+    "ray": laboratory.RaySettings,
+    "arm": UrArmSettings,
+    "limits": ArmLimits,
+    "cell": RobotCell,
+    "operator": OperatorSettings,
+    "bench": laboratory.BenchSettings,
+    "balance": laboratory.BenchBalance,
+    "pose-error": PoseErrorSettings,
     "study": study.StudyFile,
     "level": study.LevelSettings,
     "compared-calibrations": study.CalibrationsSettings,
@@ -101,23 +99,23 @@ SECTIONS: dict[str, type[Settings]] = {
 
 OF_SECTIONS = {
     **{model.__name__: f"[{name}](#{name})" for name, model in SECTIONS.items()},
-    "BalanceSection": "[balance](#bench)",
+    "BenchBalance": "[balance](#bench)",
     **dict.fromkeys((arm.__name__ for arm in ARMS.all.values()), "[arm](#arm-and-cell)"),
-    "CellSection": "[cell](#arm-and-cell)",
-    "LimitsSection": "[limits](#arm-and-cell)",
-    "BoxSection": "`{low: {x, y, z}, high: {x, y, z}}`, lengths",
-    "PlaneSection": "`{normal: [x, y, z], offset: length}`",
-    "PointSection": "`{x, y, z}`, lengths",
-    "CentreSection": "`{x, y, z}`, lengths",
-    "PoseSection": "`{x, y, z, rx, ry, rz}`, lengths and a rotation vector in rad",
-    "MountSection": "`{tilt, turn}`, angles",
-    "JointsSection": "`{base, shoulder, elbow, wrist1, wrist2, wrist3}`, angles",
-    "SerialSection": "[balance](balances.md#settings)",
-    "NumbersSection": "[balance](balances.md#settings)",
-    "OperatorSection": "[operator](#operator)",
+    "RobotCell": "[cell](#arm-and-cell)",
+    "ArmLimits": "[limits](#arm-and-cell)",
+    "Box": "`{low: {x, y, z}, high: {x, y, z}}`, lengths",
+    "Plane": "`{normal: [x, y, z], offset: length}`",
+    "Point": "`{x, y, z}`, lengths",
+    "Centre": "`{x, y, z}`, lengths",
+    "Pose": "`{x, y, z, rx, ry, rz}`, lengths and a rotation vector in rad",
+    "Mount": "`{tilt, turn}`, angles",
+    "JointAngles": "`{base, shoulder, elbow, wrist1, wrist2, wrist3}`, angles",
+    "SerialBalanceSettings": "[balance](balances.md#settings)",
+    "SimulatedBalanceSettings": "[balance](balances.md#settings)",
+    "OperatorSettings": "[operator](#operator)",
     "HiddenLiquid": "[parameters](#simulator), one value each",
-    "PoseErrorSection": "[pose error](#bench)",
-    "PoseNoiseSection": "standard deviations of the [pose error](#bench)",
+    "PoseErrorSettings": "[pose error](#bench)",
+    "PoseNoise": "standard deviations of the [pose error](#bench)",
     "TransferSection": "[transfer](#pours)",
     "Loss": "[loss](#losses)",
     "Objective": "[objective](#objectives)",
@@ -134,7 +132,7 @@ OF_SECTIONS = {
     "Actions": "[actions](#motion-and-actions)",
     "Parameters": "[parameters](#simulator)",
     "VesselFile": "[vessel](#vessels) or the path of its file",
-    "LaboratoryFile": "[laboratory](#laboratories) or the path of its file",
+    "LaboratorySettings": "[laboratory](#laboratories) or the path of its file",
     "LiquidSettings": "[liquid](#liquid) or the path of its file",
     "LevelSettings": "[level](#studies)",
     **{
@@ -350,7 +348,7 @@ def _default(key: str, info: FieldInfo, model: type[Settings]) -> str:
     if key in model.required_keys():
         return "must be given"
     value = info.get_default()
-    if value is None or value is PydanticUndefined or value == () or isinstance(value, Settings):
+    if value is None or value is PydanticUndefined or value in ((), "") or isinstance(value, Settings):
         return ""
     quantity = next((m for m in info.metadata if isinstance(m, Quantity)), None)
     if quantity is not None and quantity.unit != "1":

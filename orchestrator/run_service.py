@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
-from actors.laboratory_settings import LaboratorySpec
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from actors.laboratory_settings import LaboratorySettings
+from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import check_journal, has_begun
 from orchestrator.journal.run_record import CampaignResult, read_result
 from orchestrator.requests import Pour
@@ -120,13 +120,12 @@ class RunResources:
     approved_checksum: str = ""
     subscribers: Sequence[Watcher] = ()
     recorder: Callable[[CampaignPlan, Path], RerunMonitor | None] | None = None
-    laboratory: Callable[[LaboratorySpec, bool], Laboratory] | None = None
+    laboratory: Callable[[LaboratorySettings, bool], Laboratory] | None = None
 
-    def settings(self, campaign: CampaignPlan) -> LaboratorySpec:
+    def settings(self, campaign: CampaignPlan) -> LaboratorySettings:
         """The campaign's laboratory as it is opened with these resources."""
         spec = campaign.laboratory
-        return replace(
-            spec,
+        return spec.with_values(
             in_process=self.in_process or spec.in_process,
             accepted_checksum=self.approved_checksum,
             ray=None if self.simulators is not None else spec.ray,
@@ -250,9 +249,7 @@ class RunService:
 
         if request.folder is None or not (request.folder / JOURNAL_NAME).is_file():
             return None
-        with JournalReader(request.folder / JOURNAL_NAME) as journal:
-            result = read_result(journal, request.folder)
-        return publish(request.campaign, result)
+        return publish(request.campaign, read_result(request.folder))
 
 
 class RunHandle:

@@ -53,6 +53,7 @@ class ParameterInfo:
         shown: display unit.
         tolerance: of a bench's nuisance: its standard deviation before any measurement, in SI; 0 for parameters of the
             solver.
+        default: in SI.
     """
 
     name: str
@@ -63,11 +64,22 @@ class ParameterInfo:
     meaning: str
     shown: str
     tolerance: float
+    default: float
 
     @property
     def factor(self) -> float:
         """One shown unit in SI."""
         return SHOWN.get(self.shown, 1.0)
+
+    @property
+    def example(self) -> str:
+        """A valid value as files write it: the default."""
+        return f"{self.default / self.factor:g}" + ("" if self.shown == "1" else f" {self.shown}")
+
+    @property
+    def quantity(self) -> Quantity:
+        """Annotation of a field that holds the parameter."""
+        return Quantity(self.unit, self.example, self.lower, self.upper, whole=self.integer)
 
     @property
     def nuisance(self) -> bool:
@@ -205,6 +217,7 @@ class SimulationParameters(BaseModel):
                 field.description or "",
                 str(extra.get("shown", unit)),
                 float(extra.get("tolerance", 0.0)),
+                field.default,
             )
         return table
 

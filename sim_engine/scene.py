@@ -8,12 +8,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_engine.action import Action
 from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.settings.model import Settings
+from sim_engine.settings.quantity import Quantity
 from sim_engine.vessel.shapes import VesselSpec
 
 FloatArray = NDArray[np.float64]
@@ -105,6 +108,12 @@ class Scene:
         return replace(self, pourer=self.pourer.drawn(seed), receiver=self.receiver.drawn(seed))
 
 
+Offset = Annotated[float, Quantity("m", "1 mm", -0.05, 0.05)]
+Tilt = Annotated[float, Quantity("rad", "1 deg", -0.2, 0.2)]
+Factor = Annotated[float, Quantity("1", "1.02", 0.5, 1.5)]
+Spread = Annotated[float, Quantity("1", "0.01", 0.0, 0.5)]
+
+
 @dataclass(frozen=True)
 class PoseError:
     """Difference between real and intended placement (the virtual bench's errors of grip and placement).
@@ -143,6 +152,54 @@ class PoseError:
             tilt=self.tilt + other.tilt,
             speed_factor=self.speed_factor * other.speed_factor,
         )
+
+
+class PoseErrorSettings(Settings):
+    """How the real placement differs from the intended one."""
+
+    x: Offset = 0.0
+    """The receiver stands that much further from the pourer."""
+
+    y: Offset = 0.0
+    """… and that much sideways."""
+
+    z: Offset = 0.0
+    """… and that much higher."""
+
+    tilt: Tilt = 0.0
+    """The pourer is held that much more tilted than commanded."""
+
+    speed_factor: Factor = 1.0
+    """Executed over commanded angular velocity."""
+
+    @property
+    def error(self) -> PoseError:
+        """The errors of a pour."""
+        return PoseError(**self.model_dump())
+
+
+class PoseNoise(Settings):
+    """Standard deviations of the same from pour to pour."""
+
+    x: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
+    """Standard deviation of the distance."""
+
+    y: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
+    """Standard deviation of the sideways placement."""
+
+    z: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
+    """Standard deviation of the receiver's height."""
+
+    tilt: Annotated[float, Quantity("rad", "0.3 deg", 0.0, 0.2)] = 0.0
+    """Standard deviation of the tilt."""
+
+    speed_factor: Spread = 0.0
+    """Standard deviation of executed over commanded angular velocity."""
+
+    @property
+    def deviations(self) -> PoseError:
+        """The standard deviations [m, rad, 1]."""
+        return PoseError(**self.model_dump())
 
 
 @dataclass(frozen=True)

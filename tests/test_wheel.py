@@ -53,13 +53,13 @@ print(len(StrategyHarness(spill).run(make()).pours), "pours")
 
 CONTRACT = """
 import pytest
-from actors.arm.simulated_arm import NumbersSpec, SimulatedArm
+from actors.arm.simulated_arm import SimulatedArmSettings, SimulatedArm
 from decant.plugins.testing import ACTIONS, SCENE, ArmBench, ArmContract
 
 class TestMyArm(ArmContract):
     @pytest.fixture
     def bench(self):
-        spec = NumbersSpec(time_scale=20.0)
+        spec = SimulatedArmSettings(time_scale=20.0)
         arm = SimulatedArm(spec)
         path = spec.plan(SCENE, SCENE.action(ACTIONS.decode([0.8, 0.5]) | {"max_angle": 1.7}))
         yield ArmBench(arm, path, time_scale=20.0)

@@ -22,7 +22,7 @@ class LinkFigure:
     """A figure of a UR arm, drawn from its kinematics.
 
     Args:
-        spec: of the arm and its cell (`actors.arm.arm_settings.UrArmSpec`).
+        spec: of the arm and its cell (`actors.arm.arm_settings.UrArmSettings`).
     """
 
     spec: Any
@@ -45,12 +45,12 @@ class LinkFigure:
     @property
     def home(self) -> tuple[float, ...]:
         """See `ArmFigure.home`."""
-        return tuple(self.spec.home)
+        return tuple(self.spec.home.angles)
 
     @property
     def table(self) -> float:
         """See `ArmFigure.table`."""
-        return float(self.spec.cell.table - self.spec.cell.receiver[2])
+        return float(self.spec.cell.table - self.spec.cell.receiver.vector[2])
 
     def ends(self, joints: FloatArray) -> FloatArray:
         """See `ArmFigure.ends`."""

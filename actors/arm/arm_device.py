@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import AsyncIterator, Callable
 
 from actors.arm.arm_interface import ArmError, ArmFacts, ArmState, Executed, PlannedPour
-from actors.arm.arm_settings import ArmSpec
+from actors.arm.arm_settings import ArmSettings
 from actors.interfaces import LaboratoryError
 from actors.runtime.remote_object import Device
 
@@ -38,7 +38,7 @@ class DeviceArm:
         spec: of the arm.
     """
 
-    def __init__(self, device: Device, spec: ArmSpec) -> None:
+    def __init__(self, device: Device, spec: ArmSettings) -> None:
         self.device, self._spec = device, spec
 
     async def ready(self) -> ArmFacts:
@@ -82,7 +82,7 @@ class DeviceArm:
 
     async def untilt(self, path: PlannedPour) -> None:
         """Bring the pourer slowly upright again after that pour was stopped."""
-        await self.device.call("untilt", path, deadline=self._deadline(self._spec.untilt_time))
+        await self.device.call("untilt", path, deadline=self._deadline(self._spec.upright_time))
 
     async def recover(self) -> str:
         """Reconnect and make the arm ready after a stop whose cause the operator has removed.

@@ -1,6 +1,7 @@
 """Settings of arms.
 
-- `ArmSpec` is the base class: plain values that name the driver's class and the planner. `UrArmSpec` is for UR arms.
+- `ArmSettings` is the base class: frozen values that name the driver's class and the planner; `ARMS` is the registry of
+  installed kinds. `UrArmSettings` is for UR arms.
 - `SafetyRecord` holds safety settings that an operator has accepted.
 - `ArmDiagnostics` holds what an arm reports to `decant doctor`.
 
@@ -10,17 +11,21 @@ started.
 
 from __future__ import annotations
 
+import ipaddress
 import math
-from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+import re
+from abc import abstractmethod
+from dataclasses import dataclass
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
-from actors.arm.arm_geometry import ArmLimits, Joints, Mount, Pose, RobotCell, Vector
+from actors.arm.arm_geometry import ArmLimits, Centre, JointAngles, Mount, Pose, RobotCell, Speed
 from actors.interfaces import DeviceCheck
 from sim_engine.action import Action
 from sim_engine.scene import Scene
-from sim_engine.settings.model import NOT_IN_FINGERPRINT
+from sim_engine.settings.model import NOT_IN_FINGERPRINT, SET_BY_PROGRAM, Example, Problems, Settings, Text
+from sim_engine.settings.plugin_registry import PluginRegistry
+from sim_engine.settings.quantity import Quantity
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import ArmFigure, PlannedPour
@@ -86,26 +91,49 @@ class ArmDiagnostics:
         return DeviceCheck("position", "ok", "at home, as far as the driver tells")
 
 
-ArmModel = Literal["ur10", "ur10e"]
+class ArmSettings(Settings):
+    """Base class of the section `arm`: settings of one arm, which are sent to the machine of the bench.
 
-
-class ArmSpec(ABC):
-    """Settings of one arm: frozen values that are sent to the machine of the bench.
-
-    Attributes:
-        kind: as registered in `decant.arms`, and as written in files.
-        emulator: 'module:callable' that makes, from these settings, the emulator of the arm on a virtual bench. See
-            `actors.bench.virtual_bench.ArmEmulator`; '' for a driver that only simulates.
-        time_scale: bench seconds per second of the clock; 1 for hardware, 0 to skip all waits.
-        announcement: from the operator's consent to the first movement [s].
-        untilt_speed: angular velocity at which a stopped, tilted pourer is brought upright [rad/s].
+    The field `kind` of a subclass has the name under which it is registered in `decant.arms`.
     """
 
-    kind: ClassVar[str]
+    tag: ClassVar[str] = "kind"
+    default_tag: ClassVar[str] = "ur"
+    retired: ClassVar[dict[str, str]] = {"kind: numbers": "kind: simulated"}
+
     emulator: ClassVar[str] = ""
-    time_scale: float
-    announcement: float
-    untilt_speed: float = math.radians(10.0)
+    """'module:callable' that makes, from these settings, the emulator of the arm on a virtual bench. See
+    `actors.bench.virtual_bench.ArmEmulator`; '' for a driver that only simulates."""
+
+    kind: str = ""
+    """Kind of the arm."""
+
+    time_scale: Annotated[float, SET_BY_PROGRAM] = 1.0
+    """Bench seconds per second of the clock; 1 for hardware, 0 to skip all waits."""
+
+    warning_time: Annotated[float, SET_BY_PROGRAM] = 0.0
+    """Time from the operator's consent to the first movement [s]."""
+
+    upright_speed: Annotated[float, SET_BY_PROGRAM] = math.radians(10.0)
+    """Angular velocity at which a stopped, tilted pourer is brought upright [rad/s]."""
+
+    @classmethod
+    def unknown_tag(cls, word: str) -> str:
+        """The plug-in that provides this kind, if it could not be loaded."""
+        return next((str(broken) for broken in ARMS.broken if broken.name == word), "")
+
+    def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
+        """Add a problem for each value that does not fit the rest of the laboratory.
+
+        Args:
+            problems: of the laboratory, whose keys `arm` and `cell` are.
+            mode: 'virtual' or 'hardware'.
+            cell: the section `cell`; None if it is missing.
+        """
+
+    def in_laboratory(self, cell: RobotCell | None, time_scale: float) -> Self:
+        """The same settings in a cell, with the time scale of a virtual bench (1 on hardware)."""
+        return self.with_values(time_scale=time_scale)
 
     @abstractmethod
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
@@ -124,18 +152,10 @@ class ArmSpec(ABC):
             InvalidActionError: the pour is impossible; the text lists all problems.
         """
 
-    def paced(self, time_scale: float) -> ArmSpec:
-        """The same settings with a virtual bench's time scale."""
-        return replace(self, time_scale=time_scale)  # type: ignore[type-var]
-
-    def announced(self, announcement: float) -> ArmSpec:
-        """The same settings with another time between consent and movement [s]."""
-        return replace(self, announcement=announcement)  # type: ignore[type-var]
-
     @property
-    def untilt_time(self) -> float:
+    def upright_time(self) -> float:
         """Longest time that bringing a stopped pourer upright may take [s]."""
-        return 4.0 * math.radians(140.0) / self.untilt_speed
+        return 4.0 * math.radians(140.0) / self.upright_speed
 
     def on_clock(self, seconds: float) -> float:
         """Bench time converted to clock time [s]; 0 if nothing is waited for."""
@@ -164,7 +184,7 @@ class ArmSpec(ABC):
         """Largest angular velocity of the pourer [rad/s]; None if unknown."""
         return None
 
-    def look(self) -> ArmDiagnostics:
+    def diagnostics(self) -> ArmDiagnostics:
         """Read everything that `decant doctor` reports; nothing moves, no setting changes."""
         from actors.interfaces import LaboratoryError
 
@@ -179,57 +199,128 @@ class ArmSpec(ABC):
         return ArmDiagnostics(facts.checksum, facts.serial, facts.model, facts.version, facts.problem)
 
 
-@dataclass(frozen=True)
-class UrArmSpec(ArmSpec):
-    """A UR arm that holds the pourer.
+def _arm(loaded: object, name: str) -> type[ArmSettings]:
+    if not (isinstance(loaded, type) and issubclass(loaded, ArmSettings)):
+        raise TypeError("should be a class derived from decant.plugins.ArmSettings")
+    if loaded.model_fields["kind"].default != name:
+        raise TypeError(f"its field 'kind' should be Literal['{name}'] = '{name}', as it is registered")
+    return loaded
 
-    Attributes:
-        model: of the robot.
-        limits: of its motion in this cell.
-        cell: positions of the objects around it.
-        home: joints of the home pose, out of the operator's way, with the pourer upright [rad].
-        address: of the controller; '' for a virtual one, whose address is filled in when it starts.
-        mount: mounting of the robot.
-        tool: TCP in the flange's frame.
-        payload: of gripper and filled pourer [kg].
-        payload_centre: in the flange's frame [m].
-        grip: pourer in the TCP's frame.
-        approach_speed: of the fastest joint on the way between home and pour [rad/s].
-        approach_acceleration: of the fastest joint, likewise [rad/s²].
-        untilt_speed: angular velocity at which a stopped, tilted pourer is brought upright [rad/s].
-        announcement: from an operator's consent to the first movement [s].
-        rate: of readings [Hz], at least 100.
-        time_scale: controller seconds per second of the clock; 1 for a real one.
-    """
 
-    model: ArmModel
-    limits: ArmLimits
-    cell: RobotCell
-    home: Joints
-    address: Annotated[str, NOT_IN_FINGERPRINT] = ""
-    mount: Mount = field(default_factory=Mount)
-    tool: Pose = field(default_factory=Pose)
-    payload: float = 0.0
-    payload_centre: Vector = (0.0, 0.0, 0.0)
-    grip: Pose = field(default_factory=Pose)
-    approach_speed: float = math.radians(40.0)
-    approach_acceleration: float = math.radians(80.0)
-    untilt_speed: float = math.radians(10.0)
-    announcement: float = 3.0
-    rate: float = 125.0
-    time_scale: float = 1.0
+ARMS: PluginRegistry[type[ArmSettings]] = PluginRegistry("decant.arms", "arm", _arm)
+"""Settings classes of all installed kinds of arms."""
 
-    kind: ClassVar[str] = "ur"
+ArmModel = Literal["ur10", "ur10e"]
+
+Acceleration = Annotated[float, Quantity("rad/s^2", "80 deg/s^2", 0.0, math.radians(2000.0), positive=True)]
+
+_HOME = "{base: 0 deg, shoulder: -90 deg, elbow: 90 deg, wrist1: 0 deg, wrist2: -90 deg, wrist3: 0 deg}"
+_LIMITS = "{box: {low: {x: …, y: …, z: …}, high: {x: …, y: …, z: …}}}"
+
+
+class UrArmSettings(ArmSettings):
+    """A UR arm that holds the pourer."""
+
+    retired: ClassVar[dict[str, str]] = ArmSettings.retired | {
+        "upright_speed": "upright_speed",
+        "announcement": "warning_time",
+    }
     emulator: ClassVar[str] = "actors.emulators.ur_controller.arm_emulator:UrEmulator"
 
+    kind: Literal["ur"] = "ur"
+    """A UR robot; the default kind."""
+
+    model: Annotated[ArmModel, Example("ur10e")]
+    """Model of the robot."""
+
+    address: Annotated[Text, NOT_IN_FINGERPRINT] = ""
+    """Network address of its controller; a virtual laboratory starts its own controller."""
+
+    mount: Mount = Mount()
+    """Mounting of the robot; on a table unless given."""
+
+    tool: Annotated[Pose, Example("{z: 180 mm}")]
+    """Tool centre point in the flange's frame, as set on the teach pendant."""
+
+    payload: Annotated[float, Quantity("kg", "1.5 kg", 0.0, 12.5)]
+    """Mass of gripper and filled pourer, as set on the teach pendant."""
+
+    payload_centre: Centre = Centre()
+    """Centre of gravity of gripper and pourer in the flange's frame."""
+
+    grip: Annotated[Pose, Example("{x: 60 mm, rx: 1.571 rad}")]
+    """Pose of the pourer in the frame of the tool centre point: origin in the middle of its underside, z out of its opening, x towards the side where liquid leaves."""  # noqa: E501
+
+    home: Annotated[JointAngles, Example(_HOME)]
+    """Waiting pose of the arm, with the pourer upright."""
+
+    limits: Annotated[ArmLimits, Example(_LIMITS)]
+    """Limits of the arm in this cell."""
+
+    approach_speed: Speed = math.radians(40.0)
+    """Speed of the fastest joint between home and pour."""
+
+    approach_acceleration: Acceleration = math.radians(80.0)
+    """Acceleration of the fastest joint between home and pour."""
+
+    upright_speed: Speed = math.radians(10.0)
+    """Speed at which a stopped, tilted pourer is brought upright."""
+
+    warning_time: Annotated[float, Quantity("s", "3 s", 0.0, 60.0)] = 3.0
+    """Time from the operator's consent to the first movement."""
+
+    rate: Annotated[float, Quantity("1/s", "125 Hz", 100.0, 500.0)] = 125.0
+    """Rate at which the joints are read back."""
+
+    cell: Annotated[RobotCell, SET_BY_PROGRAM]
+    """Objects around the arm: the laboratory's section `cell`."""
+
+    def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
+        """See `ArmSettings.check_laboratory`."""
+        arm = problems.within("arm")
+        self._check_address(arm, mode)
+        if arm.valid("model", "rate"):
+            fastest = resolve_name("actors.arm.planning.kinematics:MODELS")[self.model].frequency
+            if self.rate > fastest:
+                arm.add(f"a {self.model} answers at most {fastest} times a second; write '{fastest} Hz'", "rate")
+        if cell is None:
+            if problems.valid("cell"):
+                problems.add(
+                    "an arm needs to know what stands where; add 'cell: {receiver: …, direction: …}' beside it", "arm"
+                )
+        elif problems.valid("arm", "cell"):
+            check_limits = resolve_name("actors.arm.planning.path_checks:check_limits")
+            for problem in check_limits(self.with_values(cell=cell)):
+                key, _, text = problem.partition(": ")
+                owner = problems if key.startswith("cell.") else arm
+                owner.add(text, *key.split("."), more=True)
+
+    def _check_address(self, problems: Problems, mode: str) -> None:
+        if mode != "hardware":
+            if self.address:
+                problems.add("a virtual arm has no address: remove it, or write 'mode: hardware'", "address")
+        elif not self.address:
+            text = "an arm of hardware needs its controller's 'address', for example 'address: 192.168.0.10'"
+            problems.add(text, of="address")
+        elif not _is_address(self.address):
+            problems.add(
+                f"{self.address!r} is neither an IPv4 address nor a host name; write for example '192.168.0.10', no "
+                "port",
+                "address",
+            )
+
+    def in_laboratory(self, cell: RobotCell | None, time_scale: float) -> Self:
+        """See `ArmSettings.in_laboratory`."""
+        return self.with_values(cell=cell, time_scale=time_scale)
+
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `ArmSpec.driver`."""
+        """See `ArmSettings.driver`."""
         if accepted is None:
             return resolve_name("actors.arm.ur.ur_driver:UrArm"), (self,)
         return resolve_name("actors.arm.ur.ur_driver:AcceptedArm"), (self, accepted)
 
     def plan(self, scene: Scene, action: Action) -> PourPath:
-        """See `ArmSpec.plan`."""
+        """See `ArmSettings.plan`."""
         plan_path = resolve_name("actors.arm.planning.pour_planner:plan_path")
         planning = resolve_name("actors.bench.pour_feasibility")
         pourer, receiver = planning.vessel(scene.pourer), planning.vessel(scene.receiver)
@@ -237,36 +328,50 @@ class UrArmSpec(ArmSpec):
         return path
 
     def figure(self) -> ArmFigure:
-        """See `ArmSpec.figure`."""
+        """See `ArmSettings.figure`."""
         figure: ArmFigure = resolve_name("actors.arm.appearance:LinkFigure")(self)
         return figure
 
     def missing(self) -> str | None:
-        """See `ArmSpec.missing`."""
+        """See `ArmSettings.missing`."""
         missing: str | None = resolve_name("actors.arm.ur.rtde_client:client_missing")()
         return missing
 
     @property
     def title(self) -> str:
-        """See `ArmSpec.title`."""
+        """See `ArmSettings.title`."""
         return f"{self.model.upper()} at {self.address}"
 
     @property
     def payload_limit(self) -> float | None:
-        """See `ArmSpec.payload_limit`."""
+        """See `ArmSettings.payload_limit`."""
         return self.payload
 
     @property
     def tilt_speed_limit(self) -> float:
-        """See `ArmSpec.tilt_speed_limit`."""
+        """See `ArmSettings.tilt_speed_limit`."""
         return self.limits.tilt_speed
 
     @property
-    def untilt_time(self) -> float:
-        """See `ArmSpec`."""
-        return 4.0 * self.limits.tilt / self.untilt_speed
+    def upright_time(self) -> float:
+        """See `ArmSettings`."""
+        return 4.0 * self.limits.tilt / self.upright_speed
 
-    def look(self) -> ArmDiagnostics:
-        """See `ArmSpec.look`."""
-        look: ArmDiagnostics = resolve_name("actors.arm.ur.commissioning:UrDiagnostics").at(self)
-        return look
+    def diagnostics(self) -> ArmDiagnostics:
+        """See `ArmSettings.diagnostics`."""
+        found: ArmDiagnostics = resolve_name("actors.arm.ur.commissioning:UrDiagnostics").at(self)
+        return found
+
+
+_LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
+_HOST = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(\.{_LABEL})*\.?")
+
+
+def _is_address(text: str) -> bool:
+    if re.fullmatch(r"[\d.]+", text):  # a text of digits and dots can only be meant as an address
+        try:
+            ipaddress.IPv4Address(text)
+        except ValueError:
+            return False
+        return True
+    return _HOST.fullmatch(text) is not None

@@ -1,6 +1,6 @@
 """A simulated arm. It executes a `PourMotion` in scaled time, with small errors, and can be stopped.
 
-`NumbersSpec` holds its settings, `Grip` the hidden errors of a pour. No hardware moves.
+`SimulatedArmSettings` are its settings, `Grip` the hidden errors of a pour. No hardware moves.
 """
 
 from __future__ import annotations
@@ -9,19 +9,20 @@ import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_geometry import Pose
+from actors.arm.arm_geometry import Pose, RobotCell
 from actors.arm.arm_interface import ArmFacts, ArmNotReleasedError, ArmPose, ArmRefusedError, ArmState, ArmStoppedError
-from actors.arm.arm_settings import ArmSpec
+from actors.arm.arm_settings import ArmSettings
 from actors.arm.planned_pour import ExecutedMotion, MotionPath
 from actors.bench.bench_clock import Pace
 from sim_engine.action import Action
 from sim_engine.motion import PourMotion
 from sim_engine.scene import Scene
+from sim_engine.settings.model import Problems
 
 FloatArray = NDArray[np.float64]
 
@@ -56,26 +57,25 @@ class Grip:
     seed: tuple[int, ...] = (0,)
 
 
-@dataclass(frozen=True)
-class NumbersSpec(ArmSpec):
-    """A simulated arm.
+class SimulatedArmSettings(ArmSettings):
+    """A simulated arm without protocol: it makes every motion and has no geometry."""
 
-    Attributes:
-        time_scale: bench seconds per wall-clock second; 0 skips all waits.
-        announcement: from consent to the first movement [s].
-    """
+    kind: Literal["simulated"] = "simulated"
+    """A simulated arm without protocol."""
 
-    time_scale: float = 1.0
-    announcement: float = 0.0
-
-    kind: ClassVar[str] = "numbers"
+    def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
+        """See `ArmSettings.check_laboratory`."""
+        if mode == "hardware":
+            problems.add("a simulated arm moves nothing; write 'mode: virtual'", "arm")
+        if cell is not None:
+            problems.add("a simulated arm stands nowhere; remove the section", "cell")
 
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `ArmSpec.driver`."""
+        """See `ArmSettings.driver`."""
         return SimulatedArm, (self,)
 
     def plan(self, scene: Scene, action: Action) -> MotionPath:
-        """See `ArmSpec.plan`."""
+        """See `ArmSettings.plan`."""
         from actors.bench.pour_feasibility import plan_pour
 
         return MotionPath(plan_pour(scene, action), approach_time=APPROACH_TIME)
@@ -90,7 +90,7 @@ class SimulatedArm:
         spec: its time scale.
     """
 
-    def __init__(self, spec: NumbersSpec) -> None:
+    def __init__(self, spec: SimulatedArmSettings) -> None:
         self._spec = spec
         self._pace = Pace(spec.time_scale)
         self._grip = Grip()
@@ -113,7 +113,7 @@ class SimulatedArm:
 
     def facts(self) -> ArmFacts:
         """See `Arm.facts`."""
-        return ArmFacts(model="numbers")
+        return ArmFacts(model="simulated")
 
     def hands_in(self) -> None:
         """See `Arm.hands_in`."""
@@ -133,7 +133,7 @@ class SimulatedArm:
 
     def where(self) -> ArmPose:
         """See `Arm.where`."""
-        return ArmPose(Pose(*self._place))
+        return ArmPose(Pose.of(*self._place))
 
     def recover(self) -> str:
         """See `Arm.recover`."""
@@ -179,7 +179,7 @@ class SimulatedArm:
         """See `Arm.jog`."""
         axes = ("x", "y", "z", "rx", "ry", "rz")
         if axis not in axes:
-            raise ArmRefusedError(f"an arm of numbers has no axis '{axis}'; there are {', '.join(axes)}")
+            raise ArmRefusedError(f"a simulated arm has no axis '{axis}'; there are {', '.join(axes)}")
         if not 0.0 < abs(amount) <= (FARTHEST_WAY if axis in axes[:3] else FARTHEST_TURN) or speed <= 0.0:
             raise ArmRefusedError("a step is at most 50 mm or 10°, with a speed above 0")
         self._way("jog", abs(amount) / speed, lambda t: self._state.tilt)

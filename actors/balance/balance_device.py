@@ -6,7 +6,8 @@ import asyncio
 from collections.abc import AsyncIterator
 
 from actors.balance.balance_interface import Weight
-from actors.balance.simulated_balance import PATIENCE, Load
+from actors.balance.scale_model import Load
+from actors.balance.simulated_balance import PATIENCE
 from actors.runtime.remote_object import Device
 
 ANSWER_DEADLINE = 30.0
@@ -19,7 +20,7 @@ class DeviceBalance:
     Args:
         device: holds the driver.
         time_scale: bench seconds per wall second, for deadlines; 0 disables waiting.
-        longest_call: wall time limit of the driver's calls [s], see `BalanceDevice.longest_call`.
+        longest_call: wall time limit of the driver's calls [s], see `BalanceSettings.longest_call`.
     """
 
     def __init__(self, device: Device, time_scale: float = 1.0, *, longest_call: float = 0.0) -> None:

@@ -1,54 +1,63 @@
-"""Settings of a balance: its device, its serial line, its placement, and the rule for a settled weight.
+"""Settings of a balance: its placement, its device, its serial line, and the rule for a settled weight.
 
-`BalanceSpec` is a laboratory's balance. Its `BalanceDevice` is a `SerialBalanceSpec`, a `NumbersBalanceSpec` or a
-plug-in's class, and names the driver. `Settling` applies a `SettlingRule`: a weight counts if the balance reports
-several stable readings in a row and they agree. The drivers themselves are in other modules.
+`BalanceSettings` is the base class; `SerialBalanceSettings` and plug-ins' classes derive from it and name the driver
+(`SimulatedBalanceSettings` is in `simulated_balance`). `Settling` applies a `SettlingRule`: a weight counts if the
+balance reports several stable readings in a row and they agree. The drivers themselves are in other modules.
 """
 
 from __future__ import annotations
 
-import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pkgutil import resolve_name
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
+
+from pydantic import Field
 
 from actors.balance.balance_interface import BalanceDriver
-from actors.balance.dialect_registry import dialects
-from actors.balance.dialects.dialect import Dialect, LineSettings
-from actors.balance.simulated_balance import PATIENCE, BalanceSettings, ScaleSettings, VirtualBalance
+from actors.balance.dialects.dialect import BALANCES, Dialect, LineSettings, dialects
+from actors.balance.scale_model import Duration, Error, PositiveDuration, PositiveMass, ScaleSettings
 from actors.balance.weighing_plan import Placement
 from actors.interfaces import DeviceCheck, LaboratoryError
-from sim_engine.settings.model import NOT_IN_FINGERPRINT
+from sim_engine.settings.model import (
+    NOT_IN_FINGERPRINT,
+    SET_BY_PROGRAM,
+    Choice,
+    PositiveCount,
+    Problems,
+    Settings,
+    Text,
+)
+from sim_engine.settings.quantity import Quantity
 
 
-@dataclass(frozen=True)
-class SettlingRule:
-    """Conditions for a weight to count.
+class SettlingRule(Settings):
+    """Criteria for a settled weight.
 
     One stable reading is not enough: characters get lost on serial lines, some balances report a slowly filling vessel
     as stable, and some are configured to always print a unit.
-
-    Attributes:
-        readings: number of consecutive stable readings; 2 or more.
-        span: time from the first of them to the last [s].
-        steps: largest difference between them, in steps of the display.
-        deadline: time limit for settling [s].
     """
 
-    readings: int = 4
-    span: float = 0.6
-    steps: float = 1.0
-    deadline: float = 20.0
+    readings: Annotated[int, Field(strict=True, ge=2, le=100)] = 4
+    """Number of consecutive stable readings."""
 
-    def scaled(self, time_scale: float) -> SettlingRule:
+    span: Duration = 0.6
+    """Time from the first to the last of these readings."""
+
+    steps: Annotated[float, Quantity("1", "1", 0.0, 100.0)] = 1.0
+    """Largest difference between these readings, in steps of the display."""
+
+    deadline: PositiveDuration = 20.0
+    """Maximum time for a weight to settle; then the weighing fails."""
+
+    def scaled(self, time_scale: float) -> Self:
         """The same rule for a laboratory with scaled time.
 
         Args:
             time_scale: bench seconds per second of the clock.
         """
-        return replace(self, span=self.span / time_scale, deadline=self.deadline / time_scale)
+        return self.with_values(span=self.span / time_scale, deadline=self.deadline / time_scale)
 
 
 @dataclass(frozen=True)
@@ -108,11 +117,8 @@ AUTO = "auto"
 SERIAL_EMULATOR = "actors.emulators.serial_balance.balance_process:SerialBalanceEmulator"
 """Emulates a balance on a serial line of a virtual bench; a name, because drivers do not import emulators."""
 
-DRIFTING = 60.0
-"""Longest bench time from a tare to the weighing after it, on a simulated bench [s]."""
-
-Handshake = Literal["none", "software", "hardware"]
-
+USUAL_BAUDS = (300, 600, 1200, 2400, 4800, 9600, 14_400, 19_200, 28_800, 38_400, 57_600, 115_200)
+"""Usual speeds of balances [bits per second]."""
 
 COARSE = 0.5e-3
 """Displays with larger steps cannot resolve small spills [kg]."""
@@ -122,7 +128,7 @@ class BalanceEmulator(Protocol):
     """Emulates a balance on a virtual bench; the driver connects to it as to a real balance."""
 
     @property
-    def device(self) -> BalanceDevice:
+    def balance(self) -> BalanceSettings:
         """The settings, with the emulator's address."""
         ...
 
@@ -143,21 +149,72 @@ class BalanceEmulator(Protocol):
         ...
 
 
-class BalanceDevice(ABC):
-    """Settings of a weighing device: frozen values that can be sent to the bench's machine and name their driver.
+_TYPED = ("kind", "placement", "load_tolerance", "step", "repeatability")
+"""Keys that apply if the operator types all weights."""
 
-    Attributes:
-        kind: as registered in the plug-in registry `decant.balances`, and as written in files.
-        told: whether, on a virtual bench, the driver itself receives the load instead of an emulator. It then has
-            `prepare` and `put` as in `actors.balance.simulated_balance.VirtualBalance`.
-        time_scale: bench seconds per second of the clock; 1 for a real device, 0 disables waiting.
-        repeatability: standard deviation of repeated weighings of the same load [kg].
+
+class BalanceSettings(Settings):
+    """The balance: its placement and its connection, as frozen values that are sent to the bench's machine.
+
+    A package adds a kind with a subclass, registered in the entry-point group `decant.balances` under its `kind`.
     """
 
-    kind: ClassVar[str]
-    told: ClassVar[bool] = False
-    time_scale: float = 1.0
-    repeatability: float = 0.0
+    tag: ClassVar[str] = "kind"
+    default_tag: ClassVar[str] = "serial"
+    retired: ClassVar[dict[str, str]] = {"kind: numbers": "kind: simulated"}
+
+    receives_load: ClassVar[bool] = False
+    """Whether, on a virtual bench, the driver itself receives the load instead of an emulator. It then has `prepare`
+    and `put` as in `actors.balance.simulated_balance.VirtualBalance`."""
+
+    kind: str = ""
+    """Kind of the balance; a literal in each subclass, equal to its registered name."""
+
+    placement: Literal["tray", "receiver", "everything", "manual"] = "tray"
+    """Load of the balance: 'tray' reads the spill, 'receiver' the received liquid, 'everything' the poured liquid; with 'manual' the operator types all weights."""  # noqa: E501
+
+    pourer: Literal["here", "elsewhere"] = "here"
+    """Where the pourer is weighed: on this balance, or on another one whose weight is typed."""
+
+    load_tolerance: PositiveMass = 5e-3
+    """Largest difference between a load and the load of the campaign."""
+
+    time_scale: Annotated[float, SET_BY_PROGRAM] = 1.0
+    """Bench seconds per second of the clock; 1 for a real device, 0 disables waiting."""
+
+    @classmethod
+    def unknown_tag(cls, word: str) -> str:
+        """The plug-in that provides this kind, if it could not be loaded."""
+        return next((str(broken) for broken in BALANCES.broken if broken.name == word), "")
+
+    def check_laboratory(self, problems: Problems, *, mode: str) -> None:
+        """Add a problem for each combination of values that is invalid in a laboratory.
+
+        Args:
+            problems: of these settings.
+            mode: 'virtual' or 'hardware'.
+        """
+
+    def check_manual(self, problems: Problems) -> None:
+        """Add a problem for each key that has no effect if the operator types all weights."""
+        for key, name in self.written_keys().items():
+            if name in self.model_fields_set and name not in _TYPED:
+                problems.add("is not used with placement 'manual', where the operator types all weights", key)
+
+    @property
+    def typed(self) -> bool:
+        """Whether the operator types all weights; then there is no device."""
+        return self.placement == "manual"
+
+    @property
+    def position(self) -> Placement:
+        """The load of the balance."""
+        return Placement(self.placement)
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of repeated weighings of the same load [kg]; 0 if unknown."""
+        return 0.0
 
     @abstractmethod
     def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
@@ -177,11 +234,7 @@ class BalanceDevice(ABC):
         """Start the emulator on a virtual bench; None if the device needs none."""
         return None
 
-    def paced(self, time_scale: float) -> BalanceDevice:
-        """The same balance with a virtual bench's time scale."""
-        return replace(self, time_scale=time_scale)  # type: ignore[type-var]
-
-    def look(self, *, tare: bool) -> list[DeviceCheck]:
+    def diagnostics(self, *, tare: bool) -> list[DeviceCheck]:
         """Return the checks of `decant doctor`: identification, a stable reading, its step, and optionally a tare.
 
         Args:
@@ -211,109 +264,113 @@ class BalanceDevice(ABC):
         return checks
 
 
-@dataclass(frozen=True)
-class NumbersBalanceSpec(BalanceDevice):
-    """A simulated balance.
-
-    Attributes:
-        sheet: data sheet of the balance; its time scale is the bench's.
-    """
-
-    sheet: BalanceSettings
-
-    kind: ClassVar[str] = "numbers"
-    told: ClassVar[bool] = True
-
-    def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `BalanceDevice.driver`."""
-        return VirtualBalance, (self.sheet, name)
-
-    def paced(self, time_scale: float) -> NumbersBalanceSpec:
-        """See `BalanceDevice.paced`."""
-        return NumbersBalanceSpec(replace(self.sheet, time_scale=time_scale))
-
-    @property
-    def longest_call(self) -> float:
-        """See `BalanceDevice.longest_call`."""
-        return 2.0 * PATIENCE / self.sheet.time_scale if self.sheet.time_scale > 0.0 else 0.0
-
-    @property
-    def time_scale(self) -> float:  # type: ignore[override]
-        """See `BalanceDevice`."""
-        return self.sheet.time_scale
-
-    @property
-    def repeatability(self) -> float:  # type: ignore[override]
-        """See `BalanceDevice`."""
-        return math.hypot(self.sheet.noise, self.sheet.drift * DRIFTING)
+def dialect_names() -> list[str]:
+    """Allowed values of `dialect`: all installed dialects, and automatic detection."""
+    return [AUTO, *dialects()]
 
 
-@dataclass(frozen=True)
-class SerialBalanceSpec(BalanceDevice):
-    """A balance on a serial line.
+class SerialBalanceSettings(BalanceSettings):
+    """A balance on a serial line."""
 
-    Attributes:
-        port: device; under `/dev/serial/by-id/` it keeps its name when it is plugged in again.
-        dialect: one of `actors.balance.dialect_registry.dialects`, or 'auto'.
-        baud: bits per second; None: detected.
-        format: bits, parity and stop bits, as '8N1'; None: detected.
-        handshake: how the balance may pause the line: by characters (Xon/Xoff), by wires (CTS), or not at all.
-        settling: conditions for a weight to count.
-        step: of the display [kg], if it differs from one unit of the last digit sent.
-        repeatability: standard deviation of repeated weighings of the same load [kg], from the data sheet.
-        interval: between two queries [s].
-        answer_time: longest wait for a reply [s of the clock].
-        reconnect_time: longest wait for a vanished port [s].
-        time_scale: bench seconds per second of the clock; 1 for real devices.
-        virtual: data sheet of the emulated balance, if there is no real one; it is started on a virtual bench, and
-            `port` is filled in.
-    """
+    kind: Literal["serial"] = "serial"
+    """A balance on a serial line."""
 
-    kind: ClassVar[str] = "serial"
+    port: Annotated[Text, NOT_IN_FINGERPRINT] = ""
+    """Serial port; names under /dev/serial/by-id/ do not change when the balance is reconnected."""
 
-    port: Annotated[str, NOT_IN_FINGERPRINT]
-    dialect: str = AUTO
-    baud: Annotated[int | None, NOT_IN_FINGERPRINT] = None
-    format: Annotated[str | None, NOT_IN_FINGERPRINT] = None
-    handshake: Annotated[Handshake, NOT_IN_FINGERPRINT] = "none"
-    settling: SettlingRule = field(default_factory=SettlingRule)
-    step: float | None = None
-    repeatability: float = 0.0
-    interval: float = 0.15
-    answer_time: float = 1.0
-    reconnect_time: Annotated[float, NOT_IN_FINGERPRINT] = 20.0
-    time_scale: float = 1.0
     virtual: ScaleSettings | None = None
+    """A virtual balance instead of a port."""
 
-    def __post_init__(self) -> None:
-        if self.dialect != AUTO and self.dialect not in dialects():
-            raise ValueError(f"dialect '{self.dialect}' is not known; there are {', '.join(dialects())} and {AUTO}")
-        if self.time_scale <= 0.0:
-            raise ValueError(f"time_scale must be above 0, got {self.time_scale}")
+    dialect: Annotated[str, Choice(dialect_names)] = AUTO
+    """Protocol of the balance; 'auto' detects it."""
+
+    baud: Annotated[PositiveCount | None, NOT_IN_FINGERPRINT] = None
+    """Bits per second; detected unless given."""
+
+    format: Annotated[Text | None, NOT_IN_FINGERPRINT] = None
+    """Bits, parity and stop bits, e.g. 8N1 (write '7E1' in quotes; it is a number in YAML); detected unless given."""
+
+    handshake: Annotated[Literal["none", "software", "hardware"], NOT_IN_FINGERPRINT] = "none"
+    """Flow control by the balance: characters (Xon/Xoff), wires (CTS), or none."""
+
+    step: PositiveMass | None = None
+    """Step of the display, if it is not one unit of the last digit."""
+
+    repeatability: Error = 0.0
+    """Standard deviation of repeated weighings of the same load, from the data sheet."""
+
+    settling: SettlingRule = SettlingRule()
+    """Criteria for a settled weight."""
+
+    interval: Annotated[float, Quantity("s", "0.15 s", 0.02, 5.0)] = 0.15
+    """Time between two requests for a reading."""
+
+    answer_time: PositiveDuration = 1.0
+    """Maximum time to wait for a reply."""
+
+    reconnect_time: Annotated[float, Quantity("s", "1.5 s", 0.0, 600.0), NOT_IN_FINGERPRINT] = 20.0
+    """Maximum time to wait for a port that has disappeared."""
+
+    def check_laboratory(self, problems: Problems, *, mode: str) -> None:
+        """See `BalanceSettings.check_laboratory`."""
+        if not self.typed:
+            self._check_port(problems, mode)
+            self._check_line(problems)
+        if self.settling.deadline <= self.settling.span:
+            problems.add("nothing can settle: 'deadline' should be longer than 'span'", "settling")
+
+    def _check_port(self, problems: Problems, mode: str) -> None:
+        if self.port and self.virtual is not None:
+            problems.add("a balance has a 'port' or is 'virtual', not both", "virtual")
+        elif mode == "hardware" and self.virtual is not None:
+            problems.add("a laboratory of hardware weighs on a balance that is there; give its 'port'", "virtual")
+        elif mode != "hardware" and self.port:
+            problems.add("a virtual laboratory has no port; write 'virtual: {}', or 'mode: hardware'", "port")
+        elif not self.port and self.virtual is None:
+            example = "port: /dev/serial/by-id/usb-…" if mode == "hardware" else "virtual: {resolution: 0.1 g}"
+            text = f"placement '{self.placement}' reads the balance; add '{example}', or type: 'manual'"
+            problems.add(text, of="port")
+
+    def _check_line(self, problems: Problems) -> None:
+        if self.baud is not None and self.baud not in USUAL_BAUDS:
+            usual = ", ".join(str(baud) for baud in USUAL_BAUDS)
+            problems.add(f"no balance talks at {self.baud} baud; should be one of {usual}", "baud")
+        if self.step is not None:
+            check_step(self.step, self.load_tolerance, problems, "step")
+        if self.virtual is not None:
+            check_step(self.virtual.resolution, self.load_tolerance, problems, "virtual", "resolution")
         if self.format is not None:
-            parse_format(self.format)
+            try:
+                parse_format(self.format)
+            except ValueError as error:
+                problems.add(str(error), "format")
+
+    @property
+    def deviation(self) -> float:
+        """See `BalanceSettings.deviation`."""
+        return self.repeatability
 
     def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `BalanceDevice.driver`."""
+        """See `BalanceSettings.driver`."""
         return resolve_name("actors.balance.serial_balance:SerialBalance"), (self, name)
 
     def start_emulator(self) -> BalanceEmulator | None:
-        """See `BalanceDevice.start_emulator`."""
+        """See `BalanceSettings.start_emulator`."""
         if self.virtual is None:
             return None
         emulator: BalanceEmulator = resolve_name(SERIAL_EMULATOR)(self, self.virtual)
         return emulator
 
-    def look(self, *, tare: bool) -> list[DeviceCheck]:
-        """See `BalanceDevice.look`; checks the port first."""
+    def diagnostics(self, *, tare: bool) -> list[DeviceCheck]:
+        """See `BalanceSettings.diagnostics`; checks the port first."""
         from actors.balance.serial_port import look_at_port
 
         port = look_at_port(self.port)
-        return [port] if port.state == "fail" else [port, *super().look(tare=tare)]
+        return [port] if port.state == "fail" else [port, *super().diagnostics(tare=tare)]
 
     @property
     def longest_call(self) -> float:
-        """See `BalanceDevice.longest_call`."""
+        """See `BalanceSettings.longest_call`."""
         return 4.0 * self.settling.deadline / self.time_scale + 4.0 * self.reconnect_time + 60.0
 
     @property
@@ -333,26 +390,21 @@ class SerialBalanceSpec(BalanceDevice):
         return tuple(dict.fromkeys(LineSettings(baud, *forms[0]) for baud in bauds))
 
 
-@dataclass(frozen=True)
-class BalanceSpec:
-    """A laboratory's balance.
+def check_step(step: float, tolerance: float, problems: Problems, *at: str) -> None:
+    """Add a problem if a display is too coarse to check a load.
 
-    Attributes:
-        placement: where it stands.
-        device: the weighing device; None if the operator types the weights.
-        pourer_elsewhere: whether the pourer is weighed on another balance, and typed.
-        load_tolerance: largest deviation from the requested load [kg].
+    Args:
+        step: of the display [kg].
+        tolerance: of the load [kg].
+        problems: of the balance's settings.
+        at: keys of the step.
     """
-
-    placement: Placement
-    device: BalanceDevice | None
-    pourer_elsewhere: bool = False
-    load_tolerance: float = 5e-3
-
-    @property
-    def repeatability(self) -> float:
-        """Standard deviation of repeated weighings of the same load [kg]."""
-        return 0.0 if self.device is None else self.device.repeatability
+    if step > tolerance:
+        problems.add(
+            f"a display in steps of {1e3 * step:g} g can't tell whether a load lies within load_tolerance, "
+            f"{1e3 * tolerance:g} g; weigh on a finer balance, or raise load_tolerance",
+            *at,
+        )
 
 
 def parse_format(text: str) -> tuple[int, str, int]:
@@ -372,15 +424,15 @@ def _interleaved(tables: list[tuple[LineSettings, ...]]) -> tuple[LineSettings, 
     return tuple(dict.fromkeys(table[i] for i in range(longest) for table in tables if i < len(table)))
 
 
-def look_at_balance(spec: BalanceSpec | None, *, tare: bool) -> list[DeviceCheck]:
-    """Who is there, a stable reading, its step; and whether it obeys a tare.
+def balance_diagnostics(balance: BalanceSettings | None, *, tare: bool) -> list[DeviceCheck]:
+    """Identification, a stable reading and its step, and optionally a tare.
 
     Args:
-        spec: as in the laboratory's file, its address filled in.
+        balance: as in the laboratory's file, its address filled in.
         tare: also tare it.
     """
-    if spec is None:
+    if balance is None:
         return [DeviceCheck("balance", "fail", "the file has none", "add a 'balance' section, or 'placement: manual'")]
-    if spec.device is None:
+    if balance.typed:
         return [DeviceCheck("balance", "ok", "all weights are typed by the operator")]
-    return spec.device.look(tare=tare)
+    return balance.diagnostics(tare=tare)

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from actors.balance.balance_interface import BalanceError
-from actors.balance.balance_settings import AUTO, SerialBalanceSpec, parse_format
-from actors.balance.dialect_registry import dialects
+from actors.balance.balance_settings import AUTO, SerialBalanceSettings, parse_format
+from actors.balance.dialects.dialect import dialects
 from actors.balance.line_recording import Recorder
 from actors.balance.serial_balance import SerialBalance
 
@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser.parse_args(arguments)
     if asked.to.exists():
         parser.error(f"{asked.to} exists; name another file")
-    spec = SerialBalanceSpec(
+    spec = SerialBalanceSettings(
         port=asked.port,
         dialect=asked.dialect,
         baud=asked.baud,

@@ -31,7 +31,7 @@ from actors.balance.balance_interface import (
     Weight,
     unsettled,
 )
-from actors.balance.balance_settings import SerialBalanceSpec, Settled, Settling
+from actors.balance.balance_settings import SerialBalanceSettings, Settled, Settling
 from actors.balance.dialect_detection import Detected, detect
 from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingReply, ReadingStatus, Reply
@@ -50,7 +50,7 @@ class Conversation:
         tap: receives all bytes.
     """
 
-    def __init__(self, spec: SerialBalanceSpec, interrupted: threading.Event, tap: Tap | None = None) -> None:
+    def __init__(self, spec: SerialBalanceSettings, interrupted: threading.Event, tap: Tap | None = None) -> None:
         self._spec, self._interrupted, self._tap = spec, interrupted, tap
         self.counters = Counters()
         self.found: Detected | None = None
@@ -248,7 +248,7 @@ class SerialBalance:
         tap: receives all bytes, for recording.
     """
 
-    def __init__(self, spec: SerialBalanceSpec, name: str = "balance", tap: Tap | None = None) -> None:
+    def __init__(self, spec: SerialBalanceSettings, name: str = "balance", tap: Tap | None = None) -> None:
         self._spec, self._name = spec, name
         self._rule = spec.settling.scaled(spec.time_scale)
         self._interrupted = threading.Event()

@@ -1,7 +1,7 @@
-"""Simulated balances: noise, resolution, settling, drift, and a display that needs time to become stable.
+"""A simulated balance: noise, resolution, settling, drift, and a display that needs time to become stable.
 
-`VirtualBalance` is the driver of a simulated bench. `EmulatedScale` models the weighing cell and display of an emulated
-serial balance, including its range; it has no bytes and no clock.
+`SimulatedBalanceSettings` are the settings of `VirtualBalance`, a driver without protocol. The scale of an emulated
+serial balance is in `scale_model`.
 """
 
 from __future__ import annotations
@@ -9,15 +9,17 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass
-from decimal import Decimal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from actors.balance.balance_interface import Weight
-from actors.balance.readings import KILOGRAMS, Reading, ReadingStatus
+from actors.balance.balance_settings import BalanceSettings, check_step
+from actors.balance.scale_model import SETTLED, Duration, Error, Load, PositiveMass
+from actors.balance.weighing_plan import Placement
 from actors.bench.bench_clock import Pace
 from actors.interfaces import LaboratoryError
+from sim_engine.settings.model import SET_BY_PROGRAM, Problems
 
 INTERVAL = 0.1
 """Bench time between two readings [s]."""
@@ -28,40 +30,58 @@ WINDOW = 10
 PATIENCE = 20.0
 """Bench time limit for a stable weight [s]."""
 
-_SETTLED = math.log(100.0)
-"""Number of time constants until the display is within 1 % of a change."""
+
+DRIFTING = 60.0
+"""Longest bench time from a tare to the weighing after it, on a simulated bench [s]."""
 
 
-@dataclass(frozen=True)
-class BalanceSettings:
-    """Data sheet of a simulated balance.
+class SimulatedBalanceSettings(BalanceSettings):
+    """A simulated balance without protocol: its driver receives the load directly."""
 
-    Attributes:
-        resolution: smallest step of the display [kg]; 0: no rounding.
-        noise: standard deviation of one reading [kg].
-        drift: of the zero point [kg/s].
-        settling_time: until the display shows a new load to within 1 % of it [s].
-        time_scale: bench seconds per wall second; 0 disables waiting.
-    """
+    receives_load: ClassVar[bool] = True
 
-    resolution: float
-    noise: float
-    drift: float
-    settling_time: float
-    time_scale: float
+    kind: Literal["simulated"] = "simulated"
+    """A simulated balance without protocol, on a virtual bench."""
 
+    resolution: PositiveMass = 1e-4
+    """Step of the display."""
 
-@dataclass(frozen=True)
-class Load:
-    """The load on the tray from now on.
+    noise: Error = 1e-4
+    """Standard deviation of a reading."""
 
-    Attributes:
-        times: since now, increasing [s].
-        masses: on the tray at these times [kg]; linear in between, constant after the last.
-    """
+    settling_time: Duration = 1.5
+    """Time until the display is within 1 % of a change."""
 
-    times: tuple[float, ...]
-    masses: tuple[float, ...]
+    drift: Annotated[float, SET_BY_PROGRAM] = 0.0
+    """Drift of the zero [kg/s]."""
+
+    tared: Annotated[bool, SET_BY_PROGRAM] = False
+    """Whether the dry pourer is tared, as on a simulated bench."""
+
+    def check_laboratory(self, problems: Problems, *, mode: str) -> None:
+        """See `BalanceSettings.check_laboratory`."""
+        if mode == "hardware":
+            problems.add("a laboratory of hardware weighs on a balance that is there; give its 'port'")
+        check_step(self.resolution, self.load_tolerance, problems, "resolution")
+
+    def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
+        """See `BalanceSettings.driver`."""
+        return VirtualBalance, (self, name)
+
+    @property
+    def position(self) -> Placement:
+        """See `BalanceSettings.position`."""
+        return Placement.TARED if self.tared else super().position
+
+    @property
+    def longest_call(self) -> float:
+        """See `BalanceSettings.longest_call`."""
+        return 2.0 * PATIENCE / self.time_scale if self.time_scale > 0.0 else 0.0
+
+    @property
+    def deviation(self) -> float:
+        """See `BalanceSettings.deviation`."""
+        return math.hypot(self.noise, self.drift * DRIFTING)
 
 
 class VirtualBalance:
@@ -72,7 +92,7 @@ class VirtualBalance:
     `read`.
     """
 
-    def __init__(self, settings: BalanceSettings, name: str = "virtual") -> None:
+    def __init__(self, settings: SimulatedBalanceSettings, name: str = "virtual") -> None:
         self._settings = settings
         self._name = name
         self._pace = Pace(settings.time_scale)
@@ -119,7 +139,7 @@ class VirtualBalance:
 
     def connect(self) -> str:
         """See `BalanceDriver.connect`."""
-        return f"{self._name}: a balance of numbers, step {1e3 * self._settings.resolution:g} g"
+        return f"{self._name}: a simulated balance, step {1e3 * self._settings.resolution:g} g"
 
     def keep_reference(self) -> None:
         """Do nothing: the connection cannot be lost."""
@@ -173,7 +193,7 @@ class VirtualBalance:
     def _advance(self, seconds: float) -> None:
         with self._lock:
             self._time += seconds
-            lag = self._settings.settling_time / _SETTLED
+            lag = self._settings.settling_time / SETTLED
             share = -math.expm1(-seconds / lag) if lag > 0.0 else 1.0
             self._shown += (self._load_at(self._time) - self._shown) * share
 
@@ -184,163 +204,4 @@ class VirtualBalance:
         return float(round(raw / s.resolution) * s.resolution if s.resolution > 0.0 else raw)
 
 
-_STEP = 0.01
 """Bench time step of a moving display [s]."""
-
-
-ZERO_SHARE = 0.02
-"""Largest load for a zero command, as a fraction of the capacity."""
-
-
-@dataclass(frozen=True)
-class ScaleSettings:
-    """Data sheet of an emulated scale.
-
-    Attributes:
-        resolution: step of the display [kg].
-        capacity: maximum load [kg].
-        noise: standard deviation of repeated weighings of the same load [kg]. It is drawn once per load, because a real
-            display stands still while nothing moves. A weight therefore depends on seed and loads only, not on the
-            number or times of the queries.
-        drift: of the zero point [kg/s].
-        settling_time: until the display shows a change to within 1 % of it [s].
-        rest_time: time without change until the display is stable [s].
-        unit: of the display.
-    """
-
-    resolution: float = 1e-4
-    capacity: float = 6.2
-    noise: float = 0.0
-    drift: float = 0.0
-    settling_time: float = 1.5
-    rest_time: float = 0.3
-    unit: str = "g"
-
-
-class EmulatedScale:
-    """The weighing cell and its display, in bench time."""
-
-    def __init__(self, settings: ScaleSettings, seed: tuple[int, ...] = (0,)) -> None:
-        self.settings = settings
-        factor = Decimal(repr(KILOGRAMS[settings.unit]))
-        step = (Decimal(repr(settings.resolution)) / factor).normalize()
-        self._decimal_step = step if step.as_tuple().exponent <= 0 else step.quantize(Decimal(1))  # type: ignore[operator]
-        self.prepare(seed)
-
-    def prepare(self, seed: tuple[int, ...]) -> None:
-        """Empty the scale, set bench time to 0, clear the tare, and reseed the noise."""
-        self._rng = np.random.default_rng(seed)
-        self.time = 0.0
-        self._tare = self._zero = self._offset = 0.0
-        self._load, self._loaded_at = Load((0.0,), (0.0,)), 0.0
-        self._lagging = 0.0
-        self._resting = math.inf
-
-    def put(self, load: Load) -> None:
-        """Change the load, now and in the future."""
-        self._load, self._loaded_at = load, self.time
-        self._offset = float(self._rng.normal(0.0, self.settings.noise))
-        self._resting = 0.0
-
-    def advance(self, seconds: float) -> None:
-        """Let bench time pass [s]."""
-        end = self.time + seconds
-        lag = self.settings.settling_time / _SETTLED
-        while self.time < end:
-            before = self._true(self.time)
-            if self._lagging == before and self.time >= self._loaded_at + self._load.times[-1]:
-                self._resting += end - self.time
-                self.time = end
-                return
-            step = min(_STEP, end - self.time)
-            self.time = min(self.time + step, end)
-            target = self._true(self.time)
-            self._lagging += (target - self._lagging) * (-math.expm1(-step / lag) if lag > 0.0 else 1.0)
-            if before == target and abs(target - self._lagging) < self.settings.resolution / 8.0:
-                self._lagging = target
-                self._resting += step
-            else:
-                self._resting = 0.0
-
-    @property
-    def stable(self) -> bool:
-        """Whether the display is stable."""
-        return self._resting >= self.settings.rest_time
-
-    @property
-    def gross(self) -> float:
-        """Load as measured by the cell [kg]; 0 after switching on."""
-        return self._lagging + self._offset + self.settings.drift * self.time - self._zero
-
-    @property
-    def truth(self) -> float:
-        """The true load now [kg]."""
-        return self._true(self.time)
-
-    def tare(self) -> ReadingStatus:
-        """Tare the scale; the status reports whether the load is within range."""
-        if self.range is not ReadingStatus.STABLE:
-            return self.range
-        self._tare = self.gross
-        return ReadingStatus.STABLE
-
-    def clear_tare(self) -> None:
-        """Clear the tare."""
-        self._tare = 0.0
-
-    @property
-    def tared(self) -> Decimal:
-        """The tare as displayed, in the unit."""
-        return self._rounded(self._tare)
-
-    def preset_tare(self, mass: float) -> bool:
-        """Set the tare to a known mass [kg]. Returns whether it is within the range."""
-        if not 0.0 <= mass <= self.settings.capacity:
-            return False
-        self._tare = mass
-        return True
-
-    @property
-    def capacity(self) -> Decimal:
-        """The maximum load as displayed, in the unit."""
-        return self._rounded(self.settings.capacity)
-
-    @property
-    def step(self) -> Decimal:
-        """Step of the display, in the unit."""
-        return self._decimal_step
-
-    def zero(self) -> ReadingStatus:
-        """Set the zero; refused if the load exceeds `ZERO_SHARE` of the capacity."""
-        if abs(self.gross) > ZERO_SHARE * self.settings.capacity:
-            return ReadingStatus.OVER if self.gross > 0.0 else ReadingStatus.UNDER
-        self._zero += self.gross
-        self._tare = 0.0
-        return ReadingStatus.STABLE
-
-    def power_cycle(self) -> None:
-        """Switch the scale off and on: the current load becomes the zero, and the tare is cleared."""
-        self._zero += self.gross
-        self._tare = 0.0
-
-    @property
-    def range(self) -> ReadingStatus:
-        """STABLE if the load is within range, otherwise OVER or UNDER."""
-        if self.gross > self.settings.capacity + 9.0 * self.settings.resolution:
-            return ReadingStatus.OVER
-        return ReadingStatus.UNDER if self.gross < -0.2 * self.settings.capacity else ReadingStatus.STABLE
-
-    def reading(self) -> Reading:
-        """Return the display's reading."""
-        if self.range is not ReadingStatus.STABLE:
-            return Reading(self.range)
-        status = ReadingStatus.STABLE if self.stable else ReadingStatus.UNSTABLE
-        return Reading(status, self._rounded(self.gross - self._tare), self.settings.unit)
-
-    def _rounded(self, mass: float) -> Decimal:
-        """Round a mass to digits of the display."""
-        steps = round(mass / self.settings.resolution)
-        return steps * self._decimal_step if steps else abs(0 * self._decimal_step)
-
-    def _true(self, moment: float) -> float:
-        return float(np.interp(moment - self._loaded_at, self._load.times, self._load.masses))

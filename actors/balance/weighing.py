@@ -17,7 +17,7 @@ from actors.balance.balance_interface import (
     ReferenceLostError,
     UnitError,
 )
-from actors.balance.balance_settings import BalanceSpec
+from actors.balance.balance_settings import BalanceSettings
 from actors.balance.readings import typed_weight
 from actors.balance.weighing_plan import (
     PourMasses,
@@ -54,7 +54,7 @@ class Weighings:
 
     def __init__(
         self,
-        spec: BalanceSpec,
+        spec: BalanceSettings,
         balance: DeviceBalance | None,
         ask: AskOperator,
         known: Mapping[str, PourMasses] | None = None,
@@ -63,7 +63,7 @@ class Weighings:
     ) -> None:
         self._spec, self._balance, self._ask, self._notify, self._nominal = spec, balance, ask, weighed, nominal
         self._known = dict(known or {})
-        self._steps = weighings(spec.placement, known=self._known, pourer_elsewhere=spec.pourer_elsewhere)
+        self._steps = weighings(spec.position, known=self._known, pourer_elsewhere=spec.pourer == "elsewhere")
         self._weighed: dict[str, PourMasses] = {}
 
     @property
@@ -115,7 +115,7 @@ class Weighings:
         Raises:
             WeighingError: the weighings are incomplete or inconsistent.
         """
-        return measurement(self._spec.placement, self.weighed, nominal=nominal, tolerance=self._spec.load_tolerance)
+        return measurement(self._spec.position, self.weighed, nominal=nominal, tolerance=self._spec.load_tolerance)
 
     @property
     def _pour(self) -> int:
@@ -155,7 +155,7 @@ class Weighings:
         """Return the problem with the load that was just weighed; '' if there is none."""
         if step.key != "pourer_full" or self._nominal is None:
             return ""
-        loaded = loaded_mass(self._spec.placement, self.weighed)
+        loaded = loaded_mass(self._spec.position, self.weighed)
         if abs(loaded - self._nominal) <= self._spec.load_tolerance:
             return ""
         allowed = f"{1e3 * self._nominal:g} ± {1e3 * self._spec.load_tolerance:g} g"
@@ -194,7 +194,7 @@ class Weighings:
 
     @property
     def _repeatability(self) -> float:
-        return self._spec.repeatability
+        return self._spec.deviation
 
 
 def _is_yes(answer: str) -> bool:

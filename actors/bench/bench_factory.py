@@ -9,15 +9,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from actors.arm.arm_device import DeviceArm
 from actors.arm.arm_interface import PlannedPour
-from actors.arm.arm_settings import ArmSpec, UrArmSpec
-from actors.arm.simulated_arm import NumbersSpec
+from actors.arm.arm_settings import ArmSettings, UrArmSettings
+from actors.arm.simulated_arm import SimulatedArmSettings
 from actors.balance.balance_device import DeviceBalance
-from actors.balance.balance_settings import BalanceDevice, BalanceSpec
+from actors.balance.balance_settings import BalanceSettings
 from actors.balance.weighing_plan import PourMasses
 from actors.bench.bench_operators import BenchContents, Hands, OperatorQuestions, PlayedOperator, VirtualOperator
 from actors.bench.consent import Setup
@@ -26,7 +26,7 @@ from actors.bench.pour_procedure import PourProcedure
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.virtual_bench import BenchEmulators, DeviceEmulators, FollowedBench, VirtualBench
 from actors.interfaces import InvalidActionError, LaboratoryError, Notice, Operator, ProgressCallback, SimulatorPool
-from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
+from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from actors.runtime.remote_object import Device
 from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement
@@ -121,22 +121,17 @@ class _Opening:
         self.devices.append(self.make(name, cls, *args))
         return self.devices[-1]
 
-    def arm(self, spec: ArmSpec, accepted: str | None = None) -> DeviceArm:
+    def arm(self, spec: ArmSettings, accepted: str | None = None) -> DeviceArm:
         cls, args = spec.driver(accepted)
         return DeviceArm(self("arm", cls, *args), spec)
 
-    def balance(self, spec: BalanceDevice, name: str) -> DeviceBalance:
+    def balance(self, spec: BalanceSettings, name: str) -> DeviceBalance:
         cls, args = spec.driver(name)
         return DeviceBalance(self("balance", cls, *args), spec.time_scale, longest_call=spec.longest_call)
 
 
-def needs_person(spec: LaboratorySpec) -> bool:
-    """Whether the laboratory needs a person who answers questions."""
-    return spec.arm is not None and spec.operator.answers == "person"
-
-
 async def open_bench(
-    spec: LaboratorySpec,
+    spec: LaboratorySettings,
     make: MakeDevice,
     liquid: SimulatorPool | None,
     operator: Operator | None,
@@ -162,7 +157,7 @@ async def open_bench(
             return _open_simulated(spec.bench, opening, liquid)
         if spec.balance is None:
             raise LaboratoryError(f"laboratory {spec.name}: an arm that pours needs a balance; add a 'balance' to it")
-        if operator is None and needs_person(spec):
+        if operator is None and spec.needs_person:
             raise LaboratoryError(
                 f"laboratory {spec.name} needs a person beside it who answers questions, and nobody is here to be asked"
             )
@@ -174,11 +169,10 @@ async def open_bench(
         raise
 
 
-def _open_simulated(spec: VirtualBenchSpec, opening: _Opening, liquid: SimulatorPool) -> OpenBench:
-    arm_spec, balance_spec = NumbersSpec(spec.time_scale), simulated_balance(spec)
+def _open_simulated(spec: BenchSettings, opening: _Opening, liquid: SimulatorPool) -> OpenBench:
+    arm_spec, balance_spec = SimulatedArmSettings(time_scale=spec.time_scale), simulated_balance(spec)
     arm = opening.arm(arm_spec)
-    assert balance_spec.device is not None
-    balance = opening.balance(balance_spec.device, "virtual")
+    balance = opening.balance(balance_spec, "virtual")
     ground_truth = SimulatedBench(spec, liquid, arm, balance)
     operator = SimulatedOperator(ground_truth, balance, spec.operator_time)
     setup = Setup(
@@ -192,9 +186,9 @@ def _discard_notice(notice: Notice) -> None:
 
 
 async def _open_devices(
-    spec: LaboratorySpec,
-    arm_spec: ArmSpec,
-    balance_spec: BalanceSpec,
+    spec: LaboratorySettings,
+    arm_spec: ArmSettings,
+    balance_spec: BalanceSettings,
     opening: _Opening,
     liquid: SimulatorPool | None,
     operator: Operator | None,
@@ -203,18 +197,18 @@ async def _open_devices(
     emulators: DeviceEmulators | None = None
     follows = False
     if spec.mode == "virtual":
-        emulators = DeviceEmulators(opening("emulators", BenchEmulators, arm_spec, balance_spec.device))
+        emulators = DeviceEmulators(opening("emulators", BenchEmulators, arm_spec, balance_spec))
         found = await emulators.found()
         arm_spec, follows = found.arm, found.follows
-        balance_spec = replace(balance_spec, device=found.balance)
+        balance_spec = found.balance or balance_spec
     arm = opening.arm(arm_spec, None if spec.mode == "virtual" else spec.accepted_checksum)
-    balance = None if balance_spec.device is None else opening.balance(balance_spec.device, spec.name)
-    if emulators is not None and balance_spec.device is not None and balance_spec.device.told:
+    balance = None if balance_spec.typed else opening.balance(balance_spec, spec.name)
+    if emulators is not None and balance_spec.receives_load:
         emulators.told = balance
     ground_truth = GroundTruth(arm_spec.time_scale)
     if emulators is not None and spec.bench is not None and liquid is not None:
-        hands = Hands(BenchContents(balance_spec.placement), None if balance is None else emulators.put)
-        if follows and isinstance(arm_spec, UrArmSpec):
+        hands = Hands(BenchContents(balance_spec.position), None if balance is None else emulators.put)
+        if follows and isinstance(arm_spec, UrArmSettings):
             ground_truth = FollowedBench(spec.bench, arm_spec, emulators, hands, liquid)
         else:
             ground_truth = VirtualBench(spec.bench, arm_spec.time_scale, emulators, hands, liquid)

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 from actors.arm.arm_device import DeviceArm
 from actors.arm.arm_interface import ArmError, PlannedPour
-from actors.arm.arm_settings import ArmSpec
+from actors.arm.arm_settings import ArmSettings
 from actors.balance.balance_device import DeviceBalance
-from actors.balance.balance_settings import BalanceSpec
+from actors.balance.balance_settings import BalanceSettings
 from actors.bench.bench_operators import OperatorQuestions
 from actors.bench.ground_truth import GroundTruth
 from actors.interfaces import BenchLostError, LaboratoryError, Notice, OperatorQuestion
@@ -29,13 +29,13 @@ def grams(mass: float) -> str:
     return f"{1e3 * mass:.2f} g"
 
 
-def start_question(spec: ArmSpec, path: PlannedPour) -> OperatorQuestion:
+def start_question(spec: ArmSettings, path: PlannedPour) -> OperatorQuestion:
     """Ask whether the whole pour may begin."""
     report = path.report
     return OperatorQuestion(
         f"Hands out of the cell. The arm will pour: {report.duration:.1f} s, tilting the pourer to "
         f"{math.degrees(report.tilt):.0f}° at up to {math.degrees(report.tilt_speed):.0f}°/s, no point of it faster "
-        f"than {1e3 * report.tool_speed:.0f} mm/s. It moves {spec.announcement:g} s after you say so. May it?",
+        f"than {1e3 * report.tool_speed:.0f} mm/s. It moves {spec.warning_time:g} s after you say so. May it?",
         "yes or no",
         about="start",
         hands=False,
@@ -88,21 +88,21 @@ def unsafe_question(problem: str) -> OperatorQuestion:
     )
 
 
-def upright_question(spec: ArmSpec) -> OperatorQuestion:
+def upright_question(spec: ArmSettings) -> OperatorQuestion:
     """Ask whether a stopped arm may bring the pourer upright."""
     return OperatorQuestion(
-        f"Hands out of the cell. The arm will bring the pourer upright at {math.degrees(spec.untilt_speed):.0f}°/s, "
-        f"wait, and go home. It moves {spec.announcement:g} s after you say so. May it?",
+        f"Hands out of the cell. The arm will bring the pourer upright at {math.degrees(spec.upright_speed):.0f}°/s, "
+        f"wait, and go home. It moves {spec.warning_time:g} s after you say so. May it?",
         "yes or no",
         about="untilt",
         hands=False,
     )
 
 
-def way_home_question(spec: ArmSpec) -> OperatorQuestion:
+def way_home_question(spec: ArmSettings) -> OperatorQuestion:
     """Ask whether a stopped arm may go home."""
     return OperatorQuestion(
-        f"Hands out of the cell. The arm will go home, the pourer upright. It moves {spec.announcement:g} s after you "
+        f"Hands out of the cell. The arm will go home, the pourer upright. It moves {spec.warning_time:g} s after you "
         "say so. May it?",
         "yes or no",
         about="home",
@@ -123,8 +123,8 @@ class Setup:
     """The parts of a bench that all its pours share; see `actors.bench.bench_factory.PouringBench`."""
 
     mode: str
-    spec: ArmSpec
-    balance_spec: BalanceSpec
+    spec: ArmSettings
+    balance_spec: BalanceSettings
     operator_time: float
     arm: DeviceArm
     balance: DeviceBalance | None
@@ -185,9 +185,9 @@ class Consent:
         if not await self._agreed(question):
             raise ConsentRefusedError("the operator did not let the arm move")
         spec = self._setup.spec
-        text = f"The arm moves in {spec.announcement:g} s. Keep out of its way."
+        text = f"The arm moves in {spec.warning_time:g} s. Keep out of its way."
         # The driver waits for the same time between the release and the first movement.
-        await self._setup.questions.announce(text, spec.on_clock(spec.announcement))
+        await self._setup.questions.announce(text, spec.on_clock(spec.warning_time))
         await self._setup.arm.release()
 
     # ---- recovery after a stop

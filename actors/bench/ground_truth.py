@@ -18,7 +18,7 @@ import numpy as np
 
 from actors.arm.arm_interface import Executed, PlannedPour
 from actors.interfaces import InvalidActionError, LaboratoryError, SimulatorPool
-from actors.laboratory_settings import VirtualBenchSpec
+from actors.laboratory_settings import BenchSettings
 from sim_engine.action import Action
 from sim_engine.outcome import PourOutcome, RecordedFrames, SimulatedPour
 from sim_engine.scene import PoseError, PourTask, Scene
@@ -45,7 +45,7 @@ def stream(seed: int, name: Stream) -> tuple[int, ...]:
     return (seed % 2**64, _STREAMS.index(name))
 
 
-def draw_pose_error(spec: VirtualBenchSpec, seed: int) -> PoseError:
+def draw_pose_error(spec: BenchSettings, seed: int) -> PoseError:
     """Draw the grip and placement errors of one pour: systematic error plus random error.
 
     Args:
@@ -89,7 +89,7 @@ class Spill:
     frames: RecordedFrames | None = None
 
 
-async def hidden_pour(spec: VirtualBenchSpec, simulators: SimulatorPool, task: PourTask, seed: int) -> SimulatedPour:
+async def hidden_pour(spec: BenchSettings, simulators: SimulatorPool, task: PourTask, seed: int) -> SimulatedPour:
     """Simulate the 'real' liquid in one pour; the same seed gives the same result.
 
     Args:
@@ -105,7 +105,7 @@ async def hidden_pour(spec: VirtualBenchSpec, simulators: SimulatorPool, task: P
     reason = None
     for liquid_seed in np.random.default_rng(stream(seed, "liquid")).integers(0, 2**31, ATTEMPTS):
         try:
-            simulated = await simulators.simulate(replace(task, parameters=spec.liquid, seed=int(liquid_seed)))
+            simulated = await simulators.simulate(replace(task, parameters=spec.theta, seed=int(liquid_seed)))
         except InvalidActionError as touching:
             raise TouchingError(f"the vessels as they truly stand: {touching}") from touching
         if simulated.outcome.invalid is None:
@@ -115,7 +115,7 @@ async def hidden_pour(spec: VirtualBenchSpec, simulators: SimulatorPool, task: P
 
 
 async def hidden_spill(
-    spec: VirtualBenchSpec,
+    spec: BenchSettings,
     simulators: SimulatorPool,
     scene: Scene,
     action: Action,
@@ -133,7 +133,7 @@ async def hidden_spill(
         seed: of the pour.
         record_rate: rate of the recorded particle frames for the live view [1/s].
     """
-    task = PourTask(scene, action, spec.liquid, 0, record_rate=record_rate, pose_error=draw_pose_error(spec, seed))
+    task = PourTask(scene, action, spec.theta, 0, record_rate=record_rate, pose_error=draw_pose_error(spec, seed))
     simulated = await hidden_pour(spec, simulators, task, seed)
     return replace(spill_of(simulated.outcome, scene.liquid.mass), frames=simulated.frames)
 

@@ -350,7 +350,7 @@ def _expected(setup: Setup, path: PlannedPour) -> dict[str, float]:
     """Expected time of each checkpoint [s of bench time]."""
     return {
         "operator": setup.operator_time + 4.0 * WEIGHING_TIME,
-        "approach": setup.spec.announcement + path.approach_time,
+        "approach": setup.spec.warning_time + path.approach_time,
         **{name: end - start for name, start, end in path.phases},
         "settle": path.retreat_time + SETTLING_TIME,
         "weigh": WEIGHING_TIME,

@@ -15,13 +15,12 @@ from actors.arm.arm_device import DeviceArm
 from actors.arm.arm_interface import Executed
 from actors.arm.simulated_arm import Grip
 from actors.balance.balance_device import DeviceBalance
-from actors.balance.balance_settings import BalanceSpec, NumbersBalanceSpec
-from actors.balance.simulated_balance import BalanceSettings, Load
-from actors.balance.weighing_plan import Placement
+from actors.balance.scale_model import Load
+from actors.balance.simulated_balance import SimulatedBalanceSettings
 from actors.bench.bench_operators import OperatorQuestions
 from actors.bench.ground_truth import GroundTruth, PourAsk, Spill, TouchingError, draw_pose_error, hidden_spill, stream
-from actors.interfaces import LaboratoryError, OperatorQuestion, OperatorSpec, PourFailedError, SimulatorPool
-from actors.laboratory_settings import VirtualBenchSpec
+from actors.interfaces import LaboratoryError, OperatorQuestion, OperatorSettings, PourFailedError, SimulatorPool
+from actors.laboratory_settings import BenchSettings
 
 CARRYING_TIME = 2.0
 """Bench time to put an object on the balance or to remove it [s]."""
@@ -31,16 +30,11 @@ T = TypeVar("T")
 _NOTHING = Load((0.0,), (0.0,))
 
 
-def simulated_balance(spec: VirtualBenchSpec) -> BalanceSpec:
+def simulated_balance(spec: BenchSettings) -> SimulatedBalanceSettings:
     """Balance settings of a simulated bench: the dry pourer is tared, and no load is out of tolerance."""
-    settings = BalanceSettings(
-        resolution=spec.balance_resolution,
-        noise=spec.balance_noise,
-        drift=spec.balance_drift,
-        settling_time=spec.settling_time,
-        time_scale=spec.time_scale,
+    return SimulatedBalanceSettings(tared=True, time_scale=spec.time_scale).with_values(
+        **spec.balance.model_dump(), load_tolerance=float("inf")
     )
-    return BalanceSpec(Placement.TARED, NumbersBalanceSpec(settings), load_tolerance=float("inf"))
 
 
 class SimulatedBench(GroundTruth):
@@ -53,9 +47,7 @@ class SimulatedBench(GroundTruth):
         balance: the simulated balance; bench time passes on it.
     """
 
-    def __init__(
-        self, spec: VirtualBenchSpec, simulators: SimulatorPool, arm: DeviceArm, balance: DeviceBalance
-    ) -> None:
+    def __init__(self, spec: BenchSettings, simulators: SimulatorPool, arm: DeviceArm, balance: DeviceBalance) -> None:
         super().__init__(spec.time_scale)
         self._spec, self._simulators, self._arm, self._balance = spec, simulators, arm, balance
         self._pour: PourAsk | None = None
@@ -104,7 +96,7 @@ class SimulatedBench(GroundTruth):
         """
         assert self._pour is not None
         last = (await self._spill()).times[-1]
-        await self.wait(max(last - self._pour.path.pour_time, 0.0) + self._spec.settling_time)
+        await self.wait(max(last - self._pour.path.pour_time, 0.0) + self._spec.balance.settling_time)
 
     async def end(self) -> None:
         """See `GroundTruth.end`."""
@@ -140,7 +132,7 @@ class SimulatedOperator(OperatorQuestions):
     """
 
     def __init__(self, bench: SimulatedBench, balance: DeviceBalance, preparation_time: float) -> None:
-        super().__init__(self, OperatorSpec(answers="virtual"), lambda notice: None)
+        super().__init__(self, OperatorSettings(answers="virtual"), lambda notice: None)
         self._bench, self._balance, self._time = bench, balance, preparation_time
 
     async def ask(self, question: OperatorQuestion) -> str:

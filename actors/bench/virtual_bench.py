@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.arm_interface import Executed
-from actors.arm.arm_settings import ArmSpec, UrArmSpec
+from actors.arm.arm_settings import ArmSettings, UrArmSettings
 from actors.balance.balance_device import DeviceBalance
-from actors.balance.balance_settings import BalanceDevice, BalanceEmulator
-from actors.balance.simulated_balance import Load
+from actors.balance.balance_settings import BalanceEmulator, BalanceSettings
+from actors.balance.scale_model import Load
 from actors.bench.bench_operators import Hands
 from actors.bench.ground_truth import GroundTruth, PourAsk, draw_pose_error, hidden_pour, spill_of, stream
 from actors.interfaces import LaboratoryError, SimulatorPool
-from actors.laboratory_settings import VirtualBenchSpec
+from actors.laboratory_settings import BenchSettings
 from actors.runtime.remote_object import Device
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseError, PourTask, SampledMotion
@@ -64,12 +64,12 @@ class Found:
 
     Attributes:
         arm: the arm's settings with the address of its emulator.
-        balance: the balance's settings with the address of its emulator; None if weights are typed.
+        balance: the balance's settings with the address of its emulator; None without one.
         follows: whether `history` is available.
     """
 
-    arm: ArmSpec
-    balance: BalanceDevice | None
+    arm: ArmSettings
+    balance: BalanceSettings | None
     follows: bool
 
 
@@ -89,10 +89,10 @@ class History:
 
 
 class ArmEmulator(Protocol):
-    """The emulator that an arm's driver connects to; created from an `ArmSpec`, which names it in `emulator`."""
+    """The emulator that an arm's driver connects to; created from an `ArmSettings`, which names it in `emulator`."""
 
     @property
-    def arm(self) -> ArmSpec:
+    def arm(self) -> ArmSettings:
         """The settings, with the emulator's address."""
         ...
 
@@ -113,7 +113,7 @@ class ArmEmulator(Protocol):
         ...
 
 
-def emulator_of(arm: ArmSpec) -> ArmEmulator | None:
+def emulator_of(arm: ArmSettings) -> ArmEmulator | None:
     """Start the emulator of an arm; None if the arm's driver is a simulation itself."""
     if not arm.emulator:
         return None
@@ -126,16 +126,16 @@ class BenchEmulators:
 
     Args:
         arm: settings of the arm.
-        balance: settings of the balance; None if weights are typed.
+        balance: settings of the balance; None without one.
     """
 
-    def __init__(self, arm: ArmSpec, balance: BalanceDevice | None) -> None:
+    def __init__(self, arm: ArmSettings, balance: BalanceSettings | None) -> None:
         self._spec = arm
         self._arm = emulator_of(arm)
         self._weighs = balance
         self._balance: BalanceEmulator | None = None
         try:
-            self._balance = None if balance is None else balance.start_emulator()
+            self._balance = None if balance is None or balance.typed else balance.start_emulator()
         except BaseException:
             self.close()
             raise
@@ -143,7 +143,7 @@ class BenchEmulators:
     def found(self) -> Found:
         """Return the addresses of the emulators."""
         arm = self._spec if self._arm is None else self._arm.arm
-        return Found(arm, self._weighs if self._balance is None else self._balance.device, self._arm is not None)
+        return Found(arm, self._weighs if self._balance is None else self._balance.balance, self._arm is not None)
 
     def install(self) -> None:
         """See `ArmEmulator.install`."""
@@ -306,7 +306,7 @@ class VirtualBench(GroundTruth):
 
     def __init__(
         self,
-        spec: VirtualBenchSpec,
+        spec: BenchSettings,
         time_scale: float,
         emulators: DeviceEmulators,
         hands: Hands,
@@ -380,8 +380,8 @@ class FollowedBench(VirtualBench):
 
     def __init__(
         self,
-        spec: VirtualBenchSpec,
-        arm: UrArmSpec,
+        spec: BenchSettings,
+        arm: UrArmSettings,
         emulators: DeviceEmulators,
         hands: Hands,
         simulators: SimulatorPool,

@@ -31,7 +31,7 @@ from actors.runtime.child_process import python_module, run
 from sim_engine.solver_fingerprint import ROOT, folder_digest
 
 if TYPE_CHECKING:
-    from actors.laboratory_settings import RaySpec
+    from actors.laboratory_settings import RaySettings
 
 LOOK_INTERVAL = 2.0
 """Time between two polls of the nodes [s]."""
@@ -199,7 +199,7 @@ def _installed(package: str) -> str:
         return "not installed"
 
 
-def check_cluster(spec: RaySpec, *, need_bench: bool) -> list[Node]:
+def check_cluster(spec: RaySettings, *, need_bench: bool) -> list[Node]:
     """Check that a laboratory can be opened on a cluster. The check leaves nothing on the cluster.
 
     Args:
@@ -255,7 +255,7 @@ def _read_cluster(address: str) -> dict[str, Any]:
     return {"error": f"it can't be joined: {last}"}
 
 
-def _check_nodes(spec: RaySpec, nodes: list[Node]) -> None:
+def _check_nodes(spec: RaySettings, nodes: list[Node]) -> None:
     where = f"Ray cluster at {spec.address}"
     if not any(node.cpus for node in nodes):
         raise LaboratoryError(f"{where}: none of its {len(nodes)} node(s) has a core to simulate on (--num-cpus)")
@@ -271,7 +271,7 @@ def _check_nodes(spec: RaySpec, nodes: list[Node]) -> None:
             )
 
 
-def _check_bench(spec: RaySpec, nodes: list[Node], available: dict[str, float]) -> None:
+def _check_bench(spec: RaySettings, nodes: list[Node], available: dict[str, float]) -> None:
     where, name = f"Ray cluster at {spec.address}", spec.bench_resource
     if not any(node.resources.get(name, 0.0) >= 1.0 for node in nodes):
         hosts = ", ".join(node.host for node in nodes)
@@ -368,7 +368,7 @@ class JoinedCluster:
         grown: called with the number of cores when it increases.
     """
 
-    spec: RaySpec
+    spec: RaySettings
     tell: Callable[[Notice], None]
     bench_lost: Callable[[str], None]
     here_lost: Callable[[str], None]

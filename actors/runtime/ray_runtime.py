@@ -37,7 +37,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import LaboratorySpec, simulator_count
+from actors.laboratory_settings import LaboratorySettings
 from actors.runtime.child_process import ChildProcess, own_environment, python_module
 from actors.runtime.ray_cleanup import GOODBYE, MARK, end_cluster
 
@@ -132,7 +132,7 @@ _session: _Session | None = None
 _guard = threading.RLock()
 
 
-def start_ray(spec: LaboratorySpec) -> None:
+def start_ray(spec: LaboratorySettings) -> None:
     """Start Ray for a laboratory, join its cluster, or use the Ray that this process has already started.
 
     Blocks for some seconds. From a running event loop, use `open_ray`.
@@ -162,7 +162,7 @@ def start_ray(spec: LaboratorySpec) -> None:
     keep_signals()
 
 
-async def open_ray(spec: LaboratorySpec) -> None:
+async def open_ray(spec: LaboratorySettings) -> None:
     """`start_ray` from an event loop, in its main thread if there are signal handlers to keep. May be cancelled.
 
     Raises:
@@ -287,7 +287,7 @@ def _close(session: _Session) -> None:
         session.private.cleanup.close(15.0)
 
 
-def _start_keeper(session: _Session, spec: LaboratorySpec) -> None:
+def _start_keeper(session: _Session, spec: LaboratorySettings) -> None:
     """Start Ray in a thread that lives as long as Ray does.
 
     Linux ends Ray's processes when the *thread* that started them ends. If a thread of an executor started Ray, or a
@@ -304,7 +304,7 @@ def _start_keeper(session: _Session, spec: LaboratorySpec) -> None:
         raise session.failure
 
 
-def _keep(session: _Session, spec: LaboratorySpec) -> None:
+def _keep(session: _Session, spec: LaboratorySettings) -> None:
     exit_message: ChildProcess | None = None
     settings = dict(_JOIN_SETTINGS)
     if (private := session.private) is not None:
@@ -406,7 +406,7 @@ def _open_private() -> _PrivateRay:
     return _PrivateRay(folder, lock, ChildProcess(command, output=False, errors="dropped"))
 
 
-def _start_private(private: _PrivateRay, spec: LaboratorySpec) -> None:
+def _start_private(private: _PrivateRay, spec: LaboratorySettings) -> None:
     """Start Ray's processes and connect to them; its settings must be in the environment. Linux ends them with this
     thread.
 
@@ -421,10 +421,10 @@ def _start_private(private: _PrivateRay, spec: LaboratorySpec) -> None:
         try:
             ray.init(
                 address="local",
-                num_cpus=simulator_count(spec),
+                num_cpus=spec.simulator_count,
                 num_gpus=0,
                 resources={_PROGRAM: 1},
-                object_store_memory=max(spec.object_store_mb, 80) * 1024 * 1024,
+                object_store_memory=round(max(spec.object_store, 80.0)) * 1024 * 1024,
                 include_dashboard=False,
                 logging_level=logging.ERROR,
                 log_to_driver=False,

@@ -14,7 +14,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from actors.arm.arm_geometry import Pose
+    from actors.arm.arm_geometry import Pose, RobotCell
     from actors.arm.arm_interface import (
         Arm,
         ArmFacts,
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
         PathReport,
         PlannedPour,
     )
-    from actors.arm.arm_settings import ArmDiagnostics, ArmSpec
+    from actors.arm.arm_settings import ArmDiagnostics, ArmSettings
     from actors.arm.planned_pour import ExecutedMotion, MotionPath
     from actors.balance.balance_interface import BalanceDriver, Weight
-    from actors.balance.balance_settings import BalanceDevice, BalanceEmulator, SerialBalanceSpec
+    from actors.balance.balance_settings import BalanceEmulator, BalanceSettings, SerialBalanceSettings
     from actors.balance.dialects.dialect import Dialect, LineSettings
     from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingStatus, Reply
+    from actors.balance.scale_model import Load
     from actors.balance.serial_balance import SerialBalance
-    from actors.balance.simulated_balance import Load
     from actors.bench.pour_feasibility import plan_pour
     from actors.bench.virtual_bench import ArmEmulator, History
     from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
@@ -50,9 +50,6 @@ if TYPE_CHECKING:
         Suggestion,
         SuggestionQuery,
     )
-    from orchestrator.config.arm_file import ArmSettings, CellSection
-    from orchestrator.config.balance_file import BalanceDeviceSection
-    from orchestrator.config.yaml.yaml_source import Place, Report
     from orchestrator.requests import (
         Answered,
         Ask,
@@ -91,8 +88,10 @@ if TYPE_CHECKING:
     from sim_engine.search_space import Axis, Space
     from sim_engine.settings.model import (
         NOT_IN_FINGERPRINT,
+        SET_BY_PROGRAM,
         Choice,
         Count,
+        Example,
         Name,
         Number,
         PositiveCount,
@@ -110,6 +109,7 @@ __all__ = [
     "ACTION_DIMENSIONS",
     "MAP_RESOLUTION",
     "NOT_IN_FINGERPRINT",
+    "SET_BY_PROGRAM",
     "THETA_MAP_RESOLUTION",
     "Acknowledgement",
     "Action",
@@ -123,20 +123,17 @@ __all__ = [
     "ArmPose",
     "ArmRefusedError",
     "ArmSettings",
-    "ArmSpec",
     "ArmState",
     "ArmStoppedError",
     "Ask",
     "Axis",
-    "BalanceDevice",
-    "BalanceDeviceSection",
     "BalanceDriver",
     "BalanceEmulator",
+    "BalanceSettings",
     "Calibration",
     "CalibrationPlan",
     "CalibrationQuery",
     "CalibrationSettings",
-    "CellSection",
     "Choice",
     "Count",
     "Data",
@@ -149,6 +146,7 @@ __all__ = [
     "Dialect",
     "Dimension",
     "DiscrepancyOverPours",
+    "Example",
     "ExecutedMotion",
     "Failed",
     "Fractions",
@@ -171,7 +169,6 @@ __all__ = [
     "OptimizerQueries",
     "Outcome",
     "PathReport",
-    "Place",
     "PlannedPour",
     "Pose",
     "PoseError",
@@ -189,15 +186,15 @@ __all__ = [
     "ReadingStatus",
     "RegressionQuery",
     "Reply",
-    "Report",
     "Request",
     "ResultPart",
     "RiskQuery",
+    "RobotCell",
     "Scene",
     "SearchSettings",
     "SeedStream",
     "SerialBalance",
-    "SerialBalanceSpec",
+    "SerialBalanceSettings",
     "Settings",
     "Shape",
     "SignedDistanceGrid",
@@ -233,8 +230,10 @@ _SOURCES = {
     # Settings
     "sim_engine.settings.model": (
         "NOT_IN_FINGERPRINT",
+        "SET_BY_PROGRAM",
         "Choice",
         "Count",
+        "Example",
         "Name",
         "Number",
         "PositiveCount",
@@ -297,14 +296,13 @@ _SOURCES = {
     "orchestrator.strategies.deployment.objectives": ("Objective", "Objectives"),
     # Balances
     "actors.balance.balance_interface": ("BalanceDriver", "Weight"),
-    "actors.balance.balance_settings": ("BalanceDevice", "BalanceEmulator", "SerialBalanceSpec"),
+    "actors.balance.balance_settings": ("BalanceSettings", "BalanceEmulator", "SerialBalanceSettings"),
     "actors.balance.dialects.dialect": ("Dialect", "LineSettings"),
     "actors.balance.readings": ("Acknowledgement", "LineError", "Reading", "ReadingStatus", "Reply"),
     "actors.balance.serial_balance": ("SerialBalance",),
-    "actors.balance.simulated_balance": ("Load",),
-    "orchestrator.config.balance_file": ("BalanceDeviceSection",),
+    "actors.balance.scale_model": ("Load",),
     # Arms
-    "actors.arm.arm_geometry": ("Pose",),
+    "actors.arm.arm_geometry": ("Pose", "RobotCell"),
     "actors.arm.arm_interface": (
         "Arm",
         "ArmFacts",
@@ -317,12 +315,10 @@ _SOURCES = {
         "PathReport",
         "PlannedPour",
     ),
-    "actors.arm.arm_settings": ("ArmDiagnostics", "ArmSpec"),
+    "actors.arm.arm_settings": ("ArmDiagnostics", "ArmSettings"),
     "actors.arm.planned_pour": ("ExecutedMotion", "MotionPath"),
     "actors.bench.virtual_bench": ("ArmEmulator", "History"),
     "actors.bench.pour_feasibility": ("plan_pour",),
-    "orchestrator.config.arm_file": ("ArmSettings", "CellSection"),
-    "orchestrator.config.yaml.yaml_source": ("Place", "Report"),
     # Sources of vessels
     "sim_engine.resources": ("load_arrays", "store_arrays"),
     "sim_engine.vessel.distance_grid": ("SignedDistanceGrid",),

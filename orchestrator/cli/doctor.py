@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
-from actors.balance.balance_settings import look_at_balance
+from actors.balance.balance_settings import balance_diagnostics
 from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.laboratory import check_bench_packages, check_laboratory, reached
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, say
@@ -21,7 +21,7 @@ from orchestrator.installed_plugins import broken
 from orchestrator.runs.safety_approval import SafetyRecordError, read_record, record_path, write_record
 
 if TYPE_CHECKING:
-    from actors.laboratory_settings import LaboratorySpec
+    from actors.laboratory_settings import LaboratorySettings
 
 
 _MARKS = {"ok": ("ok", "green"), "warn": ("warn", "yellow"), "fail": ("FAIL", "bold red")}
@@ -59,11 +59,11 @@ def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> Non
         check_bench_packages(spec)
     with Refused(LaboratoryError, code=FAILED), reached(spec) as ready:
         assert ready.arm is not None
-        look = ready.arm.look()
+        look = ready.arm.diagnostics()
         if accept_safety and not virtual:
             record = _accept(path, look)
         checks = look.checks(record, accept=f"decant doctor {path} --accept-safety", virtual=virtual)
-        checks += look_at_balance(ready.balance, tare=tare)
+        checks += balance_diagnostics(ready.balance, tare=tare)
     checks += _packages(spec)
     checks += [DeviceCheck("plug-in", "warn", str(one), f"mend or remove {one.package}") for one in broken()]
     failed = [check for check in checks if check.state == "fail"]
@@ -77,22 +77,22 @@ def doctor(path: Path, *, accept_safety: bool, tare: bool, as_json: bool) -> Non
     say("ready" if all(check.state == "ok" for check in checks) else "ready, with warnings")
 
 
-def _packages(spec: LaboratorySpec) -> list[DeviceCheck]:
+def _packages(spec: LaboratorySettings) -> list[DeviceCheck]:
     """Check the packages that a run needs, with the run's own check."""
     try:
-        check_laboratory(dataclasses.replace(spec, ray=None), need_bench=True)
+        check_laboratory(spec.with_values(ray=None), need_bench=True)
     except LaboratoryError as error:
         return [DeviceCheck("packages", "fail", str(error), "install them into the environment that Decant runs in")]
     return []
 
 
-def without_arm(path: Path, spec: LaboratorySpec, asked: str) -> RefusalError:
+def without_arm(path: Path, spec: LaboratorySettings, asked: str) -> RefusalError:
     """Return the refusal for a laboratory without an arm, with a suggestion.
 
     Args:
         asked: the command's purpose, as part of the message.
     """
-    has = "its bench is made of numbers" if spec.bench is not None else "it has no bench"
+    has = "its bench is simulated" if spec.bench is not None else "it has no bench"
     return RefusalError(
         f"{path}: laboratory {spec.name} has no 'arm', {has}: {asked}. Name a laboratory that has one, for example "
         "laboratories/virtual.yaml",
@@ -100,7 +100,7 @@ def without_arm(path: Path, spec: LaboratorySpec, asked: str) -> RefusalError:
     )
 
 
-def read_laboratory(path: Path) -> LaboratorySpec:
+def read_laboratory(path: Path) -> LaboratorySettings:
     """Load a laboratory's file.
 
     Raises:

@@ -9,7 +9,7 @@ import math
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +27,7 @@ FARTHEST = {"deg": 10.0, "mm": 50.0}
 SPEEDS = {"deg": 5.0, "mm": 20.0}
 """Speed of every step [deg/s], [mm/s]."""
 
-ANNOUNCEMENT = 1.0
+WARNING_TIME = 1.0
 """Time between the confirmation of a step and its motion [s]."""
 
 _STEP = re.compile(r"(?P<axis>j[1-6]|[xyz]|r[xyz])\s*(?P<amount>[+−-]?\s*\d+(?:[.,]\d+)?)")
@@ -219,6 +219,7 @@ def jog(path: Path, *, armed: bool) -> None:
         say(f"laboratory {spec.name}, virtual: nothing moves but numbers")
     with Refused(LaboratoryError, code=FAILED), reached(spec) as ready:
         assert ready.arm is not None
-        with connected(replace(ready, arm=ready.arm.announced(ANNOUNCEMENT)), accepted) as (arm, facts):
+        soon = ready.with_values(arm=ready.arm.with_values(warning_time=WARNING_TIME))
+        with connected(soon, accepted) as (arm, facts):
             say(f"{facts.model} {facts.serial}, {spec.mode}; nothing moves before a step is typed and confirmed")
             Jogging(arm, typed_line).run()

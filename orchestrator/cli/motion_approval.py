@@ -19,7 +19,7 @@ from orchestrator.runs.safety_approval import SafetyRecordError, required_checks
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm, ArmFacts
-    from actors.laboratory_settings import LaboratorySpec
+    from actors.laboratory_settings import LaboratorySettings
     from orchestrator.runs.stages import StageDefinition
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
@@ -67,7 +67,7 @@ def arm_campaign(plan: CampaignPlan, stages: Sequence[StageDefinition], *, armed
     return checksum
 
 
-def require_flag(laboratory: LaboratorySpec, *, armed: bool, again: str) -> None:
+def require_flag(laboratory: LaboratorySettings, *, armed: bool, again: str) -> None:
     """Refuse to move hardware without `--arm`.
 
     Raises:
@@ -92,7 +92,7 @@ def announce(laboratory: str, arm: str, lines: Sequence[str], lasting: str = "")
     )
 
 
-def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
+def confirm(laboratory: LaboratorySettings, lines: Sequence[str]) -> None:
     """Print what hardware will do, and require the laboratory's name to be typed.
 
     Raises:
@@ -115,7 +115,7 @@ def confirm(laboratory: LaboratorySpec, lines: Sequence[str]) -> None:
 
 
 @contextlib.contextmanager
-def connected(spec: LaboratorySpec, accepted: str | None) -> Iterator[tuple[Arm, ArmFacts]]:
+def connected(spec: LaboratorySettings, accepted: str | None) -> Iterator[tuple[Arm, ArmFacts]]:
     """The arm's driver, connected and locked; it is stopped and let go of in any case.
 
     Args:

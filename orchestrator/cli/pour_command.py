@@ -42,7 +42,7 @@ class Chosen:
 
     Attributes:
         plan: the campaign that it is taken from.
-        path: of the arm; None on a bench of numbers.
+        path: of the arm; None on a simulated bench.
     """
 
     plan: CampaignPlan
@@ -91,7 +91,7 @@ def pour(
     bench = chosen.plan.laboratory
     if chosen.path is None and (dry_run or empty or png is not None):
         raise RefusalError(
-            f"laboratory {bench.name} has no arm whose path could be planned; its bench is made of numbers",
+            f"laboratory {bench.name} has no arm whose path could be planned; its bench is simulated",
             BAD_INPUT,
         )
     if png is not None:
@@ -154,17 +154,17 @@ def report_json(report: PathReport) -> dict[str, Any]:
 
 
 def _draw(chosen: Chosen, png: Path) -> None:
-    from actors.arm.arm_settings import UrArmSpec
+    from actors.arm.arm_settings import UrArmSettings
     from actors.arm.planned_pour import PourPath
-    from orchestrator.results.arm_path_figures import path_png
+    from orchestrator.results import figure_style as style
+    from orchestrator.results.pour_figures import draw_path
     from sim_engine.vessel.vessel import build_vessel
 
     arm = chosen.plan.laboratory.arm
-    if not isinstance(chosen.path, PourPath) or not isinstance(arm, UrArmSpec):
+    if not isinstance(chosen.path, PourPath) or not isinstance(arm, UrArmSettings):
         raise RefusalError("--png: draws the joints of an arm, and this arm's path has none", BAD_INPUT)
     pourer, receiver = build_vessel(chosen.scene.pourer), build_vessel(chosen.scene.receiver)
-    drawn = path_png(
-        png,
+    figure = draw_path(
         chosen.path,
         arm,
         pourer,
@@ -172,7 +172,7 @@ def _draw(chosen: Chosen, png: Path) -> None:
         title=f"{chosen.scene.pourer.name} into {chosen.scene.receiver.name}, laboratory {chosen.plan.laboratory.name}",
         note=chosen.action.display(),
     )
-    mention(f"picture: {drawn}")
+    mention(f"picture: {style.save(figure, png)}")
 
 
 def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
@@ -214,7 +214,7 @@ def _stands_at_home(chosen: Chosen) -> bool:
     """
     with Refused(LaboratoryError, code=FAILED), reached(chosen.plan.laboratory) as ready:
         assert ready.arm is not None
-        check = ready.arm.look().at_home()
+        check = ready.arm.diagnostics().at_home()
     say(f"the arm stands {check.found}" + (f" → {check.advice}" if check.advice else ""))
     return check.state == "ok"
 
@@ -227,7 +227,7 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
         check_somebody_is_there,
         run_in_front_of_people,
     )
-    from orchestrator.journal.stage_results import result_of
+    from orchestrator.journal.codec import result_of
     from orchestrator.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import StageDefinition
     from orchestrator.strategies.single_action import OnePour, OnePoured
@@ -322,9 +322,9 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
         with reached(laboratory) as ready:
             assert ready.arm is not None
             # this command announces each movement itself, by counting down before it lets the arm move
-            driver = dataclasses.replace(ready, arm=ready.arm.announced(0.0))
+            driver = ready.with_values(arm=ready.arm.with_values(warning_time=0.0))
             with connected(driver, checksum) as (arm, facts):
-                cycle = _Cycle(arm, path, ready.arm.on_clock(laboratory.arm.announcement), ask=hardware)
+                cycle = _Cycle(arm, path, ready.arm.on_clock(laboratory.arm.warning_time), ask=hardware)
                 executed = cycle.run()
     except LaboratoryError as error:
         raise RefusalError(str(error), FAILED) from None

@@ -18,7 +18,7 @@ from contextlib import AbstractContextManager
 from typing import TextIO
 
 from actors.balance.readings import typed_weight
-from actors.interfaces import LaboratoryError, OperatorQuestion, OperatorSpec
+from actors.interfaces import LaboratoryError, OperatorQuestion, OperatorSettings
 
 GIVE_UP = "give up"
 
@@ -48,7 +48,7 @@ class TerminalOperator:
 
     def __init__(
         self,
-        spec: OperatorSpec,
+        spec: OperatorSettings,
         *,
         paused: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext,
         stdin: int = 0,

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from actors.arm.arm_settings import ArmSpec
+from actors.arm.arm_settings import ArmSettings
 from actors.bench.pour_feasibility import vessel as built
 from actors.interfaces import InvalidActionError, UnreachablePlaceError
 from orchestrator.config.campaign_file import CampaignFile
@@ -58,7 +58,7 @@ def senseless(
     scene: Scene,
     pourer: Vessel,
     receiver: Vessel,
-    arm: ArmSpec | None,
+    arm: ArmSettings | None,
     known: dict[tuple[object, ...], float | None],
 ) -> list[Senseless]:
     """Settings of a stage's actions that make little sense in one of its scenes.
@@ -225,7 +225,7 @@ def _ignore(findings: object) -> None:
 @dataclass
 class _Checker:
     source: Path
-    arm: ArmSpec | None = None
+    arm: ArmSettings | None = None
     document: Document | None = None
     warn: Callable[[Problem], None] = _ignore
     doing: Callable[[str], None] = _ignore

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import Field, create_model
 
-from orchestrator.config.laboratory_file import LaboratoryFile
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.search_ranges import Actions, Motion, Parameters
 from orchestrator.config.vessel_file import VesselFile
 from orchestrator.strategies.campaign_plan import (
@@ -248,7 +248,7 @@ class CampaignFile(Settings):
     seed: Seed = 0
     """Seed of every random choice: same campaign, seed and outcomes → same requests."""
 
-    laboratory: PathOr[LaboratoryFile] | None = None
+    laboratory: PathOr[LaboratorySettings] | None = None
     """Laboratory in which it runs."""
 
     liquid: PathOr[LiquidSettings] | None = None

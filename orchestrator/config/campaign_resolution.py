@@ -9,7 +9,7 @@ Sections are validated before (`orchestrator.config.yaml.section_validation`); v
 
 from __future__ import annotations
 
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Linear
 from orchestrator.config.campaign_checks import check_ranges
 from orchestrator.config.campaign_file import (
@@ -73,7 +73,7 @@ def resolve_objectives(
 
 
 def resolve_deployment(
-    section: DeploymentSection, builder: SceneBuilder, place: Place, laboratory: LaboratorySpec | None
+    section: DeploymentSection, builder: SceneBuilder, place: Place, laboratory: LaboratorySettings | None
 ) -> DeploymentPlan | None:
     """The plan of a deployment. Problems are added to the report; the plan may then be None."""
     report, settings = builder.report, section.settings
@@ -164,7 +164,7 @@ def resolve_calibration(
     fixed: dict[str, float],
     searched: dict[str, Axis],
     place: Place,
-    laboratory: LaboratorySpec | None,
+    laboratory: LaboratorySettings | None,
     known: tuple[NormalPrior, ...] = (),
 ) -> CalibrationPlan | None:
     """The plan of a calibration. Problems are added to the report; the plan may then be None.
@@ -308,7 +308,7 @@ def _prior(
 def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> CampaignPlan | None:
     """The plan of a campaign. Problems are added to the report; the plan may then be None."""
     references = References(report)
-    laboratory: LaboratorySpec | None = references.laboratory(file.laboratory, root.at("laboratory"))
+    laboratory: LaboratorySettings | None = references.laboratory(file.laboratory, root.at("laboratory"))
     liquid = references.liquid(file.liquid, root.at("liquid"))
     builder = SceneBuilder(file, root, references, liquid)
     for role in ("pourer", "receiver"):  # checked even if the sections override it
@@ -364,5 +364,5 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
     )
 
 
-def _is_virtual(laboratory: LaboratorySpec) -> bool:
+def _is_virtual(laboratory: LaboratorySettings) -> bool:
     return laboratory.mode == "virtual" and laboratory.bench is not None

@@ -11,11 +11,9 @@ from typing import Annotated, Any
 
 from pydantic import create_model
 
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.campaign_file import CampaignFile
 from orchestrator.config.campaign_resolution import resolve_campaign
-from orchestrator.config.laboratory_file import LaboratoryFile, resolve_laboratory
-from orchestrator.config.search_ranges import parameter_quantity
 from orchestrator.config.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.config.yaml.file_access import resolved
 from orchestrator.config.yaml.references import References
@@ -97,18 +95,17 @@ def load_vessel(path: Path | str) -> VesselSpec:
     return vessel
 
 
-def load_laboratory(path: Path) -> LaboratorySpec:
+def load_laboratory(path: Path) -> LaboratorySettings:
     """The laboratory of a file.
 
     Raises:
         ConfigError: the file is invalid.
     """
     report = Report()
-    found = References(report).file(resolved(path), LaboratoryFile)
-    laboratory = None if found is None else resolve_laboratory(*found, report)
+    found = References(report).file(resolved(path), LaboratorySettings)
     report.raise_if_any()
-    assert laboratory is not None, "a laboratory without problems has a spec"
-    return laboratory
+    assert found is not None, "a laboratory without problems has settings"
+    return found[0].ready()
 
 
 class _LooseQuantity(Quantity):
@@ -126,9 +123,8 @@ class _ThetaBase(Settings):
 
 def _theta_model() -> type[_ThetaBase]:
     fields: Any = {}
-    for name in SimulationParameters.info():
-        q = parameter_quantity(name)
-        loose = _LooseQuantity(q.unit, q.example, q.lower, q.upper, whole=q.whole)
+    for name, info in SimulationParameters.info().items():
+        loose = _LooseQuantity(info.unit, info.example, info.lower, info.upper, whole=info.integer)
         fields[name] = (Annotated[float, loose] | None, None)
     model: type[_ThetaBase] = create_model("Theta", __base__=_ThetaBase, __cls_kwargs__=MADE, **fields)
     return model

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.campaign_file import CampaignFile
-from orchestrator.config.laboratory_file import LaboratoryFile
 from orchestrator.config.vessel_file import VesselFile
 from orchestrator.study.study_file import StudyFile
 from sim_engine.settings.model import SchemaGenerator, Settings
@@ -28,7 +28,7 @@ def vessel_schema() -> dict[str, Any]:
 
 def laboratory_schema() -> dict[str, Any]:
     """Schema of laboratory files."""
-    return _schema(LaboratoryFile, "Laboratory")
+    return _schema(LaboratorySettings, "Laboratory")
 
 
 def study_schema() -> dict[str, Any]:

@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import Tag
 
 from orchestrator.config.campaign_file import CalibrationSection, LearningSection
-from orchestrator.config.laboratory_file import HiddenLiquid
 from orchestrator.config.search_ranges import Parameters
 from orchestrator.config.yaml.file_access import resolved
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
-from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
 from sim_engine.settings.model import IN_FILE, FieldMark, Settings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.vessel.shapes import MeshShape, VesselSpec
@@ -60,9 +58,9 @@ def _laboratory(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
     if bench is None:
         return dict(base)
     changed = {
-        "liquid": written(HiddenLiquid(**bench.liquid.of_the_solver())),
-        "pose_error": written(PoseErrorSection(**asdict(bench.pose_error))),
-        "pose_noise": written(PoseNoiseSection(**asdict(bench.pose_noise))),
+        "liquid": written(bench.liquid),
+        "pose_error": written(bench.pose_error),
+        "pose_noise": written(bench.pose_noise),
         "time_scale": bench.time_scale,
     }
     return {**base, "bench": {**base["bench"], **changed}}

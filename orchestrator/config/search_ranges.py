@@ -33,13 +33,7 @@ EXAMPLES = {
     "x_offset": "90 mm",
     "y_offset": "0 mm",
     "height": "60 mm",
-} | {
-    # The default of a parameter is a good example of it.
-    name: f"{default / info.factor:g}" + ("" if info.shown == "1" else f" {info.shown}")
-    for (name, info), default in zip(
-        SimulationParameters.info().items(), SimulationParameters().model_dump().values(), strict=True
-    )
-}
+} | {name: info.example for name, info in SimulationParameters.info().items()}
 """A valid value of every action dimension and simulation parameter, for messages and schemas."""
 
 
@@ -242,12 +236,6 @@ SEARCHED_TOLERANCES = 3.0
 """The default range of a measured value, in standard deviations to both sides."""
 
 
-def parameter_quantity(name: str) -> Quantity:
-    """Annotation of a simulation parameter."""
-    info = SimulationParameters.info()[name]
-    return Quantity(info.unit, EXAMPLES[name], info.lower, info.upper, whole=info.integer)
-
-
 class ParameterRangeSection(RangeSection):
     """A searched parameter: `[lowest, highest]` for a uniform prior, or `{measured: …, tolerance: …}` for a normal
     prior, which an additional range truncates."""
@@ -280,7 +268,7 @@ class ParameterRangeSection(RangeSection):
 
 
 def _parameter_range(info: ParameterInfo) -> Any:
-    quantity = parameter_quantity(info.name)
+    quantity = info.quantity
     typical = (info.tolerance or (info.upper - info.lower) / 20.0) / info.factor
     example = f"{typical:.2g}" + ("" if info.shown == "1" else f" {info.shown}")
     spread = Quantity(info.unit, example, 0.0, info.upper - info.lower, positive=True)
@@ -333,8 +321,7 @@ class ParametersBase(Settings):
 
 def _parameter(info: ParameterInfo) -> Any:
     return Annotated[
-        Annotated[float, parameter_quantity(info.name), Tag("fixed")]
-        | Annotated[_parameter_range(info), Tag("searched")],
+        Annotated[float, info.quantity, Tag("fixed")] | Annotated[_parameter_range(info), Tag("searched")],
         Discriminator(_parameter_form),
     ]
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.campaign_file import DataSection, PoursSection
 from orchestrator.config.scene_builder import SceneBuilder
 from orchestrator.config.search_ranges import MotionBase
@@ -413,7 +413,7 @@ def resolve_data(
     place: Place,
     scenes: tuple[Scene, ...],
     actions: Space,
-    laboratory: LaboratorySpec | None,
+    laboratory: LaboratorySettings | None,
     report: Report,
 ) -> ExistingPours | None:
     """Existing pours of the deployment by scene; None after a problem, which is added to the report."""
@@ -489,7 +489,7 @@ def _of_file(
 
 
 def _of_run(
-    run: str, place: Place, scenes: tuple[Scene, ...], laboratory: LaboratorySpec | None, report: Report
+    run: str, place: Place, scenes: tuple[Scene, ...], laboratory: LaboratorySettings | None, report: Report
 ) -> tuple[Path, dict[str, tuple[RecordedPour, ...]] | None]:
     previous = former_run(run, place, report)
     if previous is None:
@@ -529,7 +529,7 @@ def records_of_run(
     place: Place,
     scenes: tuple[Scene, ...],
     actions: Space,
-    laboratory: LaboratorySpec | None,
+    laboratory: LaboratorySettings | None,
     report: Report,
 ) -> RecordSet | None:
     """Calibration pours from a previous run, in any of its scenes; None after a problem."""

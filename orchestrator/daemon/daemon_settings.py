@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.catalogue.run_registry import state_directory
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.config.yaml.file_access import missing_file, resolved
@@ -137,7 +137,7 @@ class Rig:
 
     name: str
     source: Path | None = None
-    spec: LaboratorySpec | None = None
+    spec: LaboratorySettings | None = None
 
     @property
     def mode(self) -> str:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from actors.bench.bench_factory import needs_person
 from actors.interfaces import LaboratoryError
 from actors.laboratory import WarmSimulators
 from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -24,8 +23,7 @@ from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.remote_operator import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.run_readout import prune_recordings
 from orchestrator.daemon.submission_bundle import CAMPAIGN, THETA, load_confined
-from orchestrator.journal.disk_reserve import MB, free_space
-from orchestrator.journal.journal_file import JournalError
+from orchestrator.journal.journal_file import MB, JournalError, free_space
 from orchestrator.journal.run_record import CampaignResult
 from orchestrator.live_view.live_server import LiveView, recorder_of
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
@@ -141,7 +139,7 @@ class Running:
         asking, key, rig = self._common.asking, self.item.id, self._rig.name
         plan, live = request.campaign, self._common.live
         load = next(iter(scenes_of(plan).values())).liquid.mass  # a campaign has one liquid
-        asks = request.pours and needs_person(plan.laboratory)
+        asks = request.pours and plan.laboratory.needs_person
         assert self._tally is not None
 
         def recorder(plan: CampaignPlan, run: Path) -> RerunMonitor | None:

@@ -1,8 +1,8 @@
 """What version 0.2 wrote and this one no longer has: journals, results and recorded campaigns are read without it.
 
-Version 0.2 had two further models of D3, `pooled` and `scaled`, a check of the simulator by the first pours (`trust`),
-and a price of simulations for as long as no outcome told one. Its runs can be listed and reported. One that used such a
-model or check can't be resumed.
+Version 0.2 had two further models of D3, `pooled` and `scaled`, and a check of the simulator by the first pours
+(`trust`). It had a price of simulations that was used until the first outcome. Some fields of its results had other
+names. Its runs can be listed and reported. One that used such a model or check can't be resumed.
 """
 
 from __future__ import annotations
@@ -83,20 +83,53 @@ def _renamed(data: Data, names: Mapping[str, str]) -> dict[str, Any]:
     return {names.get(key, key): value for key, value in data.items()}
 
 
+_RENAMED = {
+    "deployment": {"trust": "model_check", "front": "pareto_front"},
+    "prediction": {"band": "interval"},
+}
+"""Fields of results by kind: the name of version 0.2 and today's."""
+
+
 def upgraded_result(data: Data) -> Data:
-    """A stage's result as this version reads it. Of a comparison of pours with simulations its scores are left."""
-    trust = data.get("trust")
-    if not isinstance(trust, Mapping) or "mean_z" not in trust:
+    """A stage's result as this version reads it.
+
+    Of a comparison of pours with simulations, the scores are left. Of a study's table, the number of its simulations is
+    left: their outcomes are in the journal, too.
+    """
+    if data.get("kind") == "table":
+        return {key: value for key, value in data.items() if key != "rows"}
+    data = _renamed(data, _RENAMED.get(str(data.get("kind")), {}))
+    if data.get("kind") != "deployment":
         return data
-    return {**data, "trust": {key: trust[key] for key in ("z_scores", "alarm")}}
+    check = data.get("model_check")
+    if isinstance(check, Mapping) and "mean_z" in check:
+        data["model_check"] = {key: check[key] for key in ("z_scores", "alarm")}
+    return data | {"pours": [_renamed(row, {"predicted_band": "predicted_interval"}) for row in data.get("pours", ())]}
 
 
 def upgraded_fingerprint(data: dict[str, Any]) -> dict[str, Any]:
     """A fingerprint of a campaign or study, comparable with one of this version where it means the same in both."""
     data = {**data, "deployment": _upgraded_plan(data["deployment"])} if "deployment" in data else data
+    if isinstance(laboratory := data.get("laboratory"), Mapping) and "cell" not in laboratory:
+        data = {**data, "laboratory": _upgraded_laboratory(laboratory)}
     if isinstance(arms := data.get("deployments"), Mapping):  # of a study
         data = {**data, "deployments": {label: _upgraded_plan(plan) for label, plan in arms.items()}}
     return data
+
+
+def _upgraded_laboratory(laboratory: Data) -> Data:
+    """A laboratory without an arm; one with an arm can't be resumed."""
+    bench = laboratory["bench"]
+    if bench is None:
+        return {**laboratory, "cell": None}
+    balance = {name: bench[f"balance_{name}"] for name in ("resolution", "noise", "drift")}
+    kept = {name: bench[name] for name in ("pose_error", "pose_noise", "time_scale", "operator_time")}
+    liquid = {name: value for name, value in bench["liquid"].items() if name not in _NUISANCES}
+    balance["settling_time"] = bench["settling_time"]
+    return {**laboratory, "cell": None, "bench": {"liquid": liquid, **kept, "balance": balance}}
+
+
+_NUISANCES = ("receiver_x", "receiver_y", "receiver_z", "tilt_zero", "speed_factor")
 
 
 def _upgraded_plan(plan: Any) -> Any:

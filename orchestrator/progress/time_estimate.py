@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median_low
 
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.requests import Failed, Pour, Simulate, Simulated
 from orchestrator.runs.events import (
     Event,
@@ -311,7 +311,7 @@ def _deployed(plan: DeploymentPlan, pour: float) -> WorkEstimate:
     return WorkEstimate(settings.simulations, pours, settings.simulations_beside, pour_time=pour)
 
 
-def pour_time(laboratory: LaboratorySpec, scene: Scene, actions: Space) -> float:
+def pour_time(laboratory: LaboratorySettings, scene: Scene, actions: Space) -> float:
     """Duration of one whole pour with the operator's part, as planned [s of wall time].
 
     Args:
@@ -327,9 +327,9 @@ def pour_time(laboratory: LaboratorySpec, scene: Scene, actions: Space) -> float
     motion = (angle or 0.0) / (speed or math.inf) + (scene.hold_cap / 2.0 if hold is None else hold)
     motion += (angle or 0.0) / back if back else 0.0
     bench = laboratory.bench
-    liquid = 0.0 if bench is None else PRICE * bench.liquid.particles  # a virtual bench simulates its liquid
+    liquid = 0.0 if bench is None else PRICE * bench.theta.particles  # a virtual bench simulates its liquid
     if laboratory.arm is not None:
-        whole = laboratory.operator.time + laboratory.arm.announcement + WAYS + motion + WEIGHINGS
+        whole = laboratory.operator.time + laboratory.arm.warning_time + WAYS + motion + WEIGHINGS
         return laboratory.arm.on_clock(whole) + liquid
     if bench is None or bench.time_scale <= 0.0:
         return liquid

@@ -13,7 +13,7 @@ import numpy as np
 
 from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.arm_interface import PathReport
-from actors.arm.arm_settings import ArmSpec
+from actors.arm.arm_settings import ArmSettings
 from actors.interfaces import InvalidActionError
 from actors.optimizer.questions import Linear
 from orchestrator.runs.stages import CONFIRMATION, DEPLOYMENT, StageDefinition
@@ -66,7 +66,7 @@ class Envelope:
         )
 
 
-def envelope(arm: ArmSpec, pours: Iterable[tuple[Scene, Action]]) -> Envelope:
+def envelope(arm: ArmSettings, pours: Iterable[tuple[Scene, Action]]) -> Envelope:
     """Plan paths, and see what they keep within."""
     reports, refused = [], []
     for scene, action in pours:

@@ -21,7 +21,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import BenchOffset, Linear, Point
 from orchestrator.strategies.deployment.objectives import Objectives
 from sim_engine.action import Action
@@ -489,7 +489,7 @@ class CampaignPlan:
     name: str
     seed: int
     source: Annotated[Path, NOT_IN_FINGERPRINT]
-    laboratory: LaboratorySpec
+    laboratory: LaboratorySettings
     parameters: SimulationParameters
     calibration: CalibrationPlan | None
     deployment: DeploymentPlan | None

@@ -150,7 +150,7 @@ def _mean(axes: Axes, x: float, one: Estimate, shown: SeriesStyle, least: float,
 def _level_note(study: StudyPlan, level: str) -> str:
     """Differences of a level's bench from the others: 'particles 600, friction 0.05, receiver -2 mm'."""
     benches = {one.name: one.bench for one in study.levels}
-    liquids = {name: bench.liquid.model_dump() for name, bench in benches.items()}
+    liquids = {name: bench.theta.model_dump() for name, bench in benches.items()}
     parts = [
         f"{name} {value:g}".replace("_", HARD_SPACE).replace(" ", HARD_SPACE)
         for name, value in liquids[level].items()

@@ -14,8 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from orchestrator.config.run_snapshot import record_of
+from orchestrator.journal.codec import Results, result_of
 from orchestrator.journal.journal import JOURNAL_NAME
-from orchestrator.journal.stage_results import Results, result_of
+from orchestrator.journal.run_record import answers
+from orchestrator.requests import Simulate
 from orchestrator.runs.stages import (
     CALIBRATION,
     EVALUATION,
@@ -39,7 +41,7 @@ from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.strategy import Strategy
 from orchestrator.study.study_plan import FINAL, GRID, StudyCell, StudyPlan
-from orchestrator.study.study_strategies import AnsweredByTable, FinalPour, SimulatedTable, Tabled
+from orchestrator.study.study_strategies import AnsweredByTable, FinalPour, SimulatedTable
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 
@@ -69,7 +71,7 @@ def _planned(
         base,
         name=cell.id,
         seed=cell.seed,
-        laboratory=replace(base.laboratory, bench=bench),
+        laboratory=base.laboratory.with_values(bench=bench),
         outputs=OutputSettings(
             directory=str(directory), rrd=False, figures=False, record_rate=0.0, recorded_simulations=0
         ),
@@ -166,11 +168,12 @@ def _calibration(
     stages = calibration_stages(plan.calibration)
     if cell.arm != "C1":
         return plan, stages
-    rows = result_of(load(GRID), GRID, Tabled).rows
+    found = answers(directory.parent / GRID, Simulate)
+    table = [(one.request, one.outcome) for one in found if isinstance(one.request, Simulate)]
 
     def answered(stage: StageDefinition) -> StageDefinition:
         def build(results: Results, seed: int) -> Strategy:
-            return AnsweredByTable(stage.build(results, seed), rows)
+            return AnsweredByTable(stage.build(results, seed), table)
 
         return replace(stage, build=build)
 

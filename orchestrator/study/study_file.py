@@ -15,9 +15,8 @@ from typing import Annotated, Any
 
 from pydantic import Field, create_model
 
-from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
+from actors.laboratory_settings import BenchSettings, HiddenLiquid, LaboratorySettings
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.laboratory_file import HiddenLiquid, LaboratoryFile
 from orchestrator.config.run_snapshot import as_file
 from orchestrator.config.search_ranges import Parameters, ParametersBase
 from orchestrator.config.yaml.file_access import missing_file, resolved
@@ -37,11 +36,10 @@ from orchestrator.strategies.campaign_plan import (
 from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
-from orchestrator.strategies.deployment.disturbances import PoseErrorSection, PoseNoiseSection
 from orchestrator.strategies.strategy_registry import calibrations, deployments
 from orchestrator.study.study_plan import ALL, CalibrationArm, DeploymentArm, Level, StudyPlan
 from sim_engine.liquids import SimulationParameters
-from sim_engine.scene import PoseError
+from sim_engine.scene import PoseErrorSettings, PoseNoise
 from sim_engine.search_space import Space
 from sim_engine.settings.model import (
     MADE,
@@ -202,10 +200,10 @@ class LevelSettings(Settings):
     liquid: Annotated[HiddenLiquid, Example("{particles: 4000, cohesion: 0.05 N/m}")]
     """Hidden θ of the 'real' liquid; calibration never reads it."""
 
-    pose_error: PoseErrorSection = PoseErrorSection()
+    pose_error: PoseErrorSettings = PoseErrorSettings()
     """Systematic error of grip and placement."""
 
-    pose_noise: PoseNoiseSection = PoseNoiseSection()
+    pose_noise: PoseNoise = PoseNoise()
     """Scatter of the pose error, drawn for each pour."""
 
 
@@ -221,7 +219,7 @@ class StudyFile(Settings):
     campaign: Annotated[FilePath, Example("../campaigns/paper.yaml")]
     """File of the base campaign: vessels, motions, action spaces, ranges of θ, calibration pours, loss."""
 
-    laboratory: PathOr[LaboratoryFile] | None = None
+    laboratory: PathOr[LaboratorySettings] | None = None
     """Laboratory that replaces the campaign's: a virtual one with a bench, simulated directly or over wires."""
 
     parameters: Parameters | None = None
@@ -372,7 +370,7 @@ def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
         report.problems.extend(error.problems)
         return None
     if laboratory is not None:
-        found = references.section(file.laboratory, root.at("laboratory"), LaboratoryFile)
+        found = references.section(file.laboratory, root.at("laboratory"), LaboratorySettings)
         record = {} if found is None else as_file(*found, references)
         base = replace(base, laboratory=laboratory, resolved={**base.resolved, "laboratory": record})
     return base if file.parameters is None else _with_parameters(base, file.parameters, root.at("parameters"), report)
@@ -441,7 +439,7 @@ AS_IN_THE_PAPER: dict[str, dict[str, Any]] = {
 """Settings in which the paper's forms differ from the defaults."""
 
 
-def _bench(laboratory: LaboratorySpec, at: Place, report: Report) -> VirtualBenchSpec | None:
+def _bench(laboratory: LaboratorySettings, at: Place, report: Report) -> BenchSettings | None:
     """The bench of a study. Without a usable one, the reason is added to the report and the result is None."""
     if laboratory.mode != "virtual":
         report.add(at, HARDWARE.format(laboratory.name))
@@ -460,23 +458,18 @@ def _bench(laboratory: LaboratorySpec, at: Place, report: Report) -> VirtualBenc
     else:
         # Simulated readings need no waiting; an arm over wires needs its real time.
         wired = laboratory.arm is not None
-        return replace(laboratory.bench, time_scale=laboratory.bench.time_scale if wired else 0.0)
+        return laboratory.bench if wired else laboratory.bench.with_values(time_scale=0.0)
     return None
 
 
-def _levels(written: Iterable[LevelSettings] | None, laboratory: str, bench: VirtualBenchSpec) -> tuple[Level, ...]:
+def _levels(written: Iterable[LevelSettings] | None, laboratory: str, bench: BenchSettings) -> tuple[Level, ...]:
     """The benches of all levels: as given, or the laboratory's own under its name. Incomplete levels are left out."""
     if written is None:
         return (Level(laboratory, bench),)
     return tuple(
         Level(
             level.name,
-            replace(
-                bench,
-                liquid=level.liquid.parameters(),
-                pose_error=PoseError(**level.pose_error.model_dump()),
-                pose_noise=PoseError(**level.pose_noise.model_dump()),
-            ),
+            bench.with_values(liquid=level.liquid, pose_error=level.pose_error, pose_noise=level.pose_noise),
         )
         for level in written
         if level.name is not None and level.liquid is not None

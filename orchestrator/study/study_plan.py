@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from actors.laboratory_settings import VirtualBenchSpec
+from actors.laboratory_settings import BenchSettings
 from orchestrator.runs.fingerprint import deciding, fingerprint
 from orchestrator.runs.stages import stage_seed
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
@@ -40,7 +40,7 @@ class Level:
     """
 
     name: str
-    bench: VirtualBenchSpec
+    bench: BenchSettings
 
 
 @dataclass(frozen=True)
@@ -244,5 +244,5 @@ def estimated_seconds(study: StudyPlan, cell: StudyCell) -> float:
     usual = float(study.base.parameters.particles)
     if "particles" in axes:
         usual = math.sqrt(axes["particles"].lower * axes["particles"].upper)
-    hidden = study.level(cell.level).bench.liquid.particles if cell.level else 0
+    hidden = study.level(cell.level).bench.theta.particles if cell.level else 0
     return PARTICLE_SECONDS * (cell.simulations * usual + cell.pours * hidden) + 3.0

@@ -222,7 +222,7 @@ FilePath = Annotated[Text, AfterValidator(_in_home), IN_FILE]
 class Problems(Protocol):
     """Collects problems of settings, with their positions in the file."""
 
-    def add(self, text: str, *at: str | int, key: bool = False, of: str = "") -> None:
+    def add(self, text: str, *at: str | int, key: bool = False, of: str = "", more: bool = False) -> None:
         """Add a problem, unless its position already has one.
 
         Args:
@@ -231,6 +231,7 @@ class Problems(Protocol):
             key: point at the key and not at its value.
             of: a key on which the problem depends: nothing is added if that key, or one below it, already has a
                 problem.
+            more: add it even if its position already has a problem.
         """
 
     @property
@@ -379,6 +380,22 @@ def tagged(variants: Mapping[str, type[Settings]]) -> Any:
 
     union = functools.reduce(operator.or_, (Annotated[model, Tag(name)] for name, model in variants.items()))
     return Annotated[union, Discriminator(word)]
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """Pydantic annotation of a base class of settings: one of its kinds, as `tagged`.
+
+    The kinds are read when the first value is validated, so that plug-ins can import what declares the field.
+
+    Attributes:
+        kinds: returns them by the value of their tag.
+    """
+
+    kinds: Callable[[], Mapping[str, type[Settings]]]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return handler.generate_schema(tagged(self.kinds()))
 
 
 PathOr = Annotated[

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
+from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
-from sim_engine.scene import PoseError, PourTask, Scene
+from sim_engine.scene import PoseErrorSettings, PoseNoise, PourTask, Scene
 from tests.support import fake_simulator
 from tests.support.fake_simulator import FakeSimulator, make_fake, make_scene
 
@@ -38,11 +38,11 @@ def task(action: Action) -> Callable[..., PourTask]:
 
 
 @pytest.fixture
-def bench_spec() -> VirtualBenchSpec:
-    return VirtualBenchSpec(
+def bench_spec() -> BenchSettings:
+    return BenchSettings(
         liquid=SimulationParameters(particles=3_000, cohesion=0.03),
-        pose_error=PoseError(x=0.002, tilt=0.01, speed_factor=1.02),
-        pose_noise=PoseError(x=5e-4, tilt=2e-3, speed_factor=0.01),
+        pose_error=PoseErrorSettings(x=0.002, tilt=0.01, speed_factor=1.02),
+        pose_noise=PoseNoise(x=5e-4, tilt=2e-3, speed_factor=0.01),
         time_scale=0.0,
     )
 
@@ -52,7 +52,7 @@ def ray_running() -> Iterator[None]:
     """Ray, started once; laboratories of tests join it."""
     from actors.runtime.ray_runtime import start_ray, stop_ray
 
-    start_ray(LaboratorySpec("tests", simulators=4))
+    start_ray(LaboratorySettings(name="tests", simulators=4))
     import ray
 
     # Workers can't import test modules by name.

@@ -13,7 +13,7 @@ from actors.arm.arm_device import DeviceArm
 from actors.arm.arm_interface import ArmLostError, ArmNotReleasedError, ArmStoppedError
 from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
 from actors.arm.planned_pour import MotionPath
-from actors.arm.simulated_arm import POSITION_NOISE, Grip, NumbersSpec, SimulatedArm
+from actors.arm.simulated_arm import POSITION_NOISE, Grip, SimulatedArm, SimulatedArmSettings
 from actors.bench.pour_feasibility import plan_pour
 from actors.contract_tests.arm_contract import ArmBench, ArmContract
 from actors.runtime.remote_object import LocalDevice, RayDevice
@@ -30,7 +30,7 @@ def motion(path):
 
 
 def released(scale=0.0):
-    arm = SimulatedArm(NumbersSpec(scale))
+    arm = SimulatedArm(SimulatedArmSettings(time_scale=scale))
     arm.release()
     return arm
 
@@ -89,7 +89,7 @@ def make_arm(request):
 @pytest.mark.realtime
 def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, path, motion):
     async def play():
-        arm = make_arm(NumbersSpec(0.2))
+        arm = make_arm(SimulatedArmSettings(time_scale=0.2))
         await arm.release()
         pouring = asyncio.create_task(arm.execute(path, lambda state: None))
         while not (await arm.state()).moving or (await arm.state()).time < 0.1:
@@ -121,7 +121,7 @@ def test_progress_follows_the_tilt_through_the_phases(make_arm, path, motion):
     seen = []
 
     async def play():
-        arm = make_arm(NumbersSpec(2.0))
+        arm = make_arm(SimulatedArmSettings(time_scale=2.0))
         await arm.release()
         await arm.execute(path, seen.append)
         await arm.device.close()
@@ -140,16 +140,16 @@ class Unreachable(SimulatedArm):
         raise ArmLostError("nobody answers at 192.168.0.10")
 
 
-class UnreachableSpec(NumbersSpec):
+class UnreachableSpec(SimulatedArmSettings):
     def driver(self, accepted):
         return Unreachable, (self,)
 
 
 @pytest.mark.realtime
 def test_any_arm_can_be_looked_at_and_one_that_does_not_answer_says_so():
-    (there,) = NumbersSpec().look().checks(None, accept="", virtual=True)
-    assert (there.state, there.found) == ("ok", "numbers")
-    (lost,) = UnreachableSpec().look().checks(None, accept="", virtual=True)
+    (there,) = SimulatedArmSettings().diagnostics().checks(None, accept="", virtual=True)
+    assert (there.state, there.found) == ("ok", "simulated")
+    (lost,) = UnreachableSpec().diagnostics().checks(None, accept="", virtual=True)
     assert (lost.state, lost.found) == ("fail", "nobody answers at 192.168.0.10")
 
 
@@ -167,6 +167,6 @@ def test_safety_settings_that_nobody_has_accepted_fail_on_hardware():
 class TestArmOfNumbers(ArmContract):
     @pytest.fixture
     def bench(self, path):
-        arm = SimulatedArm(NumbersSpec(2.0))
+        arm = SimulatedArm(SimulatedArmSettings(time_scale=2.0))
         yield ArmBench(arm, path, 2.0, jog=("z", 0.005, 0.02), disturb=lambda: arm.grip(Grip(speed_factor=0.7)))
         arm.close()

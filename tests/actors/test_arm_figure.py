@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_geometry import Point
+from actors.arm.arm_settings import UrArmSettings
 from orchestrator.config.file_loading import load_laboratory
 
 FILE = Path(__file__).parents[2] / "configs" / "laboratories" / "virtual.yaml"
 
 
-def _arm() -> UrArmSpec:
+def _arm() -> UrArmSettings:
     spec = load_laboratory(FILE).arm
-    assert isinstance(spec, UrArmSpec)
+    assert isinstance(spec, UrArmSettings)
     return spec
 
 
@@ -42,8 +42,8 @@ def test_the_last_link_ends_at_the_tool_and_the_pourer_is_held_by_it() -> None:
 
 def test_arm_that_is_leant_or_stands_elsewhere_is_drawn_there() -> None:
     spec = _arm()
-    there = replace(spec, cell=replace(spec.cell, receiver=(0.75, 0.1, 0.06)))
-    home = np.array(spec.home)
+    there = spec.with_values(cell=spec.cell.with_values(receiver=Point.of(0.75, 0.1, 0.06)))
+    home = np.array(spec.home.angles)
     moved = there.figure().ends(home) - spec.figure().ends(home)
     # the liquid goes along the base's y, which is the world's x
     assert np.allclose(moved, [-0.1, 0.0, 0.0])

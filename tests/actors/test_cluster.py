@@ -26,7 +26,7 @@ PROGRAM = """
 import asyncio, json, sys
 from pathlib import Path
 from actors.laboratory import open_laboratory
-from actors.laboratory_settings import LaboratorySpec, RaySpec
+from actors.laboratory_settings import LaboratorySettings, RaySettings
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PourTask
@@ -38,7 +38,7 @@ def say(*words):
 async def main(address, log):
     import ray
     action = Action(angular_velocity=60 * DEG, x_offset=0.09, height=0.05, max_angle=100 * DEG, hold_time=0.5)
-    spec = LaboratorySpec("far", ray=RaySpec(address))
+    spec = LaboratorySettings(name="far", ray=RaySettings(address=address))
     heard = []
     laboratory = open_laboratory(spec, need_bench=False, make=fake_simulator.make_fake(0.5, Path(log)))
     ray.cloudpickle.register_pickle_by_value(fake_simulator)

@@ -13,7 +13,7 @@ import pytest
 
 from actors.interfaces import LaboratoryError
 from actors.laboratory import check_laboratory, open_laboratory
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Data, MinimumQuery
 from actors.runtime.remote_object import DeviceLostError
 from orchestrator.config.file_loading import load_laboratory
@@ -31,20 +31,20 @@ PROBLEM = MinimumQuery(
 
 def laboratory(in_process, fake, **changes):
     return open_laboratory(
-        LaboratorySpec("desk", simulators=1, in_process=in_process, **changes), need_bench=False, make=fake()
+        LaboratorySettings(name="desk", simulators=1, in_process=in_process, **changes), need_bench=False, make=fake()
     )
 
 
 @pytest.mark.realtime
 def test_a_campaign_that_pours_is_refused_a_laboratory_without_a_bench():
     with pytest.raises(LaboratoryError, match="desk has no bench, but the campaign pours"):
-        open_laboratory(LaboratorySpec("desk"), need_bench=True)
+        open_laboratory(LaboratorySettings(name="desk"), need_bench=True)
 
 
 @pytest.mark.realtime
 def test_an_unknown_mode_is_refused_before_anything_starts():
     with pytest.raises(LaboratoryError, match="mode 'dream' is not known"):
-        open_laboratory(LaboratorySpec("desk", mode="dream"), need_bench=False)
+        open_laboratory(LaboratorySettings(name="desk", mode="dream"), need_bench=False)
 
 
 @pytest.mark.realtime
@@ -104,11 +104,11 @@ def test_optimiser_and_its_twin_propose_the_same_also_after_a_death(ray_running,
 def test_the_real_simulator_gives_the_same_bits_in_a_pool_a_twin_and_the_hidden_liquid(
     ray_running, bench_spec, scene, action
 ):
-    bench = replace(bench_spec, liquid=SimulationParameters(particles=400))
+    bench = bench_spec.with_values(liquid=SimulationParameters(particles=400))
     coarse = SimulationParameters(particles=300)
 
     async def play(in_process):
-        spec = LaboratorySpec("desk", simulators=1, bench=bench, in_process=in_process)
+        spec = LaboratorySettings(name="desk", simulators=1, bench=bench, in_process=in_process)
         async with open_laboratory(spec, need_bench=True) as opened:
             job = opened.simulators.simulate(PourTask(scene, action, coarse, 3, record_rate=4.0))
             return await asyncio.gather(job, opened.bench.pour(scene, action, seed=5))
@@ -124,7 +124,7 @@ def test_the_real_simulator_gives_the_same_bits_in_a_pool_a_twin_and_the_hidden_
 def test_a_moments_work_needs_no_ray_and_still_simulates_side_by_side(monkeypatch, fake, task):
     """`decant plan`: a person waits, and nothing is poured."""
     monkeypatch.setattr("actors.laboratory.installed", lambda name: name != "ray")
-    spec = LaboratorySpec("planning", simulators=2)
+    spec = LaboratorySettings(name="planning", simulators=2)
     check_laboratory(spec, need_bench=False, brief=True)
     with pytest.raises(LaboratoryError, match="Ray, which is not installed"):
         check_laboratory(spec, need_bench=False)

@@ -22,7 +22,7 @@ PROGRAM = """
 import asyncio, json, sys
 from actors.laboratory import open_laboratory
 from actors.optimizer.questions import ()
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.laboratory import WarmSimulators
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
@@ -53,7 +53,8 @@ async def questions(simulators, optimizer):
 
 async def of_its_own():
     heard = []
-    async with open_laboratory(LaboratorySpec("desk", simulators=1), need_bench=False, make=Formula) as laboratory:
+    desk = LaboratorySettings(name="desk", simulators=1)
+    async with open_laboratory(desk, need_bench=False, make=Formula) as laboratory:
         laboratory.listen(heard.append)
         await questions(laboratory.simulators, laboratory.optimizer)
     print(json.dumps(" ".join(notice.text for notice in heard)))

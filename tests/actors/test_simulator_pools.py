@@ -14,7 +14,7 @@ import numpy as np
 import psutil
 import pytest
 
-from actors.arm.simulated_arm import NumbersSpec, SimulatedArm
+from actors.arm.simulated_arm import SimulatedArm, SimulatedArmSettings
 from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
 from actors.runtime.ray_cluster import versions
 from actors.runtime.remote_object import RayDevice
@@ -199,7 +199,7 @@ def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, task):
 @pytest.mark.ray
 def test_simulators_step_back_behind_an_arm_s_driver_which_does_not(ray_running, fake, task):
     async def play():
-        arm = RayDevice("arm", SimulatedArm, NumbersSpec(0.0))
+        arm = RayDevice("arm", SimulatedArm, SimulatedArmSettings(time_scale=0.0))
         pool = ray_pool(2, make=fake())
         try:
             await pool.simulate(task())

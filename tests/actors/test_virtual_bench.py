@@ -15,7 +15,7 @@ import pytest
 from actors.bench.ground_truth import draw_pose_error, spill_of
 from actors.interfaces import InvalidActionError, NotPouredError, PourFailedError, UnknownPourError
 from actors.laboratory import open_laboratory
-from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
+from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from sim_engine.action import DEG
 from sim_engine.outcome import PourOutcome
 from sim_engine.scene import PoseError
@@ -27,8 +27,8 @@ def open_bench(fake, bench_spec):
     """Opens a laboratory around the fake liquid."""
 
     def open_it(*, ray: bool = False, make=None, simulators: int = 1, **changes):
-        spec = LaboratorySpec(
-            "virtual", simulators=simulators, bench=replace(bench_spec, **changes), in_process=not ray
+        spec = LaboratorySettings(
+            "virtual", simulators=simulators, bench=bench_spec.with_values(**changes), in_process=not ray
         )
         return open_laboratory(spec, need_bench=True, make=make or fake())
 
@@ -83,7 +83,7 @@ def test_pose_errors_scatter_about_the_systematic_one_and_follow_the_seed(bench_
     assert statistics.mean(e.x for e in errors) == pytest.approx(0.002, abs=4 * 5e-4 / np.sqrt(500))
     assert statistics.stdev(e.tilt for e in errors) == pytest.approx(2e-3, rel=0.15)
     assert {e.y for e in errors} == {0.0}
-    exact = VirtualBenchSpec(liquid=bench_spec.liquid)
+    exact = BenchSettings(liquid=bench_spec.liquid)
     assert draw_pose_error(exact, 3) == PoseError()
 
 

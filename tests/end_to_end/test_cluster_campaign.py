@@ -188,9 +188,9 @@ CHECK = """
 import sys
 from actors.runtime.ray_cluster import check_cluster
 from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import RaySpec
+from actors.laboratory_settings import RaySettings
 try:
-    check_cluster(RaySpec(sys.argv[1]), need_bench=False)
+    check_cluster(RaySettings(address=sys.argv[1]), need_bench=False)
 except LaboratoryError as error:
     print(error)
 """
@@ -223,7 +223,7 @@ MUG_POURS = """
 import asyncio, sys
 from pathlib import Path
 from actors.laboratory import open_laboratory
-from actors.laboratory_settings import LaboratorySpec, RaySpec
+from actors.laboratory_settings import LaboratorySettings, RaySettings
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene
@@ -235,7 +235,8 @@ scene = Scene("mug", cylinder("beaker", inner_radius=0.035, inner_height=0.1), m
 action = Action(angular_velocity=90 * DEG, x_offset=0.13, height=0.05, max_angle=110 * DEG, hold_time=0.2)
 
 async def main():
-    async with open_laboratory(LaboratorySpec("far", ray=RaySpec(address)), need_bench=False) as laboratory:
+    far = LaboratorySettings(name="far", ray=RaySettings(address=address))
+    async with open_laboratory(far, need_bench=False) as laboratory:
         theta = SimulationParameters(particles=300)
         tasks = [PourTask(scene, action, theta, seed) for seed in range(4)]
         for result in await asyncio.gather(*map(laboratory.simulators.simulate, tasks)):

@@ -192,7 +192,7 @@ def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_see
         laboratory.start()
         card = page.locator(".question")
         card.get_by_role("heading", name="had begun when the run was interrupted").wait_for()
-        assert card.get_by_text("made of numbers").is_visible()
+        assert card.get_by_text("simulated: it has no arm").is_visible()
         assert page.get_by_text("To stop the arm, use its own emergency stop").is_hidden()
         card.get_by_label("Spilled").fill("3,2")
         card.get_by_label("Left in the pourer").fill("0.4")

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from actors.laboratory_settings import LaboratorySpec, VirtualBenchSpec
+from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from orchestrator.progress.time_estimate import PRICE, Forecast, WorkEstimate, pour_time, work_of
 from orchestrator.requests import Failed, Pour, Simulate, Simulated
 from orchestrator.runs.events import (
@@ -172,10 +172,10 @@ def test_a_person_s_pour_takes_the_time_that_was_set_for_it_and_a_fast_bench_a_p
     }
     campaign = example_run.campaign()
     assert campaign.deployment is not None
-    bench = VirtualBenchSpec(SimulationParameters(particles=4000))
+    bench = BenchSettings(liquid=SimulationParameters(particles=4000))
     scene, actions = campaign.deployment.scenes[0], campaign.deployment.actions
-    slow = pour_time(LaboratorySpec("slow", bench=replace(bench, time_scale=1.0)), scene, actions)
-    fast = pour_time(LaboratorySpec("fast", bench=replace(bench, time_scale=10.0)), scene, actions)
-    liquid = PRICE * bench.liquid.particles
+    slow = pour_time(LaboratorySettings(name="slow", bench=bench.with_values(time_scale=1.0)), scene, actions)
+    fast = pour_time(LaboratorySettings(name="fast", bench=bench.with_values(time_scale=10.0)), scene, actions)
+    liquid = PRICE * bench.theta.particles
     assert bench.operator_time + 15.0 < slow - liquid < bench.operator_time + 45.0
     assert fast - liquid == pytest.approx((slow - liquid) / 10.0)

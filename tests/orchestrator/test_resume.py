@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.journal.journal_file import JournalError, JournalLockedError
 from orchestrator.runs.events import Event, RequestFinished, StageClosed
@@ -212,7 +212,7 @@ def test_other_settings_can_not_continue_a_run_but_the_machine_may_be_another(tm
     plan = toy_plan(directory, on_unknown="repeat")
     with pytest.raises(JournalError, match="seed: 7 became 8"):
         run(directory, resume=True, plan=replace(plan, seed=8))
-    larger = replace(plan, laboratory=LaboratorySpec("toy", simulators=64), source=tmp_path / "moved.yaml")
+    larger = replace(plan, laboratory=LaboratorySettings(name="toy", simulators=64), source=tmp_path / "moved.yaml")
     assert run(directory, resume=True, plan=larger).state == "finished"
 
 

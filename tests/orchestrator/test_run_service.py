@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import decant
 from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import RaySpec
+from actors.laboratory_settings import RaySettings
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.journal.journal import JOURNAL_NAME
@@ -74,7 +74,7 @@ def test_a_task_without_its_section_is_refused(tmp_path: Path) -> None:
 
 def test_what_can_not_be_opened_leaves_no_run_folder(tmp_path: Path) -> None:
     plan = campaign(tmp_path)
-    request = task_request(replace(plan, laboratory=replace(plan.laboratory, bench=None)))
+    request = task_request(replace(plan, laboratory=plan.laboratory.with_values(bench=None)))
     with pytest.raises(LaboratoryError, match="has no bench"):
         RunService().start(request, RunResources(in_process=True))
     assert not (tmp_path / "runs").exists()
@@ -82,9 +82,9 @@ def test_what_can_not_be_opened_leaves_no_run_folder(tmp_path: Path) -> None:
 
 def test_a_shared_pool_joins_no_cluster(tmp_path: Path) -> None:
     plan = toy_plan(tmp_path)
-    plan = replace(plan, laboratory=replace(plan.laboratory, ray=RaySpec("head:6379")))
+    plan = replace(plan, laboratory=plan.laboratory.with_values(ray=RaySettings(address="head:6379")))
     shared: Any = object()
-    assert RunResources(approved_checksum="0A").settings(plan) == replace(plan.laboratory, accepted_checksum="0A")
+    assert RunResources(approved_checksum="0A").settings(plan) == plan.laboratory.with_values(accepted_checksum="0A")
     assert RunResources(simulators=shared).settings(plan).ray is None
 
 

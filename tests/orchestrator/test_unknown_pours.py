@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.journal.codec import decode_outcome, encode_outcome
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Failed, Poured
@@ -77,7 +77,7 @@ def test_a_pour_repeated_on_the_virtual_bench_is_the_same_pour(unknown: Callable
 
 def test_matter_is_not_repeated_on_a_real_bench(tmp_path: Path) -> None:
     """Neither by the plan nor by the operator."""
-    hardware = {"laboratory": LaboratorySpec("toy", mode="hardware")}
+    hardware = {"laboratory": LaboratorySettings(name="toy", mode="hardware")}
 
     def laboratory() -> ToyLaboratory:
         return ToyLaboratory(bench=toy_campaign.ToyBench(lambda: 60.0, mode="hardware"))

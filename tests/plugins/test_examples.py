@@ -10,7 +10,7 @@ import pytest
 
 from decant.plugins import LineError, Load, Reading, ReadingStatus, VesselSpec, build_vessel
 from decant.plugins.testing import BalanceBench, BalanceContract
-from tests.plugins.decant_example.balance import SpringBalance, SpringSpec
+from tests.plugins.decant_example.balance import SpringBalance, SpringSettings
 from tests.plugins.decant_example.dialect import PLAIN
 from tests.plugins.decant_example.vessel import Cone
 
@@ -18,7 +18,7 @@ from tests.plugins.decant_example.vessel import Cone
 class TestSpring(BalanceContract):
     @pytest.fixture
     def bench(self) -> Iterator[BalanceBench]:
-        spec = SpringSpec(swing=1.0, time_scale=10.0)
+        spec = SpringSettings(swing=1.0, time_scale=10.0)
         driver = SpringBalance(spec)
         filling, empty = Load((0.0, 3600.0), (0.0, 1.0)), Load((0.0,), (0.0,))
         yield BalanceBench(

@@ -226,11 +226,11 @@ def test_the_doctor_asks_a_balance_and_an_arm_from_outside(site: Path, broken: P
 
 
 DIALECT = """
-from decant.plugins import SerialBalance, SerialBalanceSpec
+from decant.plugins import SerialBalance, SerialBalanceSettings
 from decant.plugins.testing import VirtualSerialBalance
 
 far = VirtualSerialBalance.start("plain", baud=0, time_scale=20.0)
-balance = SerialBalance(SerialBalanceSpec(far.port, time_scale=20.0))
+balance = SerialBalance(SerialBalanceSettings(port=far.port, time_scale=20.0))
 print(balance.connect())
 balance.tare()
 far.put(0.2)
@@ -267,12 +267,12 @@ def test_the_tables_of_the_pages_know_what_is_installed(site: Path) -> None:
 
 UNFINISHED = """
 from typing import Literal
-from decant.plugins import ArmSettings, BalanceDeviceSection, DesignSettings, Objective, Shape
+from decant.plugins import ArmSettings, BalanceSettings, DesignSettings, Objective, Shape
 
 class Arm(ArmSettings):
     kind: Literal["arm"] = "arm"
 
-class Balance(BalanceDeviceSection):
+class Balance(BalanceSettings):
     kind: Literal["balance"] = "balance"
 
 class Design(DesignSettings):
@@ -299,8 +299,8 @@ def test_a_class_that_leaves_out_what_its_kind_has_to_say_is_refused_with_its_pa
     broken = {one["name"]: one for one in json.loads(command(tmp_path)("plugins", "--json").stdout)["broken"]}
     assert {one["package"] for one in broken.values()} == {"unfinished 0.1"}
     assert {name: one["reason"].partition(" lacks ")[2] for name, one in broken.items()} == {
-        "arm": "'resolve'",
-        "balance": "'device'",
+        "arm": "'driver', 'plan'",
+        "balance": "'driver'",
         "design": "'build', 'thetas', 'with_thetas'",
         "wish": "'cost'",
         "bowl": "'outline' or 'build'",

@@ -23,7 +23,7 @@ from decant.plugins import (
     cylinder,
 )
 from decant.plugins.testing import ArmBench, ArmContract
-from tests.plugins.decant_example.arm import Drive, Stand, StandSpec, poses_of
+from tests.plugins.decant_example.arm import Drive, Stand, StandSettings, poses_of
 
 DEG = math.pi / 180.0
 
@@ -38,7 +38,7 @@ ACTION = Action(angular_velocity=60 * DEG, x_offset=0.09, height=0.05, max_angle
 
 def bench_of(cls: type[Stand], *, witness: bool = True, time_scale: float = 4.0) -> ArmBench:
     """A stand on its bench: its drive is the witness, its cable is cut, its belt slips."""
-    spec = StandSpec(time_scale=time_scale)
+    spec = StandSettings(time_scale=time_scale)
     drive = Drive(time_scale)
     path = spec.plan(SCENE, ACTION)
 
@@ -75,7 +75,7 @@ class TestStand(ArmContract):
 
 def test_a_pour_too_fast_for_the_motor_is_refused_with_the_key_that_allows_it() -> None:
     with pytest.raises(InvalidActionError, match=r"30 deg/s \(arm.fastest\), 90 deg/s are asked for"):
-        StandSpec(fastest=30 * DEG).plan(SCENE, ACTION)
+        StandSettings(fastest=30 * DEG).plan(SCENE, ACTION)
 
 
 # -- arms that the contract finds --------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.laboratory import RayLaboratory
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from tests.reliability import strikes
 from tests.reliability.case import CUT, FULL, KILLED, STOPPED, Case, every, first_of_kind
 from tests.reliability.formula import WORK, Formula
@@ -37,7 +37,7 @@ class RayRig(Rig):
     @contextlib.asynccontextmanager
     async def laboratory(self, life: Life) -> AsyncIterator[Any]:
         os.environ[WORK] = "0.02"
-        async with RayLaboratory(LaboratorySpec("matrix", simulators=1), Formula) as opened:
+        async with RayLaboratory(LaboratorySettings(name="matrix", simulators=1), Formula) as opened:
             pool: Any = opened.simulators
             await pool.pids()
             yield ToyLaboratory(pool, LoggingBench(life), opened.optimizer)  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
 from actors.runtime.remote_object import DeviceLostError, RayDevice
 from actors.simulators.ray_worker import ray_pool
@@ -36,7 +36,7 @@ class PooledRig(Rig):
         from actors.runtime.ray_runtime import start_ray
 
         os.environ[WORK] = "0.02"
-        start_ray(LaboratorySpec("matrix", simulators=SIMULATORS))
+        start_ray(LaboratorySettings(name="matrix", simulators=SIMULATORS))
         self._loop = asyncio.new_event_loop()
         self._pool: Any = None
         self._device: Any = None

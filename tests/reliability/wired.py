@@ -14,7 +14,7 @@ from typing import Any
 
 from actors.bench import bench_operators
 from actors.bench.bench_operators import VirtualOperator
-from actors.interfaces import OperatorQuestion, OperatorSpec
+from actors.interfaces import OperatorQuestion, OperatorSettings
 from actors.laboratory import InProcessLaboratory
 from orchestrator.journal.journal import Kind
 from tests.end_to_end.test_wired_campaign import write_wired
@@ -61,7 +61,7 @@ class WiredRig(Rig):
         spec = wired_spec(
             pace=PACE,
             hurried=True,
-            operator=OperatorSpec(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
+            operator=OperatorSettings(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
         )
         bench_operators.SCATTER = 0.0  # each refilling is one of chance, and after a restart there is one more
         async with InProcessLaboratory(spec, Formula, need_bench=True) as opened:

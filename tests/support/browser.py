@@ -25,7 +25,7 @@ from tests.support.waiting import PATIENCE
 T = TypeVar("T")
 
 PERSON = CAMPAIGN.replace(
-    "  bench:", "  arm: {kind: numbers}\n  balance: {kind: numbers}\n  operator: {answers: person}\n  bench:"
+    "  bench:", "  arm: {kind: simulated}\n  balance: {kind: simulated}\n  operator: {answers: person}\n  bench:"
 ).replace("time_scale: 0", "time_scale: 50")
 """A campaign with somebody at the bench."""
 

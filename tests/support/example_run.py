@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from actors.interfaces import PourProgress
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Data, MinimumQuery, Suggestion, SuggestionQuery, SurrogateMap
 from actors.optimizer.suggest import propose
 from orchestrator.requests import (
@@ -88,7 +88,7 @@ def campaign(*, pours: int = 3) -> CampaignPlan:
         "narrow-cup",
         7,
         Path("narrow-cup.yaml"),
-        LaboratorySpec("virtual", simulators=2),
+        LaboratorySettings(name="virtual", simulators=2),
         SimulationParameters(),
         calibration,
         deployment,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_geometry import ArmLimits, Box, JointAngles, Point, Pose, RobotCell
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planning.trajectory import follow
 from orchestrator.config.file_loading import load_vessel
 from sim_engine.action import DEG, Action
@@ -26,14 +25,18 @@ FloatArray = NDArray[np.float64]
 CONFIGS = Path(__file__).parents[2] / "configs"
 
 LIMITS = ArmLimits(
-    box_low=(0.25, -0.6, 0.0), box_high=(1.0, 0.4, 0.9), joint_speed=170 * DEG, tilt_speed=155 * DEG, clearance=3e-3
+    box=Box(low=Point.of(0.25, -0.6, 0.0), high=Point.of(1.0, 0.4, 0.9)),
+    joint_speed=170 * DEG,
+    tilt_speed=155 * DEG,
+    clearance=3e-3,
 )
-SPEC = UrArmSpec(
+SPEC = UrArmSettings(
     model="ur10e",
     limits=LIMITS,
-    cell=RobotCell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
-    home=(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
+    cell=RobotCell(receiver=Point.of(0.75, 0.0, 0.06), direction=90 * DEG),
+    home=JointAngles.of(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
     tool=Pose(z=0.17),
+    payload=0.0,
     grip=Pose(y=-0.06, rx=-90 * DEG),
 )
 ACTION = Action(
@@ -59,21 +62,21 @@ def motion(action: Action = ACTION, receiver: str = "tumbler", pivot: Pivot | No
     return plan_motion(scene, action, vessel("beaker"), vessel(receiver))
 
 
-def limited(**changes: Any) -> UrArmSpec:
+def limited(**changes: Any) -> UrArmSettings:
     """The cell with other limits."""
-    return replace(SPEC, limits=replace(LIMITS, **changes))
+    return SPEC.with_values(limits=LIMITS.with_values(**changes))
 
 
-def placed(**changes: Any) -> UrArmSpec:
+def placed(**changes: Any) -> UrArmSettings:
     """The cell with other things in it."""
-    return replace(SPEC, cell=replace(SPEC.cell, **changes))
+    return SPEC.with_values(cell=SPEC.cell.with_values(**changes))
 
 
-def waiting_at(x: float, y: float, z: float) -> UrArmSpec:
+def waiting_at(x: float, y: float, z: float) -> UrArmSettings:
     """The cell with a home that has the pourer upright at a place of the world, in the same posture."""
     pose = np.array([[x, y, z, 1.0, 0.0, 0.0, 0.0]])
-    q = follow(pose, np.array(SPEC.home), SPEC)[0]
-    return replace(SPEC, home=(q[0], q[1], q[2], q[3], q[4], q[5]))
+    q = follow(pose, np.array(SPEC.home.angles), SPEC)[0]
+    return SPEC.with_values(home=JointAngles.of(q[0], q[1], q[2], q[3], q[4], q[5]))
 
 
 def turned(rotations: FloatArray, others: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy as np
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.posterior_summary import PosteriorFound, RemainingDiscrepancy
 from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan
-from orchestrator.strategies.deployment.disturbances import PoseNoiseSection, RiskSettings
+from orchestrator.strategies.deployment.disturbances import PoseNoise, RiskSettings
 from orchestrator.strategies.deployment.safe_window import WindowSettings
 from orchestrator.strategies.strategy_registry import STRATEGIES
 from orchestrator.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE
@@ -73,7 +73,7 @@ def risk(
 ) -> RiskSettings:
     """What D1 has to bear; errors are standard deviations."""
     errors = asdict(pose_error or PoseError(speed_factor=0.0))
-    return RiskSettings(measure=measure, level=level, pose_error=PoseNoiseSection(**errors), theta=theta)
+    return RiskSettings(measure=measure, level=level, pose_error=PoseNoise(**errors), theta=theta)
 
 
 def calibrated(theta: SimulationParameters, rows: Sequence[Mapping[str, float]] = ()) -> Calibrated:

@@ -17,11 +17,11 @@ from typing import Any, Literal
 import numpy as np
 
 from actors.interfaces import PourProgress, ProgressCallback
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Data, MinimumQuery, Suggestion, SuggestionQuery
+from orchestrator.journal.codec import Results, result_of
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.journal.run_record import CampaignResult
-from orchestrator.journal.stage_results import Results, result_of
 from orchestrator.requests import (
     Decision,
     Failed,
@@ -65,7 +65,7 @@ def toy_plan(directory: Path, **changes: Any) -> CampaignPlan:
         "name": "toy",
         "seed": 7,
         "source": directory / "toy.yaml",
-        "laboratory": LaboratorySpec("toy"),
+        "laboratory": LaboratorySettings(name="toy"),
         "parameters": THETA,
         "calibration": None,
         "deployment": deployment,

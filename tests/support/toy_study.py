@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.suggest import propose
 from orchestrator.run_service import RunResources
 from orchestrator.study.study_file import load_study
@@ -68,7 +68,7 @@ class _Optimizer:
 class ToyLaboratory:
     """In this process, without physics."""
 
-    def __init__(self, spec: LaboratorySpec, need_bench: bool) -> None:
+    def __init__(self, spec: LaboratorySettings, need_bench: bool) -> None:
         assert spec.bench is not None
         self.simulators, self.optimizer = _Simulators(), _Optimizer()
         self.bench = _Bench(spec.bench.liquid) if need_bench else None

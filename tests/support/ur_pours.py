@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
+from actors.arm.arm_geometry import ArmLimits, Box, Centre, JointAngles, Point, Pose, RobotCell
 from actors.arm.arm_interface import PathReport
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath, PourPath
 
 HOME = tuple(math.radians(v) for v in (0.0, -90.0, 90.0, -90.0, -90.0, 0.0))
@@ -30,21 +29,21 @@ REPORT = PathReport(
 )
 
 
-def settings(address: str = "", **changes: Any) -> UrArmSpec:
+def settings(address: str = "", **changes: Any) -> UrArmSettings:
     """An arm with a tool and a payload."""
-    spec = UrArmSpec(
+    spec = UrArmSettings(
         model="ur10e",
-        limits=ArmLimits((-1.5, -1.5, -0.5), (1.5, 1.5, 2.0)),
-        cell=RobotCell((0.8, 0.0, 0.0)),
-        home=HOME,  # type: ignore[arg-type]
+        limits=ArmLimits(box=Box(low=Point.of(-1.5, -1.5, -0.5), high=Point.of(1.5, 1.5, 2.0))),
+        cell=RobotCell(receiver=Point.of(0.8, 0.0, 0.0), direction=0.0),
+        home=JointAngles.of(*HOME),
         address=address,
-        tool=Pose(0.0, 0.0, 0.15),
+        tool=Pose(z=0.15),
         grip=Pose(rx=math.pi),  # the flange looks down, the pourer up
         payload=1.2,
-        payload_centre=(0.0, 0.0, 0.08),
-        announcement=1.0,
+        payload_centre=Centre.of(0.0, 0.0, 0.08),
+        warning_time=1.0,
     )
-    return replace(spec, **changes)
+    return spec.with_values(**changes)
 
 
 def smooth(begin: Any, end: Any, duration: float, step: float = 0.03) -> JointPath:

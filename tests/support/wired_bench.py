@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from actors.balance.balance_settings import SerialBalanceSpec
+from actors.balance.balance_settings import SerialBalanceSettings
 from actors.balance.weighing_plan import Placement
 from actors.bench.bench_factory import PouringBench
 from actors.bench.bench_operators import BenchContents, VirtualOperator
 from actors.bench.virtual_bench import DeviceEmulators, FollowedBench, VirtualBench
-from actors.interfaces import Notice, OperatorQuestion, OperatorSpec
+from actors.interfaces import Notice, OperatorQuestion, OperatorSettings
 from actors.laboratory import InProcessLaboratory
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.file_loading import load_laboratory
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid
@@ -99,6 +100,10 @@ class Stage:
     """Done before the next question about something is answered."""
     answered_at: dict[str, float] = field(default_factory=dict)
     """Controller time at which the last question about something was answered [s]."""
+    answers: dict[str, list[str]] = field(default_factory=dict)
+    """In place of the operator's own answers to questions about something, first to last; no step is carried out."""
+    late: dict[str, float] = field(default_factory=dict)
+    """Extra time for the next question about something [s]; with inf it is never answered."""
     unsafe: list[str] = field(default_factory=list)
     """Questions that invited hands in while a program ran or a joint moved."""
 
@@ -122,7 +127,15 @@ class Stage:
                 self.unsafe.append(question.about)
             if (hook := self.before.pop(question.about, None)) is not None:
                 await hook()
-            answer = await ask(question)
+            if math.isinf(late := self.late.pop(question.about, 0.0)):
+                self.operator.heard.append(question)
+                await asyncio.Event().wait()
+            await asyncio.sleep(late)
+            if self.answers.get(question.about):
+                self.operator.heard.append(question)
+                answer = self.answers[question.about].pop(0)
+            else:
+                answer = await ask(question)
             self.answered_at[question.about] = await self.now()
             return answer
 
@@ -165,37 +178,31 @@ class Stage:
 def wired_spec(
     placement: Placement = Placement.TRAY,
     pace: float = PACE,
-    operator: OperatorSpec | None = None,
+    operator: OperatorSettings | None = None,
     *,
     hurried: bool = False,
-) -> LaboratorySpec:
+) -> LaboratorySettings:
     """The shipped virtual laboratory with an exact balance; `hurried` saves time where that changes nothing."""
     spec = load_laboratory(LABORATORIES / "virtual.yaml")
     assert spec.arm is not None
     assert spec.balance is not None
-    device = spec.balance.device
-    assert isinstance(device, SerialBalanceSpec)
+    device = spec.balance
+    assert isinstance(device, SerialBalanceSettings)
     assert device.virtual is not None
     assert spec.bench is not None
-    rule = replace(device.settling, deadline=10.0)
-    arm = replace(spec.arm, time_scale=pace)
+    rule = device.settling.with_values(deadline=10.0)
+    arm = spec.arm.with_values(time_scale=pace)
     if hurried:
-        rule = replace(rule, readings=2, span=0.2)
-        arm = replace(arm, announcement=1.0, untilt_speed=60 * DEG, approach_speed=90 * DEG)
-    virtual = replace(device.virtual, noise=0.0, drift=0.0, settling_time=0.5)
-    device = replace(device, time_scale=pace, answer_time=0.3, reconnect_time=1.0, settling=rule, virtual=virtual)
-    manual = placement is Placement.MANUAL
-    return replace(
-        spec,
+        rule = rule.with_values(readings=2, span=0.2)
+        arm = arm.with_values(warning_time=1.0, upright_speed=60 * DEG, approach_speed=90 * DEG)
+    virtual = device.virtual.with_values(noise=0.0, drift=0.0, settling_time=0.5)
+    quick = {"time_scale": pace, "answer_time": 0.3, "reconnect_time": 1.0}
+    return spec.with_values(
         in_process=True,
         arm=arm,
-        balance=replace(
-            spec.balance,
-            placement=placement,
-            device=None if manual else device,
-        ),
-        bench=replace(spec.bench, time_scale=pace),
-        operator=operator or OperatorSpec(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
+        balance=device.with_values(placement=placement.value, settling=rule, virtual=virtual, **quick),
+        bench=spec.bench.with_values(time_scale=pace),
+        operator=operator or OperatorSettings(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
     )
 
 
@@ -204,7 +211,7 @@ OpenStage = Callable[..., contextlib.AbstractAsyncContextManager[Stage]]
 
 @contextlib.asynccontextmanager
 async def opened_stage(
-    spec: LaboratorySpec | None = None,
+    spec: LaboratorySettings | None = None,
     *,
     answers: Mapping[str, Sequence[str]] | None = None,
     late: Mapping[str, float] | None = None,
@@ -216,7 +223,8 @@ async def opened_stage(
     laboratory.listen(stage.notices.append)
     async with laboratory:
         stage.attend()
-        stage.operator.script(answers or {}, late or {})
+        stage.answers = {about: list(given) for about, given in (answers or {}).items()}
+        stage.late = dict(late or {})
         yield stage
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.arm_geometry import Pose
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.ur.robot_models import MODELS, RobotModel
 from sim_engine.collision import rotations
 from sim_engine.scene import SampledMotion
@@ -276,19 +276,19 @@ class CellTransforms:
 
 
 @lru_cache(maxsize=32)
-def cell_transforms(spec: UrArmSpec) -> CellTransforms:
+def cell_transforms(spec: UrArmSettings) -> CellTransforms:
     """The constant frames of a cell."""
     tool = transform_of(spec.tool)
     mount = about("x", spec.mount.tilt) @ about("z", spec.mount.turn)  # first turned about its own z, then tilted
     return CellTransforms(
         Transforms(mount, np.zeros(3)),
-        Transforms(about("z", spec.cell.direction), np.array(spec.cell.receiver)),
+        Transforms(about("z", spec.cell.direction), np.array(spec.cell.receiver.vector)),
         tool,
         tool @ transform_of(spec.grip),
     )
 
 
-def flange_poses(poses: FloatArray, spec: UrArmSpec) -> Transforms:
+def flange_poses(poses: FloatArray, spec: UrArmSettings) -> Transforms:
     """Poses of the flange in the base's frame.
 
     Args:
@@ -299,12 +299,12 @@ def flange_poses(poses: FloatArray, spec: UrArmSpec) -> Transforms:
     return cell.base.inverse @ cell.world @ Transforms(rotations(poses), poses[:, :3]) @ cell.pourer.inverse
 
 
-def pourer_transforms(joints: FloatArray, spec: UrArmSpec) -> Transforms:
+def pourer_transforms(joints: FloatArray, spec: UrArmSettings) -> Transforms:
     """Poses of the pourer in the room's frame for joints (T, 6) [rad]."""
     return flange_transforms(joints, spec) @ cell_transforms(spec).pourer
 
 
-def flange_transforms(joints: FloatArray, spec: UrArmSpec) -> Transforms:
+def flange_transforms(joints: FloatArray, spec: UrArmSettings) -> Transforms:
     """Poses of the flange in the room's frame for joints (T, 6) [rad]."""
     return cell_transforms(spec).base @ Transforms(*forward(joints, MODELS[spec.model]))
 
@@ -319,7 +319,9 @@ def quaternions(rotation: FloatArray) -> FloatArray:
     return signed
 
 
-def pourer_motion(joints: FloatArray, times: FloatArray, spec: UrArmSpec, *, grip_tilt: float = 0.0) -> SampledMotion:
+def pourer_motion(
+    joints: FloatArray, times: FloatArray, spec: UrArmSettings, *, grip_tilt: float = 0.0
+) -> SampledMotion:
     """The motion of the pourer according to an arm's encoders.
 
     Args:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.arm_interface import PathReport
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.collision_geometry import Nearest, hull, nearest_links, nearest_to_receiver
 from actors.arm.planning.kinematics import (
@@ -41,17 +41,17 @@ PARTS = ("shoulder", "elbow", "wrist")
 """Order of the parts in `singularities`."""
 
 
-def check_limits(spec: UrArmSpec) -> list[str]:
+def check_limits(spec: UrArmSettings) -> list[str]:
     """Problems of an arm's settings; empty if there are none. Messages name the keys of a laboratory's file."""
     limits = spec.limits
-    low, high = np.array(limits.box_low), np.array(limits.box_high)
+    low, high = np.array(limits.box.low.vector), np.array(limits.box.high.vector)
     if np.any(low >= high):
         axis = "xyz"[int(np.argmax(low >= high))]
         return [f"limits.box: {axis} of 'low' should be smaller than that of 'high'"]
     return [*_speed_limits(spec), *_clearance(spec), *_receiver(spec), *_home(spec)]
 
 
-def _speed_limits(spec: UrArmSpec) -> list[str]:
+def _speed_limits(spec: UrArmSettings) -> list[str]:
     problems = []
     deg = math.degrees
     if spec.approach_speed > spec.limits.joint_speed:
@@ -59,15 +59,15 @@ def _speed_limits(spec: UrArmSpec) -> list[str]:
             f"approach_speed: {deg(spec.approach_speed):.4g} deg/s is above limits.joint_speed, "
             f"{deg(spec.limits.joint_speed):.4g} deg/s"
         )
-    if spec.untilt_speed > spec.limits.tilt_speed:
+    if spec.upright_speed > spec.limits.tilt_speed:
         problems.append(
-            f"untilt_speed: {deg(spec.untilt_speed):.4g} deg/s is above limits.tilt_speed, "
+            f"upright_speed: {deg(spec.upright_speed):.4g} deg/s is above limits.tilt_speed, "
             f"{deg(spec.limits.tilt_speed):.4g} deg/s"
         )
     return problems
 
 
-def _clearance(spec: UrArmSpec) -> list[str]:
+def _clearance(spec: UrArmSettings) -> list[str]:
     if spec.limits.clearance <= MARGIN:
         return []
     return [
@@ -76,15 +76,15 @@ def _clearance(spec: UrArmSpec) -> list[str]:
     ]
 
 
-def _receiver(spec: UrArmSpec) -> list[str]:
+def _receiver(spec: UrArmSettings) -> list[str]:
     problems = []
-    x, y, z = spec.cell.receiver
-    low, high = spec.limits.box_low, spec.limits.box_high
+    x, y, z = spec.cell.receiver.vector
+    low, high = spec.limits.box.low.vector, spec.limits.box.high.vector
     if not (low[0] <= x <= high[0] and low[1] <= y <= high[1]):
         problems.append(f"cell.receiver: ({x:.3f}, {y:.3f}) m lies outside limits.box, seen from above")
     for number, plane in enumerate(spec.limits.planes, 1):
         # a horizontal plane may pass above the receiver's position
-        if abs(plane.normal[2]) < 0.5 and float(np.dot(plane.normal, spec.cell.receiver)) < plane.offset:
+        if abs(plane.normal[2]) < 0.5 and float(np.dot(plane.normal, spec.cell.receiver.vector)) < plane.offset:
             problems.append(f"cell.receiver: ({x:.3f}, {y:.3f}, {z:.3f}) m lies beyond plane {number} of limits.planes")
     if z < spec.cell.table - 1e-6:
         problems.append(f"cell.receiver: stands at {z:.3f} m, below cell.table at {spec.cell.table:.3f} m")
@@ -105,10 +105,10 @@ def _receiver(spec: UrArmSpec) -> list[str]:
     return problems
 
 
-def _home(spec: UrArmSpec) -> list[str]:
-    model, q = MODELS[spec.model], np.array([spec.home])
+def _home(spec: UrArmSettings) -> list[str]:
+    model, q = MODELS[spec.model], np.array([spec.home.angles])
     problems = []
-    for name, angle, most in zip(JOINT_NAMES, spec.home, model.joint_range, strict=True):
+    for name, angle, most in zip(JOINT_NAMES, spec.home.angles, model.joint_range, strict=True):
         if abs(angle) > most:
             problems.append(
                 f"home: {name} at {math.degrees(angle):.1f} deg is outside its range of ±{math.degrees(most):.0f} deg"
@@ -133,10 +133,12 @@ def _home(spec: UrArmSpec) -> list[str]:
     return problems
 
 
-def outside(point: np.ndarray[tuple[int], np.dtype[np.float64]], spec: UrArmSpec) -> list[str]:
+def outside(point: np.ndarray[tuple[int], np.dtype[np.float64]], spec: UrArmSettings) -> list[str]:
     """Violations of box, planes and table at a point of the room's frame, shape (3,) [m]."""
     texts = []
-    for axis, value, low, high in zip("xyz", point, spec.limits.box_low, spec.limits.box_high, strict=True):
+    for axis, value, low, high in zip(
+        "xyz", point, spec.limits.box.low.vector, spec.limits.box.high.vector, strict=True
+    ):
         if not low <= value <= high:
             texts.append(f"outside the box, at {axis} = {value:.3f} m ({low:.3f} … {high:.3f} m are allowed)")
     for number, plane in enumerate(spec.limits.planes, 1):
@@ -193,7 +195,7 @@ def check_clearance(sampled: SampledPath, until: float, pourer: Vessel, receiver
 
 def check_reach(unreached: SampledPath) -> str:
     """Message about a path of which some poses cannot be reached in the posture of home."""
-    home = posture(np.array(unreached.spec.home), unreached.model)
+    home = posture(np.array(unreached.spec.home.angles), unreached.model)
     assert unreached.unreached is not None
     beyond = beyond_reach(unreached.unreached.rotation, unreached.unreached.position, unreached.model)
     worst = _first_worst(np.abs(beyond[:, home]))
@@ -210,7 +212,7 @@ def check_reach(unreached: SampledPath) -> str:
     return f"{when}: {-distance:.0f} mm too near to the arm's base; move the receiver away from it{another}"
 
 
-def check_way(racing: RacingJointError, spec: UrArmSpec) -> str:
+def check_way(racing: RacingJointError, spec: UrArmSettings) -> str:
     """Message about a way from home through a singularity."""
     direction = math.degrees(spec.cell.direction)
     facing = math.degrees(math.remainder(spec.cell.direction + racing.heading, 2.0 * math.pi))
@@ -259,7 +261,7 @@ def report(parts: list[SampledPath], clearance: float, pourer: Vessel, deviation
     )
 
 
-def recheck(path: JointPath, spec: UrArmSpec) -> None:
+def recheck(path: JointPath, spec: UrArmSettings) -> None:
     """Check a path again immediately before it is executed, without information about its purpose.
 
     Checks ranges, joint speeds and jumps; tool centre point and the pourer's underside against box, planes and table.
@@ -384,7 +386,7 @@ def _places(s: SampledPath, points: FloatArray) -> Iterator[str]:
     """Violations of box, planes and table by the TCP and points (V, 3) of the pourer."""
     limits = s.spec.limits
     for k, axis in enumerate("xyz"):
-        for sign, bound, word in ((1.0, limits.box_low[k], "least"), (-1.0, limits.box_high[k], "most")):
+        for sign, bound, word in ((1.0, limits.box.low.vector[k], "least"), (-1.0, limits.box.high.vector[k], "most")):
             for thing, where, value in _beyond(s, sign * np.eye(3)[k], sign * bound, points):
                 yield (
                     f"{thing} would leave the box at {axis} = {sign * value:.3f} m, {s.when(where)}; "

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath, PourPath
 from actors.arm.planning.path_checks import (
     check_clearance,
@@ -59,7 +59,7 @@ UNTILT_ACCELERATION = STEEPEST / 10.0
 """Acceleration of the return to upright after a pour that ends tilted [rad/s²]."""
 
 
-def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Vessel) -> PourPath:
+def plan_path(motion: PourMotion, spec: UrArmSettings, pourer: Vessel, receiver: Vessel) -> PourPath:
     """Plan the joints for a whole pour.
 
     The arm moves from home to the pour's first pose in straight lines with the pourer upright: directly, or, if that is
@@ -94,7 +94,7 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
     barred = bool(problems)
     pour = None
     try:
-        pour = _pour(made, np.array(spec.home) if approach is None else approach.joints[-1], spec)
+        pour = _pour(made, np.array(spec.home.angles) if approach is None else approach.joints[-1], spec)
         during = SampledPath.of("pour", pour, spec, phases)
     except OutOfReachError as error:
         during = SampledPath.beyond("pour", pour_times(made), error.poses, spec, phases)
@@ -134,7 +134,7 @@ def plan_path(motion: PourMotion, spec: UrArmSpec, pourer: Vessel, receiver: Ves
 
 @lru_cache(maxsize=16)
 def _approach(
-    start: tuple[float, ...], spec: UrArmSpec, pourer: Vessel, receiver: Vessel
+    start: tuple[float, ...], spec: UrArmSettings, pourer: Vessel, receiver: Vessel
 ) -> tuple[JointPath | None, float, tuple[str, ...]]:
     """The approach with the fewest problems, and the shortest of those, its clearance [m], and its problems.
 
@@ -149,7 +149,7 @@ def _approach(
     for knots in routes(home_pose(spec), np.array(start), over):
         path: JointPath | None = None
         try:
-            path = travel(knots, np.array(spec.home), spec)
+            path = travel(knots, np.array(spec.home.angles), spec)
             sampled = SampledPath.of("approach", path, spec)
         except OutOfReachError as error:
             sampled = SampledPath.beyond(
@@ -170,7 +170,7 @@ def _approach(
     return best[0], best[1], tuple(best[2])
 
 
-def _pour(motion: PourMotion, near: FloatArray, spec: UrArmSpec) -> JointPath:
+def _pour(motion: PourMotion, near: FloatArray, spec: UrArmSettings) -> JointPath:
     """Follow the motion within the allowed errors, with as few waypoints as possible."""
     finer = 1
     while True:
@@ -181,7 +181,7 @@ def _pour(motion: PourMotion, near: FloatArray, spec: UrArmSpec) -> JointPath:
         finer *= 2
 
 
-def _follows(path: JointPath, motion: PourMotion, spec: UrArmSpec) -> bool:
+def _follows(path: JointPath, motion: PourMotion, spec: UrArmSettings) -> bool:
     middles = 0.5 * (path.times[1:] + path.times[:-1])
     wanted = motion.sample(middles)
     world = SampledPath("pour", middles, path.at(middles), spec)
@@ -190,14 +190,14 @@ def _follows(path: JointPath, motion: PourMotion, spec: UrArmSpec) -> bool:
     return bool(apart.max() < PLACE_ERROR and turned.max() < ANGLE_ERROR)
 
 
-def _retreat(motion: PourMotion, approach: JointPath, pour: JointPath, spec: UrArmSpec) -> JointPath:
+def _retreat(motion: PourMotion, approach: JointPath, pour: JointPath, spec: UrArmSettings) -> JointPath:
     """First to upright, if the pour ends tilted; then back along the approach."""
     times = approach.times[-1] - approach.times[::-1]
     back = JointPath(times, approach.joints[::-1])
     first, last = (float(motion.tilt(np.array([t]))[0]) - motion.tilt_error for t in (0.0, motion.duration))
     if abs(last - first) < 1e-9:
         return back
-    segments = tuple(turn(0.0, last, first, spec.untilt_speed, UNTILT_ACCELERATION))
+    segments = tuple(turn(0.0, last, first, spec.upright_speed, UNTILT_ACCELERATION))
     end = segments[-1].start + segments[-1].duration
     upright = replace(motion, segments=segments, phases=(Phase("untilt", 0.0, end),))
     first_part = _pour(upright, pour.joints[-1], spec)

@@ -17,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.kinematics import (
     MODELS,
@@ -164,19 +164,19 @@ class SampledPath:
     name: str
     times: FloatArray
     joints: FloatArray
-    spec: UrArmSpec
+    spec: UrArmSettings
     phases: Phases = ()
     unreached: Transforms | None = None
 
     @classmethod
-    def of(cls, name: str, path: JointPath, spec: UrArmSpec, phases: Phases = ()) -> SampledPath:
+    def of(cls, name: str, path: JointPath, spec: UrArmSettings, phases: Phases = ()) -> SampledPath:
         """A path with midpoints between its waypoints: joints are linear in between, poses nearly so."""
         times = np.sort(np.concatenate([path.times, 0.5 * (path.times[1:] + path.times[:-1])]))
         return cls(name, times, path.at(times), spec, phases)
 
     @classmethod
     def beyond(
-        cls, name: str, times: FloatArray, poses: FloatArray, spec: UrArmSpec, phases: Phases = ()
+        cls, name: str, times: FloatArray, poses: FloatArray, spec: UrArmSettings, phases: Phases = ()
     ) -> SampledPath:
         """Poses of the pourer in the world (N, 7), some of which cannot be reached."""
         return cls(name, times, np.zeros((len(times), 6)), spec, phases, flange_poses(poses, spec))
@@ -310,7 +310,7 @@ class OutOfReachError(Exception):
         self.poses = poses
 
 
-def follow(poses: FloatArray, near: FloatArray, spec: UrArmSpec) -> FloatArray:
+def follow(poses: FloatArray, near: FloatArray, spec: UrArmSettings) -> FloatArray:
     """Joints that take the pourer through poses without jumps, in the posture of home.
 
     Args:
@@ -326,15 +326,15 @@ def follow(poses: FloatArray, near: FloatArray, spec: UrArmSpec) -> FloatArray:
     """
     model = MODELS[spec.model]
     flange = flange_poses(poses, spec)
-    joints = inverse(flange.rotation, flange.position, model)[:, posture(np.array(spec.home), model)]
+    joints = inverse(flange.rotation, flange.position, model)[:, posture(np.array(spec.home.angles), model)]
     if np.isnan(joints).any():
         raise OutOfReachError(poses)
     return np.unwrap(np.concatenate([near[None], joints]), axis=0)[1:]
 
 
-def home_pose(spec: UrArmSpec) -> FloatArray:
+def home_pose(spec: UrArmSettings) -> FloatArray:
     """Pose of the pourer in the world at the home pose, shape (7,)."""
-    frame = cell_transforms(spec).world.inverse @ pourer_transforms(np.array([spec.home]), spec)
+    frame = cell_transforms(spec).world.inverse @ pourer_transforms(np.array([spec.home.angles]), spec)
     return np.concatenate([frame.position[0], quaternions(frame.rotation)[0]])
 
 
@@ -351,7 +351,7 @@ def routes(start: FloatArray, end: FloatArray, over: float) -> list[list[FloatAr
     return [[start, end], [start, up, across, end]]
 
 
-def travel(knots: list[FloatArray], near: FloatArray, spec: UrArmSpec) -> JointPath:
+def travel(knots: list[FloatArray], near: FloatArray, spec: UrArmSettings) -> JointPath:
     """Move along straight lines from knot to knot, at rest at each.
 
     The slowest of these limits sets the time of each line: approach speed and acceleration of the fastest joint; tool
@@ -381,7 +381,7 @@ def travel(knots: list[FloatArray], near: FloatArray, spec: UrArmSpec) -> JointP
 
 
 def _line(
-    a: FloatArray, b: FloatArray, distance: float, angle: float, near: FloatArray, spec: UrArmSpec
+    a: FloatArray, b: FloatArray, distance: float, angle: float, near: FloatArray, spec: UrArmSettings
 ) -> tuple[FloatArray, FloatArray]:
     s = np.linspace(0.0, 1.0, max(math.ceil(distance / 0.005), math.ceil(angle / math.radians(1.0)), 8) + 1)
     joints = follow(_between(a, b, s), near, spec)

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 from actors.arm.arm_geometry import JOINT_NAMES, Pose
-from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord, UrArmSpec
+from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord, UrArmSettings
 from actors.arm.ur.controller_readout import PORTS, SCRIPTS, SLIDER, Exchange, Findings, ReadoutError, look_at
 from actors.arm.ur.primary_interface import RobotState
 from actors.arm.ur.worker_messages import why_not_ready
@@ -31,9 +31,9 @@ level. Gravity [m/s²].
 HOME_TOLERANCE = math.radians(1.0)
 
 
-def tool_check(spec: UrArmSpec, state: RobotState) -> DeviceCheck:
+def tool_check(spec: UrArmSettings, state: RobotState) -> DeviceCheck:
     """Compare the controller's TCP with the file's."""
-    there = Pose(*state.tool)
+    there = Pose.of(*state.tool)
     away, turned = distance(spec.tool, there), turn(spec.tool, there)
     if away <= TOOL_TOLERANCE and turned <= TURN_TOLERANCE:
         return DeviceCheck("tool", "ok", f"TCP {_point(there)}")
@@ -46,7 +46,7 @@ def tool_check(spec: UrArmSpec, state: RobotState) -> DeviceCheck:
     )
 
 
-def mount_check(spec: UrArmSpec, state: RobotState, exchange: Exchange) -> DeviceCheck:
+def mount_check(spec: UrArmSettings, state: RobotState, exchange: Exchange) -> DeviceCheck:
     """Compare the vertical that the tool's accelerometer measures with the file's mount."""
     from scipy.spatial.transform import Rotation
 
@@ -71,11 +71,11 @@ def mount_check(spec: UrArmSpec, state: RobotState, exchange: Exchange) -> Devic
     )
 
 
-def payload_check(spec: UrArmSpec, exchange: Exchange) -> DeviceCheck:
+def payload_check(spec: UrArmSettings, exchange: Exchange) -> DeviceCheck:
     """Compare the controller's payload with the file's."""
     if exchange.payload is None or exchange.payload_centre is None:
         return DeviceCheck("payload", "warn", "not told", "compare payload and centre with the teach pendant yourself")
-    away = math.dist(exchange.payload_centre, spec.payload_centre)
+    away = math.dist(exchange.payload_centre, spec.payload_centre.vector)
     text = f"{exchange.payload:.2f} kg"
     if abs(exchange.payload - spec.payload) <= PAYLOAD_TOLERANCE and away <= CENTRE_TOLERANCE:
         return DeviceCheck("payload", "ok", text)
@@ -88,9 +88,9 @@ def payload_check(spec: UrArmSpec, exchange: Exchange) -> DeviceCheck:
     )
 
 
-def home_check(spec: UrArmSpec, state: RobotState) -> DeviceCheck:
+def home_check(spec: UrArmSettings, state: RobotState) -> DeviceCheck:
     """Check whether the arm stands at its home pose."""
-    away = [abs(a - b) for a, b in zip(state.joints, spec.home, strict=True)]
+    away = [abs(a - b) for a, b in zip(state.joints, spec.home.angles, strict=True)]
     worst = max(range(6), key=away.__getitem__)
     if away[worst] <= HOME_TOLERANCE:
         return DeviceCheck("position", "ok", "at home")
@@ -102,7 +102,7 @@ def home_check(spec: UrArmSpec, state: RobotState) -> DeviceCheck:
     )
 
 
-def limit_checks(spec: UrArmSpec, state: RobotState) -> list[DeviceCheck]:
+def limit_checks(spec: UrArmSettings, state: RobotState) -> list[DeviceCheck]:
     """Check that the file's limits are within the controller's."""
     checks = []
     if state.joint_speeds:
@@ -120,7 +120,9 @@ def limit_checks(spec: UrArmSpec, state: RobotState) -> list[DeviceCheck]:
         else:
             checks.append(DeviceCheck("joint speed", "ok", "the file's limit is within the controller's"))
     out = [
-        i for i, (q, (low, high)) in enumerate(zip(spec.home, state.joint_ranges, strict=False)) if not low <= q <= high
+        i
+        for i, (q, (low, high)) in enumerate(zip(spec.home.angles, state.joint_ranges, strict=False))
+        if not low <= q <= high
     ]
     if out:
         checks.append(
@@ -166,11 +168,11 @@ class UrDiagnostics(ArmDiagnostics):
         found: values of the controller.
     """
 
-    spec: UrArmSpec | None = None
+    spec: UrArmSettings | None = None
     found: Findings | None = None
 
     @classmethod
-    def at(cls, spec: UrArmSpec) -> UrDiagnostics:
+    def at(cls, spec: UrArmSettings) -> UrDiagnostics:
         """Read everything from the controller."""
         found = look_at(spec.address)
         return cls(
@@ -198,7 +200,7 @@ class UrDiagnostics(ArmDiagnostics):
 
 
 def judge(
-    spec: UrArmSpec, found: Findings, record: SafetyRecord | None, *, accept: str, virtual: bool = False
+    spec: UrArmSettings, found: Findings, record: SafetyRecord | None, *, accept: str, virtual: bool = False
 ) -> list[DeviceCheck]:
     """One line for each fact that was read.
 
@@ -288,7 +290,7 @@ def _software(found: Findings) -> DeviceCheck:
     )
 
 
-def _dashboard(spec: UrArmSpec, found: Findings, responses: dict[str, str]) -> list[DeviceCheck]:
+def _dashboard(spec: UrArmSettings, found: Findings, responses: dict[str, str]) -> list[DeviceCheck]:
     checks = [
         DeviceCheck("model", "ok", f"{found.model.upper()}, serial number {found.serial}")
         if found.model == spec.model

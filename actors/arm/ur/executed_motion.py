@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath
 from actors.arm.planning.kinematics import MODELS, cell_transforms, forward, pourer_motion
 from actors.arm.ur.worker_messages import MotionOutcome, Sample
@@ -21,7 +21,7 @@ LONGEST_LAG = 0.3
 
 
 def executed_path(
-    samples: list[Sample], path: JointPath, spec: UrArmSpec, *, completed: bool, slider: float = 1.0
+    samples: list[Sample], path: JointPath, spec: UrArmSettings, *, completed: bool, slider: float = 1.0
 ) -> ExecutedPath:
     """The readings on the path's own clock.
 
@@ -66,7 +66,7 @@ def best_lag(times: FloatArray, joints: FloatArray, path: JointPath) -> float:
     return float(candidates[best])
 
 
-def _tracking(times: FloatArray, joints: FloatArray, path: JointPath, spec: UrArmSpec) -> dict[str, float]:
+def _tracking(times: FloatArray, joints: FloatArray, path: JointPath, spec: UrArmSettings) -> dict[str, float]:
     lag = best_lag(times, joints, path)
     planned = path.at(times - lag)
     angles = np.abs(joints - planned).max(axis=1)

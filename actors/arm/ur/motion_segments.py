@@ -16,7 +16,7 @@ import numpy as np
 
 from actors.arm.arm_geometry import JOINT_NAMES, Joints
 from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath, PourPath
 from actors.arm.planning.kinematics import (
     MODELS,
@@ -42,7 +42,7 @@ RAMP = 0.6
 _GRID = 0.02
 
 
-def leans(joints: FloatArray, spec: UrArmSpec) -> FloatArray:
+def leans(joints: FloatArray, spec: UrArmSettings) -> FloatArray:
     """Tilt of the pourer for joints (T, 6) [rad], shape (T,) [rad]."""
     tilts: FloatArray = np.arccos(np.clip(pourer_transforms(joints, spec).rotation[..., 2, 2], -1.0, 1.0))
     return tilts
@@ -68,7 +68,7 @@ def rejoin(path: JointPath, joints: FloatArray) -> tuple[float, float]:
     return float(time), float(apart[nearest].max())
 
 
-def upright_way(path: PourPath, joints: FloatArray, spec: UrArmSpec) -> tuple[JointPath, FloatArray]:
+def upright_way(path: PourPath, joints: FloatArray, spec: UrArmSettings) -> tuple[JointPath, FloatArray]:
     """From a stopped pour to an upright pourer: back along the path, or forward if the pourer was already returning.
 
     Args:
@@ -92,12 +92,12 @@ def upright_way(path: PourPath, joints: FloatArray, spec: UrArmSpec) -> tuple[Jo
     times, tilts = (back, back_tilts) if goes_back else (on, on_tilts)
     points = np.vstack([joints, path.pour.at(times)])
     tilts = np.concatenate([[tilt], tilts])
-    turning = np.abs(np.diff(tilts)) / spec.untilt_speed
+    turning = np.abs(np.diff(tilts)) / spec.upright_speed
     costs = np.maximum(turning, np.abs(np.diff(points, axis=0)).max(axis=1) / (0.5 * spec.approach_speed))
     return _paced(points, tilts, costs)
 
 
-def way_home(path: PourPath, joints: FloatArray, spec: UrArmSpec) -> JointPath:
+def way_home(path: PourPath, joints: FloatArray, spec: UrArmSettings) -> JointPath:
     """From any upright point of the approach or the retreat to home.
 
     Args:
@@ -121,7 +121,7 @@ def way_home(path: PourPath, joints: FloatArray, spec: UrArmSpec) -> JointPath:
         chosen, times = path.approach, _between(path.approach.times, back, 0.0)
     points = np.vstack([joints, chosen.at(times)])
     # A way back may begin tilted, after a pour without a return.
-    turning = np.abs(np.diff(leans(points, spec))) / spec.untilt_speed
+    turning = np.abs(np.diff(leans(points, spec))) / spec.upright_speed
     costs = np.maximum(turning, np.abs(np.diff(points, axis=0)).max(axis=1) / (0.5 * spec.approach_speed))
     return _paced(points, np.zeros(len(points)), costs)[0]
 
@@ -173,7 +173,7 @@ class MotionSegment:
     tilts: FloatArray
 
     @classmethod
-    def of(cls, name: str, path: JointPath, spec: UrArmSpec) -> MotionSegment:
+    def of(cls, name: str, path: JointPath, spec: UrArmSettings) -> MotionSegment:
         """A segment of one phase.
 
         Raises:
@@ -243,7 +243,7 @@ _JOINT_AXES = tuple(f"joint {k}" for k in range(1, 7))
 _POINTS = 101
 
 
-def jog_path(spec: UrArmSpec, joints: Joints, axis: str, amount: float, speed: float) -> JointPath:
+def jog_path(spec: UrArmSettings, joints: Joints, axis: str, amount: float, speed: float) -> JointPath:
     """One step from the arm's present pose.
 
     Args:
@@ -277,7 +277,7 @@ def jog_path(spec: UrArmSpec, joints: Joints, axis: str, amount: float, speed: f
     return JointPath(times, points)
 
 
-def _tool_steps(spec: UrArmSpec, start: FloatArray, axis: str, amounts: FloatArray) -> FloatArray:
+def _tool_steps(spec: UrArmSettings, start: FloatArray, axis: str, amounts: FloatArray) -> FloatArray:
     model, tool = MODELS[spec.model], cell_transforms(spec).tool
     rotation, position = forward(start[None], model)
     rotations, positions = np.repeat(rotation, _POINTS, axis=0), np.repeat(position, _POINTS, axis=0)
@@ -306,7 +306,7 @@ def _turn(axis: FloatArray, angle: float) -> FloatArray:
     return turned
 
 
-def _check(spec: UrArmSpec, points: FloatArray) -> None:
+def _check(spec: UrArmSettings, points: FloatArray) -> None:
     model = MODELS[spec.model]
     for name, positions, most in zip(JOINT_NAMES, points.T, model.joint_range, strict=True):
         if np.abs(positions).max() > most:
@@ -320,11 +320,11 @@ def _check(spec: UrArmSpec, points: FloatArray) -> None:
             raise ArmRefusedError(f"the {thing} would be {', '.join(outside(end, spec))}")
 
 
-def _beyond(point: FloatArray, spec: UrArmSpec) -> FloatArray:
+def _beyond(point: FloatArray, spec: UrArmSettings) -> FloatArray:
     """Distance of a point beyond each limit [m], negative inside."""
     limits = spec.limits
     planes = [plane.offset - float(np.dot(plane.normal, point)) for plane in limits.planes]
-    low, high = np.array(limits.box_low) - point, point - np.array(limits.box_high)
+    low, high = np.array(limits.box.low.vector) - point, point - np.array(limits.box.high.vector)
     return np.concatenate([low, high, planes, [spec.cell.table - point[2]]])
 
 

@@ -27,7 +27,7 @@ from actors.arm.arm_interface import (
     ArmStoppedError,
     NotAcceptedError,
 )
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import ExecutedPath, PourPath
 from actors.arm.planning.kinematics import MODELS, cell_transforms, forward
 from actors.arm.planning.path_checks import recheck
@@ -62,7 +62,7 @@ class UrArm:
         last_stop: delays of the last stop of a moving arm.
     """
 
-    def __init__(self, spec: UrArmSpec) -> None:
+    def __init__(self, spec: UrArmSettings) -> None:
         self._spec = spec
         self._session = Session(spec)
         self._working = threading.Lock()
@@ -113,7 +113,7 @@ class UrArm:
         tool = cell_transforms(self._spec).tool
         x, y, z = map(float, position[0] + rotation[0] @ tool.position)
         rx, ry, rz = map(float, Rotation.from_matrix(rotation[0] @ tool.rotation).as_rotvec())
-        return ArmPose(Pose(x, y, z, rx, ry, rz), joints, self._spec.home)
+        return ArmPose(Pose.of(x, y, z, rx, ry, rz), joints, self._spec.home.angles)
 
     def release(self) -> None:
         """See `Arm.release`."""
@@ -276,7 +276,7 @@ class UrArm:
         facts = self._session.facts
         if facts is None:
             raise ArmLostError("the arm is not connected; connect first")
-        settings = MotionSettings(tuple(spec.tool.as_list), spec.payload, spec.payload_centre)
+        settings = MotionSettings(tuple(spec.tool.as_list), spec.payload, spec.payload_centre.vector)
         number = next(_numbers)
         program = path_program(path, settings, number, cb3=not facts.e_series)
         start, end = (tuple(map(float, path.joints[k])) for k in (0, -1))
@@ -301,7 +301,7 @@ class UrArm:
             self._stops.end()
 
     def _announce(self, released: float, segment: MotionSegment, stops: int) -> None:
-        until = released + self._spec.announcement / self._spec.time_scale
+        until = released + self._spec.warning_time / self._spec.time_scale
         if self._stops.wait_for_one(stops, until - time.monotonic()):
             raise ArmStoppedError("stopped before it moved", "operator", "announced", 0.0, segment.tilt(0.0))
 
@@ -342,7 +342,7 @@ class AcceptedArm(UrArm):
         accepted: the accepted checksum; '' if none is accepted.
     """
 
-    def __init__(self, spec: UrArmSpec, accepted: str) -> None:
+    def __init__(self, spec: UrArmSettings, accepted: str) -> None:
         super().__init__(spec)
         self._accepted = accepted
         self._address = spec.address

@@ -21,7 +21,7 @@ from typing import Any
 
 from actors.arm.arm_geometry import Joints, Pose, Vector
 from actors.arm.arm_interface import ArmError, ArmFacts, ArmLostError, ArmRefusedError
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.ur.worker_messages import (
     ROBOT_MODES,
     SAFETY_MODES,
@@ -83,7 +83,7 @@ def facts_of(worker_facts: Facts) -> UrFacts:
         safety_mode=SAFETY_MODES.get(r.safety_mode, str(r.safety_mode)),
         remote=worker_facts.remote,
         checksum=worker_facts.checksum,
-        tool=Pose(*worker_facts.tool),
+        tool=Pose.of(*worker_facts.tool),
         payload=r.payload,
         payload_centre=(x, y, z),
         joints=(a, b, c, d, e, f),
@@ -213,7 +213,7 @@ class Session:
         facts: of the robot when the connection was made; None without a connection.
     """
 
-    def __init__(self, spec: UrArmSpec) -> None:
+    def __init__(self, spec: UrArmSettings) -> None:
         self._spec = spec
         self._worker: WorkerProcess | None = None
         self.facts: UrFacts | None = None

@@ -13,7 +13,7 @@ from decimal import Decimal
 from typing import Protocol
 
 from actors.balance.readings import Reading, ReadingStatus
-from actors.balance.simulated_balance import EmulatedScale
+from actors.balance.scale_model import EmulatedScale
 
 END = b"\r\n"
 """Ends every line of the dialects in this package."""

@@ -12,13 +12,12 @@ import json
 import os
 import tempfile
 import threading
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from actors.balance.balance_settings import AUTO, BalanceDevice, SerialBalanceSpec
-from actors.balance.dialect_registry import encoders
-from actors.balance.simulated_balance import Load, ScaleSettings
+from actors.balance.balance_settings import AUTO, BalanceSettings, SerialBalanceSettings
+from actors.balance.dialects.dialect import encoders
+from actors.balance.scale_model import Load, ScaleSettings
 from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ChildProcess, python_module
 from actors.runtime.ray_cleanup import MARK
@@ -126,7 +125,7 @@ class VirtualSerialBalance(FarProcess):
         """Start an emulated balance without a load.
 
         Args:
-            dialect: one of `actors.balance.dialect_registry.encoders`.
+            dialect: one of `actors.balance.dialects.dialect.encoders`.
             baud: speed of the line; 0: any speed, and characters take no time.
             scale: data sheet of the scale.
             time_scale: bench seconds per second of the clock; 0: bench time passes by `advance` only.
@@ -140,7 +139,7 @@ class VirtualSerialBalance(FarProcess):
             raise LaboratoryError(f"no virtual balance speaks '{dialect}'; there are {', '.join(encoders())}")
         settings = {
             "dialect": dialect,
-            "scale": asdict(scale or ScaleSettings()),
+            "scale": (scale or ScaleSettings()).model_dump(),
             "time_scale": time_scale,
             "latency": latency,
             "seed": list(seed),
@@ -209,17 +208,17 @@ class SerialBalanceEmulator:
         LaboratoryError: it did not start.
     """
 
-    def __init__(self, spec: SerialBalanceSpec, scale: ScaleSettings) -> None:
+    def __init__(self, spec: SerialBalanceSettings, scale: ScaleSettings) -> None:
         dialect = USUAL_DIALECT if spec.dialect == AUTO else spec.dialect
         # baud=0: in scaled time, the transmission of characters would limit the speed of the bench.
         self._balance = VirtualSerialBalance.start(
             dialect, baud=0, scale=scale, time_scale=spec.time_scale, latency=0.002
         )
-        self._spec = replace(spec, port=self._balance.port, dialect=dialect)
+        self._spec = spec.with_values(port=self._balance.port, dialect=dialect)
 
     @property
-    def device(self) -> BalanceDevice:
-        """See `BalanceEmulator.device`."""
+    def balance(self) -> BalanceSettings:
+        """See `BalanceEmulator.balance`."""
         return self._spec
 
     def prepare(self, seed: tuple[int, ...]) -> None:

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.balance.line_recording import LineEvent, LineRecording
-from actors.balance.simulated_balance import ScaleSettings
+from actors.balance.scale_model import ScaleSettings
 from actors.emulators.serial_balance.emulated_balance import EmulatedBalance, Emulation
 
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 import random
 import socket
 import time
-from dataclasses import replace
 from typing import Any
 
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.bench.virtual_bench import History
 from actors.emulators.ur_controller.controller_process import VirtualController, VirtualControllerError
 from actors.interfaces import LaboratoryError
@@ -35,20 +34,20 @@ class UrEmulator:
         spec: settings of the arm.
     """
 
-    def __init__(self, spec: UrArmSpec) -> None:
+    def __init__(self, spec: UrArmSettings) -> None:
         self._spec = spec
         self._controller = _start_controller(spec)
 
     @property
-    def arm(self) -> UrArmSpec:
+    def arm(self) -> UrArmSettings:
         """See `ArmEmulator.arm`."""
-        return replace(self._spec, address=self._controller.address)
+        return self._spec.with_values(address=self._controller.address)
 
     def install(self) -> None:
         """See `ArmEmulator.install`; sets gravity, TCP and payload, which a real controller has in its installation."""
         arm = self._spec
         tool = ", ".join(f"{value!r}" for value in arm.tool.as_list)
-        centre = ", ".join(f"{value!r}" for value in arm.payload_centre)
+        centre = ", ".join(f"{value!r}" for value in arm.payload_centre.vector)
         up = ", ".join(f"{9.82 * value!r}" for value in arm.mount.up)
         lines = [f"set_gravity([{up}])", f"set_tcp(p[{tool}])", f"set_payload({arm.payload!r}, [{centre}])"]
         program = "\n  ".join(["def install():", *lines]) + "\nend\n"
@@ -81,7 +80,7 @@ class UrEmulator:
         self._controller.close()
 
 
-def _start_controller(arm: UrArmSpec) -> VirtualController:
+def _start_controller(arm: UrArmSettings) -> VirtualController:
     """Start a controller at a free random loopback address, because campaigns and tests run in parallel."""
     chance, reason = random.SystemRandom(), ""
     for _ in range(ATTEMPTS):
@@ -90,7 +89,7 @@ def _start_controller(arm: UrArmSpec) -> VirtualController:
             continue
         try:
             return VirtualController.start(
-                address, arm.model, arm.time_scale, FREQUENCY if arm.time_scale > 1.0 else None, joints=arm.home
+                address, arm.model, arm.time_scale, FREQUENCY if arm.time_scale > 1.0 else None, joints=arm.home.angles
             )
         except VirtualControllerError as error:
             reason = str(error)

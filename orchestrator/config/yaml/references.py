@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from orchestrator.config.laboratory_file import LaboratoryFile, resolve_laboratory
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.section_validation import validate
@@ -21,7 +21,7 @@ S = TypeVar("S", bound=Settings)
 
 YAML_SUFFIXES = (".yaml", ".yml", ".json")
 
-KINDS: dict[type[Settings], str] = {VesselFile: "vessel", LaboratoryFile: "laboratory"}
+KINDS: dict[type[Settings], str] = {VesselFile: "vessel", LaboratorySettings: "laboratory"}
 """Kinds of whole files that their keys identify."""
 
 
@@ -99,7 +99,7 @@ class References:
         found = self.section(value, place, LiquidSettings)
         return None if found is None or self.report.is_broken_within(found[1]) else found[0].load()
 
-    def laboratory(self, value: Any, place: Place) -> Any:
-        """A `LaboratorySpec`; None after a problem."""
-        found = self.section(value, place, LaboratoryFile)
-        return None if found is None else resolve_laboratory(*found, self.report)
+    def laboratory(self, value: Any, place: Place) -> LaboratorySettings | None:
+        """A laboratory, ready for use; None after a problem."""
+        found = self.section(value, place, LaboratorySettings)
+        return None if found is None or self.report.is_broken_within(found[1]) else found[0].ready()

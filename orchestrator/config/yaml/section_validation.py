@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import typing
 from collections.abc import Iterator
 from typing import Any, TypeVar
@@ -18,7 +19,7 @@ from orchestrator.config.search_ranges import EXAMPLES
 from orchestrator.config.yaml.yaml_source import Loc, Place, Report
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.errors import did_you_mean
-from sim_engine.settings.model import Problems, Settings
+from sim_engine.settings.model import OneOf, Problems, Settings
 from sim_engine.settings.quantity import FROM_FILE
 
 S = TypeVar("S", bound=Settings)
@@ -98,6 +99,10 @@ def _guess_variant(variants: set[type[Settings]], data: dict[str, Any], place: P
         text = f"key '{key}' is missing; add for example '{key}: {max(examples)}'"
         report.add(place, text, key=True)
         report.broken.add((place.document.path, place.at(key).loc))
+    elif pair := next((v.retired[f"{key}: {word}"] for v in variants if f"{key}: {word}" in v.retired), ""):
+        data[key] = pair.partition(": ")[2]
+        report.add(place.at(key), _renamed(word, data[key]), renamed=(word, data[key]))
+        return
     else:
         expected = " or ".join([", ".join(map(repr, words[:-1])), repr(words[-1])])
         said = next(iter(variants)).unknown_tag(word) if isinstance(word, str) else ""
@@ -121,8 +126,12 @@ def _retired(model: type[Settings], loc: Loc, data: Any) -> tuple[str, tuple[str
             return f"{_node(data, loc)!r} {section.removed[pair]}", None
         if pair in section.retired:
             new = section.retired[pair].partition(": ")[2]
-            return f"{_node(data, loc)!r} is called '{new}' now; write that", (str(_node(data, loc)), new)
+            return _renamed(_node(data, loc), new), (str(_node(data, loc)), new)
     return None
+
+
+def _renamed(value: Any, new: str) -> str:
+    return f"{value!r} is called '{new}' now; write that"
 
 
 def _variant(sections: set[type[Settings]], data: Any) -> set[type[Settings]]:
@@ -305,7 +314,10 @@ def sections_in(annotation: Any) -> set[type[Settings]]:
     """The sections that a field may hold."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return {annotation} if issubclass(annotation, Settings) else set()
-    return {section for argument in typing.get_args(annotation) for section in sections_in(argument)}
+    if isinstance(annotation, OneOf):
+        return set(annotation.kinds().values())
+    found = {section for argument in typing.get_args(annotation) for section in sections_in(argument)}
+    return {section for section in found if not inspect.isabstract(section)}
 
 
 def _one_of(value: Any, expected: str) -> str:
@@ -343,9 +355,9 @@ class PlacedProblems:
         self._place, self._report, self._common = place, report, common
         self._before = len(report.problems)
 
-    def add(self, text: str, *at: str | int, key: bool = False, of: str = "") -> None:
+    def add(self, text: str, *at: str | int, key: bool = False, of: str = "", more: bool = False) -> None:
         """See `Problems.add`."""
-        if (at and self._report.is_broken_within(self._place.at(*at))) or (of and not self.valid(of)):
+        if (at and not more and self._report.is_broken_within(self._place.at(*at))) or (of and not self.valid(of)):
             return
         self._report.add(self._place.at(*at), text, key=key)
 

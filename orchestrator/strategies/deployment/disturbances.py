@@ -16,7 +16,7 @@ import numpy as np
 from actors.optimizer.questions import Disturbance, Point, Risk
 from orchestrator.strategies.campaign_plan import Draw
 from sim_engine.liquids import SimulationParameters
-from sim_engine.scene import PoseError
+from sim_engine.scene import PoseError, PoseNoise
 from sim_engine.search_space import Axis, Space
 from sim_engine.settings.model import Problems, Settings
 from sim_engine.settings.quantity import Quantity
@@ -41,50 +41,6 @@ EXACT = PoseError(speed_factor=0.0)
 """Standard deviations without any error."""
 
 
-Offset = Annotated[float, Quantity("m", "1 mm", -0.05, 0.05)]
-Tilt = Annotated[float, Quantity("rad", "1 deg", -0.2, 0.2)]
-Factor = Annotated[float, Quantity("1", "1.02", 0.5, 1.5)]
-Spread = Annotated[float, Quantity("1", "0.01", 0.0, 0.5)]
-
-
-class PoseErrorSection(Settings):
-    """How the real placement differs from the intended one."""
-
-    x: Offset = 0.0
-    """The receiver stands that much further from the pourer."""
-
-    y: Offset = 0.0
-    """… and that much sideways."""
-
-    z: Offset = 0.0
-    """… and that much higher."""
-
-    tilt: Tilt = 0.0
-    """The pourer is held that much more tilted than commanded."""
-
-    speed_factor: Factor = 1.0
-    """Executed over commanded angular velocity."""
-
-
-class PoseNoiseSection(Settings):
-    """Standard deviations of the same from pour to pour."""
-
-    x: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
-    """Standard deviation of the distance."""
-
-    y: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
-    """Standard deviation of the sideways placement."""
-
-    z: Annotated[float, Quantity("m", "0.5 mm", 0.0, 0.05)] = 0.0
-    """Standard deviation of the receiver's height."""
-
-    tilt: Annotated[float, Quantity("rad", "0.3 deg", 0.0, 0.2)] = 0.0
-    """Standard deviation of the tilt."""
-
-    speed_factor: Spread = 0.0
-    """Standard deviation of executed over commanded angular velocity."""
-
-
 class RiskSettings(Settings):
     """Plan for errors of execution and uncertain θ, instead of one pour that is executed exactly."""
 
@@ -94,7 +50,7 @@ class RiskSettings(Settings):
     level: Annotated[float, Quantity("1", "0.9", 0.01, 0.99)] | None = None
     """cvar: from 0, the mean of all, to 1, the single worst; 0.9 unless given."""
 
-    pose_error: PoseNoiseSection = PoseNoiseSection()
+    pose_error: PoseNoise = PoseNoise()
     """Standard deviations of the errors, normal and independent."""
 
     theta: Literal["best", "posterior"] = "best"
@@ -108,7 +64,7 @@ class RiskSettings(Settings):
     @property
     def errors(self) -> PoseError:
         """Standard deviations of the errors [m, rad, 1]."""
-        return PoseError(**self.pose_error.model_dump())
+        return self.pose_error.deviations
 
     def check(self, complaints: Problems) -> None:
         """Check that a level is given for CVaR only, and that at least one quantity is uncertain."""

@@ -77,7 +77,7 @@ def test_a_posture_is_the_one_that_the_joints_are_in(q):
 
 
 def test_links_end_at_the_axes_of_the_joints():
-    q = np.array(SPEC.home)
+    q = np.array(SPEC.home.angles)
     points = link_points(q, MODEL)
     _, axes = Kinematics(MODEL).axes(q)
     np.testing.assert_allclose(points[[0, 5, 6]], [axes[1], axes[4], axes[5]], atol=1e-12)
@@ -99,14 +99,14 @@ def test_what_is_beyond_reach_is_told_by_how_much(more):
 
 
 def test_a_flange_inside_the_base_s_own_cylinder_is_too_near():
-    rotation, _ = forward(np.array([SPEC.home]), MODEL)
+    rotation, _ = forward(np.array([SPEC.home.angles]), MODEL)
     wrist_at_axis = MODEL.d6 * rotation[:, :, 2] + np.array([0.05, 0.0, 0.6])
     np.testing.assert_allclose(beyond_reach(rotation, wrist_at_axis, MODEL)[0], 0.05 - MODEL.d4, atol=1e-9)
 
 
 @pytest.mark.parametrize(("joint", "angle", "which"), [(2, 0.0, 1), (4, 0.0, 2), (4, np.pi, 2)])
 def test_a_straight_elbow_and_a_straight_wrist_are_singular(joint, angle, which):
-    q = np.array(SPEC.home)
+    q = np.array(SPEC.home.angles)
     q[joint] = angle
     assert singularities(q, MODEL)[which] == pytest.approx(0.0, abs=1e-12)
 

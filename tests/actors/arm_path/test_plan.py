@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -11,8 +9,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from actors.arm.arm_geometry import Plane
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_geometry import Plane, Point
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath, PourPath
 from actors.arm.planning.kinematics import MODELS, cell_transforms, forward, pourer_motion, pourer_transforms
 from actors.arm.planning.path_checks import recheck
@@ -25,6 +23,7 @@ from sim_engine.collision import clearance, first_contact, rotations
 from sim_engine.motion import plan_motion
 from sim_engine.scene import Pivot
 from sim_engine.vessel.vessel import build_vessel
+from tests.support.counted_calls import counted_calls
 from tests.support.hypothesis_examples import examples
 from tests.support.planning_cell import ACTION, CONFIGS, LIMITS, SPEC, limited, motion, turned, vessel, waiting_at
 
@@ -44,7 +43,9 @@ actions = st.builds(
 )  # fmt: skip
 
 
-def planned(action=ACTION, spec: UrArmSpec = SPEC, receiver: str = "tumbler", pivot: Pivot | None = None) -> PourPath:
+def planned(
+    action=ACTION, spec: UrArmSettings = SPEC, receiver: str = "tumbler", pivot: Pivot | None = None
+) -> PourPath:
     return plan_path(motion(action, receiver, pivot), spec, vessel("beaker"), vessel(receiver))
 
 
@@ -70,9 +71,14 @@ def test_the_encoders_would_see_the_pour_that_was_asked_for(action):
 @given(action=actions, direction=st.sampled_from([75, 90, 100]), tilt=st.floats(60, 140))
 @settings(max_examples=examples(12), deadline=None)
 def test_what_is_accepted_stays_inside_all_limits(action, direction, tilt):
-    limits = replace(LIMITS, tilt=tilt * DEG, joint_speed=140 * DEG, tool_speed=0.45, box_low=(0.3, -0.4, 0.1),
-                     planes=(Plane((0.0, -1.0, 0.0), -0.02), Plane((-0.6, 0.0, -0.8), -0.9)))  # fmt: skip
-    spec = replace(SPEC, limits=limits, cell=replace(SPEC.cell, direction=direction * DEG))
+    limits = LIMITS.with_values(
+        tilt=tilt * DEG,
+        joint_speed=140 * DEG,
+        tool_speed=0.45,
+        box=LIMITS.box.with_values(low=Point.of(0.3, -0.4, 0.1)),
+        planes=(Plane(normal=(0.0, -1.0, 0.0), offset=-0.02), Plane(normal=(-0.6, 0.0, -0.8), offset=-0.9)),
+    )
+    spec = SPEC.with_values(limits=limits, cell=SPEC.cell.with_values(direction=direction * DEG))
     try:
         path = planned(action, spec)
     except InvalidActionError:
@@ -88,8 +94,8 @@ def test_what_is_accepted_stays_inside_all_limits(action, direction, tilt):
         tool = flange[1] + flange[0] @ cell_transforms(spec).tool.position
         everything = np.concatenate([points, tool[:, None]], axis=1)
         tolerance = 1e-4
-        assert (everything >= np.array(limits.box_low) - tolerance).all()
-        assert (everything <= np.array(limits.box_high) + tolerance).all()
+        assert (everything >= np.array(limits.box.low.vector) - tolerance).all()
+        assert (everything <= np.array(limits.box.high.vector) + tolerance).all()
         assert (everything[..., 2] >= spec.cell.table - tolerance).all()
         for plane in limits.planes:
             assert (everything @ np.array(plane.normal) >= plane.offset - tolerance).all()
@@ -105,10 +111,10 @@ def test_what_is_accepted_stays_inside_all_limits(action, direction, tilt):
 @settings(max_examples=examples(15), deadline=None)
 def test_the_three_parts_join_from_home_to_home(action):
     path = planned(action)
-    np.testing.assert_allclose(path.approach.joints[0], SPEC.home, atol=1e-9)
+    np.testing.assert_allclose(path.approach.joints[0], SPEC.home.angles, atol=1e-9)
     np.testing.assert_allclose(path.approach.joints[-1], path.pour.joints[0], atol=1e-6)
     np.testing.assert_allclose(path.pour.joints[-1], path.retreat.joints[0], atol=1e-6)
-    np.testing.assert_allclose(path.retreat.joints[-1], SPEC.home, atol=1e-6)
+    np.testing.assert_allclose(path.retreat.joints[-1], SPEC.home.angles, atol=1e-6)
     for part in (path.approach, path.pour, path.retreat):
         assert np.abs(np.diff(part.joints, axis=0)).max() < 5 * DEG
         recheck(part, SPEC)
@@ -170,8 +176,8 @@ def test_a_pour_that_ends_tilted_is_brought_upright_where_it_is_and_carried_home
     turning = tilts > 1e-6
     assert np.abs(lip[turning] - lip[0]).max() < 3e-4
     rates = np.abs(np.diff(tilts)) / np.diff(path.retreat.times)
-    assert rates.max() == pytest.approx(SPEC.untilt_speed, rel=1e-3)
-    np.testing.assert_allclose(path.retreat.joints[-1], SPEC.home, atol=1e-6)
+    assert rates.max() == pytest.approx(SPEC.upright_speed, rel=1e-3)
+    np.testing.assert_allclose(path.retreat.joints[-1], SPEC.home.angles, atol=1e-6)
 
 
 def test_a_step_in_speed_is_made_as_a_ramp_and_the_report_says_by_how_much_it_is_off():
@@ -230,23 +236,22 @@ def test_the_nearest_approach_of_the_vessels_is_found_among_few_poses(action):
 
 
 def test_other_robot_other_lengths():
-    spec = replace(SPEC, model="ur10")
+    spec = SPEC.with_values(model="ur10")
     path = plan_path(motion(), spec, vessel("beaker"), vessel("tumbler"))
     seen = pourer_motion(path.pour.joints, path.pour.times, spec).poses
     np.testing.assert_allclose(seen[:, :3], motion().sample(path.pour.times)[:, :3], atol=1e-6)
 
 
-def test_a_plan_takes_well_under_a_second():
+def test_a_plan_takes_little_work():
     planned()
-    began = time.process_time()
-    for _ in range(4):
+    with counted_calls() as calls:
         planned()
-    assert (time.process_time() - began) / 4 < 1.0  # some 0.15 s on a quiet core
+    assert calls.count < 25_000
 
 
 def test_limits_are_looked_at_before_anything_is_planned():
     with pytest.raises(InvalidActionError, match=r"limits\.box: x of 'low'"):
-        planned(spec=limited(box_low=(2.0, -0.6, 0.0)))
+        planned(spec=limited(box=LIMITS.box.with_values(low=Point.of(2.0, -0.6, 0.0))))
 
 
 @pytest.mark.parametrize("x_offset", [0.108, 0.112])

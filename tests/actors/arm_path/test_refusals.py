@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from actors.arm.arm_geometry import Plane, Pose
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_geometry import Box, JointAngles, Plane, Point, Pose
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.path_checks import recheck
 from actors.arm.planning.pour_planner import plan_path
@@ -18,42 +16,44 @@ from sim_engine.scene import Pivot
 from tests.support.planning_cell import ACTION, LIMITS, SPEC, limited, motion, placed, vessel, waiting_at
 
 
-def refusal(spec: UrArmSpec = SPEC, action: Action = ACTION, pivot: Pivot | None = None) -> str:
+def refusal(spec: UrArmSettings = SPEC, action: Action = ACTION, pivot: Pivot | None = None) -> str:
     with pytest.raises(InvalidActionError) as caught:
         plan_path(motion(action, pivot=pivot), spec, vessel("beaker"), vessel("tumbler"))
     return str(caught.value)
 
 
-WIDE = {"box_low": (-2.0, -2.0, -1.0), "box_high": (2.0, 2.0, 2.0)}
+WIDE = {"box": Box(low=Point.of(-2.0, -2.0, -1.0), high=Point.of(2.0, 2.0, 2.0))}
 
 
-def open_cell(**cell: object) -> UrArmSpec:
+def open_cell(**cell: object) -> UrArmSettings:
     """No box in the way."""
-    return replace(placed(**cell), limits=replace(LIMITS, **WIDE))
+    return placed(**cell).with_values(limits=LIMITS.with_values(**WIDE))
 
 
 def test_a_pour_out_of_reach_says_by_how_much():
-    text = refusal(open_cell(receiver=(1.12, 0.0, 0.06)), ACTION.with_values(x_offset=0.4, y_offset=-0.3))
+    text = refusal(open_cell(receiver=Point.of(1.12, 0.0, 0.06)), ACTION.with_values(x_offset=0.4, y_offset=-0.3))
     assert "out of the arm's reach by" in text
     assert "move the receiver nearer" in text
 
 
 def test_a_tilt_that_leads_out_of_reach_is_told_with_its_moment():
     # upright it is still in reach; the tilt lifts what is gripped
-    text = refusal(open_cell(receiver=(0.75, 0.0, 0.92)))
+    text = refusal(open_cell(receiver=Point.of(0.75, 0.0, 0.92)))
     assert "at the tilt's end, 1.93 s into the pour: out of the arm's reach by 14 mm" in text
     assert "approach" not in text
 
 
 def test_a_receiver_too_near_to_the_base():
-    assert "the wrist 77 mm from above the base's axis, 118 mm" in refusal(open_cell(receiver=(0.45, 0.0, 0.06)))
-    text = refusal(open_cell(receiver=(0.4, 0.0, 0.06)))
+    assert "the wrist 77 mm from above the base's axis, 118 mm" in refusal(
+        open_cell(receiver=Point.of(0.45, 0.0, 0.06))
+    )
+    text = refusal(open_cell(receiver=Point.of(0.4, 0.0, 0.06)))
     assert "mm too near to the arm's base; move the receiver away from it" in text
 
 
 def test_an_almost_straight_elbow_is_told_in_degrees():
-    spec = open_cell(receiver=(1.44, 0.0, 0.06))
-    text = refusal(replace(spec, limits=replace(spec.limits, singularity=0.32)))
+    spec = open_cell(receiver=Point.of(1.44, 0.0, 0.06))
+    text = refusal(spec.with_values(limits=spec.limits.with_values(singularity=0.32)))
     assert "elbow 16.7 deg from straight, 18.7 deg are asked for; move the receiver nearer or lower" in text
 
 
@@ -85,10 +85,10 @@ def test_the_robot_s_own_joint_speeds_hold_besides():
 
 
 def test_a_joint_beyond_its_range():
-    home = (*SPEC.home[:5], -300 * DEG)
+    home = (*SPEC.home.angles[:5], -300 * DEG)
     # the same pose of the pourer, tool turned to match, so that wrist 3 starts near the end of its range
     grip = SPEC.grip
-    turned = replace(SPEC, home=home, tool=Pose(z=0.17, rz=300 * DEG), grip=grip)
+    turned = SPEC.with_values(home=home, tool=Pose(z=0.17, rz=300 * DEG), grip=grip)
     assert "joint 6 (wrist 3) would turn to -4" in refusal(turned)
     assert "its range is ±363 deg" in refusal(turned)
 
@@ -109,11 +109,13 @@ def test_a_tilt_beyond_the_limit():
 
 
 def test_a_rim_that_would_leave_the_box():
-    text = refusal(limited(box_high=(1.0, -0.03, 0.9)))
+    text = refusal(limited(box=LIMITS.box.with_values(high=Point.of(1.0, -0.03, 0.9))))
     assert "cell.receiver: (0.750, 0.000) m lies outside limits.box" in text
-    text = refusal(limited(box_high=(1.0, 0.4, 0.35)))
+    text = refusal(limited(box=LIMITS.box.with_values(high=Point.of(1.0, 0.4, 0.35))))
     assert "home: the tool is outside the box, at z = 0.4" in text
-    low = replace(waiting_at(-0.3, 0.0, 0.12), limits=replace(LIMITS, box_high=(1.0, 0.4, 0.26)))
+    low = waiting_at(-0.3, 0.0, 0.12).with_values(
+        limits=LIMITS.with_values(box=LIMITS.box.with_values(high=Point.of(1.0, 0.4, 0.26))),
+    )
     text = refusal(low)
     assert "the pourer's rim would leave the box at z = 0.2" in text
     assert "at most 0.260 m are allowed" in text
@@ -121,21 +123,25 @@ def test_a_rim_that_would_leave_the_box():
 
 
 def test_an_underside_that_would_rise_out_of_the_box():
-    spec = replace(waiting_at(-0.3, 0.0, 0.12), limits=replace(LIMITS, box_high=(1.0, 0.4, 0.32)))
+    spec = waiting_at(-0.3, 0.0, 0.12).with_values(
+        limits=LIMITS.with_values(box=LIMITS.box.with_values(high=Point.of(1.0, 0.4, 0.32))),
+    )
     text = refusal(spec, ACTION.with_values(max_angle=130 * DEG))
     assert "the pourer's underside would leave the box at z = 0.3" in text
     assert "s into the pour" in text or "into the tilt" in text
 
 
 def test_a_plane_that_would_be_crossed():
-    plane = Plane((0.0, -1.0, 0.0), 0.0)
+    plane = Plane(normal=(0.0, -1.0, 0.0), offset=0.0)
     text = refusal(limited(planes=(plane,), clearance=0.0), ACTION.with_values(x_offset=0.085, max_angle=130 * DEG))
     assert "the pourer's underside would go" in text or "the pourer's rim would go" in text
     assert "mm beyond plane 1" in text
 
 
 def test_a_pourer_that_would_go_below_the_table():
-    text = refusal(placed(receiver=(0.75, 0.0, 0.0), table=0.0), ACTION.with_values(height=-0.15, x_offset=0.25))
+    text = refusal(
+        placed(receiver=Point.of(0.75, 0.0, 0.0), table=0.0), ACTION.with_values(height=-0.15, x_offset=0.25)
+    )
     assert "the pourer's underside would go" in text
     assert "mm below the table, at the approach's end" in text
 
@@ -153,8 +159,8 @@ def test_vessels_that_would_touch_or_come_too_near():
 
 def test_a_gripper_that_would_reach_into_the_receiver():
     # held far from the fingers, the pourer stands beside the receiver and the gripper in it
-    spec = replace(SPEC, grip=Pose(x=-0.1, y=-0.06, rx=-90 * DEG))
-    text = refusal(replace(spec, limits=replace(LIMITS, **WIDE)), ACTION.with_values(height=-0.02))
+    spec = SPEC.with_values(grip=Pose(x=-0.1, y=-0.06, rx=-90 * DEG))
+    text = refusal(spec.with_values(limits=LIMITS.with_values(**WIDE)), ACTION.with_values(height=-0.02))
     assert "the gripper would come within" in text
     assert "mm of the receiver, " in text
     assert "3 mm have to stay free" in text
@@ -165,18 +171,20 @@ def test_a_clearance_that_nobody_can_measure():
 
 
 def test_a_wrist_that_would_touch_the_table():
-    low = placed(receiver=(0.75, 0.0, 0.0))
+    low = placed(receiver=Point.of(0.75, 0.0, 0.0))
     text = refusal(low, ACTION.with_values(x_offset=0.2, height=-0.13, max_angle=30 * DEG))
     assert "the wrist would come 130 mm" in text
     assert "mm too near to the table, at the approach's end" in text
 
 
 def test_a_home_that_leans():
-    assert "home: the pourer leans 10.0 deg there" in refusal(replace(SPEC, home=(*SPEC.home[:5], 10 * DEG)))
+    assert "home: the pourer leans 10.0 deg there" in refusal(
+        SPEC.with_values(home=JointAngles.of(*SPEC.home.angles[:5], 10 * DEG))
+    )
 
 
 def test_a_pour_that_only_another_posture_reaches():
-    text = refusal(open_cell(receiver=(0.75, 0.0, 1.0)))
+    text = refusal(open_cell(receiver=Point.of(0.75, 0.0, 1.0)))
     assert "out of the arm's reach by" in text
     assert "another posture of the arm would reach it" in text
 
@@ -190,8 +198,9 @@ def test_all_that_is_wrong_comes_at_once():
 
 
 def test_what_can_be_said_of_a_pour_out_of_reach_is_said_too():
-    text = refusal(replace(open_cell(receiver=(1.12, 0.0, 0.06)), limits=replace(LIMITS, **WIDE, tilt=100 * DEG)),
-                   ACTION.with_values(x_offset=0.4, y_offset=-0.3))  # fmt: skip
+    far = open_cell(receiver=Point.of(1.12, 0.0, 0.06))
+    spec = far.with_values(limits=LIMITS.with_values(**WIDE, tilt=100 * DEG))
+    text = refusal(spec, ACTION.with_values(x_offset=0.4, y_offset=-0.3))
     assert "out of the arm's reach" in text
     assert "the pourer would lean 110.0 deg" in text
 
@@ -199,7 +208,7 @@ def test_what_can_be_said_of_a_pour_out_of_reach_is_said_too():
 PATH = plan_path(motion(), SPEC, vessel("beaker"), vessel("tumbler")).pour
 
 
-def rechecked(path: JointPath = PATH, spec: UrArmSpec = SPEC) -> str:
+def rechecked(path: JointPath = PATH, spec: UrArmSettings = SPEC) -> str:
     with pytest.raises(InvalidActionError) as caught:
         recheck(path, spec)
     return str(caught.value)
@@ -211,8 +220,10 @@ def test_a_planned_path_passes_the_second_look():
 
 def test_a_path_is_looked_at_again_with_the_limits_of_the_moment():
     assert "joint 6 (wrist 3) would turn at" in rechecked(spec=limited(joint_speed=50 * DEG))
-    assert "the tool would leave the box at z" in rechecked(spec=limited(box_high=(1.0, 0.4, 0.2)))
-    assert "mm beyond plane 1" in rechecked(spec=limited(planes=(Plane((0.0, 0.0, -1.0), -0.2),)))
+    assert "the tool would leave the box at z" in rechecked(
+        spec=limited(box=LIMITS.box.with_values(high=Point.of(1.0, 0.4, 0.2)))
+    )
+    assert "mm beyond plane 1" in rechecked(spec=limited(planes=(Plane(normal=(0.0, 0.0, -1.0), offset=-0.2),)))
     assert "below the table" in rechecked(spec=placed(table=0.25))
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,7 +20,7 @@ UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 @pytest.mark.parametrize(("direction", "expected"), [(0.0, (0.65, 0.0)), (90.0, (0.75, -0.1)), (-90.0, (0.75, 0.1))])
 def test_the_pourer_stands_against_the_direction_that_is_poured_in(direction, expected):
-    spec = replace(placed(direction=direction * DEG), tool=Pose(), grip=Pose())
+    spec = placed(direction=direction * DEG).with_values(tool=Pose(), grip=Pose())
     flange = flange_poses(np.array([[-0.1, 0.0, 0.2, *UPRIGHT]]), spec)
     assert tuple(flange.position[0]) == pytest.approx((*expected, 0.26))
     # liquid leaves towards the pourer's x
@@ -36,7 +34,7 @@ poses = st.tuples(st.floats(-0.2, 0.0), st.floats(-0.1, 0.1), st.floats(0.05, 0.
 @settings(max_examples=examples(60), deadline=None)
 def test_joints_for_a_pose_put_the_pourer_there(pose, roll):
     x, y, z, tilt = pose
-    spec = replace(SPEC, grip=Pose(0.01, -0.05, 0.02, -1.2 + 0.1 * roll, 0.3, 0.1))
+    spec = SPEC.with_values(grip=Pose.of(0.01, -0.05, 0.02, -1.2 + 0.1 * roll, 0.3, 0.1))
     wanted = np.array([[x, y, z, np.cos(tilt / 2), 0.0, np.sin(tilt / 2), 0.0]])
     flange = flange_poses(wanted, spec)
     found = inverse(flange.rotation, flange.position, MODELS["ur10e"])[0]
@@ -71,6 +69,6 @@ def test_a_pourer_that_slipped_in_the_fingers_is_tilted_more_about_the_tool_cent
 
 
 def test_at_home_the_pourer_stands_behind_the_receiver_and_upright():
-    frame = pourer_transforms(np.array([SPEC.home]), SPEC)
+    frame = pourer_transforms(np.array([SPEC.home.angles]), SPEC)
     assert frame.rotation[0, 2, 2] == pytest.approx(1.0, abs=1e-9)
     assert frame.position[0, 1] < -0.2

@@ -26,7 +26,9 @@ from .test_planned import ACTION, SPEC, motion, vessels
 def bench_of(cls: type[UrArm]) -> Iterator[ArmBench]:
     """An arm and its controller, whose true joints are the witness."""
     path = plan_path(motion(ACTION.with_values(angular_velocity=25 * DEG)), SPEC, *vessels())
-    with VirtualController.start(free_address(), SPEC.model, SPEC.time_scale, 125.0, joints=SPEC.home) as controller:
+    with VirtualController.start(
+        free_address(), SPEC.model, SPEC.time_scale, 125.0, joints=SPEC.home.angles
+    ) as controller:
 
         def true_poses(since: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
             kept = controller.fault("history", since=max(since + 1e-6, 0.0))
@@ -35,7 +37,7 @@ def bench_of(cls: type[UrArm]) -> Iterator[ArmBench]:
                 return np.zeros(0), np.zeros((0, 7))
             return times, pourer_motion(joints, times, SPEC).poses
 
-        arm = cls(replace(SPEC, address=controller.address))
+        arm = cls(SPEC.with_values(address=controller.address))
         yield ArmBench(
             arm,
             path,
@@ -92,4 +94,4 @@ class WaitsForTheController(UrArm):
 )
 def test_a_driver_that_does_not_do_what_it_reports_is_found(cls: type[UrArm], found_by: str, message: str) -> None:
     with contextlib.contextmanager(bench_of)(cls) as bench, pytest.raises(AssertionError, match=message):
-        getattr(ArmContract(), found_by)(replace(bench, lost_within=3.0))
+        getattr(ArmContract(), found_by)(bench.with_values(lost_within=3.0))

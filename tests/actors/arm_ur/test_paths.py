@@ -75,7 +75,7 @@ def test_un_tilting_ends_upright_never_tilts_further_and_is_slow(share: float, n
     assert tilts[-1] == pytest.approx(0.0, abs=1e-6)
     assert way.joints[-1] == pytest.approx(START, abs=1e-6)
     speeds = np.abs(np.diff(way.joints, axis=0)) / np.diff(way.times)[:, None]
-    assert speeds[:, 5].max() < 1.05 * spec.untilt_speed + 0.01
+    assert speeds[:, 5].max() < 1.05 * spec.upright_speed + 0.01
     assert speeds.max() < spec.approach_speed
     # from rest to rest
     assert max(speeds[0].max(), speeds[-1].max()) < 0.05
@@ -109,7 +109,7 @@ def test_a_way_home_that_begins_tilted_is_taken_slowly() -> None:
     path = replace(POUR, retreat=retreat)
     way = way_home(path, retreat.at(np.array([0.8]))[0], spec)
     turning = np.abs(np.diff(leans(way.joints, spec))) / np.diff(way.times)
-    assert turning.max() < 1.1 * spec.untilt_speed
+    assert turning.max() < 1.1 * spec.upright_speed
 
 
 # ---- how a path was followed
@@ -163,7 +163,7 @@ def test_a_step_of_the_tool_is_straight_and_keeps_its_orientation() -> None:
 
 def test_a_step_into_the_table_is_refused_and_one_out_of_it_is_not() -> None:
     spec = settings()
-    high = replace(spec, cell=replace(spec.cell, table=2.0))  # the arm is below it already
+    high = spec.with_values(cell=spec.cell.with_values(table=2.0))  # the arm is below it already
     jog_path(high, HOME, "z", 0.02, 0.05)  # type: ignore[arg-type]
     with pytest.raises(ArmRefusedError, match="below the table"):
         jog_path(high, HOME, "z", -0.02, 0.05)  # type: ignore[arg-type]

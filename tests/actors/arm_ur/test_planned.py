@@ -9,9 +9,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from actors.arm.arm_geometry import ArmLimits, Pose, RobotCell
+from actors.arm.arm_geometry import ArmLimits, Box, JointAngles, Point, Pose, RobotCell
 from actors.arm.arm_interface import ArmStoppedError
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planning.kinematics import pourer_motion
 from actors.arm.planning.pour_planner import plan_path
 from actors.arm.ur.motion_segments import leans
@@ -27,15 +27,20 @@ from tests.support.loopback import free_address
 
 from .conftest import Call, Rig
 
-SPEC = UrArmSpec(
+SPEC = UrArmSettings(
     model="ur10e",
-    limits=ArmLimits((0.2, -0.7, 0.0), (1.1, 0.5, 1.0), joint_speed=170 * DEG, tilt_speed=155 * DEG, clearance=3e-3),
-    cell=RobotCell(receiver=(0.75, 0.0, 0.06), direction=90 * DEG),
-    home=(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
+    limits=ArmLimits(
+        box=Box(low=Point.of(0.2, -0.7, 0.0), high=Point.of(1.1, 0.5, 1.0)),
+        joint_speed=170 * DEG,
+        tilt_speed=155 * DEG,
+        clearance=3e-3,
+    ),
+    cell=RobotCell(receiver=Point.of(0.75, 0.0, 0.06), direction=90 * DEG),
+    home=JointAngles.of(-14 * DEG, -91 * DEG, -115 * DEG, -154 * DEG, -104 * DEG, 0.0),
     tool=Pose(z=0.17),
     grip=Pose(y=-0.06, rx=-90 * DEG),
     payload=0.9,
-    announcement=0.0,
+    warning_time=0.0,
     time_scale=5.0,
 )
 ACTION = Action(
@@ -66,8 +71,8 @@ def planned() -> Callable[..., Rig]:
 
     def make(action: Action) -> Rig:
         path = plan_path(motion(action), SPEC, *vessels())
-        controller = VirtualController.start(free_address(), "ur10e", SPEC.time_scale, 125.0, joints=SPEC.home)
-        made.append(Rig(controller, UrArm(replace(SPEC, address=controller.address)), path))
+        controller = VirtualController.start(free_address(), "ur10e", SPEC.time_scale, 125.0, joints=SPEC.home.angles)
+        made.append(Rig(controller, UrArm(SPEC.with_values(address=controller.address)), path))
         made[-1].arm.connect()
         return made[-1]
 
@@ -83,7 +88,7 @@ def test_what_was_executed_is_the_planned_pour_seen_through_the_encoders(planned
     rig.to_start()
     executed = rig.arm.execute(rig.path)
     rig.arm.retreat(rig.path)
-    assert rig.joints == pytest.approx(SPEC.home, abs=1e-3)
+    assert rig.joints == pytest.approx(SPEC.home.angles, abs=1e-3)
     poured = pourer_motion(executed.joints, executed.times, SPEC)
     asked = pourer_motion(rig.path.pour.joints, rig.path.pour.times, SPEC)
     late = asked.sample(executed.times - executed.tracking["lag"])
@@ -115,4 +120,4 @@ def test_a_pour_without_a_return_is_brought_upright_on_the_way_home_even_after_a
     rig.arm.retreat(rig.path)
     tilts = leans(rig.history(began)[1], SPEC)
     assert tilts.max() < caught.value.tilt + 1 * DEG
-    assert rig.joints == pytest.approx(SPEC.home, abs=1e-3)
+    assert rig.joints == pytest.approx(SPEC.home.angles, abs=1e-3)

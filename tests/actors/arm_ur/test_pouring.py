@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -100,7 +99,7 @@ def test_nothing_moves_before_an_operator_has_released_the_arm(resting: Rig) -> 
 
 @pytest.mark.realtime
 def test_movement_begins_after_the_announced_delay(make_rig: Make) -> None:
-    rig = make_rig(announcement=8.0)
+    rig = make_rig(warning_time=8.0)
     began = rig.now
     rig.to_start()
     times, joints = rig.history(began)
@@ -110,7 +109,7 @@ def test_movement_begins_after_the_announced_delay(make_rig: Make) -> None:
 
 @pytest.mark.realtime
 def test_a_stop_while_movement_is_announced_keeps_the_arm_still(make_rig: Make) -> None:
-    rig = make_rig(announcement=30.0)
+    rig = make_rig(warning_time=30.0)
     began = rig.now
     rig.arm.release()
     moving = Call(rig.arm.move_to_start, rig.path)
@@ -150,4 +149,4 @@ def _upload(rig: Rig, statements: str) -> None:
 
     with socket.create_connection((rig.controller.address, 30003), timeout=5) as connection:
         connection.sendall(f"def other():\n {statements}\nend\n".encode())
-        time.sleep(0.1)
+        rig.await_that(lambda: "program other started" in str(rig.fault("state")["messages"]), "start of the program")

@@ -46,7 +46,7 @@ def comes_home(rig: Rig) -> None:
     times, joints = rig.history(began)
     assert joints[:, 5].max() - START[5] < tilt + 0.02  # never more tilted than it was
     speeds = np.abs(np.diff(joints[:, 5])) / np.diff(times)
-    assert speeds.max() < 1.3 * rig.arm._spec.untilt_speed
+    assert speeds.max() < 1.3 * rig.arm._spec.upright_speed
     assert rig.joints == pytest.approx(START, abs=1e-3)
     assert rig.arm.state().tilt == pytest.approx(0.0, abs=0.01)
     with pytest.raises(ArmNotReleasedError):

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import pytest
 
-from actors.balance.balance_settings import SerialBalanceSpec, SettlingRule
-from actors.balance.dialect_registry import dialects
+from actors.balance.balance_settings import SerialBalanceSettings, SettlingRule
+from actors.balance.dialects.dialect import dialects
+from actors.balance.scale_model import ScaleSettings
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.simulated_balance import ScaleSettings
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.serial_balance.emulated_balance import BalanceFaults
 
@@ -25,10 +25,10 @@ SOON = {"settling": SettlingRule(deadline=4.0)}
 """Gives up early, where giving up is what is tested."""
 
 
-def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSpec:
+def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSettings:
     """Settings that leave nothing to be found out."""
-    spec = SerialBalanceSpec(
-        virtual.port,
+    spec = SerialBalanceSettings(
+        port=virtual.port,
         dialect=dialect,
         baud=9600,
         format="8N1",
@@ -37,7 +37,7 @@ def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSpec:
         reconnect_time=2.0,
         time_scale=PACE,
     )
-    return replace(spec, **changes)
+    return spec.with_values(**changes)
 
 
 @pytest.fixture(scope="module")

@@ -10,14 +10,15 @@ import pytest
 
 from actors.balance.balance_interface import BalanceError, NoConnectionError, Weight
 from actors.balance.balance_settings import SettlingRule
+from actors.balance.scale_model import Load
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.simulated_balance import BalanceSettings, Load, VirtualBalance
+from actors.balance.simulated_balance import SimulatedBalanceSettings, VirtualBalance
 from actors.contract_tests import balance_contract as contract
 from actors.contract_tests.balance_contract import BalanceBench, BalanceContract
 
 from .conftest import spec_for
 
-SETTINGS = BalanceSettings(resolution=1e-4, noise=2e-4, drift=0.0, settling_time=1.5, time_scale=0.0)
+SETTINGS = SimulatedBalanceSettings(resolution=1e-4, noise=2e-4, drift=0.0, settling_time=1.5, time_scale=0.0)
 
 
 def of_numbers(cls: type[VirtualBalance]) -> BalanceBench:

@@ -11,9 +11,8 @@ import pytest
 import serial
 
 from actors.balance.balance_interface import BalanceError, LineSettingsError, UnknownDialectError
-from actors.balance.balance_settings import SerialBalanceSpec, SettlingRule, parse_format
-from actors.balance.dialect_registry import dialects
-from actors.balance.dialects.dialect import LineSettings
+from actors.balance.balance_settings import SerialBalanceSettings, SettlingRule, parse_format
+from actors.balance.dialects.dialect import LineSettings, dialects
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.serial_port import port_advice
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
@@ -29,7 +28,7 @@ def unknown(virtual: Callable[[str], VirtualSerialBalance]) -> Iterator[Callable
 
     def of(far: VirtualSerialBalance | str, **settings) -> tuple[VirtualSerialBalance, SerialBalance]:
         far = virtual(far) if isinstance(far, str) else far
-        spec = SerialBalanceSpec(far.port, time_scale=PACE, settling=SettlingRule(deadline=10.0), **settings)
+        spec = SerialBalanceSettings(port=far.port, time_scale=PACE, settling=SettlingRule(deadline=10.0), **settings)
         opened.append(SerialBalance(spec, "kern-1"))
         return far, opened[-1]
 
@@ -157,12 +156,12 @@ def test_a_setting_that_the_port_refuses_is_left_out_and_named(unknown, monkeypa
 
 
 def test_settings_narrow_the_search():
-    every = SerialBalanceSpec("p").candidates()
+    every = SerialBalanceSettings(port="p").candidates()
     assert every[0] == LineSettings(9600)
     assert LineSettings(1200, 7, "O") in every
-    assert SerialBalanceSpec("p", dialect="kcp", baud=4800, format="8N1").candidates() == (LineSettings(4800),)
-    assert {c.baud for c in SerialBalanceSpec("p", baud=2400).candidates()} == {2400}
-    assert {c.format for c in SerialBalanceSpec("p", format="7E1").candidates()} == {"7E1"}
+    assert SerialBalanceSettings(port="p", dialect="kcp", baud=4800, format="8N1").candidates() == (LineSettings(4800),)
+    assert {c.baud for c in SerialBalanceSettings(port="p", baud=2400).candidates()} == {2400}
+    assert {c.format for c in SerialBalanceSettings(port="p", format="7E1").candidates()} == {"7E1"}
 
 
 @pytest.mark.parametrize("text", ["9N1", "8X1", "8N", "8N3", ""])

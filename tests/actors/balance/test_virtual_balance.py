@@ -5,19 +5,19 @@ from __future__ import annotations
 import math
 import threading
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from actors.balance.simulated_balance import BalanceSettings, Load, VirtualBalance
+from actors.balance.scale_model import Load
+from actors.balance.simulated_balance import SimulatedBalanceSettings, VirtualBalance
 from actors.interfaces import LaboratoryError
 
-SHEET = BalanceSettings(resolution=1e-4, noise=2e-4, drift=0.0, settling_time=1.5, time_scale=0.0)
+SHEET = SimulatedBalanceSettings(resolution=1e-4, noise=2e-4, drift=0.0, settling_time=1.5, time_scale=0.0)
 
 
 def balance(seed: int = 1, **changes: float) -> VirtualBalance:
-    made = VirtualBalance(replace(SHEET, **changes))
+    made = VirtualBalance(SHEET.with_values(**changes))
     made.prepare((seed,))
     return made
 

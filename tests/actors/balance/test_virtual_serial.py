@@ -14,8 +14,8 @@ import pytest
 import serial
 
 from actors.balance.readings import ReadingStatus
+from actors.balance.scale_model import EmulatedScale, Load, ScaleSettings
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.simulated_balance import EmulatedScale, Load, ScaleSettings
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.serial_balance.emulated_balance import Emulation
 from actors.interfaces import LaboratoryError

@@ -8,7 +8,6 @@ import pytest
 
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_interface import ReferenceLostError
-from actors.balance.balance_settings import BalanceSpec
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.weighing import Weighings
 from actors.balance.weighing_plan import Placement, WeighingError
@@ -70,7 +69,7 @@ def play(virtual, placement: Placement, surprises=None, *, elsewhere=False, pour
     far = virtual("kcp")
     operator = Operator(far, placement, surprises)
     serial = spec_for(far, "kcp")
-    spec = BalanceSpec(placement, None if placement is Placement.MANUAL else serial, pourer_elsewhere=elsewhere)
+    spec = serial.with_values(placement=placement.value, pourer="elsewhere" if elsewhere else "here")
 
     async def all_of_it():
         driver = SerialBalance(serial, "kern-1")

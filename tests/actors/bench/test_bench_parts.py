@@ -21,7 +21,7 @@ from actors.bench.bench_operators import (
     PlayedOperator,
 )
 from actors.bench.virtual_bench import LONGEST_REST, executed_pour
-from actors.interfaces import Notice, OperatorQuestion, OperatorSpec
+from actors.interfaces import Notice, OperatorQuestion, OperatorSettings
 
 STEP = 0.008
 
@@ -105,7 +105,7 @@ class Person:
 
 def ask(after: float, **spec: float) -> tuple[object, OperatorQuestions, list[Notice]]:
     notices: list[Notice] = []
-    questions = OperatorQuestions(Person(after), OperatorSpec(**spec), notices.append)
+    questions = OperatorQuestions(Person(after), OperatorSettings(**spec), notices.append)
 
     async def play() -> object:
         try:

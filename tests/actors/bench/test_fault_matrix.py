@@ -21,7 +21,7 @@ import pytest
 
 from actors.arm.planning.kinematics import pourer_motion
 from actors.bench.bench_operators import VirtualOperator
-from actors.interfaces import LaboratoryError, NotPouredError, OperatorSpec, UnknownPourError
+from actors.interfaces import LaboratoryError, NotPouredError, OperatorSettings, UnknownPourError
 from sim_engine.action import DEG
 from sim_engine.outcome import PourMeasurement
 from tests.support.waiting import PATIENCE
@@ -242,7 +242,7 @@ def test_a_fault_of_the_arm(open_stage, name, phase):
     told = "\n".join(notice.text for notice in stage.notices)
     asked = sum(recover.problem == question.problem for question in stage.operator.heard)
     assert told.count(recover.problem) == asked, "those who watch are told as often as the operator"
-    np.testing.assert_allclose(tale.joints[-1], SPEC.arm.home, atol=0.02)
+    np.testing.assert_allclose(tale.joints[-1], SPEC.arm.home.angles, atol=0.02)
     if phase == "approach":
         assert isinstance(outcome, NotPouredError), outcome
         assert stage.heard.index("recover") < stage.heard.index("home")
@@ -289,7 +289,7 @@ def test_an_operator_who_does_not_want_the_stopped_arm_to_move(open_stage, how, 
             phase,
             ARM["protective stop"],
             mend=set(),
-            spec={"operator": OperatorSpec(answers="virtual", time=2.0, reminder=15.0, deadline=45.0)},
+            spec={"operator": OperatorSettings(answers="virtual", time=2.0, reminder=15.0, deadline=45.0)},
             **(
                 {"answers": {"recover": ["no"]}, "late": {"recover": 2.0}}
                 if how == "no"
@@ -315,7 +315,7 @@ def test_an_operator_who_leaves_the_balance_as_it_is(open_stage, how):
     """No weight that was taken is lost, and the spill still lies where it can be weighed."""
     fault = replace(BALANCE["unplugged"], mend=None)
     scripted = {"answers": {"balance": ["no"]}} if how == "no" else {"late": {"balance": math.inf}}
-    spec = {"operator": OperatorSpec(answers="virtual", time=2.0, reminder=15.0, deadline=45.0)}
+    spec = {"operator": OperatorSettings(answers="virtual", time=2.0, reminder=15.0, deadline=45.0)}
     tale = asyncio.run(tell_tale(open_stage, "weigh", fault, mend=set(), spec=spec, **scripted))
     assert isinstance(tale.outcome, UnknownPourError)
     assert "pourer_full" in str(tale.outcome)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from actors.arm.simulated_arm import NumbersSpec
+from actors.arm.simulated_arm import SimulatedArmSettings
 from actors.bench.virtual_bench import slipped
 from actors.interfaces import UnknownPourError
 from sim_engine.action import DEG
@@ -19,7 +18,7 @@ PACE = 10.0
 
 
 def without_a_robot():
-    return replace(wired_spec(pace=PACE, hurried=True), arm=NumbersSpec(PACE, announcement=1.0))
+    return wired_spec(pace=PACE, hurried=True).with_values(arm=SimulatedArmSettings(time_scale=PACE, warning_time=1.0))
 
 
 @pytest.mark.realtime

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from actors.arm.planned_pour import unpack
 from actors.arm.planning.kinematics import pourer_motion
 from actors.balance.weighing_plan import Placement
 from actors.bench.virtual_bench import History
-from actors.interfaces import InvalidActionError, NotPouredError, OperatorSpec, PourProgress
+from actors.interfaces import InvalidActionError, NotPouredError, OperatorSettings, PourProgress
 from sim_engine.outcome import PourMeasurement
 from tests.support.wired_bench import ACTION, SCENE, Stage, opened_stage, reach, wired_spec
 
@@ -81,12 +81,12 @@ def test_the_arm_moves_only_after_consent_and_the_announced_delay_and_is_home_wh
     times, joints = np.array(poured.history.times), np.array(poured.history.joints)
     spec = wired_spec().arm
     moved = np.flatnonzero(np.max(np.abs(joints - joints[0]), axis=1) > 1e-3)
-    assert times[moved[0]] - poured.stage.answered_at["start"] >= 0.9 * spec.announcement
-    np.testing.assert_allclose(joints[-1], spec.home, atol=1e-3)
+    assert times[moved[0]] - poured.stage.answered_at["start"] >= 0.9 * spec.warning_time
+    np.testing.assert_allclose(joints[-1], spec.home.angles, atol=1e-3)
     assert poured.heard == ["tray_wiped", "pourer_empty", "pourer_full", "set_up", "start", "pourer_after"]
     text, seconds = poured.stage.operator.announced[0]
     assert "moves in 3 s" in text
-    assert seconds == pytest.approx(spec.announcement / spec.time_scale)  # of the clock
+    assert seconds == pytest.approx(spec.warning_time / spec.time_scale)  # of the clock
 
 
 @pytest.mark.realtime
@@ -156,7 +156,7 @@ def test_no_consent_no_movement(open_stage):
 
 @pytest.mark.realtime
 def test_nobody_there_is_reminded_then_given_up_and_nothing_moves(open_stage):
-    patience = OperatorSpec(answers="virtual", time=2.0, reminder=4.0, deadline=12.0)
+    patience = OperatorSettings(answers="virtual", time=2.0, reminder=4.0, deadline=12.0)
 
     async def play():
         async with open_stage(wired_spec(operator=patience), late={"start": math.inf}) as stage:
@@ -237,8 +237,8 @@ def test_a_pour_given_up_while_it_tilts_stops_the_arm_where_it_is(open_stage):
 def test_an_error_of_the_grip_changes_what_is_poured_and_not_what_the_arm_reads(open_stage):
     async def play(tilt):
         spec = wired_spec()
-        bench = replace(spec.bench, pose_error=replace(spec.bench.pose_error, tilt=tilt), pose_noise=ZERO)
-        async with open_stage(replace(spec, bench=bench)) as stage:
+        bench = spec.bench.with_values(pose_error=spec.bench.pose_error.with_values(tilt=tilt), pose_noise=ZERO)
+        async with open_stage(spec.with_values(bench=bench)) as stage:
             measured = await stage.pour()
             executed = unpack(measured.notes["executed"])
             read = pourer_motion(executed.joints, executed.times, spec.arm).tilt(executed.times).max()
@@ -249,4 +249,4 @@ def test_an_error_of_the_grip_changes_what_is_poured_and_not_what_the_arm_reads(
     assert read_again == pytest.approx(read, abs=0.03)
 
 
-ZERO = replace(wired_spec().bench.pose_noise, x=0.0, y=0.0, tilt=0.0, speed_factor=0.0)
+ZERO = wired_spec().bench.pose_noise.with_values(x=0.0, y=0.0, tilt=0.0, speed_factor=0.0)

@@ -6,7 +6,6 @@ import asyncio
 import os
 import signal
 import sys
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -23,7 +22,7 @@ def laboratory(ray_running):
     import ray
 
     ray.cloudpickle.register_pickle_by_value(sys.modules[Trickle.__module__])  # workers can't import test modules
-    spec = replace(wired_spec(pace=2.0, hurried=True), in_process=False, simulators=1)
+    spec = wired_spec(pace=2.0, hurried=True).with_values(in_process=False, simulators=1)
     return RayLaboratory(spec, Trickle, need_bench=True)
 
 

@@ -42,7 +42,7 @@ def test_after_ctrl_c_twice_it_is_said_what_may_be_lost_and_what_to_do(tmp_path:
     assert states(tmp_path / "run")[-1] == "unknown"
     plan = toy_plan(tmp_path)
     assert given_up_pours(tmp_path / "run") == ["pour 1 of stage only"]
-    real = replace(plan, laboratory=replace(plan.laboratory, mode="hardware"))
+    real = replace(plan, laboratory=plan.laboratory.with_values(mode="hardware"))
     for each, advice in (
         (real, "lost unless you weigh it now.*Resuming asks what came of it: 'weighed SPILLED RETAINED'"),
         (plan, "Resuming asks what came of it: on a virtual bench 'repeat'"),

@@ -10,7 +10,7 @@ import pytest
 
 from actors.arm.arm_geometry import Pose
 from actors.arm.arm_interface import ArmPose
-from actors.arm.arm_settings import UrArmSpec
+from actors.arm.arm_settings import UrArmSettings
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import LaboratoryError
 from orchestrator.cli.jogging import JogError, Jogging, JogStep, parse_step, steps_home
@@ -50,9 +50,9 @@ class Arm:
 class Session:
     def __init__(self, *typed: str) -> None:
         spec = load_laboratory(LABORATORY).arm
-        assert isinstance(spec, UrArmSpec)
-        self.home = spec.home
-        self.arm, self.screen, self._typed = Arm(spec.home), "", list(typed)
+        assert isinstance(spec, UrArmSettings)
+        self.home = spec.home.angles
+        self.arm, self.screen, self._typed = Arm(spec.home.angles), "", list(typed)
         self.jogging = Jogging(self.arm, self._read, self._tell)  # type: ignore[arg-type]
 
     def _read(self, prompt: str) -> str:

@@ -16,7 +16,7 @@ from rich.console import Console
 
 from actors.bench.bench_operators import OperatorQuestions
 from actors.bench.consent import stopped_question
-from actors.interfaces import LaboratoryError, Notice, OperatorQuestion, OperatorSpec
+from actors.interfaces import LaboratoryError, Notice, OperatorQuestion, OperatorSettings
 from orchestrator.cli.terminal_operator import TerminalOperator
 from orchestrator.progress.console_progress import ProgressDisplay
 from orchestrator.runs.events import LogLine
@@ -24,7 +24,7 @@ from tests.support import example_run
 
 DONE = OperatorQuestion("Put the full pourer into the gripper.", "done")
 WEIGHT = OperatorQuestion("Weigh the pourer on the other balance.", "weight")
-PATIENT = OperatorSpec(reminder=30.0, deadline=60.0)
+PATIENT = OperatorSettings(reminder=30.0, deadline=60.0)
 
 
 class Keyboard:
@@ -43,7 +43,7 @@ class Keyboard:
             while text not in self.screen.getvalue():
                 await asyncio.sleep(0.01)
 
-    def operator(self, spec: OperatorSpec = PATIENT) -> TerminalOperator:
+    def operator(self, spec: OperatorSettings = PATIENT) -> TerminalOperator:
         return TerminalOperator(spec, stdin=self.terminal, out=self.screen)
 
 
@@ -140,7 +140,7 @@ def test_giving_up_ends_the_pour_with_the_question_that_it_was_given_up_at(keybo
 def test_nobody_answers_reminders_then_the_question_is_given_up(keyboard: Keyboard) -> None:
     async def scene() -> None:
         with pytest.raises(LaboratoryError, match="nobody answered within 1 s"):
-            await keyboard.operator(OperatorSpec(reminder=0.3, deadline=1.0)).ask(DONE)
+            await keyboard.operator(OperatorSettings(reminder=0.3, deadline=1.0)).ask(DONE)
 
     played(scene)
     shown = keyboard.screen.getvalue()

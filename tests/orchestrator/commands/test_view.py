@@ -12,16 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.arm.arm_settings import UrArmSpec
-from actors.laboratory_settings import LaboratorySpec
+from actors.arm.arm_settings import UrArmSettings
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.cli.console import RefusalError
 from orchestrator.cli.view_command import _recording_of, _view
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.journal.codec import encode_outcome, encode_request
 from orchestrator.journal.journal import JOURNAL_NAME, Header, Journal, Kind
 from orchestrator.live_view.blueprints import put_beside
-from orchestrator.live_view.repeated_pour import NoSuchPourError, find_pour, task_of
 from orchestrator.live_view.run_recording import CampaignRecording
+from orchestrator.live_view.simulation_view import NoSuchPourError, find_pour, task_of
 from orchestrator.requests import Pour, Poured
 from sim_engine.outcome import PourMeasurement
 from tests.support import example_run
@@ -87,10 +87,10 @@ def test_pour_is_simulated_again_as_the_arm_moved_with_the_load_that_was_weighed
     from actors.arm.planned_pour import ExecutedPath, pack
 
     arm = load_laboratory(ROOT / "configs" / "laboratories" / "virtual.yaml").arm
-    assert isinstance(arm, UrArmSpec)
+    assert isinstance(arm, UrArmSettings)
     joints = np.array(arm.home) + np.linspace(0.0, 0.4, 50)[:, None] * np.array([0, 0, 0, 0, 0, 1.0])
     _journal(tmp_path, {"executed": pack(ExecutedPath(np.arange(50) * 0.1, joints, True))})
-    plan = replace(example_run.campaign(), laboratory=LaboratorySpec("virtual", arm=arm))
+    plan = replace(example_run.campaign(), laboratory=LaboratorySettings(name="virtual", arm=arm))
     (tmp_path / "theta.json").write_text('{"theta": {"particles": 700, "cohesion": 0.03}}')
     pour = find_pour(tmp_path, 1)
     assert pour.stage == "deployment:narrow cup", "the last stage with such a pour"

@@ -8,10 +8,9 @@ from textwrap import dedent
 
 import pytest
 
-from actors.arm.arm_geometry import Plane, Pose
-from actors.arm.arm_settings import UrArmSpec
-from orchestrator.config.arm_file import CellSection, UrArmSection, resolve_arm
-from orchestrator.config.yaml.section_validation import validate
+from actors.arm.arm_geometry import Plane, Pose, RobotCell
+from actors.arm.arm_settings import UrArmSettings
+from orchestrator.config.yaml.section_validation import PlacedProblems, validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from sim_engine.settings.model import Settings
@@ -19,23 +18,23 @@ from tests.support.campaign_files import written_out
 
 
 class Laboratory(Settings):
-    arm: UrArmSection | None = None
+    arm: UrArmSettings | None = None
     """As in a laboratory's file."""
 
-    cell: CellSection | None = None
+    cell: RobotCell | None = None
     """Likewise."""
 
 
-def load(text: str, mode: str = "virtual") -> UrArmSpec:
+def load(text: str, mode: str = "virtual") -> UrArmSettings:
     report = Report()
     place = Place(Document.parse(dedent(text), Path("lab.yaml").resolve()))
     section = validate(Laboratory, place, report)
-    spec = None
     if section is not None and section.arm is not None:
-        spec = resolve_arm(section.arm, section.cell, place, report, mode=mode)
+        section.arm.check_laboratory(PlacedProblems(place, report), mode=mode, cell=section.cell)
     report.raise_if_any()
-    assert spec is not None
-    return spec
+    assert section is not None
+    assert section.arm is not None
+    return section.arm.in_laboratory(section.cell, 1.0)
 
 
 BOX = "{low: {x: 250 mm, y: -600 mm, z: 0 mm}, high: {x: 1000 mm, y: 400 mm, z: 900 mm}}"
@@ -67,8 +66,8 @@ FULL = HARDWARE.replace(f"    box: {BOX}", f"""\
   payload_centre: {{x: 1 mm, y: 2 mm, z: 110 mm}}
   approach_speed: 30 deg/s
   approach_acceleration: 60 deg/s^2
-  untilt_speed: 15 deg/s
-  announcement: 5 s
+  upright_speed: 15 deg/s
+  warning_time: 5 s
   rate: 250 Hz""")  # fmt: skip
 
 
@@ -78,16 +77,16 @@ def test_every_key_reaches_the_arm():
     assert (spec.model, spec.address, spec.payload) == ("ur10e", "192.168.0.10", 1.6)
     assert spec.tool == Pose(z=0.17)
     assert spec.grip == Pose(y=-0.06, rx=deg(-90.0))
-    assert spec.payload_centre == pytest.approx((0.001, 0.002, 0.11))
-    assert spec.home == pytest.approx([deg(v) for v in (-14, -91, -115, -154, -104, 0)])
+    assert spec.payload_centre.vector == pytest.approx((0.001, 0.002, 0.11))
+    assert spec.home.angles == pytest.approx([deg(v) for v in (-14, -91, -115, -154, -104, 0)])
     assert (spec.approach_speed, spec.approach_acceleration) == pytest.approx((deg(30.0), deg(60.0)))
-    assert (spec.untilt_speed, spec.announcement, spec.rate) == pytest.approx((deg(15.0), 5.0, 250.0))
+    assert (spec.upright_speed, spec.warning_time, spec.rate) == pytest.approx((deg(15.0), 5.0, 250.0))
     limits, cell = spec.limits, spec.cell
-    assert (limits.box_low, limits.box_high) == ((0.25, -0.6, 0.0), (1.0, 0.4, 0.9))
-    assert limits.planes == (Plane((0.0, -1.0, 0.0), -0.39), Plane((0.6, 0.0, 0.8), 0.15))
+    assert (limits.box.low.vector, limits.box.high.vector) == ((0.25, -0.6, 0.0), (1.0, 0.4, 0.9))
+    assert limits.planes == (Plane(normal=(0.0, -1.0, 0.0), offset=-0.39), Plane(normal=(0.6, 0.0, 0.8), offset=0.15))
     assert (limits.joint_speed, limits.tilt, limits.tilt_speed) == pytest.approx((deg(120), deg(135), deg(110)))
     assert (limits.tool_speed, limits.singularity, limits.clearance) == pytest.approx((0.8, 0.15, 0.008))
-    assert (cell.receiver, cell.direction, cell.table) == ((0.75, 0.0, 0.06), pytest.approx(deg(90)), -0.01)
+    assert (cell.receiver.vector, cell.direction, cell.table) == ((0.75, 0.0, 0.06), pytest.approx(deg(90)), -0.01)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +137,7 @@ CASES = [
     (changed("x: 750 mm, y: 0", "x: 750 mm, y: 500"), "virtual", r"cell.receiver: .* lies outside limits.box"),
     (changed("z: 60 mm", "z: -60 mm"), "virtual", r"lab.yaml:10:13: cell.receiver: stands at -0.060 m, below"),
     (changed("approach_speed: 30", "approach_speed: 130", FULL), "hardware", r"approach_speed: 130 deg/s is above"),
-    (changed("untilt_speed: 15", "untilt_speed: 120", FULL), "hardware", r"untilt_speed: 120 deg/s is above"),
+    (changed("upright_speed: 15", "upright_speed: 120", FULL), "hardware", r"upright_speed: 120 deg/s is above"),
     (changed("singularity: 0.15", "singularity: 0.6", FULL), "hardware", r"home: the shoulder is 0.\d+ from singular"),
     (changed("offset: -390 mm", "offset: 150 mm", FULL), "hardware", r"receiver: .* lies beyond plane 1"),
     (changed("x: 750 mm, y: 0 mm", "x: 1500 mm, y: 0 mm").replace("x: 1000", "x: 1800"), "virtual",
@@ -162,7 +161,7 @@ def test_all_mistakes_come_at_once():
 def test_keys_are_typed_in_the_sections_that_say_them():
     # every key has a sentence for the editor's tooltip
     def sentences(model: type[Settings]) -> list[str | None]:
-        return [field.description for field in model.model_fields.values()]
+        return [model.model_fields[name].description for name in model.written_keys().values()]
 
-    assert all(sentences(UrArmSection))
-    assert all(sentences(CellSection))
+    assert all(sentences(UrArmSettings))
+    assert all(sentences(RobotCell))

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from actors.arm.arm_settings import UrArmSpec
-from actors.arm.simulated_arm import NumbersSpec
-from orchestrator.config.arm_file import ARMS
+from actors.arm.arm_settings import ARMS, UrArmSettings
+from actors.arm.simulated_arm import SimulatedArmSettings
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.config.yaml.yaml_errors import ConfigError
 
@@ -29,24 +28,26 @@ def refusal(folder: Path, arm: str) -> str:
 
 
 def test_ours_come_in_by_the_door(tmp_path):
-    assert {"numbers", "ur"} <= set(ARMS.names)
+    assert {"simulated", "ur"} <= set(ARMS.names)
     assert ARMS.package("ur").startswith("decant ")
-    arm = load_laboratory(written(tmp_path, "arm: {kind: numbers}\n")).arm
-    assert arm == NumbersSpec(time_scale=30.0)
+    arm = load_laboratory(written(tmp_path, "arm: {kind: simulated}\n")).arm
+    assert arm == SimulatedArmSettings(time_scale=30.0)
 
 
 def test_an_arm_without_a_kind_is_a_ur_robot(tmp_path):
     whole = SHIPPED[UNTIL:FROM]
     bare = load_laboratory(written(tmp_path, whole)).arm
-    assert isinstance(bare, UrArmSpec)
+    assert isinstance(bare, UrArmSettings)
     assert load_laboratory(written(tmp_path, whole.replace("arm:\n", "arm:\n  kind: ur\n", 1))).arm == bare
 
 
 def test_what_is_wrong_with_a_kind_is_told_with_its_place(tmp_path):
-    assert "7:13: arm.kind: 'nubers' is not known here; did you mean 'numbers'?" in refusal(
-        tmp_path, "arm: {kind: nubers}\n"
+    assert "7:13: arm.kind: 'simulatd' is not known here; did you mean 'simulated'?" in refusal(
+        tmp_path, "arm: {kind: simulatd}\n"
     )
-    assert "7:22: arm.model: belongs to ur, not to numbers" in refusal(tmp_path, "arm: {kind: numbers, model: ur10}\n")
-    assert "an arm of numbers stands nowhere" in refusal(
-        tmp_path, "arm: {kind: numbers}\ncell: {receiver: {x: 700 mm, y: 0 mm, z: 0 mm}, direction: 0 deg}\n"
+    assert "7:24: arm.model: belongs to ur, not to simulated" in refusal(
+        tmp_path, "arm: {kind: simulated, model: ur10}\n"
+    )
+    assert "a simulated arm stands nowhere" in refusal(
+        tmp_path, "arm: {kind: simulated}\ncell: {receiver: {x: 700 mm, y: 0 mm, z: 0 mm}, direction: 0 deg}\n"
     )

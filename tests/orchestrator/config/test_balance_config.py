@@ -7,24 +7,26 @@ from textwrap import dedent
 
 import pytest
 
-from actors.balance.balance_settings import BalanceSpec, SerialBalanceSpec, SettlingRule
-from actors.balance.simulated_balance import ScaleSettings
+from actors.balance.balance_settings import SerialBalanceSettings, SettlingRule
+from actors.balance.scale_model import ScaleSettings
 from actors.balance.weighing_plan import Placement
-from orchestrator.config.balance_file import SerialSection, SettlingSection, VirtualScaleSection, resolve_balance
-from orchestrator.config.yaml.section_validation import validate
+from orchestrator.config.yaml.section_validation import PlacedProblems, validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from tests.support.campaign_files import written_out
 
 
-def load(text: str, mode: str = "hardware") -> BalanceSpec:
+def load(text: str, mode: str = "hardware") -> SerialBalanceSettings:
     report = Report()
     place = Place(Document.parse(dedent(text), Path("lab.yaml").resolve()))
-    section = validate(SerialSection, place, report)
-    spec = None if section is None else resolve_balance(section, place, report, mode=mode)
+    balance = validate(SerialBalanceSettings, place, report)
+    if balance is not None:
+        if balance.typed:
+            balance.check_manual(PlacedProblems(place, report))
+        balance.check_laboratory(PlacedProblems(place, report), mode=mode)
     report.raise_if_any()
-    assert spec is not None
-    return spec
+    assert balance is not None
+    return balance
 
 
 FULL = """
@@ -48,50 +50,44 @@ VIRTUAL = "virtual: {resolution: 0.01 g, noise: 0.02 g, drift: 0.001 g/s, settli
 
 
 def test_every_key_reaches_the_balance():
-    spec = load(FULL)
-    assert spec.placement is Placement.RECEIVER
-    assert spec.pourer_elsewhere
-    assert spec.load_tolerance == pytest.approx(2e-3)
-    serial = spec.device
-    assert isinstance(serial, SerialBalanceSpec)
+    serial = load(FULL)
+    assert serial.position is Placement.RECEIVER
+    assert serial.pourer == "elsewhere"
+    assert serial.load_tolerance == pytest.approx(2e-3)
     assert (serial.port, serial.dialect, serial.baud, serial.format) == (
         "/dev/serial/by-id/usb-KERN", "kern-swt", 4800, "7E1")  # fmt: skip
     assert serial.handshake == "software"
     assert serial.step == pytest.approx(5e-5)
     assert serial.repeatability == pytest.approx(2e-5)
-    assert serial.settling == SettlingRule(6, 2.0, 2.0, 30.0)
+    assert serial.settling == SettlingRule(readings=6, span=2.0, steps=2.0, deadline=30.0)
     assert (serial.interval, serial.answer_time, serial.reconnect_time) == (0.2, 2.0, 60.0)
 
 
 def test_a_port_is_enough_and_the_rest_is_found_out():
-    serial = load(SIMPLE).device
-    assert isinstance(serial, SerialBalanceSpec)
+    serial = load(SIMPLE)
     assert (serial.dialect, serial.baud, serial.format) == ("auto", None, None)
 
 
 def test_a_virtual_balance_has_a_data_sheet():
-    device = load(VIRTUAL, mode="virtual").device
-    assert isinstance(device, SerialBalanceSpec)
-    assert device.virtual == ScaleSettings(1e-5, 3.0, 2e-5, 1e-6, 2.0)
-    other = load(VIRTUAL + "dialect: sbi\n", mode="virtual").device
-    assert isinstance(other, SerialBalanceSpec)
-    assert other.dialect == "sbi"
+    sheet = ScaleSettings(resolution=1e-5, capacity=3.0, noise=2e-5, drift=1e-6, settling_time=2.0)
+    assert load(VIRTUAL, mode="virtual").virtual == sheet
+    assert load(VIRTUAL + "dialect: sbi\n", mode="virtual").dialect == "sbi"
 
 
 def test_where_the_operator_types_there_is_no_line():
-    assert load("placement: manual\nload_tolerance: 1 g\n").device is None
+    assert load("placement: manual\nload_tolerance: 1 g\n").typed
 
 
 @pytest.mark.parametrize(("text", "mode"), [(FULL, "hardware"), (SIMPLE, "hardware"), (VIRTUAL, "virtual"),
                                             ("placement: manual", "hardware")])  # fmt: skip
 def test_the_resolved_balance_loads_to_the_same(text, mode):
     spec = load(text, mode)
-    assert load(written_out(SerialSection, text), mode) == spec
+    assert load(written_out(SerialBalanceSettings, text), mode) == spec
 
 
 def test_the_page_on_balances_names_every_key():
     page = (Path(__file__).parents[3] / "docs" / "balances.md").read_text(encoding="utf-8")
-    for model in (SerialSection, SettlingSection, VirtualScaleSection):
+    for model in (SerialBalanceSettings, SettlingRule, ScaleSettings):
         for key in model.written_keys():
             assert f"`{key}`" in page
 
@@ -99,7 +95,7 @@ def test_the_page_on_balances_names_every_key():
 def test_the_balance_shown_on_that_page_is_one():
     page = (Path(__file__).parents[3] / "docs" / "balances.md").read_text(encoding="utf-8")
     shown = page.partition("```yaml\nbalance:\n")[2].partition("```")[0]
-    assert load(shown).placement is Placement.TRAY
+    assert load(shown).placement == "tray"
 
 
 @pytest.mark.parametrize(

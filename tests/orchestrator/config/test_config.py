@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.laboratory_settings import RaySpec
+from actors.laboratory_settings import RaySettings
 from orchestrator.catalogue.run_registry import state_directory
 from orchestrator.cli.command_options import call
 from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
@@ -224,7 +224,7 @@ def test_an_address_of_a_cluster_that_ray_would_puzzle_over_is_refused(address: 
 def test_a_cluster_needs_an_address_and_its_bench_has_a_usual_name(tmp_path: Path) -> None:
     path = tmp_path / "lab.yaml"
     path.write_text("name: far\nmode: virtual\nray: {address: '[fd00::1]:6379'}\n")
-    assert load_laboratory(path).ray == RaySpec("[fd00::1]:6379", "decant_bench")
+    assert load_laboratory(path).ray == RaySettings(address="[fd00::1]:6379", bench_resource="decant_bench")
     path.write_text("name: far\nmode: virtual\nray: {bench_resource: left}\n")
     with pytest.raises(ConfigError, match="key 'address' is missing"):
         load_laboratory(path)
@@ -297,14 +297,14 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     assert (plan.name, plan.seed, plan.parallel_simulations, plan.on_unknown) == ("everything", 41, 5, "repeat")
     assert tuple(plan.outputs.model_dump().values()) == (str(tmp_path / "here"), False, False, 4.0, 2)
     lab = plan.laboratory
-    assert (lab.name, lab.simulators, lab.in_process, lab.object_store_mb) == ("odd", 3, True, 300)
-    assert lab.ray == RaySpec("head.local:6379", "left_bench")
-    assert (bench.liquid.particles, bench.liquid.viscosity, bench.liquid.friction) == (3100, 7.0, 0.31)
-    assert dataclasses.astuple(bench.pose_error) == pytest.approx((0.0011, -0.002, 0.7 * DEG, 1.03, 0.0007))
-    assert dataclasses.astuple(bench.pose_noise) == pytest.approx((0.0003, 0.0004, 0.2 * DEG, 0.02, 0.0))
-    assert (bench.time_scale, bench.operator_time, bench.settling_time) == pytest.approx((12.0, 60.0, 2.5))
-    assert (bench.balance_resolution, bench.balance_noise) == pytest.approx((1e-5, 2e-4))
-    assert bench.balance_drift == pytest.approx(0.5e-3 / 60.0)
+    assert (lab.name, lab.simulators, lab.in_process, lab.object_store) == ("odd", 3, True, 300)
+    assert lab.ray == RaySettings(address="head.local:6379", bench_resource="left_bench")
+    assert (bench.theta.particles, bench.liquid.viscosity, bench.liquid.friction) == (3100, 7.0, 0.31)
+    assert dataclasses.astuple(bench.pose_error.error) == pytest.approx((0.0011, -0.002, 0.7 * DEG, 1.03, 0.0007))
+    assert dataclasses.astuple(bench.pose_noise.deviations) == pytest.approx((0.0003, 0.0004, 0.2 * DEG, 0.02, 0.0))
+    assert (bench.time_scale, bench.operator_time, bench.balance.settling_time) == pytest.approx((12.0, 60.0, 2.5))
+    assert (bench.balance.resolution, bench.balance.noise) == pytest.approx((1e-5, 2e-4))
+    assert bench.balance.drift == pytest.approx(0.5e-3 / 60.0)
     scene = calibration.scene
     assert (scene.liquid.name, scene.liquid.mass, scene.liquid.density) == ("oil", 0.15, pytest.approx(920.0))
     assert (scene.liquid.surface_tension, scene.liquid.dynamic_viscosity) == pytest.approx((0.032, 0.084))

@@ -17,7 +17,7 @@ import httpx
 import pytest
 
 from actors.interfaces import OperatorQuestion
-from actors.laboratory_settings import LaboratorySpec
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.catalogue.run_registry import VARIABLE
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.daemon.access_control import Role, token_of
@@ -269,7 +269,7 @@ def test_real_and_virtual_cannot_be_mistaken(page: Any, tmp_path: Path) -> None:
         page.get_by_text("nothing real moves").wait_for()
         assert page.locator("header").get_by_text("VIRTUAL", exact=True).is_visible()
         virtual = page.evaluate("getComputedStyle(document.querySelector('header')).background")
-    real = Rig("north", tmp_path / "north.yaml", LaboratorySpec("north", mode="hardware"))
+    real = Rig("north", tmp_path / "north.yaml", LaboratorySettings(name="north", mode="hardware"))
     with on_port(tmp_path / "other", rigs=(real,)) as lab:
         page.goto(lab.address())
         page.get_by_text("north: a real arm").wait_for()

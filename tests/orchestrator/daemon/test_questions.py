@@ -33,8 +33,8 @@ def with_person(tmp_path: Path) -> Path:
 
     text = CAMPAIGN.replace("pours: 3", "pours: 2").replace(
         "  bench: {liquid: {particles: 400}, time_scale: 0}\n",
-        "  bench: {liquid: {particles: 400}, time_scale: 1000}\n  arm: {kind: numbers}\n"
-        "  balance: {kind: numbers}\n  operator: {answers: person}\n",
+        "  bench: {liquid: {particles: 400}, time_scale: 1000}\n  arm: {kind: simulated}\n"
+        "  balance: {kind: simulated}\n  operator: {answers: person}\n",
     )
     write_campaign(tmp_path, text)
     return tmp_path

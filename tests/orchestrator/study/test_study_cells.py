@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +92,7 @@ def test_without_levels_a_study_pours_on_its_laboratory_as_it_is(tmp_path: Path)
     twin = study.base.laboratory.bench
     assert [level.name for level in study.levels] == [study.compared] == ["twin"]
     assert twin is not None
-    assert study.levels[0].bench == replace(twin, time_scale=0.0), "numbers are not waited for"
+    assert study.levels[0].bench == twin.with_values(time_scale=0.0), "numbers are not waited for"
     wired = {**changes, "laboratory": str(ROOT / "configs/laboratories/virtual.yaml")}
     study = load_study(written(tmp_path / "wired", wired))
     assert study.base.laboratory.arm is not None

@@ -1,7 +1,6 @@
 """A stand as an arm: a slide lifts the pourer, a motor turns it about its lip. All that an arm needs, in one file.
 
-`Stand` is the driver, `Drive` what it moves, `StandSpec` its settings as values, `StandSection` what stands in a
-laboratory's file:
+`Stand` is the driver, `Drive` what it moves, `StandSettings` what stands in a laboratory's file:
 
     arm: {kind: stand, fastest: 60 deg/s}
 """
@@ -12,13 +11,14 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal
+from dataclasses import replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from decant.plugins import (
+    SET_BY_PROGRAM,
     Action,
     ArmFacts,
     ArmLostError,
@@ -26,17 +26,15 @@ from decant.plugins import (
     ArmPose,
     ArmRefusedError,
     ArmSettings,
-    ArmSpec,
     ArmState,
     ArmStoppedError,
-    CellSection,
     ExecutedMotion,
     InvalidActionError,
     MotionPath,
-    Place,
     Pose,
+    Problems,
     Quantity,
-    Report,
+    RobotCell,
     Scene,
     plan_pour,
 )
@@ -45,26 +43,29 @@ HOME_HEIGHT = 0.05
 """Where the slide waits, above where it pours [m]."""
 
 
-@dataclass(frozen=True)
-class StandSpec(ArmSpec):
-    """A stand with a motor.
+class StandSettings(ArmSettings):
+    """A stand whose motor turns the pourer."""
 
-    Attributes:
-        fastest: largest speed of the motor [rad/s].
-    """
+    kind: Literal["stand"] = "stand"
+    """A stand with a motor."""
 
-    fastest: float = math.radians(90.0)
-    time_scale: float = 1.0
-    announcement: float = 0.5
+    fastest: Annotated[float, Quantity("rad/s", "90 deg/s", 0.0, 10.0, positive=True)] = math.radians(90.0)
+    """Largest speed of its motor."""
 
-    kind: ClassVar[str] = "stand"
+    warning_time: Annotated[float, SET_BY_PROGRAM] = 0.5
+    """Time from the operator's consent to the first movement [s]."""
+
+    def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
+        """See `ArmSettings.check_laboratory`."""
+        if mode == "hardware":
+            problems.add("this example has no motor; write 'mode: virtual'", "arm")
 
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `ArmSpec.driver`; a stand has no safety settings that could be accepted."""
+        """See `ArmSettings.driver`; a stand has no safety settings that could be accepted."""
         return Stand, (self,)
 
     def plan(self, scene: Scene, action: Action) -> MotionPath:
-        """See `ArmSpec.plan`: the motor makes any motion that isn't too fast for it."""
+        """See `ArmSettings.plan`: the motor makes any motion that isn't too fast for it."""
         path = MotionPath(plan_pour(scene, action), approach_time=1.0, retreat_time=1.0)
         if path.report.tilt_speed > self.fastest * 1.001:
             asked, most = math.degrees(path.report.tilt_speed), math.degrees(self.fastest)
@@ -72,23 +73,6 @@ class StandSpec(ArmSpec):
                 f"the stand turns at most at {most:.0f} deg/s (arm.fastest), {asked:.0f} deg/s are asked for"
             )
         return path
-
-
-class StandSection(ArmSettings):
-    """A stand whose motor turns the pourer."""
-
-    kind: Literal["stand"] = "stand"
-    """A stand with a motor."""
-
-    fastest: Annotated[float, Quantity("rad/s", "90 deg/s", 0.0, 10.0, positive=True)] = StandSpec.fastest
-    """That its motor turns."""
-
-    def resolve(self, cell: CellSection | None, place: Place, report: Report, *, mode: str) -> StandSpec | None:
-        """See `ArmSettings.resolve`."""
-        if mode == "hardware":
-            report.add(place.at("arm"), "this example has no motor; write 'mode: virtual'")
-            return None
-        return StandSpec(fastest=self.fastest)
 
 
 class Drive:
@@ -146,7 +130,7 @@ class Stand:
         drive: what it moves; its own by default.
     """
 
-    def __init__(self, spec: StandSpec, drive: Drive | None = None) -> None:
+    def __init__(self, spec: StandSettings, drive: Drive | None = None) -> None:
         self._spec = spec
         self._drive = drive or Drive(spec.time_scale)
         self._one = threading.Lock()
@@ -259,7 +243,7 @@ class Stand:
     def _upright(self, name: str) -> None:
         self._consent()
         _, tilt, height = self._read()
-        duration = abs(tilt) / self._spec.untilt_speed
+        duration = abs(tilt) / self._spec.upright_speed
         self._way(name, duration, _ramp(tilt, 0.0, duration), lambda t: height)
 
     def _way(

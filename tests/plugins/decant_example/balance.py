@@ -9,41 +9,20 @@ from __future__ import annotations
 import math
 import threading
 import time
-from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from decant.plugins import BalanceDevice, BalanceDeviceSection, LaboratoryError, Load, Quantity, Weight
+from decant.plugins import BalanceSettings, LaboratoryError, Load, Quantity, Weight
 
 PATIENCE = 20.0
 """How long it may take to come to rest [s of bench time]."""
 
 
-@dataclass(frozen=True)
-class SpringSpec(BalanceDevice):
-    """Settings as values.
-
-    Attributes:
-        step: of its display [kg].
-        swing: how long it swings after a change [s].
-        time_scale: bench seconds per second of the clock.
-    """
-
-    step: float = 1e-4
-    swing: float = 1.0
-    time_scale: float = 1.0
-
-    kind: ClassVar[str] = "spring"
-    told: ClassVar[bool] = True
-
-    def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `BalanceDevice.driver`."""
-        return SpringBalance, (self, name)
-
-
-class SpringSection(BalanceDeviceSection):
+class SpringSettings(BalanceSettings):
     """A balance with a spring."""
+
+    receives_load: ClassVar[bool] = True
 
     kind: Literal["spring"] = "spring"
     """A balance with a spring."""
@@ -54,15 +33,15 @@ class SpringSection(BalanceDeviceSection):
     swing: Annotated[float, Quantity("s", "1 s", 0.0, 60.0)] = 1.0
     """How long it swings after a change."""
 
-    def device(self) -> SpringSpec:
-        """See `BalanceDeviceSection.device`."""
-        return SpringSpec(self.step, self.swing)
+    def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
+        """See `BalanceSettings.driver`."""
+        return SpringBalance, (self, name)
 
 
 class SpringBalance:
     """The driver; see `decant.plugins.BalanceDriver`."""
 
-    def __init__(self, spec: SpringSpec, name: str = "spring") -> None:
+    def __init__(self, spec: SpringSettings, name: str = "spring") -> None:
         self._spec, self._name = spec, name
         self._tare = 0.0
         self._load, self._changed = Load((0.0,), (0.0,)), -math.inf
