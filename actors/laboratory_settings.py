@@ -17,7 +17,7 @@ from pydantic_core import PydanticCustomError
 from actors.arm.arm_geometry import RobotCell
 from actors.arm.arm_settings import ARMS, ArmSettings
 from actors.balance.balance_settings import BalanceSettings
-from actors.balance.dialects.dialect import kinds
+from actors.balance.dialect_registry import kinds
 from actors.balance.scale_model import Drift
 from actors.interfaces import OperatorSettings
 from sim_engine.liquids import RETIRED_PARAMETERS, SimulationParameters

@@ -27,7 +27,7 @@ class Plugin:
 def doors() -> tuple[PluginRegistry[Any], ...]:
     """All plug-in registries. Plug-ins are loaded on first use."""
     from actors.arm.arm_settings import ARMS
-    from actors.balance.dialects.dialect import BALANCES
+    from actors.balance.dialect_registry import BALANCES
     from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES
     from sim_engine.vessel.shapes import VESSELS
 

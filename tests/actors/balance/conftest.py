@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from actors.balance.balance_settings import SerialBalanceSettings, SettlingRule
-from actors.balance.dialects.dialect import dialects
+from actors.balance.dialect_registry import dialects
 from actors.balance.scale_model import ScaleSettings
 from actors.balance.serial_balance import SerialBalance
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance

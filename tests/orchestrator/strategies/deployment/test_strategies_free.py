@@ -158,12 +158,12 @@ def test_the_next_pour_is_asked_for_with_one_quick_question() -> None:
         assert isinstance(requests, list)
         question = next(r for r in requests if isinstance(r, Suggest))
         assert question.purpose == "pour"
-        problem = question.problem
-        assert problem.effort is not None
-        assert problem.effort.start
-        assert problem.effort.iterations <= 4
-        assert problem.map_resolution == 0
-        assert len(problem.simulated) <= MOST_SIMULATIONS
+        query = question.query
+        assert query.effort is not None
+        assert query.effort.start
+        assert query.effort.iterations <= 4
+        assert query.map_resolution == 0
+        assert len(query.simulated) <= MOST_SIMULATIONS
         followed += 1
     assert followed == 3
     assert log.strategy.result().map is not None
