@@ -42,12 +42,6 @@ def test_a_campaign_that_pours_is_refused_a_laboratory_without_a_bench():
 
 
 @pytest.mark.realtime
-def test_an_unknown_mode_is_refused_before_anything_starts():
-    with pytest.raises(LaboratoryError, match="mode 'dream' is not known"):
-        open_laboratory(LaboratorySettings(name="desk", mode="dream"), need_bench=False)
-
-
-@pytest.mark.realtime
 def test_an_arm_of_hardware_is_not_opened_without_a_person_to_ask():
     spec = load_laboratory(Path(__file__).parents[2] / "configs" / "laboratories" / "ur10-kern.yaml")
     with pytest.raises(LaboratoryError, match="ur10-kern needs a person beside it who answers questions"):
