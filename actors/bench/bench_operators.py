@@ -12,9 +12,8 @@ The wording of the questions belongs to `actors.bench.consent` and `actors.balan
 from __future__ import annotations
 
 import asyncio
-import math
 import time
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
@@ -268,36 +267,17 @@ class VirtualOperator:
 
     def __init__(self, hands: Hands, time: float) -> None:
         self._hands, self._time = hands, time
-        self._late: dict[str, float] = {}
-        self._answers: dict[str, list[str]] = {}
         self._again = 0
         self.heard: list[OperatorQuestion] = []
         self.announced: list[tuple[str, float]] = []
-
-    def script(self, answers: Mapping[str, Sequence[str]], late: Mapping[str, float]) -> None:
-        """Set scripted answers and delays, for tests.
-
-        Args:
-            answers: replace the operator's own answers to questions about a subject, first to last; no step is carried
-                out.
-            late: extra time for the next question about a subject [s of the clock]; with inf, it is never answered.
-        """
-        self._answers = {about: list(given) for about, given in answers.items()}
-        self._late = dict(late)
 
     async def ask(self, question: OperatorQuestion) -> str:
         """See `Operator.ask`."""
         self.heard.append(question)
         about = question.about
         self._again = self._again + 1 if question.problem else 0
-        late = self._late.pop(about, 0.0)
-        if math.isinf(late):
-            await asyncio.Event().wait()
         share = SHARES[about] / sum(SHARES.values()) if about in SHARES else GLANCE
-        await asyncio.sleep(share * self._time + late)
-        scripted = self._answers.get(about)
-        if scripted:
-            return scripted.pop(0)
+        await asyncio.sleep(share * self._time)
         if self._again > PERSISTENCE:
             if question.wants == "yes or no":
                 return "no"

@@ -84,7 +84,13 @@ def _renamed(data: Data, names: Mapping[str, str]) -> dict[str, Any]:
 
 
 def upgraded_result(data: Data) -> Data:
-    """A stage's result as this version reads it. Of a comparison of pours with simulations its scores are left."""
+    """A stage's result as this version reads it.
+
+    Of a comparison of pours with simulations, the scores are left. Of a study's table, the number of its simulations is
+    left: their outcomes are in the journal, too.
+    """
+    if data.get("kind") == "table":
+        return {key: value for key, value in data.items() if key != "rows"}
     trust = data.get("trust")
     if not isinstance(trust, Mapping) or "mean_z" not in trust:
         return data

@@ -14,8 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from orchestrator.config.run_snapshot import record_of
-from orchestrator.journal.journal import JOURNAL_NAME
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.run_record import answers
 from orchestrator.journal.stage_results import Results, result_of
+from orchestrator.requests import Simulate
 from orchestrator.runs.stages import (
     CALIBRATION,
     EVALUATION,
@@ -39,7 +41,7 @@ from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.strategy import Strategy
 from orchestrator.study.study_plan import FINAL, GRID, StudyCell, StudyPlan
-from orchestrator.study.study_strategies import AnsweredByTable, FinalPour, SimulatedTable, Tabled
+from orchestrator.study.study_strategies import AnsweredByTable, FinalPour, SimulatedTable
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 
@@ -166,11 +168,12 @@ def _calibration(
     stages = calibration_stages(plan.calibration)
     if cell.arm != "C1":
         return plan, stages
-    rows = result_of(load(GRID), GRID, Tabled).rows
+    with JournalReader(directory.parent / GRID / JOURNAL_NAME) as journal:
+        table = [(a.request, a.outcome) for a in answers(journal, Simulate) if isinstance(a.request, Simulate)]
 
     def answered(stage: StageDefinition) -> StageDefinition:
         def build(results: Results, seed: int) -> Strategy:
-            return AnsweredByTable(stage.build(results, seed), rows)
+            return AnsweredByTable(stage.build(results, seed), table)
 
         return replace(stage, build=build)
 

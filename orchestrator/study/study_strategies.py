@@ -7,47 +7,29 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 from orchestrator.requests import Decision, Failed, Outcome, Poured, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.single_action import OnePour
-from orchestrator.strategies.stage_result import ResultPart, StageResult
+from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Progress, Strategy, is_sound
 from orchestrator.strategies.trials import SeedStream
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import PourOutcome, normalised_spillage
+from sim_engine.outcome import normalised_spillage
 
 Key = tuple[tuple[tuple[str, float], ...], tuple[tuple[str, float | None], ...]]
 
 
-class TableRow(ResultPart):
-    """One simulation of a table."""
-
-    theta: SimulationParameters
-    action: dict[str, float | None]
-    """All dimensions [SI]."""
-
-    fractions: tuple[float, float, float, float] | None = None
-    """Received, spilled, retained, in flight; None if the simulation was lost."""
-
-    particles: int = 0
-    lost: str = ""
-    """Reason why there are no fractions."""
-
-
 class Tabled(StageResult):
-    """Simulations that the repetitions of a study share."""
+    """Simulations that the repetitions of a study share; their outcomes are in the journal of their run."""
 
     kind: Literal["table"] = "table"
 
     simulations: int
     """Number of simulations with an answer."""
-
-    rows: tuple[TableRow, ...]
-    """All simulations; empty until the end."""
 
 
 class FinalPoured(StageResult):
@@ -79,7 +61,7 @@ class SimulatedTable:
     ) -> None:
         seeds = SeedStream(seed, "table")
         each = [(action, seeds.next()) for action in actions]
-        self._rows: list[TableRow] = []
+        self._answered = 0
         self._total = len(actions) * len(thetas)
         self._unissued = deque(Simulate(scene, action, theta, s, "table") for theta in thetas for action, s in each)
         self._open: list[Simulate] = []
@@ -101,36 +83,29 @@ class SimulatedTable:
         if not isinstance(request, Simulate) or request not in self._open:
             raise ValueError(f"this simulation was not asked for: {request}")
         self._open.remove(request)
-        theta, action = request.parameters, request.action.values()
-        match outcome:
-            case Simulated(result) if result.invalid is None and is_sound(result.fractions):
-                fractions = (result.received, result.spilled, result.retained, result.in_flight)
-                self._rows.append(TableRow(theta=theta, action=action, fractions=fractions, particles=result.particles))
-            case _:
-                lost = getattr(outcome, "reason", "") or "invalid outcome"
-                self._rows.append(TableRow(theta=theta, action=action, lost=lost))
+        self._answered += 1
 
     def progress(self) -> Progress:
         """Simulations answered, and their total number."""
-        return Progress(len(self._rows), self._total)
+        return Progress(self._answered, self._total)
 
     def result(self) -> Tabled:
-        """One row per simulation when all are answered; until then only their number, which subscribers receive."""
-        return Tabled(simulations=len(self._rows), rows=tuple(self._rows) if self.finished else ())
+        """Number of simulations answered."""
+        return Tabled(simulations=self._answered)
 
 
 class AnsweredByTable:
     """Wraps a strategy and answers its simulations from a table; only its other requests reach the laboratory."""
 
-    def __init__(self, inner: Strategy, rows: Sequence[TableRow]) -> None:
+    def __init__(self, inner: Strategy, table: Iterable[tuple[Simulate, Outcome]]) -> None:
         """Wrap a strategy.
 
         Args:
             inner: any strategy that simulates only at the θ and actions of the table.
-            rows: rows of a `SimulatedTable`.
+            table: requests of a `SimulatedTable` and their outcomes.
         """
         self._inner = inner
-        self._known = {_key(row.theta, row.action): row for row in rows}
+        self._known = {_key(request): outcome for request, outcome in table}
 
     @property
     def finished(self) -> bool:
@@ -168,28 +143,12 @@ class AnsweredByTable:
         return self._inner.result()
 
     def _answer(self, request: Simulate) -> Outcome:
-        row = self._known.get(_key(request.parameters, request.action.values()))
-        if row is None:
-            raise ValueError(f"the table has no simulation of {request.parameters} at {request.action}")
-        if row.fractions is None:
-            return Failed("simulation", row.lost)
-        received, spilled, retained, in_flight = row.fractions
-        return Simulated(
-            PourOutcome(
-                received=received,
-                spilled=spilled,
-                retained=retained,
-                in_flight=in_flight,
-                escaped=0.0,
-                particles=row.particles,
-                spacing=0.0,
-                density_error=0.0,
-                simulated_time=0.0,
-                steps=0,
-                cpu_s=0.0,
-                seed=request.seed,
-            )
-        )
+        match outcome := self._known.get(_key(request)):
+            case None:
+                raise ValueError(f"the table has no simulation of {request.parameters} at {request.action}")
+            case Simulated(result) if result.invalid is None and is_sound(result.fractions):
+                return outcome
+        return Failed("simulation", getattr(outcome, "reason", "") or "invalid outcome")
 
 
 class FinalPour:
@@ -259,5 +218,5 @@ class FinalPour:
         return FinalPoured(action_si=action, loss=self._costing.worst, spillage=1.0, made=False, reason=reason)
 
 
-def _key(theta: SimulationParameters, action: Mapping[str, float | None]) -> Key:
-    return tuple(sorted(theta.model_dump().items())), tuple(sorted(action.items()))
+def _key(request: Simulate) -> Key:
+    return tuple(sorted(request.parameters.model_dump().items())), tuple(sorted(request.action.values().items()))

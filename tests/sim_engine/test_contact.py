@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 
 import numpy as np
 import pytest
@@ -28,6 +27,7 @@ from sim_engine.scene import Pivot, PoseError, SampledMotion, Scene
 from sim_engine.simulator import InvalidSceneError, check_motion
 from sim_engine.vessel.shapes import cylinder
 from sim_engine.vessel.vessel import build_vessel
+from tests.support.counted_calls import counted_calls
 from tests.support.hypothesis_examples import examples
 
 A = build_vessel(cylinder("a", inner_radius=0.04, inner_height=0.1, wall=0.002, floor=0.002))
@@ -139,12 +139,12 @@ def test_poses_that_are_none_are_refused(poses: Poses, message: str) -> None:
         first_contact(A, B, poses)
 
 
-def test_a_whole_motion_is_checked_in_a_fraction_of_a_second() -> None:
+def test_a_whole_motion_is_checked_with_little_work() -> None:
     poses = tilting(np.radians(np.linspace(0.0, 120.0, 120)), 0.098, 0.005)
     first_contact(A, B, poses)  # samples are drawn once per vessel
-    start = time.process_time()
-    first_contact(A, B, poses)
-    assert time.process_time() - start < 0.3
+    with counted_calls() as calls:
+        first_contact(A, B, poses)
+    assert calls.count < 60 * len(poses)
 
 
 def swung(rng: np.random.Generator) -> tuple[Scene, Action, PourMotion]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import socket
-import time
 from pathlib import Path
 
 from actors.emulators.ur_controller.controller_process import VirtualController
+from tests.support.waiting import wait_for
 
 HOME = (-14.0, -91.0, -115.0, -154.0, -104.0, 0.0)
 """[deg]"""
@@ -49,7 +49,7 @@ def install(controller: VirtualController, tool: float = 0.17, payload: float = 
     program = f"def setup():\n set_tcp(p[0,0,{tool},0,0,0])\n set_payload({payload}, [0,0,0.11])\nend\n"
     with socket.create_connection((controller.address, 30003), timeout=5.0) as connection:
         connection.sendall(program.encode())
-        time.sleep(0.2)
+        wait_for(lambda: controller.fault("state")["payload"] == payload, "payload on the controller")
 
 
 CAMPAIGN = """\

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -99,6 +100,10 @@ class Stage:
     """Done before the next question about something is answered."""
     answered_at: dict[str, float] = field(default_factory=dict)
     """Controller time at which the last question about something was answered [s]."""
+    answers: dict[str, list[str]] = field(default_factory=dict)
+    """In place of the operator's own answers to questions about something, first to last; no step is carried out."""
+    late: dict[str, float] = field(default_factory=dict)
+    """Extra time for the next question about something [s]; with inf it is never answered."""
     unsafe: list[str] = field(default_factory=list)
     """Questions that invited hands in while a program ran or a joint moved."""
 
@@ -122,7 +127,15 @@ class Stage:
                 self.unsafe.append(question.about)
             if (hook := self.before.pop(question.about, None)) is not None:
                 await hook()
-            answer = await ask(question)
+            if math.isinf(late := self.late.pop(question.about, 0.0)):
+                self.operator.heard.append(question)
+                await asyncio.Event().wait()
+            await asyncio.sleep(late)
+            if self.answers.get(question.about):
+                self.operator.heard.append(question)
+                answer = self.answers[question.about].pop(0)
+            else:
+                answer = await ask(question)
             self.answered_at[question.about] = await self.now()
             return answer
 
@@ -210,7 +223,8 @@ async def opened_stage(
     laboratory.listen(stage.notices.append)
     async with laboratory:
         stage.attend()
-        stage.operator.script(answers or {}, late or {})
+        stage.answers = {about: list(given) for about, given in (answers or {}).items()}
+        stage.late = dict(late or {})
         yield stage
 
 

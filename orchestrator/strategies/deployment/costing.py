@@ -101,7 +101,7 @@ class Costing:
         return self.loss(fractions, loaded_mass=self.scene.liquid.mass, particles=self.parameters.particles)
 
 
-LEARNT_FROM = 25
+MEDIAN_OF = 25
 """Number of latest simulations whose median is the cost of a simulation; the median ignores single slow ones."""
 
 WITHOUT_OUTCOME = 2.0
@@ -132,9 +132,9 @@ class Prices:
 
     def __init__(self, settings: PricesSettings, worst: float) -> None:
         self._settings, self._worst = settings, worst
-        self._seen: deque[float] = deque(maxlen=LEARNT_FROM)
+        self._seen: deque[float] = deque(maxlen=MEDIAN_OF)
 
-    def learn(self, seconds: float) -> None:
+    def record(self, seconds: float) -> None:
         """Record the CPU seconds of a simulation."""
         if seconds > 0.0:
             self._seen.append(seconds)

@@ -33,8 +33,8 @@ from orchestrator.strategies.deployment.model_monitoring import (
     DiscrepancyPolicySettings,
     RiskLimitSettings,
     Rules,
+    SimulatorMonitor,
     StopSettings,
-    Trust,
     offset_priors,
     subsampled,
 )
@@ -178,7 +178,9 @@ class Hybrid(Deployment[D3Settings]):
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         super().__init__(plan, scene, parameters, seed)
         self._rules = self._settings.rules(self._costing.worst)
-        self._trust = Trust(self._rules, plan.actions, self._costing.worst) if self._settings.adaptive else None
+        self._monitor = (
+            SimulatorMonitor(self._rules, plan.actions, self._costing.worst) if self._settings.adaptive else None
+        )
         self._then: Callable[[str], None] | None = None
         self._ended: str | None = None
         self._unasked: Ask | None = None
@@ -244,41 +246,37 @@ class Hybrid(Deployment[D3Settings]):
 
     def _judged(self, suggestion: Suggestion, pour: Callable[[Suggestion], None]) -> None:
         """Record the conclusions about the simulator, and make the next pour if they allow it."""
-        if self._trust is None or suggestion.discrepancy is None:
+        if self._monitor is None or suggestion.discrepancy is None:
             pour(suggestion)
             return
-        self._trust.record(suggestion.discrepancy, self._pours)
-        verdict = self._trust.judge(suggestion, self._pours, self._plan.pours - self._counted)
+        self._monitor.record(suggestion.discrepancy, self._pours)
+        verdict = self._monitor.judge(suggestion, self._pours, self._plan.pours - self._counted)
         self._take_decisions()
         if verdict.ask is not None:
 
             def answered(answer: str) -> None:
-                assert self._trust is not None
-                end = self._trust.answer(answer, limit=verdict.limit)
+                assert self._monitor is not None
+                end = self._monitor.answer(answer, limit=verdict.limit)
                 self._take_decisions()
                 if end:
-                    self._end(end)
+                    self._ended = end
                 else:
                     self._judged(suggestion, pour)
 
             self._unasked, self._then = verdict.ask, answered
         elif verdict.end:
-            self._end(verdict.end)
+            self._ended = verdict.end  # conclude with the data so far
         else:
             pour(suggestion)
 
     def _take_decisions(self) -> None:
-        assert self._trust is not None
-        self.decisions += self._trust.decisions
-        self._trust.decisions.clear()
-
-    def _end(self, why: str) -> None:
-        """Make no further pour; conclude with the data so far."""
-        self._ended = why
+        assert self._monitor is not None
+        self.decisions += self._monitor.decisions
+        self._monitor.decisions.clear()
 
     def _concluded(self, suggestion: Suggestion) -> None:
-        if self._trust is not None and suggestion.discrepancy is not None:
-            self._trust.record(suggestion.discrepancy, self._pours)
+        if self._monitor is not None and suggestion.discrepancy is not None:
+            self._monitor.record(suggestion.discrepancy, self._pours)
             self._take_decisions()
         self._conclude(suggestion)
 
@@ -291,7 +289,7 @@ class Hybrid(Deployment[D3Settings]):
         """Acquisition of the next pour."""
         if self._settings.adaptive and not self._scalarization.exploring:
             return "least_loss"
-        return "lcb" if self._pours or self._former else "posterior_minimum"
+        return "lcb" if self._pours or self._prior_pours else "posterior_minimum"
 
     def _pour_query(self, **parts: Any) -> PourQuery:
         """A query for the next pour; with a count of 0, about the real cost only."""
@@ -330,11 +328,11 @@ class Hybrid(Deployment[D3Settings]):
     # -- results ---------------------------------------------------------------------------------------------------
 
     def _trusted(self, weighed: Sequence[PourTrial]) -> PredictionCheck | Believed:
-        return super()._trusted(weighed) if self._trust is None else self._trust.result()
+        return super()._trusted(weighed) if self._monitor is None else self._monitor.result()
 
     def result(self) -> Deployed:
         """The result so far, with the conclusions about the bench."""
-        bench = None if self._trust is None else self._trust.bench()
+        bench = None if self._monitor is None else self._monitor.bench()
         return super().result().model_copy(update={"ended": self._ended, "bench": bench})
 
     def progress(self) -> Progress:
@@ -396,7 +394,7 @@ class FreeHybrid(Hybrid):
         """As in D3; in addition, record the duration of a simulation."""
         super().tell(request, outcome)
         if isinstance(request, Simulate) and isinstance(outcome, Simulated):
-            self._prices.learn(outcome.outcome.cpu_s)
+            self._prices.record(outcome.outcome.cpu_s)
         if isinstance(request, Pour):
             self._rested_at = None
 

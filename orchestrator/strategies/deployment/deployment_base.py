@@ -22,7 +22,7 @@ from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Deployed, Recommended, RiskFound, SimulatedAction
 from orchestrator.strategies.deployment.model_monitoring import Believed
 from orchestrator.strategies.deployment.objectives import Vector
-from orchestrator.strategies.deployment.real_pours import PourTrial, PredictionCheck, expecting, former_pours, trust
+from orchestrator.strategies.deployment.real_pours import PourTrial, PredictionCheck, expecting, prior_pours, trust
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from orchestrator.strategies.deployment.scalarization import Scalarization
 from orchestrator.strategies.stage_result import displayed_map
@@ -80,7 +80,7 @@ class Deployment(ABC, Generic[S]):
         self._trials = Trials()
         self._width_known = False
         self._pours: list[PourTrial] = []
-        self._former = () if self._data is None else former_pours(self._data, scene, plan.actions, self._costing)
+        self._prior_pours = () if self._data is None else prior_pours(self._data, scene, plan.actions, self._costing)
         self._queued_pour: Pour | None = None
         self._pouring: Pour | None = None
         self._final: Suggestion | None = None
@@ -89,7 +89,7 @@ class Deployment(ABC, Generic[S]):
         self.decisions: list[Decision] = []
         if self._data is not None:
             path = self._data.path
-            text = f"{len(self._former)} former pours enter the data ({path.parent.name}/{path.name})"
+            text = f"{len(self._prior_pours)} former pours enter the data ({path.parent.name}/{path.name})"
             self.decisions.append(Decision("; left out: ".join([text, *self._data.left_out])))
 
     # -- requests and outcomes --------------------------------------------------------------------------------------
@@ -211,12 +211,12 @@ class Deployment(ABC, Generic[S]):
 
     @property
     def _poured(self) -> list[tuple[Point, Vector]]:
-        return [*self._former, *((p.point, p.vector) for p in self._pours if p.vector is not None)]
+        return [*self._prior_pours, *((p.point, p.vector) for p in self._pours if p.vector is not None)]
 
     @property
     def _counted(self) -> int:
         """Pours that count against the budget."""
-        former = len(self._former) if self._data is not None and self._data.counts else 0
+        former = len(self._prior_pours) if self._data is not None and self._data.counts else 0
         return former + sum(p.status in ("weighed", "failed") for p in self._pours)
 
     @property
@@ -331,7 +331,7 @@ class Deployment(ABC, Generic[S]):
                 for trial in self._trials.all
                 if trial.closed and trial.cost is not None
             ),
-            former_pours=len(self._former),
+            former_pours=len(self._prior_pours),
             refused_pours=self._refused,
             failed_pours=sum(p.status == "failed" for p in self._pours),
             trust=self._trusted([p for p in self._pours if p.status == "weighed" and p.cost is not None]),

@@ -1,6 +1,6 @@
 """The simulator judged by pours: its deviation from the bench, in words, and the rules that follow from it.
 
-- `Trust` records the optimiser's conclusions after every pour and decides whether the next pour is made.
+- `SimulatorMonitor` records the optimiser's conclusions after every pour and decides whether the next pour is made.
 - `offset_priors` and `displacement` describe how a bench may deviate from its simulator.
 - `subsampled` selects the observations that a query carries.
 """
@@ -163,7 +163,7 @@ class Rules:
     good_enough: float | None
 
 
-class Trust:
+class SimulatorMonitor:
     """Records the conclusions about the simulator, and decides whether a proposed pour is made."""
 
     def __init__(self, rules: Rules, actions: Space, worst: float) -> None:

@@ -1,7 +1,7 @@
 """Real pours of a deployment: their records, their conversion to data, and a check of their predictions.
 
 - `PourTrial` is a pour with its prediction and outcome; `PourRow` is its form in results.
-- `former_pours` converts pours from before the campaign.
+- `prior_pours` converts pours from before the campaign.
 - `trust` compares the first pours with their predictions.
 
 The module requests no pours.
@@ -183,7 +183,7 @@ def expecting(text: str, prediction: Prediction) -> Decision:
     return Decision(text, expected)
 
 
-def former_pours(
+def prior_pours(
     data: ExistingPours, scene: Scene, actions: Space, costing: Costing
 ) -> tuple[tuple[Point, Vector], ...]:
     """Points and objectives of the pours from before the campaign in a scene."""

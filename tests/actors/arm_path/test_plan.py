@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from itertools import product
 
 import numpy as np
@@ -24,6 +23,7 @@ from sim_engine.collision import clearance, first_contact, rotations
 from sim_engine.motion import plan_motion
 from sim_engine.scene import Pivot
 from sim_engine.vessel.vessel import build_vessel
+from tests.support.counted_calls import counted_calls
 from tests.support.hypothesis_examples import examples
 from tests.support.planning_cell import ACTION, CONFIGS, LIMITS, SPEC, limited, motion, turned, vessel, waiting_at
 
@@ -242,12 +242,11 @@ def test_other_robot_other_lengths():
     np.testing.assert_allclose(seen[:, :3], motion().sample(path.pour.times)[:, :3], atol=1e-6)
 
 
-def test_a_plan_takes_well_under_a_second():
+def test_a_plan_takes_little_work():
     planned()
-    began = time.process_time()
-    for _ in range(4):
+    with counted_calls() as calls:
         planned()
-    assert (time.process_time() - began) / 4 < 1.0  # some 0.15 s on a quiet core
+    assert calls.count < 25_000
 
 
 def test_limits_are_looked_at_before_anything_is_planned():

@@ -90,7 +90,11 @@ class Rig:
 
     def await_rest(self) -> None:
         self.await_that(lambda: max(map(abs, self.fault("state")["speeds"])) == 0.0, "rest")
-        time.sleep(0.1)  # joints follow their targets a few milliseconds late
+        self.await_time(self.now + 0.5)  # joints follow their targets a few milliseconds late
+
+    def await_time(self, clock: float) -> None:
+        """Until the controller's clock shows so much [s]."""
+        self.await_that(lambda: self.now >= clock, f"time {clock}")
 
     @staticmethod
     def await_that(condition: Callable[[], bool], what: str, patience: float = PATIENCE) -> None:

@@ -11,7 +11,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -56,7 +55,7 @@ def stood_soon(rig: Rig, since: float, limit: float) -> None:
     assert at_rest < limit * rig.arm._spec.time_scale
     assert 0.05 < joints[-1][5] - START[5] < 1.3
     later = rig.now
-    time.sleep(0.3)
+    rig.await_time(later + 0.3 * rig.arm._spec.time_scale)
     assert rig.moved(later) < 1e-6
     assert rig.fault("state")["runtime_state"] == "STOPPED"
 
@@ -72,6 +71,15 @@ def goes_on_only_by_an_operator(rig: Rig) -> None:
     rig.arm.release()
     rig.arm.untilt()
     assert rig.joints == pytest.approx(START, abs=1e-3)
+
+
+def answers(rig: Rig) -> bool:
+    """Whether the controller accepts connections of the driver."""
+    try:
+        socket.create_connection((rig.controller.address, 30004), timeout=5.0).close()
+    except OSError:
+        return False
+    return True
 
 
 # ---- lines
@@ -102,7 +110,7 @@ def test_after_a_reboot_in_mid_pour_tool_and_payload_are_set_again(make_rig: Mak
     lost(rig.pouring())
     with pytest.raises(ArmLostError):
         rig.arm.connect()
-    time.sleep(4.0)
+    rig.await_that(lambda: answers(rig), "controller after its reboot")
     facts = rig.arm.connect()
     assert (facts.robot_mode, facts.payload) == ("off", 0.0)
     rig.arm.release()
@@ -310,7 +318,7 @@ def test_a_controller_that_did_not_take_the_payload_keeps_the_arm_still(
 def _upload(rig: Rig, statements: str) -> None:
     with socket.create_connection((rig.controller.address, 30003), timeout=5) as connection:
         connection.sendall(f"def other():\n {statements}\nend\n".encode())
-        time.sleep(0.1)
+        rig.await_that(lambda: "program other started" in str(rig.fault("state")["messages"]), "start of the program")
 
 
 # ---- what is asked for

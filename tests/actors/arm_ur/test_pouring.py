@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -150,4 +149,4 @@ def _upload(rig: Rig, statements: str) -> None:
 
     with socket.create_connection((rig.controller.address, 30003), timeout=5) as connection:
         connection.sendall(f"def other():\n {statements}\nend\n".encode())
-        time.sleep(0.1)
+        rig.await_that(lambda: "program other started" in str(rig.fault("state")["messages"]), "start of the program")

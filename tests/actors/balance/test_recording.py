@@ -15,7 +15,7 @@ from actors.balance.record_line import main
 from actors.balance.serial_balance import SerialBalance
 from actors.emulators.serial_balance.balance_process import RecordedBalance
 from actors.runtime.child_process import child_environment
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, wait_for
 
 from .conftest import spec_for
 
@@ -72,17 +72,13 @@ def test_the_driver_weighs_what_was_recorded(tmp_path):
     try:
         driver = SerialBalance(spec_for(far, "kern-swt"))
         driver.connect()
-        first, second = driver.read(), _later(driver)
+        first = driver.read()
+        second = wait_for(lambda: later if (later := driver.read()).stable else None, "stable reading")
         driver.close()
     finally:
         far.close()
     assert (first.shown, first.stable) == ("12.30", False)
     assert (second.shown, second.stable) == ("12.34 g", True)
-
-
-def _later(driver: SerialBalance):
-    time.sleep(0.05)
-    return driver.read()
 
 
 @pytest.mark.realtime

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -55,12 +54,14 @@ def test_the_stream_goes_on_while_a_weight_is_waited_for_and_does_not_change_it(
 
 
 @pytest.mark.realtime
-def test_the_last_reading_is_shown_at_once_while_another_call_has_the_line(driver):
+def test_the_last_reading_is_shown_at_once_while_another_call_has_the_line(driver, monkeypatch):
     _, balance = driver("kcp")
     shown = balance.weigh().shown
+    begun, listen = threading.Event(), balance._conversation.listen
+    monkeypatch.setattr(balance._conversation, "listen", lambda seconds: (begun.set(), listen(seconds)))
     listening = threading.Thread(target=balance.listen, args=(3.0,))
     listening.start()
-    time.sleep(0.2)
+    assert begun.wait(PATIENCE)
     assert balance.read().shown == shown
     assert listening.is_alive(), "it was read while the other call had the line"
     listening.join()

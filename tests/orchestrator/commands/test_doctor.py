@@ -7,7 +7,6 @@ import os
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from functools import partial
 from math import degrees, radians
@@ -30,6 +29,7 @@ from orchestrator.config.file_loading import load_laboratory
 from orchestrator.runs.safety_approval import SafetyRecordError, accepted_checksum, read_record, record_path
 from tests.support import hardware_laboratory
 from tests.support.loopback import free_address
+from tests.support.waiting import wait_for
 
 JOINTS = [radians(q) for q in hardware_laboratory.HOME]
 
@@ -371,13 +371,15 @@ def test_a_robot_that_hangs_where_the_file_has_it_stand_is_told(
     """What the tool feels tells where up is."""
     with socket.create_connection((controller.address, 30003), timeout=5.0) as connection:
         connection.sendall(f"def hang():\n set_gravity([{up}])\nend\n".encode())
-        time.sleep(0.3)
+        wait_for(lambda: "program hang started" in str(controller.fault("state")["messages"]), "the program's start")
     try:
         found = checked(laboratory)["mount"]
     finally:
         with socket.create_connection((controller.address, 30003), timeout=5.0) as connection:
             connection.sendall(b"def stand():\n set_gravity([0, 0, 9.82])\nend\n")
-            time.sleep(0.3)
+            wait_for(
+                lambda: "program stand started" in str(controller.fault("state")["messages"]), "start of the program"
+            )
     assert found["state"] == state, found
     if state == "fail":
         assert "tilt 90 deg, turn 0 deg would agree" in found["found"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import resource
 from pathlib import Path
 
 import pytest
@@ -124,11 +123,8 @@ def test_bad_usage_is_explained(command: str, folder: Path) -> None:
         "simulate small.yaml --set angular_velocity=100 --set x_offset=10",
     ],
 )
-def test_refusing_is_quick_and_wakes_nothing_heavy(command: str, inputs: Path) -> None:
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+def test_refusing_wakes_nothing_heavy(command: str, inputs: Path) -> None:
     done = process(command, inputs)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1] == "loaded:"
-    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 4.0
     assert not (inputs / "runs").exists()

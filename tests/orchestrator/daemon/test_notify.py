@@ -7,8 +7,7 @@ import logging
 import socket
 import socketserver
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -16,8 +15,7 @@ import pytest
 
 from orchestrator.daemon import notifications as notify
 from orchestrator.daemon.notifications import QUEUE, Notifier, NotifyError
-
-GENEROUS = 30.0
+from tests.support.waiting import PATIENCE, wait_for
 
 
 class WebReceiver:
@@ -78,13 +76,6 @@ class MailReceiver(socketserver.StreamRequestHandler):
                 return
 
 
-def wait_for(met: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + GENEROUS
-    while not met():
-        assert time.monotonic() < deadline, "it did not happen"
-        time.sleep(0.01)
-
-
 QUESTION = {"question": {"text": "Refill the beaker to 200 g", "problem": "", "options": []}}
 
 
@@ -136,7 +127,7 @@ def test_a_mail_is_delivered(monkeypatch: pytest.MonkeyPatch) -> None:
         notifier = Notifier(["env:DECANT_MAIL"])
         begun(notifier)
         notifier.note("QuestionAsked", QUESTION, "narrow-1a2b")
-        notifier.close(GENEROUS)
+        notifier.close(PATIENCE)
         server.shutdown()
     (letter,) = MailReceiver.letters
     assert "anna@lab.example" in letter
@@ -179,15 +170,16 @@ def test_silence_is_noticed_without_anybody_asking(web: WebReceiver) -> None:
 def test_a_dead_receiver_slows_nothing_and_is_counted(
     web: WebReceiver, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It takes connections and never answers; the other receiver gets everything meanwhile."""
+    """It takes connections and does not answer; the other receiver gets everything meanwhile."""
     monkeypatch.setattr(notify, "PAUSES", (0.0, 0.0))
-    with socket.create_server(("127.0.0.1", 0)) as dead, caplog.at_level(logging.WARNING):
-        notifier = Notifier([f"json://127.0.0.1:{dead.getsockname()[1]}/?rto=1&cto=1", web.url], about=["question"])
+    with caplog.at_level(logging.WARNING):
+        dead = socket.create_server(("127.0.0.1", 0))
+        url = f"json://127.0.0.1:{dead.getsockname()[1]}/?rto=9999&cto=9999"
+        notifier = Notifier([url, web.url], about=["question"])
         begun(notifier)
-        begin = time.thread_time()
-        for _ in range(QUEUE + 20):
+        for _ in range(QUEUE + 20):  # would never come to an end if a note waited for the receiver
             notifier.note("QuestionAsked", QUESTION, "narrow-1a2b")
-        assert time.thread_time() - begin < 1.0  # of this thread's own time: nothing was waited for
+        dead.close()  # ends the connections
         ours, theirs = notifier.counts["json (1)"], notifier.counts["json (2)"]
         wait_for(lambda: theirs.sent + theirs.dropped == QUEUE + 20)
         wait_for(lambda: ours.failed > 0)

@@ -95,7 +95,7 @@ def test_the_price_of_a_simulation_is_what_outcomes_say() -> None:
     prices = Prices(PricesSettings(pour=90.0), worst=1.0)
     assert prices.simulation(2) == 1.0
     for seconds in (10.0, 500.0, 12.0, 0.0):
-        prices.learn(seconds)
+        prices.record(seconds)
     assert prices.simulation(2) == 6.0  # the median; 0 is not a measurement
     assert prices.prefers_pour(0.001, 0.1, 2)
     assert not prices.prefers_pour(0.01, 0.1, 2)
