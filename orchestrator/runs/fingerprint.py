@@ -50,10 +50,9 @@ def deciding(value: Any) -> Any:
         if isinstance(value, ProfileShape):
             value = value.outline()  # lengths in any unit are the same
         free = value.free_fields() if isinstance(value, Liquid | ProfileShape) else frozenset()
-        cls: type[Any] = value.__class__
         fields = {
             name: (getattr(value, name), mark)
-            for name, mark in marks_of(cls).items()
+            for name, mark in marks_of(type(value)).items()
             if mark not in (NOT_IN_FINGERPRINT, SET_BY_PROGRAM) and name not in free
         }
         kind = {"kind": value.kind} if isinstance(value, Shape) else {}
