@@ -42,7 +42,7 @@ from optimisers import interval
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.journal.stage_results import result_of
+from orchestrator.journal.codec import result_of
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.stages import CALIBRATION, calibrated_theta, calibration_stages, stage_seed
 from orchestrator.strategies.calibration.calibration_base import Calibrated, DesignSettings

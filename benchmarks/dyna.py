@@ -38,7 +38,7 @@ from actors.interfaces import ProgressCallback
 from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
-from orchestrator.results.pool_occupancy import RESTS, Occupancy
+from orchestrator.journal.run_record import POOL_RESTS, Occupancy
 from orchestrator.runs.events import DecisionMade, Event
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan, OutputSettings
@@ -109,7 +109,7 @@ class Bench:
 
     def watch(self, event: Event) -> None:
         """The strategy says when the pool may rest."""
-        if isinstance(event, DecisionMade) and RESTS in event.decision.values:
+        if isinstance(event, DecisionMade) and POOL_RESTS in event.decision.values:
             self.occupancy.rests(self._clock.time())
 
     async def simulate(self, task: PourTask) -> SimulatedPour:
@@ -182,7 +182,7 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
         "mean wait, ms": 1e3 * float(np.mean(bench.occupancy.waits)),
         "longest answer, ms": 1e3 * max(bench.answers),
         "CPU, s": time.thread_time() - begun,
-        "alarm": float(stage.trust.alarm),
+        "alarm": float(stage.model_check.alarm),
         "reported": bench.true(stage.recommended.action_si),
     }
     for pours in (n for n in AFTER if n <= asked.pours):

@@ -27,7 +27,7 @@ from skipping_clock import run
 
 from actors.bench.ground_truth import hidden_spill
 from actors.interfaces import InvalidActionError, ProgressCallback
-from orchestrator.results.pool_occupancy import Occupancy
+from orchestrator.journal.run_record import Occupancy
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.strategies.campaign_plan import DeploymentPlan, OutputSettings
 from orchestrator.strategies.deployment.costing import PricesSettings
@@ -160,7 +160,7 @@ def campaign(study: StudyPlan, arm: DeploymentPlan, seed: int, fluid: Fluid, ask
         "longest wait, ms": 1e3 * max(fluid.occupancy.waits, default=0.0),
         "mean wait, ms": 1e3 * float(np.mean(fluid.occupancy.waits)),
         "longest answer, ms": 1e3 * max(fluid.answers),
-        "alarm": float(stage.trust.alarm),
+        "alarm": float(stage.model_check.alarm),
         "apart, s": fluid.apart,
     }
     for pours in (n for n in AFTER if n <= asked.pours):

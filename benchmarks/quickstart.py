@@ -110,7 +110,7 @@ def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
             "at": [round(u, 4) for u in campaign.deployment.actions.encode(pour.action_si)],
             "loss": pour.loss,
             "predicted": pour.predicted,
-            "band": pour.predicted_band,
+            "band": pour.predicted_interval,
         }
         for pour in found.pours
         if pour.status == "weighed" and pour.loss is not None

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import check_journal, has_begun
 from orchestrator.journal.run_record import CampaignResult, read_result
 from orchestrator.requests import Pour
@@ -249,9 +249,7 @@ class RunService:
 
         if request.folder is None or not (request.folder / JOURNAL_NAME).is_file():
             return None
-        with JournalReader(request.folder / JOURNAL_NAME) as journal:
-            result = read_result(journal, request.folder)
-        return publish(request.campaign, result)
+        return publish(request.campaign, read_result(request.folder))
 
 
 class RunHandle:

@@ -77,7 +77,7 @@ def calibrate(path: Path, options: RunOptions) -> None:
 def calibration_json(result: CampaignResult, published: Published) -> dict[str, Any]:
     """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see
     `CalibrationEvaluation`."""
-    from orchestrator.journal.stage_results import result_of
+    from orchestrator.journal.codec import result_of
     from orchestrator.results.stage_views import rival_scores
     from orchestrator.runs.stages import CALIBRATION, EVALUATION, calibrated_theta, deployed_theta
     from orchestrator.strategies.calibration.calibration_base import Calibrated
@@ -124,7 +124,7 @@ def plan_pour(
 ) -> None:
     """D1 for one receiver: the action that the calibrated simulator would pour with, and what to expect of it."""
     from orchestrator.cli.prediction_inputs import foretelling
-    from orchestrator.journal.stage_results import result_of
+    from orchestrator.journal.codec import result_of
     from orchestrator.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
     from orchestrator.strategies.deployment.deployment_result import Deployed

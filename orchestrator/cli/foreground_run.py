@@ -213,7 +213,7 @@ def run_in_front_of_people(
     try:
         _close(handle, live)
         published = handle.publish()
-        print_summary(plan, published.summary)
+        print_summary(published.summary)
     except KeyboardInterrupt:
         raise RefusalError(f"interrupted{finished_without_report(directory)}", INTERRUPTED) from None
     if published.report is not None:
@@ -296,12 +296,12 @@ def interruption(directory: Path, plan: CampaignPlan, again: str) -> str:
 
 def finished_without_report(directory: Path) -> str:
     """Follows 'interrupted' if all stages of a run are done and its results may not be published; empty otherwise."""
-    from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
     from orchestrator.journal.journal_file import JournalError
+    from orchestrator.journal.run_record import read_record
     from orchestrator.states import State
 
-    with contextlib.suppress(JournalError), JournalReader(directory / JOURNAL_NAME) as journal:
-        if journal.state() is State.FINISHED:
+    with contextlib.suppress(JournalError):
+        if read_record(directory).state is State.FINISHED:
             return (
                 " after the last stage, while the results were written; the run is finished, and nothing is lost. "
                 f"Write its summary, figures and report with: decant report {directory}"
@@ -311,20 +311,12 @@ def finished_without_report(directory: Path) -> str:
 
 def given_up_pours(directory: Path) -> list[str]:
     """Pours of a run that had begun and have no outcome: 'pour 3 of stage deployment:narrow'."""
-    from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
     from orchestrator.journal.journal_file import JournalError
-    from orchestrator.requests import Pour
-    from orchestrator.runs.replay import read_history
+    from orchestrator.journal.run_record import read_record
 
-    found: list[str] = []
-    with contextlib.suppress(JournalError), JournalReader(directory / JOURNAL_NAME) as journal:
-        for stage in [entry.stage for entry in journal.entries(kinds=[Kind.STAGE_OPENED])]:
-            history = read_history(journal, stage)
-            for key in history.unknown_pours():
-                request = history.request(key)
-                assert isinstance(request, Pour)
-                found.append(f"pour {request.number} of stage {stage}")
-    return found
+    with contextlib.suppress(JournalError):
+        return [f"pour {one.request.number} of stage {one.stage}" for one in read_record(directory).unknown_pours]
+    return []
 
 
 def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
@@ -333,21 +325,20 @@ def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
     Whatever goes wrong with it, a further Ctrl-C too, is no reason to say less about the run itself.
     """
     from orchestrator.journal.codec import digest
-    from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-    from orchestrator.journal.run_record import read_result
+    from orchestrator.journal.run_record import read_header, read_result
     from orchestrator.results.publishing import report_on
     from orchestrator.runs.fingerprint import fingerprint
 
-    with contextlib.suppress(Exception, KeyboardInterrupt), JournalReader(directory / JOURNAL_NAME) as journal:
-        if digest(journal.header.fingerprint) != digest(fingerprint(plan)):
+    with contextlib.suppress(Exception, KeyboardInterrupt):
+        if digest(read_header(directory).fingerprint) != digest(fingerprint(plan)):
             return None  # it was refused, since this is another campaign
-        return report_on(plan, read_result(journal, directory), draw=plan.outputs.figures)[0]
+        return report_on(plan, read_result(directory), draw=plan.outputs.figures)[0]
     return None
 
 
 def file_trouble(error: OSError, directory: Path) -> str:
     """What went wrong with a file of a run: which one, and how much room there should be where the disk is full."""
-    from orchestrator.journal.disk_reserve import MB, TO_BEGIN, free_space
+    from orchestrator.journal.journal_file import MB, TO_BEGIN, free_space
 
     where = error.filename or directory
     text = f"{where}: {error.strerror}"

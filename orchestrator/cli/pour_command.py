@@ -156,15 +156,15 @@ def report_json(report: PathReport) -> dict[str, Any]:
 def _draw(chosen: Chosen, png: Path) -> None:
     from actors.arm.arm_settings import UrArmSettings
     from actors.arm.planned_pour import PourPath
-    from orchestrator.results.arm_path_figures import path_png
+    from orchestrator.results import figure_style as style
+    from orchestrator.results.pour_figures import draw_path
     from sim_engine.vessel.vessel import build_vessel
 
     arm = chosen.plan.laboratory.arm
     if not isinstance(chosen.path, PourPath) or not isinstance(arm, UrArmSettings):
         raise RefusalError("--png: draws the joints of an arm, and this arm's path has none", BAD_INPUT)
     pourer, receiver = build_vessel(chosen.scene.pourer), build_vessel(chosen.scene.receiver)
-    drawn = path_png(
-        png,
+    figure = draw_path(
         chosen.path,
         arm,
         pourer,
@@ -172,7 +172,7 @@ def _draw(chosen: Chosen, png: Path) -> None:
         title=f"{chosen.scene.pourer.name} into {chosen.scene.receiver.name}, laboratory {chosen.plan.laboratory.name}",
         note=chosen.action.display(),
     )
-    mention(f"picture: {drawn}")
+    mention(f"picture: {style.save(figure, png)}")
 
 
 def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
@@ -227,7 +227,7 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
         check_somebody_is_there,
         run_in_front_of_people,
     )
-    from orchestrator.journal.stage_results import result_of
+    from orchestrator.journal.codec import result_of
     from orchestrator.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import StageDefinition
     from orchestrator.strategies.single_action import OnePour, OnePoured

@@ -207,9 +207,10 @@ def _show(task: PourTask, pour: SimulatedPour, options: SimulateOptions) -> None
 
         mention(f"recording: {simulation_rrd(options.rrd, task, pour)} (open it with: rerun {options.rrd})")
     if options.png is not None:
-        from orchestrator.results.pour_figures import simulation_png
+        from orchestrator.results import figure_style as style
+        from orchestrator.results.pour_figures import simulation_figure
 
-        mention(f"picture: {simulation_png(options.png, task, pour)}")
+        mention(f"picture: {style.save(simulation_figure(task, pour), options.png)}")
 
 
 def schema(which: str) -> None:
@@ -250,14 +251,15 @@ def predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     dimensions = [name for name in table.dimensions if name in table.varying()] or list(table.dimensions)
     found = scores(rows)
     if options.csv is not None:
-        from orchestrator.results.prediction_figures import write_scored
+        from orchestrator.results.prediction_scores import write_scored
 
         mention(f"table: {write_scored(options.csv, rows, dimensions)}")
     if options.png is not None:
-        from orchestrator.results.prediction_figures import draw_scored
+        from orchestrator.results import figure_style as style
+        from orchestrator.results.prediction_scores import draw_scored
 
         title = f"{scene.pourer.name} into {scene.receiver.name}, {len(rows)} weighed pours"
-        mention(f"picture: {draw_scored(options.png, rows, title=title, note=said)}")
+        mention(f"picture: {style.save(draw_scored(rows, title=title, note=said), options.png)}")
     if options.as_json:
         print_json(
             {

@@ -83,7 +83,7 @@ def _nothing_there(folder: Path) -> str:
 def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
     from orchestrator.config.file_loading import recorded_campaign
     from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+    from orchestrator.journal.journal import JOURNAL_NAME
     from orchestrator.journal.journal_check import check_journal
     from orchestrator.journal.run_record import read_result
     from orchestrator.results.html_report import REPORT_NAME
@@ -97,8 +97,7 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
     try:
         try:
             plan = recorded_campaign(folder / RESOLVED)
-            with JournalReader(folder / JOURNAL_NAME) as journal:
-                result = read_result(journal, folder)
+            result = read_result(folder)
         except (ConfigError, RunError) as error:
             reason = f"Its campaign or its results can't be read: {error}"
             if missing := missing_plugins(read_versions(folder)):

@@ -252,7 +252,7 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
                 "complete": not found.problems,
                 "problems": found.problems,
                 "entries": found.entries,
-                "entries_without_chain": found.unchecked,
+                "entries_without_chain": 0 if found.chained else found.entries,
                 "pours": found.pours,
             }
         )

@@ -426,6 +426,7 @@ def _written_mesh(
     """Write a mesh in millimetres next to the vessel's file, after checking that it holds liquid."""
     import trimesh
 
+    from orchestrator.results import figure_style as style
     from orchestrator.results.pour_figures import draw_solid
     from sim_engine.vessel.shapes import MeshShape, VesselSpec
     from sim_engine.vessel.vessel import build_vessel
@@ -447,7 +448,7 @@ def _written_mesh(
             f"brimful it held {1e6 * _volume(sources, brimful):.0f} mL, and the mesh has {1e6 * built.capacity:.0f} "
             "mL: check its unit, and whether its inside was seen"
         )
-    picture = draw_solid(name, built, out.with_suffix(".png"))
+    picture = style.save(draw_solid(name, built), out.with_suffix(".png"))
     lines = [f"# {note}." for note in (*notes, *doubts)]
     lines += [f"name: {json.dumps(name, ensure_ascii=False)}", f"mesh: {path.name}", "unit: mm", f"up: {up}"]
     out.write_text("\n".join(lines) + "\n")

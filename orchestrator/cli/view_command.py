@@ -122,8 +122,7 @@ def _serve(shown: Path, at: str | None) -> None:
 
 def _again(what: Path, number: int, particles: int | None, stage: str | None, path: Path) -> Path:
     from orchestrator.cli.console import waiting_for
-    from orchestrator.live_view.repeated_pour import NoSuchPourError, find_pour, task_of
-    from orchestrator.live_view.simulation_view import simulation_rrd
+    from orchestrator.live_view.simulation_view import NoSuchPourError, find_pour, simulation_rrd, task_of
     from orchestrator.run_errors import RunError
     from sim_engine.simulator import PourSimulator
 
@@ -140,8 +139,11 @@ def _again(what: Path, number: int, particles: int | None, stage: str | None, pa
     with contextlib.closing(simulator), waiting_for(lambda: f"simulating, {time.monotonic() - begin:.0f} s so far"):
         result = simulator.simulate(task)
     said = f"{1e3 * task.scene.liquid.mass * result.outcome.spilled:.1f} g spilled in this simulation"
-    mention(f"{pour.title}; {said}, {result.outcome.particles} particles")
-    return simulation_rrd(path, task, result, pour.title)
+    assert pour.measured is not None
+    weighed = f"{1e3 * pour.measured.spilled:.1f} g spilled when it was poured"
+    title = f"pour {pour.request.number} of {pour.stage}, simulated again ({weighed})"
+    mention(f"{title}; {said}, {result.outcome.particles} particles")
+    return simulation_rrd(path, task, result, title)
 
 
 def _beside(what: list[Path], path: Path) -> Path:

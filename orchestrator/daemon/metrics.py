@@ -16,7 +16,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
 
 from orchestrator.daemon.supervisor import Supervisor
-from orchestrator.journal.disk_reserve import free_space
+from orchestrator.journal.journal_file import free_space
 
 
 class _Collector:

@@ -25,6 +25,7 @@ from orchestrator.daemon.rig_worker import job_of
 from orchestrator.daemon.run_readout import REPORT, summary_of
 from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, RigOut, StatusOut
 from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.results.run_summary import PourSummary
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
@@ -106,24 +107,24 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
     """Return one campaign with its pours and its summary."""
     item = found_item(daemon, key)
     summary: dict[str, Any] | None = None
-    pours: list[dict[str, Any]] = []
+    pours: list[PourSummary] = []
     if item.run is not None:
         directory = daemon.settings.runs / item.run
 
-        def read() -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
+        # A process that was killed leaves a journal that ends in the middle of the pour.
+        live = daemon.progress(item) is not None
+
+        def read() -> tuple[list[PourSummary], dict[str, Any] | None]:
             def plan() -> CampaignPlan:
                 return job_of(daemon.settings, item, daemon.settings.rig(item.rig)).campaign
 
-            return daemon.pours.of(directory, plan), summary_of(directory)
+            return daemon.pours.of(directory, plan, live=live), summary_of(directory)
 
         try:
             pours, summary = await asyncio.to_thread(read)
         except (ConfigError, RunError, KeyError):  # for example, a rig that the settings no longer contain
             summary = await asyncio.to_thread(summary_of, directory)
     table = campaign_out(request, daemon, item).model_dump()
-    if daemon.progress(item) is None:  # the process was killed, so the journal ends in the middle of the pour
-        for pour in pours:
-            pour["state"] = "unknown" if pour["state"] == "under way" else pour["state"]
     deeds = daemon.store.deeds(item.id)
     return CampaignDetailOut.model_validate({**table, "pours_made": pours, "summary": summary, "deeds": deeds})
 

@@ -23,8 +23,7 @@ from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.remote_operator import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.run_readout import prune_recordings
 from orchestrator.daemon.submission_bundle import CAMPAIGN, THETA, load_confined
-from orchestrator.journal.disk_reserve import MB, free_space
-from orchestrator.journal.journal_file import JournalError
+from orchestrator.journal.journal_file import MB, JournalError, free_space
 from orchestrator.journal.run_record import CampaignResult
 from orchestrator.live_view.live_server import LiveView, recorder_of
 from orchestrator.live_view.rerun_subscriber import RerunMonitor

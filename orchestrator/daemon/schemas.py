@@ -9,6 +9,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from orchestrator.results.run_summary import PourSummary
+
 
 class _In(BaseModel):
     model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
@@ -150,35 +152,10 @@ class CampaignOut(_Out):
     """URL of the live view."""
 
 
-class PourOut(_Out):
-    """A requested pour."""
-
-    stage: str
-    number: int
-    receiver: str
-    action: str
-    """Values of the action with their units."""
-
-    predicted: str
-    measured: str
-    """'' until the pour is weighed."""
-
-    loss: str
-    """Meaning of `predicted` and `measured`, such as 'spilled / poured': each loss has its own denominator."""
-
-    spillage: float | None
-    """Fraction of the load that was spilled: spilled / loaded."""
-
-    state: Literal["asked", "under way", "weighed", "failed", "unknown"]
-    """'unknown': the run ended during the pour, so it has no outcome; the operator enters it at the next resume."""
-
-    time: float | None
-
-
 class CampaignDetailOut(CampaignOut):
     """A submitted campaign with its results so far."""
 
-    pours_made: list[PourOut]
+    pours_made: list[PourSummary]
     summary: dict[str, Any] | None
     """`summary.json` of its run, after publication."""
 

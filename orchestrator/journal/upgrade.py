@@ -1,8 +1,8 @@
 """What version 0.2 wrote and this one no longer has: journals, results and recorded campaigns are read without it.
 
-Version 0.2 had two further models of D3, `pooled` and `scaled`, a check of the simulator by the first pours (`trust`),
-and a price of simulations for as long as no outcome told one. Its runs can be listed and reported. One that used such a
-model or check can't be resumed.
+Version 0.2 had two further models of D3, `pooled` and `scaled`, and a check of the simulator by the first pours
+(`trust`). It had a price of simulations that was used until the first outcome. Some fields of its results had other
+names. Its runs can be listed and reported. One that used such a model or check can't be resumed.
 """
 
 from __future__ import annotations
@@ -83,6 +83,13 @@ def _renamed(data: Data, names: Mapping[str, str]) -> dict[str, Any]:
     return {names.get(key, key): value for key, value in data.items()}
 
 
+_RENAMED = {
+    "deployment": {"trust": "model_check", "front": "pareto_front"},
+    "prediction": {"band": "interval"},
+}
+"""Fields of results by kind: the name of version 0.2 and today's."""
+
+
 def upgraded_result(data: Data) -> Data:
     """A stage's result as this version reads it.
 
@@ -91,10 +98,13 @@ def upgraded_result(data: Data) -> Data:
     """
     if data.get("kind") == "table":
         return {key: value for key, value in data.items() if key != "rows"}
-    trust = data.get("trust")
-    if not isinstance(trust, Mapping) or "mean_z" not in trust:
+    data = _renamed(data, _RENAMED.get(str(data.get("kind")), {}))
+    if data.get("kind") != "deployment":
         return data
-    return {**data, "trust": {key: trust[key] for key in ("z_scores", "alarm")}}
+    check = data.get("model_check")
+    if isinstance(check, Mapping) and "mean_z" in check:
+        data["model_check"] = {key: check[key] for key in ("z_scores", "alarm")}
+    return data | {"pours": [_renamed(row, {"predicted_band": "predicted_interval"}) for row in data.get("pours", ())]}
 
 
 def upgraded_fingerprint(data: dict[str, Any]) -> dict[str, Any]:

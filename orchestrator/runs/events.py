@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from actors.interfaces import PourProgress
-from orchestrator.journal.stage_results import Results
+from orchestrator.journal.codec import Results
 from orchestrator.requests import Decision, Outcome, Request
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Progress

@@ -11,9 +11,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from orchestrator.journal.codec import canonical, decode_outcome, decode_request, encode_request, first_difference
+from orchestrator.journal.codec import (
+    canonical,
+    decode_outcome,
+    decode_request,
+    decode_result,
+    encode_request,
+    first_difference,
+)
 from orchestrator.journal.journal import JournalReader, Kind
-from orchestrator.journal.stage_results import decode_result
 from orchestrator.requests import Answered, Ask, Outcome, Request, Slots
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import RequestFinished

@@ -16,11 +16,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from actors.interfaces import Laboratory, Notice, Telling
-from orchestrator.journal.disk_reserve import NoSpaceError
+from orchestrator.journal.codec import Results, decode_results
 from orchestrator.journal.journal import JOURNAL_NAME, Journal, Kind
-from orchestrator.journal.journal_file import Header, JournalError
+from orchestrator.journal.journal_file import Header, JournalError, NoSpaceError
 from orchestrator.journal.run_record import CampaignResult, read_result
-from orchestrator.journal.stage_results import Results, decode_results
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import (
     CampaignClosed,
@@ -341,6 +340,6 @@ class _Run:
         self._watchers.emit(CampaignClosed(state=str(self._state), results=results))
 
     def _close(self) -> CampaignResult:
-        result = read_result(self._journal, self._directory, seconds=time.monotonic() - self._begin)
+        result = read_result(self._directory, seconds=time.monotonic() - self._begin)
         self._watchers.emit(CampaignClosed(state=str(result.state), results=result.results))
         return result

@@ -19,11 +19,9 @@ from typing import Any
 from orchestrator.catalogue.run_registry import register
 from orchestrator.installed_plugins import packages as plugin_packages
 from orchestrator.journal.codec import digest
-from orchestrator.journal.disk_reserve import TO_BEGIN, require_space
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-from orchestrator.journal.journal_check import check_journal, has_begun
-from orchestrator.journal.journal_file import JournalError
-from orchestrator.journal.pour_ledger import LEDGER_NAME, readable_lines
+from orchestrator.journal.journal_check import LEDGER_NAME, check_journal, has_begun, readable_lines
+from orchestrator.journal.journal_file import TO_BEGIN, JournalError, require_space
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from orchestrator.journal.stage_results import Results
+from orchestrator.journal.codec import Results
 from orchestrator.requests import Ask, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
 from orchestrator.runs.request_executor import RequestExecutor
 from orchestrator.runs.stages import StageDefinition, calibrated_theta, stage_seed

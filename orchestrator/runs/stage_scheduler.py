@@ -23,10 +23,9 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from actors.interfaces import PourProgress
-from orchestrator.journal.codec import decode_outcome, encode_outcome, encode_request, to_json
+from orchestrator.journal.codec import decode_outcome, encode_outcome, encode_request, encode_result, to_json
 from orchestrator.journal.journal import Draft, Journal, Kind
 from orchestrator.journal.journal_file import JournalError
-from orchestrator.journal.stage_results import encode_result
 from orchestrator.requests import Ask, Decision, Order, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import (

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from orchestrator.journal.stage_results import Results, result_of
+from orchestrator.journal.codec import Results, result_of
 from orchestrator.requests import Order
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.calibration.action_prior import Contexts, drawn_benches

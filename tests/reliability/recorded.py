@@ -17,7 +17,7 @@ from tests.reliability.case import AHEAD, BACK, CUT, FULL, KILLED, STOPPED, Case
 from tests.reliability.program import ProgramRig
 from tests.reliability.rig import Life
 
-WRITER = "orchestrator.live_view.recording_writer"
+WRITER = "orchestrator.live_view.rerun_subscriber"
 
 
 class RecordingRig(ProgramRig):

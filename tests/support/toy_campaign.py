@@ -19,9 +19,9 @@ import numpy as np
 from actors.interfaces import PourProgress, ProgressCallback
 from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Data, MinimumQuery, Suggestion, SuggestionQuery
+from orchestrator.journal.codec import Results, result_of
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.journal.run_record import CampaignResult
-from orchestrator.journal.stage_results import Results, result_of
 from orchestrator.requests import (
     Decision,
     Failed,

@@ -20,8 +20,8 @@ from orchestrator.config.file_loading import load_laboratory
 from orchestrator.journal.codec import encode_outcome, encode_request
 from orchestrator.journal.journal import JOURNAL_NAME, Header, Journal, Kind
 from orchestrator.live_view.blueprints import put_beside
-from orchestrator.live_view.repeated_pour import NoSuchPourError, find_pour, task_of
 from orchestrator.live_view.run_recording import CampaignRecording
+from orchestrator.live_view.simulation_view import NoSuchPourError, find_pour, task_of
 from orchestrator.requests import Pour, Poured
 from sim_engine.outcome import PourMeasurement
 from tests.support import example_run

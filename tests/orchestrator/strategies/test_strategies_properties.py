@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from actors.optimizer.questions import Data, Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
-from orchestrator.journal.stage_results import encode_result
+from orchestrator.journal.codec import encode_result
 from orchestrator.requests import Outcome, Pour, Poured, Request, Suggest
 from orchestrator.run_errors import LearningError
 from orchestrator.runs.events import Event, RequestFinished

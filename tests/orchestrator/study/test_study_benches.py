@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.journal.stage_results import result_of
+from orchestrator.journal.codec import result_of
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
 from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.calibration.calibration_scores import Scores

@@ -138,7 +138,7 @@ def poured(arm: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
         former_pours=0,
         refused_pours=1,
         failed_pours=0,
-        trust=PredictionCheck(z_scores=(), alarm=False),
+        model_check=PredictionCheck(z_scores=(), alarm=False),
     )
 
 

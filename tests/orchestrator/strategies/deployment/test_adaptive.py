@@ -58,7 +58,7 @@ def said(strategy: Hybrid) -> list[str]:
 
 
 def believed(strategy: Hybrid) -> Believed:
-    trust = strategy.result().trust
+    trust = strategy.result().model_check
     assert isinstance(trust, Believed)
     return trust
 
@@ -83,9 +83,9 @@ def test_every_pour_is_announced_with_the_band_that_its_row_has() -> None:
         decision for decision in strategy.decisions if "  predicted " in decision.text and "/2 " in decision.text
     ]
     for pour, decision in zip(strategy.result().pours, announced, strict=True):
-        assert pour.predicted_band == (decision.values["low"], decision.values["high"])
+        assert pour.predicted_interval == (decision.values["low"], decision.values["high"])
         assert "nine pours in ten lie between" in decision.text
-        assert 0.0 <= pour.predicted_band[0] < pour.predicted_band[1] <= 1.0
+        assert 0.0 <= pour.predicted_interval[0] < pour.predicted_interval[1] <= 1.0
 
 
 def test_a_result_with_what_was_said_survives_its_file() -> None:
@@ -304,7 +304,7 @@ def test_a_campaign_that_asks_pauses_and_goes_on_as_answered(tmp_path: Path) -> 
         run(directory, resume=True, ask_operator=answering("lost"))
     result = run(directory, resume=True, ask_operator=answering("Go on"))
     assert result.state == "finished"
-    assert next(iter(result.results.values())).trust.followed == "go on"
+    assert next(iter(result.results.values())).model_check.followed == "go on"
     with JournalReader(directory / JOURNAL_NAME) as journal:
         assert [e.body["answer"] for e in journal.entries(kinds=[Kind.OPERATOR_ANSWERED])] == ["go on"]
     # what it asked for is what a campaign asks for that has decided so beforehand
@@ -334,4 +334,4 @@ def test_an_answer_is_replayed_exactly(tmp_path: Path) -> None:
     asyncio.run(paused_after_the_answer())
     result = run(directory, resume=True)
     assert result.state == "finished"
-    assert next(iter(result.results.values())).trust.followed == "go on"
+    assert next(iter(result.results.values())).model_check.followed == "go on"

@@ -11,7 +11,7 @@ import pytest
 
 from actors.optimizer.questions import Data
 from orchestrator.config.campaign_checks import touch
-from orchestrator.journal.stage_results import encode_result
+from orchestrator.journal.codec import encode_result
 from orchestrator.requests import Failed, Outcome, Pour, Request, Simulate, Suggest
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import RiskQuery
-from orchestrator.journal.codec import decode_request, encode_request
-from orchestrator.journal.stage_results import decode_result, encode_result
+from orchestrator.journal.codec import decode_request, decode_result, encode_request, encode_result
 from orchestrator.requests import Failed, Simulate, Suggest
 from orchestrator.run_errors import RunError
 from orchestrator.runs.stages import with_posterior

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import Data
-from orchestrator.journal.stage_results import encode_result
+from orchestrator.journal.codec import encode_result
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Suggest
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
@@ -222,8 +222,8 @@ def test_a_simulator_that_is_wrong_raises_the_alarm_and_a_right_one_does_not():
     wrong, right = make("D3", 1, pours=5), make("D3", 1, pours=5)
     StrategyHarness(upside_down, narrow_cup).run(wrong)
     StrategyHarness(narrow_cup).run(right)
-    assert wrong.result().trust.alarm
-    assert not right.result().trust.alarm
+    assert wrong.result().model_check.alarm
+    assert not right.result().model_check.alarm
 
 
 @pytest.mark.parametrize(

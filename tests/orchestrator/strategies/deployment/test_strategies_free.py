@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import Data
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.journal import Kind
+from orchestrator.journal.run_record import POOL_RESTS, Occupancy, read_record
 from orchestrator.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
-from orchestrator.results.pool_occupancy import RESTS, Occupancy, occupancies
 from orchestrator.strategies.deployment.costing import Prices, PricesSettings
 from orchestrator.strategies.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
 from orchestrator.strategies.deployment.model_monitoring import DiscrepancyPolicySettings, subsampled
@@ -84,8 +84,8 @@ def test_the_pool_rests_when_simulations_promise_nothing_and_goes_on_when_someth
     many, few = played(tireless)[0], played(lazy)[0]
     assert len(many.simulations) > 45
     assert len(few.simulations) < 25
-    assert not any(RESTS in decision.values for decision in tireless.decisions)
-    rests = [decision for decision in lazy.decisions if RESTS in decision.values]
+    assert not any(POOL_RESTS in decision.values for decision in tireless.decisions)
+    rests = [decision for decision in lazy.decisions if POOL_RESTS in decision.values]
     assert rests
     assert "only pours tell: a simulation promises" in rests[0].text
     assert len(few.pours) == len(many.pours) == 2
@@ -111,7 +111,7 @@ def test_a_simulator_that_fails_for_ever_is_let_alone() -> None:
     play, _ = played(strategy, broken, narrow_cup, beside=200)
     assert len(play.pours) == 2
     assert len(play.simulations) < 80
-    assert any("came to nothing" in d.text for d in strategy.decisions if RESTS in d.values)
+    assert any("came to nothing" in d.text for d in strategy.decisions if POOL_RESTS in d.values)
 
 
 def test_a_person_who_is_asked_about_the_simulator_is_answered_before_the_next_pour() -> None:
@@ -126,7 +126,7 @@ def test_a_person_who_is_asked_about_the_simulator_is_answered_before_the_next_p
     play.run(log)
     assert [r.number for r in play.pours] == [1, 2, 3, 4, 5, 6]
     assert sum(isinstance(r, Ask) for r in play.asked) == 1
-    assert strategy.result().trust.followed == "go on"
+    assert strategy.result().model_check.followed == "go on"
 
 
 # -- nobody waits ----------------------------------------------------------------------------------------------------
@@ -235,8 +235,7 @@ def test_killed_in_the_middle_of_free_simulations_it_goes_on_from_its_journal(tm
     assert _run(tmp_path / "run", 0.2, resume=True).state == "finished"
     assert logical_record(tmp_path / "run")[: len(before)] == before
     assert set(finished_times(tmp_path / "run").values()) == {1}
-    with JournalReader(tmp_path / "run" / JOURNAL_NAME) as journal:
-        (found,) = occupancies(journal.entries(), 2).values()
+    (found,) = read_record(tmp_path / "run", slots=2).occupancies.values()
     assert found.fraction is not None
     assert 0.0 < found.fraction <= 1.0
 
