@@ -56,7 +56,7 @@ deployment:
   motion: {max_angle: 115 deg, height: 60 mm}
   actions: {angular_velocity: [60 deg/s, 180 deg/s], x_offset: [60 mm, 100 mm]}
   pours: 8
-outputs: {rrd: false, figures: false}
+outputs: {recording: false, figures: false}
 """
 
 READER = """

@@ -11,7 +11,7 @@ real strategy, scheduler, journal and optimiser, in one process, on a clock that
 
     D2      pours alone
     fixed   D3 with 37 simulations and 2 beside each pour (the paper's form)
-    priced  D3 with `per_pour: free`: simulations by what they are worth, before the first pour at most 37
+    priced  D3 with `simulations_per_pour: free`: simulations by what they are worth, before the first pour at most 37
     longer  the same, with at most 200 before the first pour
     tireless  as priced, but the pool never rests
 """
@@ -42,7 +42,7 @@ from orchestrator.journal.run_record import POOL_RESTS, Occupancy
 from orchestrator.runs.events import DecisionMade, Event
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan, OutputSettings
-from orchestrator.strategies.deployment.costing import PricesSettings
+from orchestrator.strategies.deployment.costing import CostSettings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.deployment.deployment_result import Deployed
@@ -63,21 +63,21 @@ def arms(asked: argparse.Namespace, space: Space) -> dict[str, DeploymentPlan]:
     settings = D3Settings(
         pours=asked.pours,
         prior_simulations=asked.prior,
-        per_pour="free",
+        simulations_per_pour="free",
         model=asked.model,
     )
-    free, prices = DeploymentPlan(settings, (SCENE,), space, Loss()), PricesSettings(pour=asked.pour)
+    free, costs = DeploymentPlan(settings, (SCENE,), space, Loss()), CostSettings(pour=asked.pour)
     return {
         "D2": replace(free, settings=D2Settings(pours=asked.pours)),
-        "fixed": free.with_settings(per_pour=2),
-        "priced": free.with_settings(prices=prices),
-        "longer": free.with_settings(prices=prices, prior_simulations=200),
-        "tireless": free.with_settings(prices=PricesSettings(pour=asked.pour, worth=0.0)),
+        "fixed": free.with_settings(simulations_per_pour=2),
+        "priced": free.with_settings(costs=costs),
+        "longer": free.with_settings(costs=costs, prior_simulations=200),
+        "tireless": free.with_settings(costs=CostSettings(pour=asked.pour, worth=0.0)),
     }
 
 
 class Bench:
-    """A laboratory of numbers: simulators, arm and optimiser, with prices, and a record of who was busy when."""
+    """A laboratory of numbers: simulators, arm and optimiser, with costs, and a record of who was busy when."""
 
     mode = "virtual"
 
@@ -164,7 +164,7 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
             parameters=SimulationParameters(particles=500),
             calibration=None,
             deployment=arm,
-            outputs=OutputSettings(directory=folder, record_rate=0.0),
+            outputs=OutputSettings(directory=folder, frame_rate=0.0),
             parallel_simulations=asked.slots,
         )
         begun = time.thread_time()

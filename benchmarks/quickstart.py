@@ -96,7 +96,11 @@ def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
     shipped = load_campaign(CAMPAIGN, laboratory)
     pool = KeptPours(into / f"pours-{solver_fingerprint()}-{seed}.jsonl")
     with tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder:
-        content: dict[str, Any] = {**shipped.resolved, "seed": seed, "outputs": {"directory": folder, "rrd": False}}
+        content: dict[str, Any] = {
+            **shipped.resolved,
+            "seed": seed,
+            "outputs": {"directory": folder, "recording": False},
+        }
         content["laboratory"]["bench"]["time_scale"] = 3000  # nobody watches; the numbers are the same
         content["calibration"]["random_baseline"] = 0
         campaign = build_campaign(content, folder)

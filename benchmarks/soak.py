@@ -63,7 +63,7 @@ calibration:
   actions: {angular_velocity: [60 deg/s, 100 deg/s], max_angle: [80 deg, 115 deg]}
   pours: {count: 3, holdout: 1}
   simulations: 5
-  initial: 3
+  initial_samples: 3
 deployment:
   strategy: D3
   receiver: {name: narrow, profile: {unit: mm, inner: [[0, 0], [20, 0], [20, 90]], wall: 4 mm, floor: 4 mm}}
@@ -71,9 +71,9 @@ deployment:
   actions: {angular_velocity: [60 deg/s, 100 deg/s], x_offset: [70 mm, 100 mm]}
   prior_simulations: 3
   pours: 2
-  per_pour: 1
+  simulations_per_pour: 1
 on_unknown: ask
-outputs: {rrd: false, figures: false}
+outputs: {recording: false, figures: false}
 """
 
 ORDER = (

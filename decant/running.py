@@ -94,7 +94,7 @@ def run(
         in_process: everything in this process, without Ray; else simulations run side by side.
 
     What is suspicious about the campaign, or not simulated, is issued as `UserWarning` before it begins. A recording
-    is written if the campaign has `outputs: {rrd: true}` and Rerun is installed.
+    is written if the campaign has `outputs: {recording: true}` and Rerun is installed.
 
     Raises:
         ValueError: the vessels or motions can't be used, draws of θ are missing, or the laboratory is hardware, which

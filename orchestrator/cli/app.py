@@ -109,7 +109,7 @@ _campaign_command(
     "calibrate",
     """Only calibrate: find the θ whose simulated spillage matches the weighed pours (C1 to C4), scored on other pours.
 
-The recommended θ is written to runs/ID/theta.json in SI units (cohesion in N/m, viscosity in 1/s), for `--parameters`.
+The recommended θ is written to runs/ID/theta.json in SI units (cohesion in N/m, xsph_rate in 1/s), for `--parameters`.
 """,
     "decant calibrate configs/campaigns/recorded.yaml --json",
     "decant calibrate my.yaml && decant plan my.yaml --parameters runs/my-20300131-1/theta.json",

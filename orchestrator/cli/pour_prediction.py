@@ -66,8 +66,8 @@ def simulate(path: Path, options: SimulateOptions) -> None:
     problems = check_vessels(scene, plan.source, wanted_in(plan, scene, options.scene))
     if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
-    record_rate = 20.0 if options.rrd or options.png else 0.0
-    tasks = known.tasks(scene, action, options.seed, options.seeds, record_rate)
+    frame_rate = 20.0 if options.rrd or options.png else 0.0
+    tasks = known.tasks(scene, action, options.seed, options.seeds, frame_rate)
     with Refused(BackendError, at="--backend: "):
         require_backend(options.backend)
     simulator = PourSimulator(options.backend)

@@ -64,20 +64,20 @@ class PredictionInputs:
         """All θ that simulations cycle through."""
         return self.drawn or (self.theta,)
 
-    def tasks(self, scene: Scene, action: Action, seed: int, seeds: int, record_rate: float = 0.0) -> list[PourTask]:
+    def tasks(self, scene: Scene, action: Action, seed: int, seeds: int, frame_rate: float = 0.0) -> list[PourTask]:
         """Return the simulations of one pour. They cycle through θ; uncertain vessel shapes are drawn for each
         simulation.
 
         Args:
             seed: seed of the first simulation.
             seeds: number of simulations, at least as many as θ.
-            record_rate: frame rate of the first simulation [1/s].
+            frame_rate: frame rate of the first simulation [1/s].
         """
         from sim_engine.scene import PourTask
 
         turns, count = self.thetas, max(seeds, len(self.thetas))
         return [
-            PourTask(scene.drawn(seed + i), action, turns[i % len(turns)], seed + i, 0.0 if i else record_rate)
+            PourTask(scene.drawn(seed + i), action, turns[i % len(turns)], seed + i, 0.0 if i else frame_rate)
             for i in range(count)
         ]
 

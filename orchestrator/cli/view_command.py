@@ -172,7 +172,7 @@ def _recording_of(what: Path) -> Path:
     found = sorted(run.glob("campaign*.rrd"), key=lambda path: path.stat().st_mtime)
     found = [path for path in found if "optimising" not in path.name]
     if not found:
-        raise RefusalError(f"{run}: has no recording; was it run with 'outputs: {{rrd: false}}'?", BAD_INPUT)
+        raise RefusalError(f"{run}: has no recording; was it run with 'outputs: {{recording: false}}'?", BAD_INPUT)
     return found[-1]
 
 
@@ -212,9 +212,9 @@ def live_view(plan: CampaignPlan, *, live: bool, at: str | None) -> LiveView | N
         return None
     if not installed("rerun"):
         raise RefusalError("--live: needs Rerun, which is not installed: pip install 'decant[live]'", BAD_INPUT)
-    if not plan.outputs.rrd:
+    if not plan.outputs.recording:
         raise RefusalError(
-            f"--live: {plan.source} says 'outputs: {{rrd: false}}', and a live view shows what is recorded; "
+            f"--live: {plan.source} says 'outputs: {{recording: false}}', and a live view shows what is recorded; "
             "leave that out",
             BAD_INPUT,
         )

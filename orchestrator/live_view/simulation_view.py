@@ -110,7 +110,7 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
 
     Args:
         path: `.rrd` to write; replaced if it exists.
-        task: simulated task, with `record_rate` > 0.
+        task: simulated task, with `frame_rate` > 0.
         result: result of the simulation.
         title: title of the recording; default: names of the vessels, and the seed.
 
@@ -201,7 +201,7 @@ def task_of(plan: CampaignPlan, run: Path, pour: RecordedPour, particles: int | 
         theta = theta.model_copy(update={"particles": particles})
     scene = scenes_of(plan)[pour.request.scene]
     scene = replace(scene, liquid=scene.liquid.model_copy(update={"mass": measured.loaded}))
-    task = PourTask(scene, pour.request.action, theta, pour.request.seed % 2**31, record_rate=DETAIL)
+    task = PourTask(scene, pour.request.action, theta, pour.request.seed % 2**31, frame_rate=DETAIL)
     arm, record = plan.laboratory.arm, measured.notes.get("executed")
     figure = None if arm is None else arm.figure()
     executed = None if figure is None or not record else figure.executed(record)

@@ -324,7 +324,7 @@ def pour_time(laboratory: LaboratorySettings, scene: Scene, actions: Space) -> f
     angle, speed, back, hold = (
         values.get(name) for name in ("max_angle", "angular_velocity", "return_velocity", "hold_time")
     )
-    motion = (angle or 0.0) / (speed or math.inf) + (scene.hold_cap / 2.0 if hold is None else hold)
+    motion = (angle or 0.0) / (speed or math.inf) + (scene.max_hold_time / 2.0 if hold is None else hold)
     motion += (angle or 0.0) / back if back else 0.0
     bench = laboratory.bench
     liquid = 0.0 if bench is None else PRICE * bench.theta.particles  # a virtual bench simulates its liquid

@@ -128,7 +128,7 @@ def simulation_figure(task: PourTask, result: SimulatedPour) -> Figure:
     """Figure of one simulated pour.
 
     Args:
-        task: the simulated task, with `record_rate` > 0.
+        task: the simulated task, with `frame_rate` > 0.
         result: its result.
 
     Raises:

@@ -119,7 +119,7 @@ def _difference(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]
         there, here = theirs["liquid"][name], ours["liquid"][name]
         if not math.isclose(there, here, rel_tol=1e-6):
             found.append(f"its liquid has {there * factor:g} {unit}, here {here * factor:g} {unit}")
-    for name in ("pivot", "hold_cap"):
+    for name in ("pivot", "max_hold_time"):
         if theirs.get(name) != ours[name]:
             found.append(f"its motion.{name} is another one")
     return found

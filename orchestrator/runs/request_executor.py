@@ -84,12 +84,12 @@ class RequestExecutor:
     """Runs requests on a laboratory and converts errors of single requests into outcomes."""
 
     def __init__(
-        self, laboratory: Laboratory, scenes: Mapping[str, Scene], deadlines: Deadlines, record_rate: float
+        self, laboratory: Laboratory, scenes: Mapping[str, Scene], deadlines: Deadlines, frame_rate: float
     ) -> None:
         self._laboratory = laboratory
         self._scenes = scenes
         self.deadlines = deadlines
-        self._record_rate = record_rate
+        self._frame_rate = frame_rate
         self._real = asyncio.Lock()
         self._optimiser = asyncio.Lock()
         self.ahead = SpeculativeExecution(self._speculate, laboratory.simulators.size)
@@ -116,14 +116,14 @@ class RequestExecutor:
             return await self._simulated(request, record=record)
 
     async def _simulated(self, request: Simulate, *, record: bool = False) -> tuple[Outcome, RecordedFrames | None]:
-        rate = self._record_rate if record else 0.0
+        rate = self._frame_rate if record else 0.0
         scene = self._scene(request.scene)
         task = PourTask(
             scene.drawn(request.seed) if request.drawn_shapes else scene,
             request.action,
             request.parameters,
             request.seed,
-            record_rate=rate,
+            frame_rate=rate,
             pose_error=request.pose_error,
         )
         try:

@@ -167,7 +167,7 @@ class _Run:
             if isinstance(laboratory, Telling):
                 laboratory.listen(self._on_notice)
             self._check_bench(laboratory, histories)
-            executor = RequestExecutor(laboratory, self._scenes, self._deadlines, self._plan.outputs.record_rate)
+            executor = RequestExecutor(laboratory, self._scenes, self._deadlines, self._plan.outputs.frame_rate)
             executor.ahead.changed = lambda running, waiting: self._watchers.emit(
                 MadeAhead(running=running, waiting=waiting)
             )
@@ -223,7 +223,7 @@ class _Run:
             watchers=self._watchers,
             capacity=self._plan.parallel_simulations,
             order=stage.order,
-            recordings=self._plan.outputs.recorded_simulations if self._plan.outputs.record_rate > 0.0 else 0,
+            recordings=self._plan.outputs.recorded_simulations if self._plan.outputs.frame_rate > 0.0 else 0,
             on_pausing=lambda reason: self._enter(State.PAUSING, reason),
             on_stopping=lambda reason: self._enter(State.STOPPING, reason),
         )

@@ -73,7 +73,7 @@ def _planned(
         seed=cell.seed,
         laboratory=base.laboratory.with_values(bench=bench),
         outputs=OutputSettings(
-            directory=str(directory), rrd=False, figures=False, record_rate=0.0, recorded_simulations=0
+            directory=str(directory), recording=False, figures=False, frame_rate=0.0, recorded_simulations=0
         ),
         on_unknown="repeat",
     )

@@ -104,7 +104,7 @@ def test_the_real_simulator_gives_the_same_bits_in_a_pool_a_twin_and_the_hidden_
     async def play(in_process):
         spec = LaboratorySettings(name="desk", simulators=1, bench=bench, in_process=in_process)
         async with open_laboratory(spec, need_bench=True) as opened:
-            job = opened.simulators.simulate(PourTask(scene, action, coarse, 3, record_rate=4.0))
+            job = opened.simulators.simulate(PourTask(scene, action, coarse, 3, frame_rate=4.0))
             return await asyncio.gather(job, opened.bench.pour(scene, action, seed=5))
 
     (ours, measured), (twins, measured_twin) = asyncio.run(play(False)), asyncio.run(play(True))

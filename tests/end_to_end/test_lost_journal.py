@@ -26,7 +26,7 @@ from tests.support import small_campaign
 from tests.support.command_process import Workplace, ended, started_after_they_were_finished
 from tests.support.waiting import PATIENCE
 
-CAMPAIGN = small_campaign.CAMPAIGN.replace("directory: runs,", "directory: runs, figures: false, rrd: false,")
+CAMPAIGN = small_campaign.CAMPAIGN.replace("directory: runs,", "directory: runs, figures: false, recording: false,")
 
 RUN = ("run", "small.yaml", "--in-process")
 RESUME = (*RUN, "--resume", "--run")

@@ -32,7 +32,7 @@ def test_paper_has_the_budgets_of_the_paper() -> None:
     assert deployment is not None
     assert (calibration.pour_count, calibration.holdout) == (32, 4)
     assert (calibration.strategy, calibration.simulations) == ("C4", 108)
-    assert deployment.settings == D3Settings(prior_simulations=37, pours=15, per_pour=2)
+    assert deployment.settings == D3Settings(prior_simulations=37, pours=15, simulations_per_pour=2)
     receivers = {scene.receiver.name for scene in deployment.scenes}
     assert len(receivers) == 3
     assert calibration.scene.receiver.name not in receivers

@@ -24,7 +24,7 @@ from typer.testing import CliRunner
 
 import decant
 from orchestrator.cli.app import app
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.file_loading import load_campaign, recorded_campaign
 from orchestrator.daemon.event_feed import PASSING as PASSED_BY
 from orchestrator.daemon.event_feed import event_json
 from orchestrator.journal.codec import encode_request, first_difference
@@ -118,7 +118,7 @@ def test_a_run_writes_and_shows_the_same(golden: Golden, tmp_path: Path) -> None
     folder = tmp_path / "quickstart-20300131-1"
     folder.mkdir()
     plan = replace(
-        plan, outputs=plan.outputs.model_copy(update={"directory": str(tmp_path), "rrd": False, "figures": False})
+        plan, outputs=plan.outputs.model_copy(update={"directory": str(tmp_path), "recording": False, "figures": False})
     )
     events: list[Event] = []
     display = ProgressDisplay(plan, quiet=True)
@@ -219,7 +219,7 @@ def test_old_run_has_the_same_tables(name: str, runs: Path, golden: Golden) -> N
 @pytest.mark.parametrize("name", ["learnt", "weighed"])
 def test_old_run_is_published_again_as_it_was(name: str, runs: Path, golden: Golden) -> None:
     folder = runs / "runs" / name
-    plan = load_campaign(folder / "resolved.json")
+    plan = recorded_campaign(folder / "resolved.json")
     result = read_result(folder)
     published = publish(plan, result)
     console = Console(file=io.StringIO(), width=120, no_color=True)
@@ -255,7 +255,7 @@ def test_old_run_with_a_model_that_is_retired_is_listed_and_reported_but_not_res
 def test_old_run_is_replayed(name: str, runs: Path) -> None:
     """Strategies that are told what the journal has ask again for what it has."""
     folder = runs / "runs" / name
-    plan = load_campaign(folder / "resolved.json")
+    plan = recorded_campaign(folder / "resolved.json")
     asked = 0
     with JournalReader(folder / JOURNAL_NAME) as journal:
         results: dict[str, StageResult] = {}
@@ -287,7 +287,7 @@ def test_old_run_has_the_fingerprint_of_its_campaign(name: str, runs: Path) -> N
     folder = runs / "runs" / name
     with JournalReader(folder / JOURNAL_NAME) as journal:
         written = journal.header.fingerprint
-    assert first_difference(written, fingerprint(load_campaign(folder / "resolved.json"))) is None
+    assert first_difference(written, fingerprint(recorded_campaign(folder / "resolved.json"))) is None
 
 
 def _sorted(value: Any) -> str:

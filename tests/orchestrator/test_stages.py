@@ -61,19 +61,25 @@ def calibration(**changes: Any) -> CalibrationPlan:
         "scene": SCENE,
         "actions": SPACE,
         "parameters": PARAMETERS,
-        "fixed_parameters": {"particles": 700, "viscosity": 4.0},
+        "fixed_parameters": {"particles": 700, "xsph_rate": 4.0},
         "pour_count": 5,
         "holdout": 1,
         "simulations": 5,
         "random_baseline": 3,
-        "initial": 4,
+        "initial_samples": 4,
     }
     return plans.calibration(**values | changes)
 
 
 def campaign(directory: Path, **changes: Any) -> CampaignPlan:
     deployment = plans.deployment(
-        scenes=(SCENE, NARROW), actions=SPACE, loss=Loss(), pours=2, prior_simulations=4, per_pour=2, initial=3
+        scenes=(SCENE, NARROW),
+        actions=SPACE,
+        loss=Loss(),
+        pours=2,
+        prior_simulations=4,
+        simulations_per_pour=2,
+        initial_samples=3,
     )
     values = {"calibration": calibration(), "deployment": deployment, "on_unknown": "repeat"}
     return toy_plan(directory, **(values | changes))
@@ -96,7 +102,7 @@ def test_a_whole_campaign_calibrates_and_then_pours_with_what_it_found(tmp_path:
     result = run(tmp_path / "run", campaign(tmp_path), watchers=[events.append])
     assert list(result.results) == ["pours", "calibration", "evaluation", "deployment:cup", "deployment:narrow"]
     theta = result.results["calibration"].found.theta
-    assert (theta.particles, theta.viscosity) == (700, 4.0)
+    assert (theta.particles, theta.xsph_rate) == (700, 4.0)
     done = [e for e in events if isinstance(e, RequestFinished)]
     deployed = [e.request for e in done if e.stage.startswith("deployment") and isinstance(e.request, Simulate)]
     assert deployed
@@ -127,7 +133,7 @@ def test_a_theta_that_the_pours_do_not_justify_is_not_deployed_and_everything_pu
     assert (gain.recommended, gain.pours) == ("uncalibrated", 5)
     scored = [e for e in events if isinstance(e, RequestFinished) and e.stage == "evaluation"]
     assert len(scored) == work_of(plan, ["evaluation"])["evaluation"].simulations == 2 * 5
-    plain = SimulationParameters(particles=700, viscosity=4.0)
+    plain = SimulationParameters(particles=700, xsph_rate=4.0)
     assert evaluation.thetas["uncalibrated"] == plain
     assert {
         event.request.parameters
@@ -261,8 +267,8 @@ def test_the_calibrated_and_the_random_meet_the_same_seeds(tmp_path: Path) -> No
     ("settings", "order"),
     [
         (D3Settings(pours=2), "logical"),
-        (D3Settings(pours=2, per_pour=0), "logical"),
-        (D3Settings(pours=2, per_pour="free"), "completion"),
+        (D3Settings(pours=2, simulations_per_pour=0), "logical"),
+        (D3Settings(pours=2, simulations_per_pour="free"), "completion"),
         (D2Settings(pours=2), "logical"),
     ],
 )
@@ -280,7 +286,10 @@ def test_free_simulations_fill_the_time_of_a_pour(tmp_path: Path) -> None:
     plan = campaign(tmp_path, calibration=None)
     assert plan.deployment is not None
     plan = replace(
-        plan, deployment=replace(plan.deployment.with_settings(per_pour="free", prior_simulations=3), scenes=(SCENE,))
+        plan,
+        deployment=replace(
+            plan.deployment.with_settings(simulations_per_pour="free", prior_simulations=3), scenes=(SCENE,)
+        ),
     )
     room = laboratory()
     assert room.bench is not None

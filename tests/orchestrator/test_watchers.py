@@ -59,7 +59,7 @@ def test_recorded_simulations_bring_frames_and_the_same_outcomes(tmp_path: Path)
 
         async def with_frames(task: PourTask) -> Any:
             result = await plain(task)
-            return replace(result, frames=RecordedFrames([0.0], [], [], []) if task.record_rate > 0 else None)
+            return replace(result, frames=RecordedFrames([0.0], [], [], []) if task.frame_rate > 0 else None)
 
         laboratory.simulators.simulate = with_frames  # type: ignore[method-assign]
         return laboratory
@@ -71,10 +71,10 @@ def test_recorded_simulations_bring_frames_and_the_same_outcomes(tmp_path: Path)
         simulated = sorted((e.id, e.frames is not None) for e in done if isinstance(e.request, Simulate))
         assert [number for number, (_, framed) in enumerate(simulated, start=1) if framed] == [1, 2]
     plan = toy_plan(tmp_path)
-    silent = replace(plan, outputs=plan.outputs.model_copy(update={"record_rate": 0.0}))
+    silent = replace(plan, outputs=plan.outputs.model_copy(update={"frame_rate": 0.0}))
     laboratory = ToyLaboratory()
     run(tmp_path / "silent", laboratory, plan=silent)
-    assert all(task.record_rate == 0.0 for task in laboratory.simulators.tasks)
+    assert all(task.frame_rate == 0.0 for task in laboratory.simulators.tasks)
     assert logical_record(tmp_path / "silent") == logical_record(tmp_path / "run")
 
 

@@ -65,7 +65,7 @@ deployment:
   receiver: narrow.yaml
   actions: {angular_velocity: [20 deg/s, 60 deg/s], x_offset: [70 mm, 100 mm]}
   pours: 3
-outputs: {directory: runs, rrd: false}
+outputs: {directory: runs, recording: false}
 """
 
 

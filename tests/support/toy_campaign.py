@@ -60,7 +60,7 @@ THETA = SimulationParameters(particles=500)
 
 
 def toy_plan(directory: Path, **changes: Any) -> CampaignPlan:
-    deployment = plans.deployment(scenes=(SCENE,), actions=SPACE, loss=Loss(), pours=3, per_pour=2)
+    deployment = plans.deployment(scenes=(SCENE,), actions=SPACE, loss=Loss(), pours=3, simulations_per_pour=2)
     values: dict[str, Any] = {
         "name": "toy",
         "seed": 7,
@@ -69,7 +69,7 @@ def toy_plan(directory: Path, **changes: Any) -> CampaignPlan:
         "parameters": THETA,
         "calibration": None,
         "deployment": deployment,
-        "outputs": OutputSettings(directory=str(directory), record_rate=10.0, recorded_simulations=2),
+        "outputs": OutputSettings(directory=str(directory), frame_rate=10.0, recorded_simulations=2),
         "parallel_simulations": 2,
     }
     return CampaignPlan(**(values | changes))

@@ -44,7 +44,7 @@ deployment:
   actions: {angular_velocity: [60 deg/s, 180 deg/s], x_offset: [60 mm, 100 mm]}
   pours: 3
 on_unknown: repeat
-outputs: {rrd: false, figures: false}
+outputs: {recording: false, figures: false}
 """
 
 

@@ -167,7 +167,7 @@ class OneShotPlanning(Deployment[D1Settings]):
             else:  # the only pour has been weighed
                 self._finish()
         elif len(self._trials) == 0:
-            count = min(max(self._settings.initial, 1), max(wanted - 1, 1))
+            count = min(max(self._settings.initial_samples, 1), max(wanted - 1, 1))
             self._questions.put(self._space_filling(count=count), "start", simulate)
         elif done < wanted - 1:
             if self._trials.ready:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, ClassVar, Generic, TypeVar, cast
 
 from actors.optimizer.questions import (
     Data,
@@ -38,10 +38,12 @@ from sim_engine.settings.model import PositiveSimulationCount
 class SearchSettings(DeploymentSettings):
     """Settings of D1, D2 and D3: Bayesian optimisation."""
 
+    retired: ClassVar[dict[str, str]] = {"initial": "initial_samples"}
+
     kappa: Kappa = 2.0
     """κ of the lower confidence bound."""
 
-    initial: PositiveSimulationCount = 3
+    initial_samples: PositiveSimulationCount = 3
     """Random actions before the surrogate takes over."""
 
 

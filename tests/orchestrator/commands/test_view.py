@@ -108,7 +108,7 @@ def test_pour_of_an_arm_of_numbers_is_simulated_by_its_action(tmp_path: Path) ->
     task = task_of(example_run.campaign(), tmp_path, find_pour(tmp_path, 1))
     assert task.motion is None
     assert task.action == example_run.ACTION
-    assert task.record_rate > 10.0
+    assert task.frame_rate > 10.0
 
 
 def test_what_is_not_there_is_refused_with_what_is(recording: Path, tmp_path: Path) -> None:

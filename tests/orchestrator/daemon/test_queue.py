@@ -264,7 +264,7 @@ def test_warnings_of_the_check_and_a_missing_recording_are_reported_as_the_run_b
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("orchestrator.live_view.live_server.installed", lambda module: False)
-    far = CAMPAIGN.replace("[60 mm, 100 mm]", "[60 mm, 500 mm]").replace("rrd: false", "rrd: true")
+    far = CAMPAIGN.replace("[60 mm, 100 mm]", "[60 mm, 500 mm]").replace("recording: false", "recording: true")
 
     async def work() -> None:
         write_campaign(tmp_path, far)

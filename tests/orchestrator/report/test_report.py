@@ -179,7 +179,7 @@ def test_bars_of_the_test_discrepancy_are_the_evaluations_scores(results: dict[s
 
 def test_maps_can_be_drawn_for_any_number_of_axes(tmp_path: Path) -> None:
     for dimension in (1, 3):
-        space = Space(tuple(Axis(name, 0.0, 1.0) for name in ("cohesion", "friction", "viscosity")[:dimension]))
+        space = Space(tuple(Axis(name, 0.0, 1.0) for name in ("cohesion", "friction", "xsph_rate")[:dimension]))
         points = [space.decode([u] * dimension) for u in (0.1, 0.5, 0.9)]
         picture = SurrogatePicture("θ", "|Δ| [%]", space, points, [3.0, 1.0, 2.0], points[1])
         assert is_picture(style.save(draw_surrogate(picture), tmp_path / f"{dimension}.png"))

@@ -133,7 +133,7 @@ def test_killed_in_the_middle_it_goes_on_and_comes_to_what_an_undisturbed_one_co
 
 @pytest.mark.realtime
 def test_a_cell_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None:
-    arms, levels = {"C4": {"repetitions": 1, "simulations": 4, "initial": 4}}, read("quick")["mismatch"][:1]
+    arms, levels = {"C4": {"repetitions": 1, "simulations": 4, "initial_samples": 4}}, read("quick")["mismatch"][:1]
     deployment = {"D3": {**read("quick")["deployment"]["D3"], "pours": 1, "repetitions": 1}}
     study = replace(small(tmp_path, calibration=arms, deployment=deployment, mismatch=levels), confirm=0)
     blocked = run_folder(study.folder, "calibration.small.C4.01")

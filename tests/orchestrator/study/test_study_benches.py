@@ -36,7 +36,7 @@ def cut(folder: Path, **changes: Any) -> StudyPlan:
         "C4": {"repetitions": 1, "simulations": 12},
         "C4_active": {"repetitions": 1, "simulations": 12, "pours": 4, "design_simulations": 16},
     }
-    data["deployment"] = {"D2": {"repetitions": 1, "pours": 2, "initial": 2}}
+    data["deployment"] = {"D2": {"repetitions": 1, "pours": 2, "initial_samples": 2}}
     return load_study(written(folder, {**data, **changes, "confirm": 0}))
 
 

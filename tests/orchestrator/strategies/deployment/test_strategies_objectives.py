@@ -291,7 +291,7 @@ def test_a_search_for_the_front_covers_more_of_it_than_as_many_drawn_actions() -
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_a_search_for_the_front_is_repeated_by_a_replay_and_whatever_finishes_first(strategy: str) -> None:
     def fresh() -> Any:
-        return make(strategy, (SPILLAGE, TIME), 4, pareto=True, pours=4, per_pour=2, iterations=8)
+        return make(strategy, (SPILLAGE, TIME), 4, pareto=True, pours=4, simulations_per_pour=2, iterations=8)
 
     first, late = play(fresh(), slots=3), play(fresh(), slots=3, order="last")
     assert (late.simulations, late.pours) == (first.simulations, first.pours)
