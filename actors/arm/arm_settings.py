@@ -229,7 +229,7 @@ class UrArmSettings(ArmSettings):
     """A UR arm that holds the pourer."""
 
     retired: ClassVar[dict[str, str]] = ArmSettings.retired | {
-        "upright_speed": "upright_speed",
+        "untilt_speed": "upright_speed",
         "announcement": "warning_time",
     }
     emulator: ClassVar[str] = "actors.emulators.ur_controller.arm_emulator:UrEmulator"

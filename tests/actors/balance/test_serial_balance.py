@@ -10,7 +10,7 @@ import pytest
 from actors.balance.balance_interface import BalanceFaultError, CommandError, NotStableError, OutOfRangeError, UnitError
 from actors.balance.balance_settings import SettlingRule
 from actors.balance.dialect_registry import encoders
-from actors.balance.simulated_balance import Load
+from actors.balance.scale_model import Load
 
 from .conftest import SOON
 

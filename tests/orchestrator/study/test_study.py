@@ -207,7 +207,7 @@ def test_a_final_pour_is_the_recommended_action_with_fresh_chance_and_its_code_i
     values = learnt.results["deployment:narrow"].recommended.action_si
     finals = [one.results["final"] for one in again]
     action = study.deployments[0].plan.scenes[0].action(values)
-    hidden = study.levels[0].bench.liquid
+    hidden = study.levels[0].bench.theta
     least = toy_study.spilled(action, hidden, 0) - 0.01
     for one in finals:
         assert one.action_si == action.values()

@@ -67,7 +67,7 @@ def test_no_bench_lets_the_cups_touch_where_calibration_and_deployment_pour() ->
     for scene, actions in spaces:
         low = {axis.name: axis.lower for axis in actions.axes}
         for level in study.levels:
-            task = PourTask(scene, scene.action(low), level.bench.liquid, 1, pose_error=level.bench.pose_error)
+            task = PourTask(scene, scene.action(low), level.bench.theta, 1, pose_error=level.bench.pose_error.error)
             try:
                 simulator.prepare(task)
             except InvalidSceneError as error:
