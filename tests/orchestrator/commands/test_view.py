@@ -88,7 +88,7 @@ def test_pour_is_simulated_again_as_the_arm_moved_with_the_load_that_was_weighed
 
     arm = load_laboratory(ROOT / "configs" / "laboratories" / "virtual.yaml").arm
     assert isinstance(arm, UrArmSettings)
-    joints = np.array(arm.home) + np.linspace(0.0, 0.4, 50)[:, None] * np.array([0, 0, 0, 0, 0, 1.0])
+    joints = np.array(arm.home.angles) + np.linspace(0.0, 0.4, 50)[:, None] * np.array([0, 0, 0, 0, 0, 1.0])
     _journal(tmp_path, {"executed": pack(ExecutedPath(np.arange(50) * 0.1, joints, True))})
     plan = replace(example_run.campaign(), laboratory=LaboratorySettings(name="virtual", arm=arm))
     (tmp_path / "theta.json").write_text('{"theta": {"particles": 700, "cohesion": 0.03}}')
