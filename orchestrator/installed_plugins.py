@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any
 
+from sim_engine.resources import DISTRIBUTION
 from sim_engine.settings.plugin_registry import PluginRegistry, UnloadablePlugin
 
 
@@ -44,7 +45,7 @@ def packages() -> dict[str, tuple[str, list[str]]]:
     found: dict[str, tuple[str, list[str]]] = {}
     for door in doors():
         for entry in entry_points(group=door.group):
-            if entry.dist is not None and entry.dist.name != "decant":
+            if entry.dist is not None and entry.dist.name != DISTRIBUTION:
                 _, names = found.setdefault(entry.dist.name, (entry.dist.version, []))
                 names.append(f"{door.group}: {entry.name}")
     return found

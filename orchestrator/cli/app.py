@@ -49,7 +49,9 @@ def _version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        print(f"decant {version('decant')}")
+        from sim_engine.resources import DISTRIBUTION
+
+        print(f"decant {version(DISTRIBUTION)}")
         raise typer.Exit
 
 

@@ -58,7 +58,7 @@ def view(
     from sim_engine.resources import installed
 
     if not installed("rerun"):
-        raise RefusalError("view: needs Rerun, which is not installed: pip install 'decant[live]'", BAD_INPUT)
+        raise RefusalError("view: needs Rerun, which is not installed: pip install 'decant-pouring[live]'", BAD_INPUT)
     if pour is None and (particles is not None or stage is not None):
         raise RefusalError("--particles and --stage go with --pour", BAD_INPUT)
     if pour is not None and len(recordings) != 1:
@@ -193,7 +193,7 @@ def live_view(plan: CampaignPlan, *, live: bool, at: str | None) -> LiveView | N
     if not live and at is None:
         return None
     if not installed("rerun"):
-        raise RefusalError("--live: needs Rerun, which is not installed: pip install 'decant[live]'", BAD_INPUT)
+        raise RefusalError("--live: needs Rerun, which is not installed: pip install 'decant-pouring[live]'", BAD_INPUT)
     if not plan.outputs.recording:
         raise RefusalError(
             f"--live: {plan.source} says 'outputs: {{recording: false}}', and a live view shows what is recorded; "

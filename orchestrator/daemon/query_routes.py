@@ -34,6 +34,7 @@ from orchestrator.journal.journal_file import free_space
 from orchestrator.results.run_summary import PourSummary
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.resources import DISTRIBUTION
 
 READERS = 400
 """Largest number of concurrent event streams."""
@@ -50,7 +51,7 @@ async def status(request: Request, daemon: Daemon, person: Viewer) -> StatusOut:
     emergency = daemon.emergency
     return StatusOut.model_validate(
         {
-            "version": importlib.metadata.version("decant"),
+            "version": importlib.metadata.version(DISTRIBUTION),
             "time": time.time(),
             "began": daemon.began,
             "stopping": daemon.stopping,

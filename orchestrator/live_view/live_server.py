@@ -219,6 +219,6 @@ def recorder_of(
     """
     if not can_record(plan):
         if plan.outputs.recording:
-            tell("no recording: it needs Rerun, which is not installed (pip install 'decant[live]')")
+            tell("no recording: it needs Rerun, which is not installed (pip install 'decant-pouring[live]')")
         return None
     return RerunMonitor(run / RECORDING, plan) if live is None else live.watcher_for(plan, run)

@@ -25,6 +25,7 @@ from orchestrator.journal.journal_file import TO_BEGIN, JournalError, require_sp
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.resources import DISTRIBUTION
 
 RESOLVED, VERSIONS = "resolved.json", "versions.json"
 """Files with the resolved plan of a run and with the versions of the program that began it."""
@@ -71,9 +72,9 @@ def write_provenance(directory: Path, plan: CampaignPlan) -> None:
 def versions() -> dict[str, Any]:
     """Versions of Python, the platform, Decant, its dependencies, and packages that add plug-ins."""
     packages: dict[str, str] = {}
-    names = ["decant"]
+    names = [DISTRIBUTION]
     try:
-        names += [re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in importlib.metadata.requires("decant") or []]
+        names += [re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in importlib.metadata.requires(DISTRIBUTION) or []]
     except importlib.metadata.PackageNotFoundError:
         names += ["numpy", "scipy", "scikit-learn", "taichi", "ray", "trimesh"]
     for name in names:

@@ -35,7 +35,7 @@ def invoke(command: str) -> Any:
 
 def test_the_version_is_that_of_the_package() -> None:
     result = invoke("--version")
-    assert (result.exit_code, result.stdout) == (0, f"decant {version('decant')}\n")
+    assert (result.exit_code, result.stdout) == (0, f"decant {version('decant-pouring')}\n")
 
 
 def test_shells_can_be_taught_to_complete() -> None:

@@ -256,7 +256,7 @@ def test_without_an_extra_doctor_names_package_and_extra_before_it_starts_anythi
     assert "Traceback" not in told.stderr
     said = " ".join((told.stdout + told.stderr).split())
     assert package in said
-    assert "pip install 'decant[lab]'" in said
+    assert "pip install 'decant-pouring[lab]'" in said
     looked = module in ("rtde_receive", "ray")  # neither is needed to read what arm and balance say
     assert ("started: 1" in told.stderr) is looked
     assert told.returncode == (1 if looked else 2)
