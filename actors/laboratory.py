@@ -58,7 +58,7 @@ def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool 
     if not _without_ray(spec, need_bench=need_bench, brief=brief) and not installed("ray"):
         raise LaboratoryError(
             f"laboratory {spec.name}: simulators side by side need Ray, which is not installed: pip install "
-            "'decant[lab]', or run with --in-process, one simulation after the other"
+            "'decant-pouring[lab]', or run with --in-process, one simulation after the other"
         )
     if spec.ray is not None and not spec.in_process:
         check_cluster(spec.ray, need_bench=need_bench)
@@ -80,7 +80,7 @@ def check_bench_packages(spec: LaboratorySettings) -> None:
         names = " and ".join(f"'{PACKAGES.get(module, module)}'" for module in missing)
         raise LaboratoryError(
             f"laboratory {spec.name}: arm and balance need {names}, not installed here: pip install "
-            f"'decant[{EXTRAS[missing[0]]}]'"
+            f"'decant-pouring[{EXTRAS[missing[0]]}]'"
         )
 
 

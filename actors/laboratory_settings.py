@@ -17,10 +17,10 @@ from pydantic_core import PydanticCustomError
 from actors.arm.arm_geometry import RobotCell
 from actors.arm.arm_settings import ARMS, ArmSettings
 from actors.balance.balance_settings import BalanceSettings
-from actors.balance.dialects.dialect import kinds
+from actors.balance.dialect_registry import kinds
 from actors.balance.scale_model import Drift
 from actors.interfaces import OperatorSettings
-from sim_engine.liquids import SimulationParameters
+from sim_engine.liquids import RETIRED_PARAMETERS, SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise
 from sim_engine.settings.model import (
     MADE,
@@ -80,6 +80,8 @@ class BenchBalance(Settings):
 
 class HiddenLiquidBase(Settings):
     """θ of the 'real' liquid of the virtual bench. Hidden: calibration never reads it."""
+
+    retired: ClassVar[dict[str, str]] = RETIRED_PARAMETERS
 
     def parameters(self) -> SimulationParameters:
         """The hidden θ."""

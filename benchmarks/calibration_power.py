@@ -1,7 +1,7 @@
 """What calibration buys: parameter by parameter on recorded pours, and by cross-validation over all of them.
 
     python benchmarks/calibration_power.py [CAMPAIGN] [--seeds 11 12] [--simulations 108] [--particles 1000]
-                                           [--known wall_distance=1.5 lip_drop=0] [--folds 8]
+                                           [--known wall_distance=1.5 rim_correction=0] [--folds 8]
                                            [--fold-simulations 72] [--workers 1] [--fresh] [--json]
     python benchmarks/calibration_power.py --as-it-is --seeds 11 12 13 --folds 0
 
@@ -67,16 +67,16 @@ from sim_engine.scene import PourTask
 from sim_engine.search_space import Axis, Space
 
 CAMPAIGN = ROOT / "configs" / "campaigns" / "recorded.yaml"
-STEPS = (("viscosity",), ("cohesion",), ("friction",), ("wall_distance", "lip_drop"), ("eddies",))
+STEPS = (("xsph_rate",), ("cohesion",), ("friction",), ("wall_distance", "rim_correction"), ("smagorinsky_constant",))
 """Which parameters join the search, one step after the other."""
 
 RANGES = {
     axis.name: axis
     for axis in (
         Axis("cohesion", 0.0, 0.1),
-        Axis("viscosity", 0.0, 10.0),
+        Axis("xsph_rate", 0.0, 10.0),
         Axis("friction", 0.0, 0.3),
-        Axis("eddies", 0.0, 0.2),
+        Axis("smagorinsky_constant", 0.0, 0.2),
     )
 }
 """Ranges of parameters that the campaign does not search."""

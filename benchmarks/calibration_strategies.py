@@ -1,8 +1,8 @@
 """C1, C2, C3, C4 and no calibration at all: discrepancy of θ* on recorded pours that it never saw, and the price.
 
-    python benchmarks/calibration_strategies.py [CAMPAIGN] [--search wall_distance lip_drop]
+    python benchmarks/calibration_strategies.py [CAMPAIGN] [--search wall_distance rim_correction]
                                                 [--rows C1=2800 C2=504 C3=1652 C4=108] [--seeds 11 12 13]
-                                                [--known cohesion=0 viscosity=0]
+                                                [--known cohesion=0 xsph_rate=0]
                                                 [--random 8] [--once C1 random] [--workers 1] [--fresh] [--kept]
                                                 [--json]
 
@@ -42,7 +42,7 @@ from optimisers import interval
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.journal.stage_results import result_of
+from orchestrator.journal.codec import result_of
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.stages import CALIBRATION, calibrated_theta, calibration_stages, stage_seed
 from orchestrator.strategies.calibration.calibration_base import Calibrated, DesignSettings
@@ -89,9 +89,9 @@ def at_price(plan: CalibrationPlan, row: Row) -> CalibrationPlan:
     pours = sum(scored.pour.split == TRAINED_ON and scored.pour.spillage is not None for scored in recorded(plan))
     kind, names = calibrations()[row.name], plan.parameters.names
     settings = kind.like(plan.settings, simulations=row.budget)
-    if (initial := getattr(settings, "initial", None)) is not None:
+    if (initial := getattr(settings, "initial_samples", None)) is not None:
         trials = row.budget if row.name == "C4" else max(row.budget // pours, 1)
-        settings = settings.model_copy(update={"initial": min(initial, trials)})
+        settings = settings.model_copy(update={"initial_samples": min(initial, trials)})
     complaints = Complaints()
     settled = settings.settled(names, pours, complaints)
     if settled is None or complaints.any:
@@ -204,7 +204,7 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("campaign", type=Path, nargs="?", default=CAMPAIGN, help="with recorded pours")
-    parser.add_argument("--search", nargs="+", default=("wall_distance", "lip_drop"), metavar="PARAMETER")
+    parser.add_argument("--search", nargs="+", default=("wall_distance", "rim_correction"), metavar="PARAMETER")
     parser.add_argument("--known", nargs="*", default=[], metavar="NAME=VALUE", help="of what is not searched")
     parser.add_argument("--rows", nargs="+", default=PAPER, metavar="STRATEGY=SIMULATIONS")
     parser.add_argument("--seeds", type=int, nargs="+", default=(11, 12, 13))

@@ -126,7 +126,7 @@ def main() -> None:
         wanted = [(n, seed) for n in options.particles for seed in range(1, options.seeds + 1)]
         wanted += [(n, 1) for n in options.finest]
         for n, seed in wanted:
-            theta = SimulationParameters(particles=n, cohesion=0.0, viscosity=1.0)
+            theta = SimulationParameters(particles=n, cohesion=0.0, xsph_rate=1.0)
             for pour in POURS[: options.pours]:
                 key = store.key(pour.name, n, seed)
                 if key not in store.known:

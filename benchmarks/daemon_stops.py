@@ -29,7 +29,7 @@ from ruamel.yaml import YAML
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client
-from orchestrator.daemon.submission_bundle import Files, pack
+from orchestrator.daemon.submissions import Files, pack
 
 ROOT = Path(__file__).parents[1]
 READERS = 200
@@ -56,7 +56,7 @@ deployment:
   motion: {max_angle: 115 deg, height: 60 mm}
   actions: {angular_velocity: [60 deg/s, 180 deg/s], x_offset: [60 mm, 100 mm]}
   pours: 8
-outputs: {rrd: false, figures: false}
+outputs: {recording: false, figures: false}
 """
 
 READER = """
@@ -140,7 +140,7 @@ def warm(client: Client, sent: tuple[str, Files]) -> float:
     """From the submission of a plan to the beginning of its first simulation [s]."""
     begin = time.time()
     last = client.get("/status")["last_event"]
-    key = client.post("/campaigns", {"text": sent[0], "files": sent[1], "verb": "plan"})["id"]
+    key = client.post("/campaigns", {"text": sent[0], "files": sent[1], "task": "plan"})["id"]
     for told in client.events(last, key):
         if told.type == "RequestStarted" and told.data["request"]["type"] == "Simulate":
             client.post(f"/campaigns/{key}/stop")

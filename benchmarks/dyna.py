@@ -11,7 +11,7 @@ real strategy, scheduler, journal and optimiser, in one process, on a clock that
 
     D2      pours alone
     fixed   D3 with 37 simulations and 2 beside each pour (the paper's form)
-    priced  D3 with `per_pour: free`: simulations by what they are worth, before the first pour at most 37
+    priced  D3 with `simulations_per_pour: free`: simulations by what they are worth, before the first pour at most 37
     longer  the same, with at most 200 before the first pour
     tireless  as priced, but the pool never rests
 """
@@ -38,11 +38,11 @@ from actors.interfaces import ProgressCallback
 from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
-from orchestrator.results.pool_occupancy import RESTS, Occupancy
+from orchestrator.journal.run_record import POOL_RESTS, Occupancy
 from orchestrator.runs.events import DecisionMade, Event
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan, OutputSettings
-from orchestrator.strategies.deployment.costing import PricesSettings
+from orchestrator.strategies.deployment.costing import CostSettings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.deployment.deployment_result import Deployed
@@ -63,21 +63,21 @@ def arms(asked: argparse.Namespace, space: Space) -> dict[str, DeploymentPlan]:
     settings = D3Settings(
         pours=asked.pours,
         prior_simulations=asked.prior,
-        per_pour="free",
+        simulations_per_pour="free",
         model=asked.model,
     )
-    free, prices = DeploymentPlan(settings, (SCENE,), space, Loss()), PricesSettings(pour=asked.pour)
+    free, costs = DeploymentPlan(settings, (SCENE,), space, Loss()), CostSettings(pour=asked.pour)
     return {
         "D2": replace(free, settings=D2Settings(pours=asked.pours)),
-        "fixed": free.with_settings(per_pour=2),
-        "priced": free.with_settings(prices=prices),
-        "longer": free.with_settings(prices=prices, prior_simulations=200),
-        "tireless": free.with_settings(prices=PricesSettings(pour=asked.pour, worth=0.0)),
+        "fixed": free.with_settings(simulations_per_pour=2),
+        "priced": free.with_settings(costs=costs),
+        "longer": free.with_settings(costs=costs, prior_simulations=200),
+        "tireless": free.with_settings(costs=CostSettings(pour=asked.pour, worth=0.0)),
     }
 
 
 class Bench:
-    """A laboratory of numbers: simulators, arm and optimiser, with prices, and a record of who was busy when."""
+    """A laboratory of numbers: simulators, arm and optimiser, with costs, and a record of who was busy when."""
 
     mode = "virtual"
 
@@ -109,7 +109,7 @@ class Bench:
 
     def watch(self, event: Event) -> None:
         """The strategy says when the pool may rest."""
-        if isinstance(event, DecisionMade) and RESTS in event.decision.values:
+        if isinstance(event, DecisionMade) and POOL_RESTS in event.decision.values:
             self.occupancy.rests(self._clock.time())
 
     async def simulate(self, task: PourTask) -> SimulatedPour:
@@ -164,11 +164,11 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
             parameters=SimulationParameters(particles=500),
             calibration=None,
             deployment=arm,
-            outputs=OutputSettings(directory=folder, record_rate=0.0),
+            outputs=OutputSettings(directory=folder, frame_rate=0.0),
             parallel_simulations=asked.slots,
         )
         begun = time.thread_time()
-        result = run(run_campaign(plan, bench, Path(folder) / "run", watchers=[bench.watch]))
+        result = run(run_campaign(plan, bench, Path(folder) / "run", subscribers=[bench.watch]))
     bench.occupancy.finish()
     (stage,) = result.results.values()
     assert isinstance(stage, Deployed)
@@ -182,7 +182,7 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
         "mean wait, ms": 1e3 * float(np.mean(bench.occupancy.waits)),
         "longest answer, ms": 1e3 * max(bench.answers),
         "CPU, s": time.thread_time() - begun,
-        "alarm": float(stage.trust.alarm),
+        "alarm": float(stage.model_check.alarm),
         "reported": bench.true(stage.recommended.action_si),
     }
     for pours in (n for n in AFTER if n <= asked.pours):

@@ -27,10 +27,10 @@ from skipping_clock import run
 
 from actors.bench.ground_truth import hidden_spill
 from actors.interfaces import InvalidActionError, ProgressCallback
-from orchestrator.results.pool_occupancy import Occupancy
+from orchestrator.journal.run_record import Occupancy
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.strategies.campaign_plan import DeploymentPlan, OutputSettings
-from orchestrator.strategies.deployment.costing import PricesSettings
+from orchestrator.strategies.deployment.costing import CostSettings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.strategies.deployment.deployment_result import Deployed
@@ -123,13 +123,13 @@ class _Apart:
 
 def arms(asked: argparse.Namespace, base: DeploymentPlan) -> dict[str, DeploymentPlan]:
     """What is compared; see `dyna.py`."""
-    free = replace(base, settings=D3Settings.like(base.settings, pours=asked.pours, per_pour="free"))
-    prices = PricesSettings(pour=asked.pour)
+    free = replace(base, settings=D3Settings.like(base.settings, pours=asked.pours, simulations_per_pour="free"))
+    costs = CostSettings(pour=asked.pour)
     return {
         "D2": replace(free, settings=D2Settings.like(free.settings)),
-        "fixed": free.with_settings(per_pour=2),
-        "priced": free.with_settings(prices=prices),
-        "tireless": free.with_settings(prices=PricesSettings(pour=asked.pour, worth=0.0)),
+        "fixed": free.with_settings(simulations_per_pour=2),
+        "priced": free.with_settings(costs=costs),
+        "tireless": free.with_settings(costs=CostSettings(pour=asked.pour, worth=0.0)),
     }
 
 
@@ -143,10 +143,10 @@ def campaign(study: StudyPlan, arm: DeploymentPlan, seed: int, fluid: Fluid, ask
             parameters=replace_particles(study, asked.particles),
             calibration=None,
             deployment=arm,
-            outputs=OutputSettings(directory=folder, rrd=False, figures=False, record_rate=0.0),
+            outputs=OutputSettings(directory=folder, recording=False, figures=False, frame_rate=0.0),
             parallel_simulations=asked.slots,
         )
-        result = run(run_campaign(plan, fluid, Path(folder) / "run", watchers=[fluid.watch]))
+        result = run(run_campaign(plan, fluid, Path(folder) / "run", subscribers=[fluid.watch]))
     fluid.occupancy.finish()
     (stage,) = result.results.values()
     assert isinstance(stage, Deployed)
@@ -160,7 +160,7 @@ def campaign(study: StudyPlan, arm: DeploymentPlan, seed: int, fluid: Fluid, ask
         "longest wait, ms": 1e3 * max(fluid.occupancy.waits, default=0.0),
         "mean wait, ms": 1e3 * float(np.mean(fluid.occupancy.waits)),
         "longest answer, ms": 1e3 * max(fluid.answers),
-        "alarm": float(stage.trust.alarm),
+        "alarm": float(stage.model_check.alarm),
         "apart, s": fluid.apart,
     }
     for pours in (n for n in AFTER if n <= asked.pours):

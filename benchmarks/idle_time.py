@@ -28,7 +28,7 @@ from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 ROOT = Path(__file__).parents[1]
 
 WITH = "from orchestrator.cli.app import main; main()"
-NONE = "SpeculativeExecution.foresee = lambda self, request: None"
+NONE = "SpeculativeExecution.predict = lambda self, request: None"
 WITHOUT = f"from orchestrator.runs.speculation import SpeculativeExecution; {NONE}; {WITH}"
 
 

@@ -302,7 +302,7 @@ def _events(plan: CampaignPlan) -> Callable[[int], list[Event]]:
     space = plan.deployment.actions
     weighed = Data(tuple(map(tuple, rng.random((12, space.dimension)))), tuple(rng.random(12)))
     question = Suggest(MinimumQuery(space, weighed, map_resolution=25))
-    answer = propose(question.problem)
+    answer = propose(question.query)
 
     def at(tick: int) -> list[Event]:
         told: list[Event] = []

@@ -73,7 +73,8 @@ def campaign(arm: str, level: str, seed: int, pours: int, simulations: int) -> d
     play(strategy, world.answer)
     best = strategy.best_values
     reported = 1.0 if best is None else valley.true(valley.space.encode(best))
-    shown = [[*pour.predicted_band, pour.loss] for pour in strategy.result().weighed if pour.predicted_band is not None]
+    weighed = strategy.result().weighed
+    shown = [[*pour.predicted_interval, pour.loss] for pour in weighed if pour.predicted_interval is not None]
     return {"arm": arm, "level": level, "seed": seed, "poured": world.poured, "reported": reported, "bands": shown}
 
 

@@ -96,7 +96,11 @@ def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
     shipped = load_campaign(CAMPAIGN, laboratory)
     pool = KeptPours(into / f"pours-{solver_fingerprint()}-{seed}.jsonl")
     with tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder:
-        content: dict[str, Any] = {**shipped.resolved, "seed": seed, "outputs": {"directory": folder, "rrd": False}}
+        content: dict[str, Any] = {
+            **shipped.resolved,
+            "seed": seed,
+            "outputs": {"directory": folder, "recording": False},
+        }
         content["laboratory"]["bench"]["time_scale"] = 3000  # nobody watches; the numbers are the same
         content["calibration"]["random_baseline"] = 0
         campaign = build_campaign(content, folder)
@@ -110,7 +114,7 @@ def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
             "at": [round(u, 4) for u in campaign.deployment.actions.encode(pour.action_si)],
             "loss": pour.loss,
             "predicted": pour.predicted,
-            "band": pour.predicted_band,
+            "band": pour.predicted_interval,
         }
         for pour in found.pours
         if pour.status == "weighed" and pour.loss is not None
@@ -224,7 +228,9 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=["shipped"])
     parser.add_argument("--laboratory", type=Path, default=ROOT / "configs" / "laboratories" / "twin.yaml")
     parser.add_argument("--into", type=Path, default=ROOT / "build" / "quickstart")
-    parser.add_argument("--write", action="store_true", help="write the table of what is there into docs/evidence/results.md")
+    parser.add_argument(
+        "--write", action="store_true", help="write the table of what is there into docs/evidence/results.md"
+    )
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # this is a process that makes one seed
     asked = parser.parse_args()
     if asked.one is not None:

@@ -36,7 +36,7 @@ from ruamel.yaml import YAML
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client, DaemonError
-from orchestrator.daemon.submission_bundle import Files, pack
+from orchestrator.daemon.submissions import Files, pack
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.results import figure_style as style
 
@@ -63,7 +63,7 @@ calibration:
   actions: {angular_velocity: [60 deg/s, 100 deg/s], max_angle: [80 deg, 115 deg]}
   pours: {count: 3, holdout: 1}
   simulations: 5
-  initial: 3
+  initial_samples: 3
 deployment:
   strategy: D3
   receiver: {name: narrow, profile: {unit: mm, inner: [[0, 0], [20, 0], [20, 90]], wall: 4 mm, floor: 4 mm}}
@@ -71,9 +71,9 @@ deployment:
   actions: {angular_velocity: [60 deg/s, 100 deg/s], x_offset: [70 mm, 100 mm]}
   prior_simulations: 3
   pours: 2
-  per_pour: 1
+  simulations_per_pour: 1
 on_unknown: ask
-outputs: {rrd: false, figures: false}
+outputs: {recording: false, figures: false}
 """
 
 ORDER = (
@@ -139,7 +139,7 @@ def one(client: Client, kind: str, sent: tuple[str, Files]) -> str:
     """Have a campaign run to its end, whatever is done to it on the way; the state that it ends in."""
     last = client.get("/status")["last_event"]
     verb = "plan" if kind == "plan" else "run"
-    key = client.post("/campaigns", {"text": sent[0], "files": sent[1], "verb": verb})["id"]
+    key = client.post("/campaigns", {"text": sent[0], "files": sent[1], "task": verb})["id"]
     done = False
     for told in client.events(last, key):
         match told.type:

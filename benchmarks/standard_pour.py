@@ -61,16 +61,16 @@ def standard_action(angular_velocity: float = 30 * DEG, hold_time: float = 2.0) 
     )
 
 
-def standard_task(particles: int, seed: int, *, record_rate: float = 0.0, cohesion: float = 0.0) -> PourTask:
+def standard_task(particles: int, seed: int, *, frame_rate: float = 0.0, cohesion: float = 0.0) -> PourTask:
     """The standard pour at the default θ but for N, and without surface tension, which the peer hasn't either."""
     theta = SimulationParameters(particles=particles, cohesion=cohesion)
-    return PourTask(SCENE, standard_action(), theta, seed, record_rate=record_rate)
+    return PourTask(SCENE, standard_action(), theta, seed, frame_rate=frame_rate)
 
 
 def short_task(particles: int) -> PourTask:
     """The fastest pour there is: it compiles every kernel that a long one uses."""
     theta = SimulationParameters(particles=particles)
-    return PourTask(SCENE, standard_action(180 * DEG, 0.0), theta, 0, record_rate=1.0)
+    return PourTask(SCENE, standard_action(180 * DEG, 0.0), theta, 0, frame_rate=1.0)
 
 
 @cache
@@ -123,7 +123,7 @@ def measure(simulator: PourSimulator, particles: int, seed: int, cohesion: float
         SystemExit: the outcome is invalid, so that its time means nothing.
     """
     begun = time.perf_counter()
-    run = simulator.simulate(standard_task(particles, seed, record_rate=10.0, cohesion=cohesion))
+    run = simulator.simulate(standard_task(particles, seed, frame_rate=10.0, cohesion=cohesion))
     wall = time.perf_counter() - begun
     outcome = run.outcome
     if outcome.invalid is not None:

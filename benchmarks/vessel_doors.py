@@ -10,10 +10,11 @@ import re
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from orchestrator.cli.vessel_measurement import Sources, vessel
+from orchestrator.cli.vessel_command import vessel
 from orchestrator.config.file_loading import load_vessel
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
@@ -49,7 +50,7 @@ class Row:
     spillage: tuple[float, float]
 
 
-def doors(of: Bench, folder: Path) -> dict[str, Sources]:
+def doors(of: Bench, folder: Path) -> dict[str, dict[str, Any]]:
     """What is given for each."""
     tall, wall, floor = f"{of.height} m", f"{of.shape.wall} m", f"{of.shape.floor} m"
     outside = f"{of.height + of.shape.floor} m"
@@ -59,17 +60,22 @@ def doors(of: Bench, folder: Path) -> dict[str, Sources]:
     of.solid().export(folder / "scan.stl")
     half = of.save_cloud(folder / "half.csv", hole=True, seen=1.0)
     return {
-        "callipers": Sources(height=tall, diameters=diameters, wall=wall, floor=floor),
-        "photograph": Sources(photo=photo, known_height=outside, wall=wall, floor=floor),
-        "points": Sources(points=of.save_cloud(folder / "cloud.csv"), unit="mm", wall=wall, floor=floor),
-        "points of one side, a hole": Sources(points=half, unit="mm", wall=wall, floor=floor),
-        "depth image": Sources(depth=of.depth(folder / "depth.png"), focal=FOCAL, wall=wall, floor=floor),
-        "fill table": Sources(height=tall, fill=fill, wall=wall, floor=floor),
-        "tilt table": Sources(height=tall, tilt=tilt, wall=wall, floor=floor),
-        "all tables and callipers": Sources(
-            height=tall, diameters=diameters, fill=fill, tilt=tilt, wall=wall, floor=floor
-        ),
-        "mesh": Sources(mesh=folder / "scan.stl"),
+        "callipers": {"height": tall, "diameters": diameters, "wall": wall, "floor": floor},
+        "photograph": {"photo": photo, "known_height": outside, "wall": wall, "floor": floor},
+        "points": {"points": of.save_cloud(folder / "cloud.csv"), "unit": "mm", "wall": wall, "floor": floor},
+        "points of one side, a hole": {"points": half, "unit": "mm", "wall": wall, "floor": floor},
+        "depth image": {"depth": of.depth(folder / "depth.png"), "focal": FOCAL, "wall": wall, "floor": floor},
+        "fill table": {"height": tall, "fill": fill, "wall": wall, "floor": floor},
+        "tilt table": {"height": tall, "tilt": tilt, "wall": wall, "floor": floor},
+        "all tables and callipers": {
+            "height": tall,
+            "diameters": diameters,
+            "fill": fill,
+            "tilt": tilt,
+            "wall": wall,
+            "floor": floor,
+        },
+        "mesh": {"mesh": folder / "scan.stl"},
     }
 
 
@@ -110,7 +116,7 @@ def measure(seeds: int) -> list[Row]:
         with tempfile.TemporaryDirectory() as scratch:
             for number, (door, sources) in enumerate(doors(of, Path(scratch)).items()):
                 out = Path(scratch) / f"{number}.yaml"
-                vessel(out, sources, name=None, as_json=False)
+                vessel(out, **sources)
                 spec = load_vessel(out)
                 built = build_vessel(spec, use_cache=False)
                 off = np.abs(profile_of(built, z) - true)

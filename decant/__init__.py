@@ -1,4 +1,4 @@
-"""Decant for notebooks and other programs: `import decant`. What it can do, with examples: docs/library.md.
+"""Decant for notebooks and other programs: `import decant`. What it can do, with examples: docs/tutorials/notebook.md.
 
 Everything here is imported when it is used first: `import decant` itself starts nothing and costs next to nothing.
 Whatever is not named in `__all__` may change without notice.

@@ -6,20 +6,28 @@ files. This module does not start or resume runs.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orchestrator.config.file_loading import recorded_campaign
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.journal.run_record import CampaignResult, RequestOutcome, Row, answers, pour_row, read_result
-from orchestrator.journal.stage_results import Results
-from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated
+from orchestrator.journal.codec import Results
+from orchestrator.journal.journal import JOURNAL_NAME
+from orchestrator.journal.run_record import CampaignResult, Row, answers, pour_row, read_record, read_result
+from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated
 from orchestrator.results.loss_units import loss_of_pour
-from orchestrator.results.publishing import Published, report_on
+from orchestrator.results.publishing import Published, report_on, summary_of
 from orchestrator.results.publishing import publish as write
-from orchestrator.results.stage_views import deployments_of, gain_of, predictions_of, recommended_theta_of, theta_of
+from orchestrator.results.run_summary import RunSummary
+from orchestrator.results.stage_views import (
+    deployments_of,
+    gain_of,
+    predictions_of,
+    receiver_names,
+    recommended_theta_of,
+    theta_of,
+)
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.calibration_scores import CalibrationGain
 from orchestrator.strategies.campaign_plan import CampaignPlan
@@ -60,6 +68,15 @@ class Run:
         return self.result.results
 
     @property
+    def summary(self) -> RunSummary:
+        """The result document: everything that the report shows, in numbers and in words with units.
+
+        Raises:
+            RunError: the journal cannot be read.
+        """
+        return summary_of(self.campaign, self.result) if self.published is None else self.published.summary
+
+    @property
     def calibrated(self) -> CalibratedTheta | None:
         """θ*, its predictions and other θ that fit; None without a calibration."""
         return theta_of(self.results)
@@ -80,14 +97,14 @@ class Run:
     @property
     def recommended(self) -> dict[str, Recommended]:
         """The action to use from now on, by receiver."""
-        names = _receivers(self.campaign)
+        names = receiver_names(self.campaign)
         found = {names.get(scene, scene): one.recommended for scene, one in deployments_of(self.results).items()}
         return {name: one for name, one in found.items() if one is not None}
 
     @property
     def predictions(self) -> dict[str, dict[str, SampleStatistics]]:
         """Outcomes of the recommended actions with fresh seeds, by receiver and quantity."""
-        names = _receivers(self.campaign)
+        names = receiver_names(self.campaign)
         return {names.get(scene, scene): one.over_seeds for scene, one in predictions_of(self.results).items()}
 
     @property
@@ -117,7 +134,7 @@ class Run:
 
     def figures(self) -> dict[str, Figure]:
         """All figures that its results allow, by name."""
-        from orchestrator.results.campaign_figures import figures_of
+        from orchestrator.results.run_figures import figures_of
 
         return figures_of(self.campaign, self.results)
 
@@ -154,13 +171,9 @@ class Run:
 
     # -- rows --------------------------------------------------------------------------------------------------------
 
-    def _answers(self, kind: type[Request]) -> Iterator[RequestOutcome]:
-        with JournalReader(self.directory / JOURNAL_NAME) as journal:
-            yield from answers(journal, kind)
-
     def _pours(self) -> Iterator[Row]:
-        names = _receivers(self.campaign)
-        for one in self._answers(Pour):
+        names = receiver_names(self.campaign)
+        for one in answers(self.directory, Pour):
             request, outcome = one.request, one.outcome
             assert isinstance(request, Pour)
             row: Row = {"stage": one.stage, "id": one.id, "receiver": names.get(request.scene, request.scene)}
@@ -170,8 +183,8 @@ class Run:
             yield {**row, "seconds": one.seconds}
 
     def _simulations(self) -> Iterator[Row]:
-        names = _receivers(self.campaign)
-        for one in self._answers(Simulate):
+        names = receiver_names(self.campaign)
+        for one in answers(self.directory, Simulate):
             request = one.request
             assert isinstance(request, Simulate)
             row: Row = {"stage": one.stage, "id": one.id, "receiver": names.get(request.scene, request.scene)}
@@ -188,10 +201,9 @@ class Run:
             yield row
 
     def _decisions(self) -> Iterator[Row]:
-        with JournalReader(self.directory / JOURNAL_NAME) as journal:
-            for entry in journal.entries(kinds=[Kind.DECISION]):
-                values = {f"value_{name}": value for name, value in (entry.body.get("values") or {}).items()}
-                yield {"time": entry.t, "stage": entry.stage, "text": entry.body["text"], **values}
+        for one in read_record(self.directory).decisions:
+            values = {f"value_{name}": value for name, value in one.values.items()}
+            yield {"time": one.time, "stage": one.stage, "text": one.text, **values}
 
     def _curves(self) -> Iterator[Row]:
         for stage, result in self.results.items():
@@ -199,13 +211,8 @@ class Run:
                 best: float | None = None
                 for number, trial in enumerate(result.trials, start=1):
                     best = _least(best, trial.discrepancy)
-                    yield {
-                        "stage": stage,
-                        "what": "discrepancy",
-                        "number": number,
-                        "value": trial.discrepancy,
-                        "best": best,
-                    }
+                    row = {"stage": stage, "what": "discrepancy", "number": number}
+                    yield {**row, "value": trial.discrepancy, "best": best}
         for result in deployments_of(self.results).values():
             best = None
             for number, simulated in enumerate(result.simulated, start=1):
@@ -219,7 +226,7 @@ class Run:
                 yield {**row, "predicted": pour.predicted, "predicted_deviation": pour.predicted_deviation}
 
     def _outflows(self) -> Iterator[Row]:
-        for one in self._answers(Simulate):
+        for one in answers(self.directory, Simulate):
             if isinstance(one.outcome, Simulated):
                 found = one.outcome.outcome
                 for time, poured, spilled in zip(
@@ -244,8 +251,7 @@ def open_run(directory: Path | str, campaign: CampaignPlan | None = None) -> Run
     if not (folder / JOURNAL_NAME).is_file():
         raise FileNotFoundError(f"{folder}: there is no run in this folder (no {JOURNAL_NAME})")
     plan = recorded_campaign(folder / "resolved.json") if campaign is None else campaign
-    with JournalReader(folder / JOURNAL_NAME) as journal:
-        return Run(plan, read_result(journal, folder))
+    return Run(plan, read_result(folder))
 
 
 def publish(run: Run) -> Published:
@@ -255,12 +261,6 @@ def publish(run: Run) -> Published:
         OSError: a file cannot be written.
     """
     return write(run.campaign, run.result)
-
-
-def _receivers(campaign: CampaignPlan) -> Mapping[str, str]:
-    from orchestrator.results.stage_views import receiver_names
-
-    return receiver_names(campaign)
 
 
 def _least(best: float | None, value: float | None) -> float | None:

@@ -35,7 +35,7 @@ from orchestrator.run_service import (
     read_theta,
     task_request,
 )
-from orchestrator.runs.events import Watcher as Watch
+from orchestrator.runs.events import Subscriber as Watch
 from orchestrator.runs.run_folder import create_run
 from orchestrator.runs.stages import POSTERIOR_DRAWS, posterior_draws
 from orchestrator.shipped import shipped, starting_set
@@ -94,11 +94,11 @@ def run(
         in_process: everything in this process, without Ray; else simulations run side by side.
 
     What is suspicious about the campaign, or not simulated, is issued as `UserWarning` before it begins. A recording
-    is written if the campaign has `outputs: {rrd: true}` and Rerun is installed.
+    is written if the campaign has `outputs: {recording: true}` and Rerun is installed.
 
     Raises:
-        ValueError: the vessels or motions can't be used, draws of θ are missing, or the laboratory is hardware, which
-            the command line arms (`RunError` or `InvalidArgumentError`, both a `DecantError`).
+        ValueError: the vessels or motions can't be used, draws of θ are missing, or the laboratory is hardware, whose
+            motion the command line enables (`RunError` or `InvalidArgumentError`, both a `DecantError`).
         LaboratoryError: the laboratory can't be opened.
         RunError: the run can't begin, go on or end; the text says what is kept, and what to do.
     """
@@ -221,8 +221,8 @@ def _checked(request: RunRequest, watch: Sequence[Watch], in_process: bool) -> R
     campaign, service = request.campaign, RunService()
     if campaign.laboratory.mode == "hardware":
         raise InvalidArgumentError(
-            f"laboratory {campaign.laboratory.name} is hardware, which is armed from the command line alone: "
-            f"decant run {campaign.source} --arm"
+            f"laboratory {campaign.laboratory.name} is hardware, whose motion is enabled from the command line alone: "
+            f"decant run {campaign.source} --enable-motion"
         )
     report = service.check(request)
     report.require()

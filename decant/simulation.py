@@ -47,12 +47,9 @@ class Simulation:
 
     def figure(self) -> Figure:
         """Four moments of the first seed from the side, and the place of the liquid at every time."""
-        from orchestrator.results import figure_style as style
-        from orchestrator.results.pour_figures import simulation_png
+        from orchestrator.results.pour_figures import simulation_figure
 
-        with style.unsaved() as figures:
-            simulation_png(Path("pour.png"), self.task, self.pours[0])
-        return figures[0]
+        return simulation_figure(self.task, self.pours[0])
 
 
 def simulate(

@@ -20,7 +20,7 @@ sys.path.insert(0, str(ROOT))
 project = "Decant"
 author = "The Decant developers"
 project_copyright = author
-version = release = version_of("decant")
+version = release = version_of("decant-pouring")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 root_doc = "docs/index"

@@ -59,8 +59,8 @@ deployment:
   actions: {angular_velocity: [60 deg/s, 180 deg/s], x_offset: [60 mm, 100 mm]}
   prior_simulations: 6
   pours: 6
-  per_pour: 2
-outputs: {rrd: false}
+  simulations_per_pour: 2
+outputs: {recording: false}
 """
 
 

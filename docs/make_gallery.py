@@ -12,7 +12,7 @@ import numpy as np
 import decant
 from orchestrator.config.file_loading import load_vessel
 from orchestrator.results import figure_style as style
-from orchestrator.results.pour_figures import fill_section, section, simulation_png
+from orchestrator.results.pour_figures import fill_section, section, simulation_figure
 from sim_engine.vessel.vessel import build_vessel
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -37,7 +37,7 @@ def main() -> None:
     campaign = decant.load_campaign(ROOT / "configs" / "campaigns" / "quickstart.yaml")
     for name, (receiver, action) in POURS.items():
         found = decant.simulate(campaign, action, receiver=VESSELS / f"{receiver}.yaml", seed=SEED)
-        simulation_png(IMAGES / f"gallery-pour-{name}.png", found.task, found.pours[0])
+        style.save(simulation_figure(found.task, found.pours[0]), IMAGES / f"gallery-pour-{name}.png")
         outcome = found.pours[0].outcome
         print(f"{name}: {100 * outcome.spilled:.1f} % spilled, {100 * outcome.retained:.1f} % retained")
 

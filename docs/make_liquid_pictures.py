@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/liquids.md: water, oil and glycerol leave the same cup, and where their streams may cling.
+"""Draw the pictures of docs/experiments/liquids.md: water, oil and glycerol leave the same cup, and where their streams may cling.
 
 python docs/make_liquid_pictures.py
 """
@@ -110,7 +110,7 @@ def main() -> None:
     figure, axes = plt.subplots(len(rows), len(TIMES), figsize=(9.0, 8.4), sharex=True, sharey=True)
     for row, (title, liquid) in zip(axes, rows.items(), strict=True):
         task = PourTask(
-            replace(scene, liquid=liquid), action, SimulationParameters(particles=PARTICLES), 1, record_rate=20.0
+            replace(scene, liquid=liquid), action, SimulationParameters(particles=PARTICLES), 1, frame_rate=20.0
         )
         run = simulator.simulate(task)
         assert run.frames is not None

@@ -15,8 +15,7 @@ import numpy as np
 from PIL import Image
 
 from actors.runtime.child_process import child_environment
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-from orchestrator.journal.stage_results import decode_results
+from orchestrator.journal.run_record import read_result
 from orchestrator.results import figure_style as style
 from orchestrator.results.stage_views import deployments_of
 from orchestrator.strategies.deployment.deployment_result import Deployed
@@ -47,8 +46,7 @@ def main(runs: list[Path]) -> None:
 
 def learnt_in(run: Path) -> Deployed:
     """What a run's deployment learnt."""
-    with JournalReader(run / JOURNAL_NAME) as journal:
-        (deployed,) = deployments_of(decode_results(journal.stage_results())).values()
+    (deployed,) = deployments_of(read_result(run).results).values()
     return deployed
 
 

@@ -1,7 +1,7 @@
 """Reports of the docs and their pictures: `python docs/make_report_pictures.py RUN STUDY`.
 
 RUN and STUDY are folders of a quickstart and of the quick study that have ended. Copies both pages to docs/reports and
-draws what docs/from-yaml-to-report.md shows of them. Needs Playwright and a Chromium (`--chromium`), and pypdfium2 for
+draws what docs/tutorials/first-pour.md shows of them. Needs Playwright and a Chromium (`--chromium`), and pypdfium2 for
 the pages as they are printed.
 """
 

@@ -27,7 +27,7 @@ from actors.arm.arm_settings import ARMS, UrArmSettings
 from actors.balance.balance_settings import SerialBalanceSettings
 from actors.interfaces import OperatorSettings
 from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
-from orchestrator.cli.solver_report import kept_records
+from orchestrator.cli.physics_command import kept_records
 from orchestrator.config import campaign_file as campaign
 from orchestrator.config import vessel_file as vessel
 from orchestrator.config.scene_builder import DEFAULTS, NEEDED
@@ -37,7 +37,7 @@ from orchestrator.daemon import daemon_settings as daemon
 from orchestrator.daemon.notifications import NotifySection
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import OutputSettings
-from orchestrator.strategies.deployment.costing import PricesSettings
+from orchestrator.strategies.deployment.costing import CostSettings
 from orchestrator.strategies.deployment.disturbances import RiskSettings
 from orchestrator.strategies.deployment.model_monitoring import (
     DiscrepancyPolicySettings,
@@ -64,16 +64,16 @@ SECTIONS: dict[str, type[Settings]] = {
     "campaign": campaign.CampaignFile,
     "simulator": campaign.SimulatorSection,
     "calibration": campaign.CalibrationSection,
-    "pours": campaign.PoursSection,
-    "transfer": campaign.TransferSection,
+    "pours": campaign.PoursSettings,
+    "transfer": campaign.TransferSettings,
     "deployment": campaign.DeploymentSection,
     "risk": RiskSettings,
     "window": WindowSettings,
-    "costs": PricesSettings,
+    "costs": CostSettings,
     "discrepancy_policy": DiscrepancyPolicySettings,
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
-    "data": campaign.DataSection,
+    "data": campaign.DataSettings,
     "loss": Loss,
     "objective": Objective,
     "outputs": OutputSettings,
@@ -121,17 +121,17 @@ OF_SECTIONS = {
     "HiddenLiquid": "[parameters](#simulator), one value each",
     "PoseErrorSettings": "[pose error](#pose-error)",
     "PoseNoise": "standard deviations of the [pose error](#pose-error)",
-    "TransferSection": "[transfer](#transfer)",
+    "TransferSettings": "[transfer](#transfer)",
     "Loss": "[loss](#loss)",
     "Objective": "[objective](#objectives)",
     **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
     "RiskSettings": "[risk](#risk)",
     "WindowSettings": "[window](#window)",
-    "PricesSettings": "[costs](#costs)",
+    "CostSettings": "[costs](#costs)",
     "DiscrepancyPolicySettings": "[discrepancy policy](#discrepancy-policy)",
     "RiskLimitSettings": "[risk limit](#risk-limit)",
     "StopSettings": "[stop](#stop)",
-    "DataSection": "[data](#data)",
+    "DataSettings": "[data](#data)",
     "ProfileShape": "[profile](#profile)",
     "Motion": "[motion](#motion-and-actions)",
     "Actions": "[actions](#motion-and-actions)",

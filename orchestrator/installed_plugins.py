@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any
 
+from sim_engine.resources import DISTRIBUTION
 from sim_engine.settings.plugin_registry import PluginRegistry, UnloadablePlugin
 
 
@@ -27,7 +28,7 @@ class Plugin:
 def doors() -> tuple[PluginRegistry[Any], ...]:
     """All plug-in registries. Plug-ins are loaded on first use."""
     from actors.arm.arm_settings import ARMS
-    from actors.balance.dialects.dialect import BALANCES
+    from actors.balance.dialect_registry import BALANCES
     from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES
     from sim_engine.vessel.shapes import VESSELS
 
@@ -44,7 +45,7 @@ def packages() -> dict[str, tuple[str, list[str]]]:
     found: dict[str, tuple[str, list[str]]] = {}
     for door in doors():
         for entry in entry_points(group=door.group):
-            if entry.dist is not None and entry.dist.name != "decant":
+            if entry.dist is not None and entry.dist.name != DISTRIBUTION:
                 _, names = found.setdefault(entry.dist.name, (entry.dist.version, []))
                 names.append(f"{door.group}: {entry.name}")
     return found

@@ -20,12 +20,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import check_journal, has_begun
 from orchestrator.journal.run_record import CampaignResult, read_result
 from orchestrator.requests import Pour
 from orchestrator.run_errors import RunError
-from orchestrator.runs.events import CampaignStateChanged, Event, PourProgressed, RequestFinished, Watcher
+from orchestrator.runs.events import CampaignStateChanged, Event, PourProgressed, RequestFinished, Subscriber
+from orchestrator.runs.resume import AskOperator
 from orchestrator.runs.run_folder import create_run
 from orchestrator.runs.stages import (
     POSTERIOR_DRAWS,
@@ -35,7 +36,6 @@ from orchestrator.runs.stages import (
     prediction_stages,
     stages_of,
 )
-from orchestrator.runs.unknown_pours import AskOperator
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
@@ -118,7 +118,7 @@ class RunResources:
     operator: Operator | None = None
     ask_operator: AskOperator | None = None
     approved_checksum: str = ""
-    subscribers: Sequence[Watcher] = ()
+    subscribers: Sequence[Subscriber] = ()
     recorder: Callable[[CampaignPlan, Path], RerunMonitor | None] | None = None
     laboratory: Callable[[LaboratorySettings, bool], Laboratory] | None = None
 
@@ -249,9 +249,7 @@ class RunService:
 
         if request.folder is None or not (request.folder / JOURNAL_NAME).is_file():
             return None
-        with JournalReader(request.folder / JOURNAL_NAME) as journal:
-            result = read_result(journal, request.folder)
-        return publish(request.campaign, result)
+        return publish(request.campaign, read_result(request.folder))
 
 
 class RunHandle:
@@ -275,7 +273,7 @@ class RunHandle:
         self._request, self._laboratory, self._recorder = request, laboratory, recorder
         self.folder, self.checkpoint = folder, ""
         self._ask_operator = resources.ask_operator
-        self._subscribers: list[Watcher] = [*resources.subscribers, self._note]
+        self._subscribers: list[Subscriber] = [*resources.subscribers, self._note]
         if recorder is not None:
             self._subscribers.append(recorder)
         self._pausing = self._aborting = self._abandoning = False
@@ -307,7 +305,7 @@ class RunHandle:
             self._laboratory,
             self.folder,
             resume=self._request.resume == "yes",
-            watchers=self._subscribers,
+            subscribers=self._subscribers,
             ask_operator=self._ask_operator,
             stages=self._request.stages,
         )

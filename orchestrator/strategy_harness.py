@@ -23,7 +23,7 @@ from typing import Literal
 import numpy as np
 
 from actors.optimizer.suggest import propose
-from orchestrator.journal.stage_results import decode_result, encode_result
+from orchestrator.journal.codec import decode_result, encode_result
 from orchestrator.requests import (
     Ask,
     Failed,

@@ -24,7 +24,7 @@ from sim_engine.errors import did_you_mean
 from sim_engine.settings.model import Problems, Settings, Text
 from sim_engine.settings.quantity import Quantity
 
-LARGEST_LIP_DROP = 1.0
+LARGEST_RIM_CORRECTION = 1.0
 
 THIN = 5e-6
 """Largest kinematic viscosity at which the solver treats a liquid like water [m²/s]. Its boundary layers √(πνt), a
@@ -99,7 +99,7 @@ class Liquid(BaseModel):
         contact_angle: of the liquid on the vessels [rad].
 
     A liquid above `THIN` is simulated with this viscosity and this tension, and sticks to walls. For a liquid as thin
-    as water these values have no effect: θ's `viscosity` and `cohesion` are used, and it slips. Together with the
+    as water these values have no effect: θ's `xsph_rate` and `cohesion` are used, and it slips. Together with the
     planned flow they determine the effects that a simulation does not cover, see `sim_engine.model_validity`. The
     defaults are water's at 20 °C.
     """
@@ -156,7 +156,7 @@ class SimulationParameters(BaseModel):
     """Surface tension [N/m], the same at any spacing: drops oscillate at Rayleigh's frequency. If the spacing exceeds
     about one capillary length (2.7 mm for water), it only affects drips."""
 
-    viscosity: float = Field(default=3.0, ge=0.0, le=60.0, json_schema_extra={"unit": "1/s"})
+    xsph_rate: float = Field(default=3.0, ge=0.0, le=60.0, json_schema_extra={"unit": "1/s"})
     """Rate at which a particle's velocity relaxes to its neighbours' mean (XSPH) [1/s], independent of the time step.
     For liquids as thin as water."""
 
@@ -164,7 +164,7 @@ class SimulationParameters(BaseModel):
     """True viscosity divided by that of the scene's liquid, for liquids above 5 mm²/s. A degree of temperature changes
     it by 2 to 9 %, a point of water in glycerol by 10 %."""
 
-    eddies: float = Field(default=0.17, ge=0.0, le=0.3, json_schema_extra={"unit": "1"})
+    smagorinsky_constant: float = Field(default=0.17, ge=0.0, le=0.3, json_schema_extra={"unit": "1"})
     """Smagorinsky's constant C: motion finer than a spacing has the viscosity (C d)² |S|. The value 0.17 follows from
     theory, and keeps streams of few particles as narrow as those of many. At 0 shear makes particles climb over each
     other and widens the stream, as in solvers without such a viscosity."""
@@ -177,7 +177,7 @@ class SimulationParameters(BaseModel):
     """Distance from a wall at which particles come to rest, in spacings (FleX: collision distance). At 0.5 a vessel
     holds its true volume; a larger value narrows vessels and raises lips, as walls made of particles do."""
 
-    lip_drop: float = Field(default=0.5, ge=0.0, le=LARGEST_LIP_DROP, json_schema_extra={"unit": "1"})
+    rim_correction: float = Field(default=0.5, ge=0.0, le=LARGEST_RIM_CORRECTION, json_schema_extra={"unit": "1"})
     """Rims are lower by so many spacings for particles at rest, by less for faster particles, and not at all above the
     speed √(g d). A layer of particles cannot be thinner than a spacing: at 0.5 its middle passes a lip with the head
     that a true film needs. At 0 a lip holds back more, as in solvers that do not correct their lips."""
@@ -236,6 +236,9 @@ class SimulationParameters(BaseModel):
         rounded = {k: round(v) if cls.model_fields[k].annotation is int else v for k, v in values.items()}
         return cls.model_validate(rounded)
 
+
+RETIRED_PARAMETERS = {"viscosity": "xsph_rate", "eddies": "smagorinsky_constant", "lip_drop": "rim_correction"}
+"""Names that earlier versions had for parameters, and the present ones."""
 
 ROOM = 20.0
 """Default temperature [°C]."""
@@ -480,7 +483,7 @@ class LiquidSettings(Settings):
     viscosity: Annotated[float, Quantity("Pa*s", "1 mPa*s", lower=1e-5, upper=1e3)] | None = None
     """Dynamic viscosity; the table's unless given. Required for a liquid that is not in the table. Above 5 mm²/s
     (viscosity over density) it is simulated, and the liquid sticks to walls; for thinner ones set the simulation
-    parameter `viscosity`."""
+    parameter `xsph_rate`."""
 
     contact_angle: Annotated[float, Quantity("rad", "40 deg", lower=0.0, upper=math.pi)] = NEUTRAL
     """Contact angle on the vessels' walls. It agrees with theory if particles are finer than the capillary length (1.9

@@ -3,7 +3,7 @@
 `plan_motion` makes a `PourMotion` of `Segment`s; `Motion` is the interface that executed motions share
 (`sim_engine.scene.SampledMotion`).
 
-Frames and signs: `sim_engine.action` (picture in docs/frames.md). The pourer stands upright at (−x_offset, y_offset)
+Frames and signs: `sim_engine.action` (picture in docs/laboratory/frames.md). The pourer stands upright at (−x_offset, y_offset)
 with its lip `height` above the receiver's rim, turns about a horizontal line along y (the pivot), holds, and returns
 upright.
 """
@@ -188,8 +188,8 @@ def plan_motion(
     vessel_pivot = tuple(float(v) for v in pivot_vessel)
     if hold is None:
         tilting = PourMotion(tuple(segments), (phases[0],), world, vessel_pivot)  # type: ignore[arg-type]
-        end = predicted_end_of_flow(pourer, scene.liquid.volume, tilting.tilt, tilted + scene.hold_cap)
-        hold = min(max(end - tilted, 0.0), scene.hold_cap)
+        end = predicted_end_of_flow(pourer, scene.liquid.volume, tilting.tilt, tilted + scene.max_hold_time)
+        hold = min(max(end - tilted, 0.0), scene.max_hold_time)
     phases.append(Phase("hold", tilted, tilted + hold))
     if action.return_velocity is not None:
         back = turn(tilted + hold, action.max_angle, 0.0, action.return_velocity, action.angular_acceleration)

@@ -18,7 +18,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_engine.settings.model import Settings
+from sim_engine.settings.model import Problems, Settings
 from sim_engine.settings.quantity import Quantity
 
 
@@ -207,6 +207,11 @@ class Loss(Settings):
 
     retained_weight: Annotated[float, Quantity("1", "1.0", 0.0, 100.0)] = 1.0
     """Weight w of the retained liquid, for spilled_and_retained."""
+
+    def check_values(self, problems: Problems) -> None:
+        """Check that a weight belongs to the loss."""
+        if "retained_weight" in self.model_fields_set and self.name != "spilled_and_retained":
+            problems.add(f"belongs to spilled_and_retained, not to {self.name}", "retained_weight", key=True)
 
     def __call__(self, fractions: Fractions, *, loaded_mass: float, particles: int) -> float | None:
         """Loss of a pour, to be minimised; None if it is undefined.

@@ -30,6 +30,9 @@ from sim_engine.errors import DecantError
 
 ENVIRONMENT_VARIABLE = "DECANT_CACHE_DIR"
 
+DISTRIBUTION = "decant-pouring"
+"""Name of the installed distribution. The name `decant` belongs to another project on the package index."""
+
 
 _log = logging.getLogger(__name__)
 _reported: set[Path] = set()
@@ -193,7 +196,7 @@ def require(module: str, what_for: str) -> None:
     if not installed(module):
         package, extra = PACKAGES.get(module, module), EXTRAS[module]
         raise MissingExtraError(
-            f"{what_for} needs the package '{package}', which is not installed: pip install 'decant[{extra}]'"
+            f"{what_for} needs the package '{package}', which is not installed: pip install '{DISTRIBUTION}[{extra}]'"
         )
 
 

@@ -83,7 +83,7 @@ class Scene:
     Attributes:
         name: key in strategies and the journal.
         fixed: action dimensions that are not searched, SI (None switches an optional one off).
-        hold_cap: longest hold 'until the predicted end of flow' [s].
+        max_hold_time: longest hold 'until the predicted end of flow' [s].
     """
 
     name: str
@@ -92,7 +92,7 @@ class Scene:
     liquid: Liquid
     pivot: Pivot = Pivot()
     fixed: dict[str, float | None] = field(default_factory=dict)
-    hold_cap: float = 5.0
+    max_hold_time: float = 5.0
 
     def action(self, chosen: dict[str, float]) -> Action:
         """The complete action of a searched point. Raises ValueError as `Action.compose` does."""
@@ -208,7 +208,7 @@ class PourTask:
 
     Attributes:
         seed: of the initial positions; same task, same seed → same bits on one CPU thread.
-        record_rate: frames of all particles that are kept per simulated second; 0 keeps none.
+        frame_rate: frames of all particles that are kept per simulated second; 0 keeps none.
         parameters: θ_s, and the bench's nuisances.
         pose_error: deviations of this one pour in addition to those nuisances; None for a plain simulation.
         motion: executed motion that was read back from an arm, instead of the motion planned for `action`. It must
@@ -219,7 +219,7 @@ class PourTask:
     action: Action
     parameters: SimulationParameters
     seed: int
-    record_rate: float = 0.0
+    frame_rate: float = 0.0
     pose_error: PoseError | None = None
     motion: SampledMotion | None = None
 

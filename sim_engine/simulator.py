@@ -168,10 +168,10 @@ class TimeLoop:
         """
         n = self.task.parameters.particles
         now = fluid.time(self.scene)
-        if self.task.record_rate > 0.0 and self.clock >= self._next_frame:
+        if self.task.frame_rate > 0.0 and self.clock >= self._next_frame:
             self.frames.append((now, *fluid.particles(self.scene)))
             while self._next_frame <= self.clock:
-                self._next_frame += 1.0 / self.task.record_rate
+                self._next_frame += 1.0 / self.task.frame_rate
         if now > self.times[-1]:
             self.times.append(now)
             self.poured.append(1.0 - float(counts[ParticleState.IN_POURER]) / n)
@@ -508,7 +508,7 @@ class PourSimulator:
         else:
             follow(fluid, courses, cancelled)
         for course, task, motion in zip(courses, tasks, motions, strict=True):
-            if task.record_rate > 0.0:
+            if task.frame_rate > 0.0:
                 course.frames[:0] = self._level_frames(task, motion, course.start)
         return [
             SimulatedPour(outcome(fluid, course, loading), recorded_frames(course, motion))
@@ -532,7 +532,7 @@ class PourSimulator:
     ) -> list[tuple[float, NDArray[np.float32], NDArray[np.uint8]]]:
         """Frames from before the simulation began, when the liquid lay level: time, positions, states."""
         homes = np.full(task.parameters.particles, int(ParticleState.IN_POURER), np.uint8)
-        times = np.arange(0.0, start - 0.5 / task.record_rate, 1.0 / task.record_rate)
+        times = np.arange(0.0, start - 0.5 / task.frame_rate, 1.0 / task.frame_rate)
         return [(float(t), self._laid(task, motion, float(t)), homes) for t in times]
 
     def _setup(self, task: PourTask, motion: Motion, start: float) -> SceneSetup:

@@ -145,17 +145,19 @@ def _small_laboratory(lab: Any) -> None:
 
 def _small_quickstart(campaign: Any) -> None:
     campaign["laboratory"] = "../laboratories/twin.yaml"
-    campaign["motion"]["hold_cap"] = "0.5 s"
+    campaign["motion"]["max_hold_time"] = "0.5 s"
     campaign["simulator"]["parameters"]["particles"] = 200
-    campaign["calibration"].update(pours={"count": 3, "holdout": 1}, simulations=4, initial=3, random_baseline=1)
-    campaign["deployment"].update(prior_simulations=3, pours=2, per_pour=1)
-    campaign["outputs"].update(rrd=False, figures=False)
+    campaign["calibration"].update(
+        pours={"count": 3, "holdout": 1}, simulations=4, initial_samples=3, random_baseline=1
+    )
+    campaign["deployment"].update(prior_simulations=3, pours=2, simulations_per_pour=1)
+    campaign["outputs"].update(recording=False, figures=False)
 
 
 def _small_recorded(campaign: Any) -> None:
     campaign["simulator"]["parameters"] = {"particles": 200, "cohesion": ["0 N/m", "0.1 N/m"]}
-    campaign["calibration"].update(simulations=5, initial=3, random_baseline=1)
-    campaign["outputs"].update(rrd=False, figures=False)
+    campaign["calibration"].update(simulations=5, initial_samples=3, random_baseline=1)
+    campaign["outputs"].update(recording=False, figures=False)
 
 
 def _small_study(study: Any) -> None:
@@ -163,8 +165,8 @@ def _small_study(study: Any) -> None:
     study.update(search=["cohesion"], pours=3, holdout=1, mismatch=[study["mismatch"][0]], confirm=0)
     study["compared"] = study["mismatch"][0]["name"]
     study["mismatch"][0]["liquid"]["particles"] = 250
-    study["calibration"] = {"C4": {"repetitions": 1, "simulations": 4, "initial": 3}}
-    study["deployment"] = {"D2": {"repetitions": 1, "pours": 2, "initial": 2}}
+    study["calibration"] = {"C4": {"repetitions": 1, "simulations": 4, "initial_samples": 3}}
+    study["deployment"] = {"D2": {"repetitions": 1, "pours": 2, "initial_samples": 2}}
 
 
 def _shorten(table: Path, rows: int = 4) -> None:

@@ -83,11 +83,11 @@ def test_each_set_searches_one_step_more_at_the_same_budget(
     assert nothing.simulations == 0
     assert nothing.fixed_parameters == calibration.fixed_parameters
     assert {job.simulations for job in jobs[1:]} == {10}
-    assert first.parameters.names == ("viscosity",)
-    assert second.parameters.names == ("viscosity", "cohesion")
-    fixed = {name: value for name, value in calibration.fixed_parameters.items() if name != "viscosity"}
+    assert first.parameters.names == ("xsph_rate",)
+    assert second.parameters.names == ("xsph_rate", "cohesion")
+    fixed = {name: value for name, value in calibration.fixed_parameters.items() if name != "xsph_rate"}
     assert first.fixed_parameters == fixed
-    assert set(last.parameters.names) == {*calibration.parameters.names, "viscosity", "cohesion"}
+    assert set(last.parameters.names) == {*calibration.parameters.names, "xsph_rate", "cohesion"}
     assert without_nuisances(last.fixed_parameters) == {"particles": 1000}
     ours = {axis.name: axis for axis in calibration.parameters.axes}
     assert all(ours.get(axis.name, axis) == axis for axis in last.parameters.axes)
@@ -103,16 +103,16 @@ def test_particles_are_the_options_where_the_campaign_does_not_fix_them(
 
 def found(train: float, test: float, errors: list[float]) -> dict[str, Any]:
     discrepancy = {"train": train, "test": test, "transfer": None}
-    return {"discrepancy": discrepancy, "errors": errors, "theta": {"viscosity": 1.23456}, "cpu_s": 1.5}
+    return {"discrepancy": discrepancy, "errors": errors, "theta": {"xsph_rate": 1.23456}, "cpu_s": 1.5}
 
 
 def test_rows_are_means_over_seeds_and_folds_weigh_pours_alike(power: ModuleType) -> None:
     two = [found(0.01, 0.02, [0.1]), found(0.03, 0.06, [0.2, 0.3, 0.4])]
     two[1]["posterior"] = {"train": None, "test": 0.041}  # the first one had none, or was kept before there were any
-    row = power.set_row("viscosity", two)
+    row = power.set_row("xsph_rate", two)
     assert (row["train_posterior_seeds"], row["test_posterior_seeds"]) == ([], [0.041])
     assert (row["train"], row["test"], row["transfer"], row["test_seeds"]) == (0.02, 0.04, None, [0.02, 0.06])
-    assert (row["searched"], row["cpu_s"], row["thetas"][0]) == ("viscosity", 3.0, {"viscosity": 1.235})
+    assert (row["searched"], row["cpu_s"], row["thetas"][0]) == ("xsph_rate", 3.0, {"xsph_rate": 1.235})
     folds = power.fold_summary(two)
     assert (folds["discrepancy"], folds["pours"], folds["largest"]) == (0.25, 4, 0.4)
     assert folds["standard_error"] == pytest.approx(0.0645, abs=1e-4)  # s/√n of 0.1, 0.2, 0.3, 0.4
@@ -174,10 +174,10 @@ def test_the_campaign_as_it_is_searches_what_it_searches_with_the_seed_that_is_a
 def test_a_last_row_takes_some_parameters_as_known(
     power: ModuleType, calibration: CalibrationPlan, options: argparse.Namespace
 ) -> None:
-    options.known = ["wall_distance=1.5", "lip_drop=0"]
+    options.known = ["wall_distance=1.5", "rim_correction=0"]
     last = power.job(calibration, options, f"set {len(power.growing_sets())} 11").calibration
-    assert set(last.parameters.names) == {"cohesion", "viscosity", "friction", "eddies"}
-    assert without_nuisances(last.fixed_parameters) == {"particles": 1000, "wall_distance": 1.5, "lip_drop": 0.0}
+    assert set(last.parameters.names) == {"cohesion", "xsph_rate", "friction", "smagorinsky_constant"}
+    assert without_nuisances(last.fixed_parameters) == {"particles": 1000, "wall_distance": 1.5, "rim_correction": 0.0}
     options.known = ["wall_distanse=1.5"]
     with pytest.raises(SystemExit, match="wall_distanse"):
         power.wanted_sets(options)

@@ -33,7 +33,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 @pytest.fixture
 def plan(bench: ModuleType) -> CampaignPlan:
-    found: CampaignPlan = bench.searched(load_campaign(bench.CAMPAIGN), ["wall_distance", "lip_drop"], {})
+    found: CampaignPlan = bench.searched(load_campaign(bench.CAMPAIGN), ["wall_distance", "rim_correction"], {})
     return found
 
 
@@ -68,7 +68,7 @@ def test_budgets_are_the_papers_and_none_is_exceeded(bench: ModuleType, plan: Ca
         bench.at_price(calibration, bench.Row(name, budget))
         for name, budget in (("C1", 2800), ("C2", 504), ("C3", 1652), ("C4", 108))
     )
-    assert c1.settings.grid == {"wall_distance": 10, "lip_drop": 10}
+    assert c1.settings.grid == {"wall_distance": 10, "rim_correction": 10}
     assert (c2.settings.thetas, c3.settings.thetas, c4.simulations) == (18, 59, 108)
     assert [one.simulations for one in (c1, c2, c3)] == [2800, 504, 1652]
     for name in ("C1", "C2", "C3", "C4"):
@@ -115,8 +115,10 @@ def test_what_can_t_be_compared_is_refused(bench: ModuleType, monkeypatch: pytes
         return str(refused.value)
 
     assert "--rows C7=3: should be a strategy and its simulations" in refusal("--rows", "C7=3")
-    assert "not searched by recorded.yaml; it searches eddies, friction, wall" in refusal("--search", "cohesion")
-    assert "--known lip_drop: searched as well" in refusal("--known", "lip_drop=0")
+    assert "not searched by recorded.yaml; it searches smagorinsky_constant, friction, wall" in refusal(
+        "--search", "cohesion"
+    )
+    assert "--known rim_correction: searched as well" in refusal("--known", "rim_correction=0")
     quickstart = BENCHMARKS.parent / "configs" / "campaigns" / "quickstart.yaml"
     assert "a campaign with recorded pours is needed" in refusal(str(quickstart))
 
@@ -139,7 +141,18 @@ def test_the_table_is_of_what_was_made_and_what_was_kept_is_not_made_again(
         return made[-1]
 
     def table(*more: str) -> list[dict[str, Any]]:
-        arguments = ["--rows", "C4=20", "--random", "2", "--known", "eddies=0", "--once", "random", *more, "--json"]
+        arguments = [
+            "--rows",
+            "C4=20",
+            "--random",
+            "2",
+            "--known",
+            "smagorinsky_constant=0",
+            "--once",
+            "random",
+            *more,
+            "--json",
+        ]
         monkeypatch.setattr(sys, "argv", ["calibration_strategies.py", *arguments])
         bench.main()
         rows: list[dict[str, Any]] = json.loads(capsys.readouterr().out.strip().splitlines()[-1])["rows"]
@@ -158,8 +171,8 @@ def test_the_table_is_of_what_was_made_and_what_was_kept_is_not_made_again(
         assert rows[-1][split] == pytest.approx(sum(values) / 2, abs=1e-4)
         low, high = rows[-1][f"{split}_interval"]
         assert low <= rows[-1][split] <= high
-    assert [theta["eddies"] for theta in rows[-1]["thetas_found"]] == [0.0, 0.0]
-    assert rows[0]["thetas_found"][0]["eddies"] > 0.0
+    assert [theta["smagorinsky_constant"] for theta in rows[-1]["thetas_found"]] == [0.0, 0.0]
+    assert rows[0]["thetas_found"][0]["smagorinsky_constant"] > 0.0
 
     monkeypatch.setattr(bench, "run_self", lambda *arguments: pytest.fail("made again"))
     assert table("--seeds", "11", "12") == rows

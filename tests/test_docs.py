@@ -18,13 +18,9 @@ from orchestrator.cli import foreground_run as common
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign, load_vessel
 from orchestrator.journal.journal import Kind
-from orchestrator.runs.unknown_pours import OperatorNeededError
+from orchestrator.runs.resume import OperatorNeededError
 from sim_engine import model_validity as regimes
-from sim_engine.action import DEG, Action
 from sim_engine.lip_flow import EDGE
-from sim_engine.liquids import Liquid
-from sim_engine.scene import Scene
-from sim_engine.vessel.vessel import build_vessel
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "configs").rglob("*.md")])
@@ -114,19 +110,29 @@ def test_every_package_is_on_the_architecture_page_and_every_file_named_there_ex
 
 
 def test_journal_kinds_are_the_journal_s() -> None:
-    chapter = text_of(ROOT / "docs" / "explanation" / "architecture.md").partition("## The journal")[2].partition("\n## ")[0]
+    chapter = (
+        text_of(ROOT / "docs" / "explanation" / "architecture.md").partition("## The journal")[2].partition("\n## ")[0]
+    )
     rows = re.findall(r"^\| (`.+?) \|", chapter, re.MULTILINE)
     assert {word for row in rows for word in re.findall(r"`([\w.]+)`", row)} == {str(kind) for kind in Kind}
 
 
 def test_exit_codes_are_the_commands() -> None:
-    chapter = text_of(ROOT / "docs" / "experiments" / "interrupt-and-resume.md").partition("## Exit codes")[2].partition("\n## ")[0]
+    chapter = (
+        text_of(ROOT / "docs" / "experiments" / "interrupt-and-resume.md")
+        .partition("## Exit codes")[2]
+        .partition("\n## ")[0]
+    )
     codes = {int(code) for code in re.findall(r"^\| (\d+) \|", chapter, re.MULTILINE)}
     assert codes == {0, common.FAILED, common.BAD_INPUT, OperatorNeededError.exit_code, common.INTERRUPTED}
 
 
 def test_vessel_shown_in_the_guide_is_one(tmp_path: Path) -> None:
-    shown = [block for kind, block in FENCE.findall(text_of(ROOT / "docs" / "reference" / "vessel.md")) if "profile:" in block]
+    shown = [
+        block
+        for kind, block in FENCE.findall(text_of(ROOT / "docs" / "reference" / "vessel.md"))
+        if "profile:" in block
+    ]
     assert len(shown) == 1
     path = tmp_path / "vessel.yaml"
     path.write_text(shown[0], encoding="utf-8")
@@ -147,7 +153,9 @@ def test_numbers_of_the_solver_are_the_code_s() -> None:
 
 
 def test_limits_of_what_is_simulated_are_the_code_s() -> None:
-    page = text_of(ROOT / "docs" / "explanation" / "simulator.md").partition("## Model validity")[2].partition("\n## ")[0]
+    page = (
+        text_of(ROOT / "docs" / "explanation" / "simulator.md").partition("## Model validity")[2].partition("\n## ")[0]
+    )
     for limit in (
         f"| We < {regimes.DRIBBLING_WEBER:g} at the rim |",
         f"| Bo < {regimes.WETTING_BOND:g} of the film |",
@@ -173,8 +181,11 @@ def test_quickstart_is_what_the_tutorial_says() -> None:
 
 def test_every_block_of_yaml_is_yaml_with_known_keys() -> None:
     """Whole files are loaded; parts of files have only keys that a file of some kind has at their top."""
-    known = {key for model in (CampaignFile, LaboratoryFile, VesselFile, StudyFile, DaemonFile, ArmKeys, DeploymentKeys)
-             for key in model}
+    known = {
+        key
+        for model in (CampaignFile, LaboratoryFile, VesselFile, StudyFile, DaemonFile, ArmKeys, DeploymentKeys)
+        for key in model
+    }
     for page in PAGES:
         for kind, block in FENCE.findall(text_of(page)):
             if kind == "yaml":

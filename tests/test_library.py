@@ -191,7 +191,7 @@ def test_every_public_error_is_a_decant_error_and_what_it_was_before() -> None:
 def small(folder: Path, **changes: Any) -> decant.CampaignPlan:
     """The quickstart with runs in a folder of the test; its sections with other values."""
     content = dict(decant.load_campaign(decant.shipped("campaigns/quickstart.yaml")).resolved)
-    content["outputs"] = {"directory": str(folder / "runs"), "rrd": False, "figures": False}
+    content["outputs"] = {"directory": str(folder / "runs"), "recording": False, "figures": False}
     for name, section in changes.items():
         content[name] = section
     content = {name: section for name, section in content.items() if section is not None}
@@ -288,7 +288,7 @@ def test_a_run_of_the_library_is_recorded_and_warns_as_one_of_the_command_line(
 ) -> None:
     pytest.importorskip("rerun")
     content = dict(small(tmp_path).resolved)
-    content["outputs"] = {**content["outputs"], "rrd": True}
+    content["outputs"] = {**content["outputs"], "recording": True}
     actions = {**content["deployment"]["actions"], "x_offset": ["150 mm", "300 mm"]}
     content["deployment"] = {**content["deployment"], "actions": actions}
     campaign = decant.build_campaign(content, tmp_path)

@@ -72,3 +72,9 @@ def test_modules_that_commands_name_exist() -> None:
             if name not in known and ".".join(parts[:-1]) not in known:
                 wrong.append(f"{path.relative_to(ROOT)}: {name}")
     assert wrong == []
+
+
+def test_journals_are_read_by_one_module_outside_the_engine() -> None:
+    readers = [name for name, path in modules().items() if "JournalReader" in path.read_text(encoding="utf-8")]
+    engine = ("orchestrator.journal.journal", "orchestrator.runs.")
+    assert [name for name in readers if not name.startswith(engine)] == ["orchestrator.journal.run_record"]

@@ -167,17 +167,17 @@ def test_without_extras_one_simulates_and_plans(tmp_path: Path) -> None:
     planning = ["plan", campaign, "--parameters", str(theta), "--iterations", "2", "--seeds", "2"]
     done = run(command(*planning, "--in-process"), tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "pip install 'decant[live]'" in done.stderr, "a recording was wanted"
+    assert "pip install 'decant-pouring[live]'" in done.stderr, "a recording was wanted"
     assert run(command(*planning), tmp_path).returncode == 0, "plain processes need no Ray"
     done = run(command("calibrate", campaign), tmp_path)
     assert done.returncode == 2
-    assert "pip install 'decant[lab]'" in done.stderr
+    assert "pip install 'decant-pouring[lab]'" in done.stderr
 
 
 def test_without_extras_a_table_says_what_to_install(tmp_path: Path) -> None:
     code = f"{BLOCKED}\nfrom decant.run_results import _frame\n_frame(iter([]))"
     done = run(code, tmp_path)
-    assert "pip install 'decant[tables]'" in done.stderr
+    assert "pip install 'decant-pouring[tables]'" in done.stderr
 
 
 @pytest.mark.slow
@@ -205,7 +205,7 @@ def test_the_wheel_works_in_a_bare_environment(wheel: Path, tmp_path: Path) -> N
     assert done.returncode == 0, done.stderr
     done = decant("plan", *campaign, "--iterations", "2", "--seeds", "2", "--in-process")
     assert done.returncode == 0, done.stderr
-    assert "decant[lab]" in decant("run", "lab/campaigns/quickstart.yaml").stderr
+    assert "decant-pouring[lab]" in decant("run", "lab/campaigns/quickstart.yaml").stderr
 
     def run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(

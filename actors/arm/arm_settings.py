@@ -198,6 +198,13 @@ class ArmSettings(Settings):
             arm.close()
         return ArmDiagnostics(facts.checksum, facts.serial, facts.model, facts.version, facts.problem)
 
+    def readiness(self) -> DeviceCheck | None:
+        """Read whether a motion could begin now, for a display while no run uses the arm.
+
+        The reading is short, changes nothing, and does not connect the driver. None if this kind of arm offers none.
+        """
+        return None
+
 
 def _arm(loaded: object, name: str) -> type[ArmSettings]:
     if not (isinstance(loaded, type) and issubclass(loaded, ArmSettings)):
@@ -222,7 +229,7 @@ class UrArmSettings(ArmSettings):
     """A UR arm that holds the pourer."""
 
     retired: ClassVar[dict[str, str]] = ArmSettings.retired | {
-        "upright_speed": "upright_speed",
+        "untilt_speed": "upright_speed",
         "announcement": "warning_time",
     }
     emulator: ClassVar[str] = "actors.emulators.ur_controller.arm_emulator:UrEmulator"
@@ -361,6 +368,13 @@ class UrArmSettings(ArmSettings):
         """See `ArmSettings.diagnostics`."""
         found: ArmDiagnostics = resolve_name("actors.arm.ur.commissioning:UrDiagnostics").at(self)
         return found
+
+    def readiness(self) -> DeviceCheck | None:
+        """See `ArmSettings.readiness`."""
+        if not self.address:
+            return None
+        check: DeviceCheck = resolve_name("actors.arm.ur.commissioning:readiness")(self)
+        return check
 
 
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"

@@ -16,7 +16,8 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 from pydantic import Field
 
 from actors.balance.balance_interface import BalanceDriver
-from actors.balance.dialects.dialect import BALANCES, Dialect, LineSettings, dialects
+from actors.balance.dialect_registry import BALANCES, dialects
+from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.scale_model import Duration, Error, PositiveDuration, PositiveMass, ScaleSettings
 from actors.balance.weighing_plan import Placement
 from actors.interfaces import DeviceCheck, LaboratoryError
@@ -257,7 +258,7 @@ class BalanceSettings(Settings):
                 said = "not tried; --tare tries it (what is on it counts as nothing then)"
                 checks.append(DeviceCheck("balance tare", "ok", said))
         except LaboratoryError as error:
-            todo = "docs/balances.md has a table of what it says and what to do"
+            todo = "docs/laboratory/connect-a-balance.md lists causes and remedies"
             checks.append(DeviceCheck("balance", "fail", str(error), todo))
         finally:
             driver.close()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from actors.balance.balance_interface import BalanceError
 from actors.balance.balance_settings import AUTO, SerialBalanceSettings, parse_format
-from actors.balance.dialects.dialect import dialects
+from actors.balance.dialect_registry import dialects
 from actors.balance.line_recording import Recorder
 from actors.balance.serial_balance import SerialBalance
 

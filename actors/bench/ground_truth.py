@@ -120,7 +120,7 @@ async def hidden_spill(
     scene: Scene,
     action: Action,
     seed: int,
-    record_rate: float = 0.0,
+    frame_rate: float = 0.0,
 ) -> Spill:
     """Simulate the liquid for an arm that executes the commanded action with this pour's errors; raises like
     `hidden_pour`.
@@ -131,9 +131,9 @@ async def hidden_spill(
         scene: the intended scene.
         action: the commanded action.
         seed: of the pour.
-        record_rate: rate of the recorded particle frames for the live view [1/s].
+        frame_rate: rate of the recorded particle frames for the live view [1/s].
     """
-    task = PourTask(scene, action, spec.theta, 0, record_rate=record_rate, pose_error=draw_pose_error(spec, seed))
+    task = PourTask(scene, action, spec.theta, 0, frame_rate=frame_rate, pose_error=draw_pose_error(spec, seed))
     simulated = await hidden_pour(spec, simulators, task, seed)
     return replace(spill_of(simulated.outcome, scene.liquid.mass), frames=simulated.frames)
 
@@ -172,7 +172,7 @@ class PourAsk:
     show: Callable[[RecordedFrames], None] | None = None
 
     @property
-    def record_rate(self) -> float:
+    def frame_rate(self) -> float:
         """Frame rate of the hidden liquid's particles [1/s]; 0 without a live view. The simulation is unaffected."""
         return 0.0 if self.show is None else WATCHED_RATE
 

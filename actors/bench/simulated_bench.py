@@ -57,7 +57,7 @@ class SimulatedBench(GroundTruth):
         """See `GroundTruth.prepare`; starts the simulation of the liquid."""
         self._pour = pour
         self._liquid = asyncio.create_task(
-            hidden_spill(self._spec, self._simulators, pour.scene, pour.action, pour.seed, pour.record_rate)
+            hidden_spill(self._spec, self._simulators, pour.scene, pour.action, pour.seed, pour.frame_rate)
         )
         await self._balance.prepare(stream(pour.seed, "balance"))
         error = draw_pose_error(self._spec, pour.seed)

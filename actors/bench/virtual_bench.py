@@ -363,7 +363,7 @@ class VirtualBench(GroundTruth):
         scene = replace(pour.scene, liquid=pour.scene.liquid.model_copy(update={"mass": mass}))
         shift = PoseError(x=error.x, y=error.y, z=error.z)
         task = PourTask(scene, pour.action, SimulationParameters(), 0, pose_error=shift, motion=motion)
-        task = replace(task, record_rate=pour.record_rate)
+        task = replace(task, frame_rate=pour.frame_rate)
         simulated = await hidden_pour(self._spec, self._simulators, task, pour.seed)
         pour.shown(simulated.frames)
         spill = spill_of(simulated.outcome, mass)

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 from actors.interfaces import LaboratoryError, Notice
 from actors.runtime.child_process import python_module, run
+from sim_engine.resources import DISTRIBUTION
 from sim_engine.solver_fingerprint import ROOT, folder_digest
 
 if TYPE_CHECKING:
@@ -185,7 +186,7 @@ def versions() -> Versions:
     """The versions on this machine."""
     return Versions(
         python=sys.version.split()[0],
-        decant=_installed("decant"),
+        decant=_installed(DISTRIBUTION),
         simulator=folder_digest(ROOT / "sim_engine"),
         taichi=_installed("taichi"),
         numpy=_installed("numpy"),

@@ -1,4 +1,4 @@
-"""Names for authors of plug-ins: strategies, objectives, balances, arms and sources of vessels. See docs/extending.md.
+"""Names for authors of plug-ins: strategies, objectives, balances, arms and sources of vessels. See docs/extend/plug-ins.md.
 
 ::
 

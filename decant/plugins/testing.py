@@ -4,7 +4,7 @@
     from decant.plugins.testing import BalanceBench, BalanceContract    # needs pytest
     from decant.plugins.testing import StrategyHarness, check_strategy
 
-How to use them: docs/extending.md. Each name is imported on first use.
+How to use them: docs/extend/plug-ins.md. Each name is imported on first use.
 """
 
 from __future__ import annotations

@@ -23,9 +23,9 @@ from orchestrator.catalogue.export import write_tables
 from orchestrator.catalogue.queries import condition_sql, differing_settings, outcomes
 from orchestrator.catalogue.run_reading import TABLES, UNREADABLE, Column, RunRead, read_run, unreadable
 from orchestrator.catalogue.run_registry import known, make_state_directory, state_directory
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import has_begun
-from orchestrator.journal.run_record import Row
+from orchestrator.journal.run_record import Row, read_header
 from orchestrator.run_errors import RunError
 from orchestrator.states import RESTING
 
@@ -178,8 +178,7 @@ class Catalogue:
         """See `CatalogueClient`."""
         found, plans = [self._find(name) for name in names], []
         for run in found:
-            with JournalReader(Path(run["path"]) / JOURNAL_NAME) as journal:
-                plans.append(journal.header.fingerprint)
+            plans.append(read_header(Path(run["path"])).fingerprint)
         results = [outcomes(run) for run in found]
         return {"runs": [run["path"] for run in found], "settings": differing_settings(plans), "outcomes": results}
 

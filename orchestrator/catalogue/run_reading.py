@@ -15,8 +15,7 @@ from typing import Any, Literal
 
 from orchestrator.catalogue.annotations import Annotations, AnnotationsError, read_annotations
 from orchestrator.journal.codec import CodecError, from_json
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-from orchestrator.journal.run_record import PourMade, Row, pour_row, read_record
+from orchestrator.journal.run_record import RecordedPour, Row, pour_row, read_record
 from orchestrator.run_errors import RunError
 from orchestrator.runs.prior_data import scenes_in
 from orchestrator.strategies.stage_result import displayed_action
@@ -133,8 +132,7 @@ def read_run(directory: Path) -> RunRead:
     annotations = Annotations()
     try:
         annotations = read_annotations(directory)
-        with JournalReader(directory / JOURNAL_NAME) as journal:
-            return RunRead(*_rows(journal, directory), annotations)
+        return RunRead(*_rows(directory), annotations)
     except (RunError, CodecError, AnnotationsError, OSError) as error:
         return unreadable(directory, str(error), annotations)
     except Exception as error:  # damaged content can cause any error, and must not hide other runs
@@ -151,21 +149,22 @@ def unreadable(directory: Path, problem: str, annotations: Annotations) -> RunRe
     return RunRead(row, annotations=annotations)
 
 
-def _rows(journal: JournalReader, directory: Path) -> tuple[Row, list[Row]]:
+def _rows(directory: Path) -> tuple[Row, list[Row]]:
     """The row of a run and those of its pours."""
-    plan, record = journal.header.fingerprint, read_record(journal)
+    record = read_record(directory)
+    plan = record.header.fingerprint
     laboratory = plan.get("laboratory") or {}
     scenes = {str(scene["name"]): scene for scene in scenes_in(plan)}
     about = {
         "run": directory.name,
         "path": str(directory),
-        "campaign": journal.header.name,
+        "campaign": record.header.name,
         "mode": laboratory.get("mode", "virtual"),
     }
-    pours = [about | _pour(pour, plan, scenes) for pour in record.pours if pour.came != "not begun"]
+    pours = [about | _pour(pour, plan, scenes) for pour in record.pours if pour.state != "asked"]
     outcomes = [row["outcome"] for row in pours]
     run = about | {
-        "begun": record.created,
+        "begun": record.header.created,
         "ended": record.ended,
         "state": str(record.state),
         "reason": record.reason,
@@ -173,17 +172,17 @@ def _rows(journal: JournalReader, directory: Path) -> tuple[Row, list[Row]]:
         "seed": plan.get("seed"),
         **{key: _different(s[key]["name"] for s in scenes.values()) for key in ("liquid", "pourer", "receiver")},
         "strategy": _different(filter(None, (_strategy(plan, part) for part in ("calibration", "deployment")))),
-        "simulations": sum(stage.simulations for stage in record.stages.values()),
+        "simulations": record.simulations,
         "pours": outcomes.count("weighed"),
         "failed_pours": outcomes.count("failed"),
         "open_pours": outcomes.count("open"),
         "spilled_g": sum(row.get("spilled_g") or 0.0 for row in pours),
     }
     receivers = {name: scene["receiver"]["name"] for name, scene in scenes.items()}
-    return run | _result_columns(journal.stage_results(), receivers), pours
+    return run | _result_columns(record.results, receivers), pours
 
 
-def _pour(pour: PourMade, plan: Mapping[str, Any], scenes: Mapping[str, Any]) -> Row:
+def _pour(pour: RecordedPour, plan: Mapping[str, Any], scenes: Mapping[str, Any]) -> Row:
     request, deployment = pour.request, plan.get("deployment") or {}
     scene = scenes.get(request.scene, {})
     deployed = any(scene["name"] == request.scene for scene in deployment.get("scenes", ()))
@@ -207,7 +206,7 @@ def _pour(pour: PourMade, plan: Mapping[str, Any], scenes: Mapping[str, Any]) ->
         "pourer": scene.get("pourer", {}).get("name", ""),
         "receiver": scene.get("receiver", {}).get("name", request.scene),
         "liquid": scene.get("liquid", {}).get("name", ""),
-        "outcome": "open" if pour.came == "unknown" else pour.came,
+        "outcome": "open" if pour.outcome is None else pour.state,
         "loss": measured,
         "loss_name": "" if calibrating else "objectives" if loss is None else loss.name,
         "predicted_deviation": None if request.predicted is None else request.predicted.deviation,

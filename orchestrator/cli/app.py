@@ -1,42 +1,35 @@
-"""The `decant` command: declares the commands with their options and help texts.
+"""The `decant` command: the application and the table of its commands, with examples for their help texts.
 
-Each command imports the module that does its work when it is called, so that `--help` starts fast. The daemon's
-commands, `decant vessel` and `decant runs` are registered from their own modules.
+Each command is a function of its module, with its options as parameters. It imports what it needs when it is called, so
+that `--help` starts fast.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
 
-from orchestrator.cli import queue_commands, robot_commands, run_commands, simulate_command, vessel_command
-from orchestrator.cli import report_command as report
-from orchestrator.cli import view_command as view
-from orchestrator.cli.command_options import (
-    Answer,
-    Arm,
-    Campaign,
-    InProcess,
-    Json,
-    Live,
-    LiveAt,
-    OtherLaboratory,
-    Parameters,
-    Quiet,
-    Receiver,
-    Resume,
-    RunId,
-    Seed,
-    Thetas,
-    call,
-    examples,
-    given,
+from orchestrator.cli import (
+    campaign_commands,
+    file_commands,
+    physics_command,
+    pour_command,
+    queue_commands,
+    report_command,
+    robot_commands,
+    run_commands,
+    simulate_command,
+    study_command,
+    vessel_command,
+    view_command,
 )
+from orchestrator.cli.command_options import Command, Commands, command, examples
 
 app = typer.Typer(
     name="decant",
+    cls=Commands,
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
@@ -56,7 +49,9 @@ def _version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        print(f"decant {version('decant')}")
+        from sim_engine.resources import DISTRIBUTION
+
+        print(f"decant {version(DISTRIBUTION)}")
         raise typer.Exit
 
 
@@ -69,244 +64,133 @@ def decant(
     """Options that precede the command."""
 
 
-def _campaign_command(name: str, text: str, *lines: str) -> None:
-    """Add a command that runs a campaign or a part of one; all of them have the same options."""
+def _add(work: Callable[..., None], *shown: str, name: str | None = None, panel: str | None = None) -> None:
+    """Add a command.
 
-    def verb(
-        campaign: Campaign,
-        resume: Resume = False,
-        run_id: RunId = None,
-        answer: Answer = None,
-        in_process: InProcess = False,
-        arm: Arm = False,
-        live: Live = False,
-        live_at: LiveAt = None,
-        laboratory: OtherLaboratory = None,
-        seed: Seed = None,
-        as_json: Json = False,
-        quiet: Quiet = False,
-    ) -> None:
-        options = given(locals(), "campaign", "name")
-        from orchestrator.cli import campaign_commands as campaigns
-
-        call(getattr(campaigns, name), campaign, campaigns.RunOptions(**options))
-
-    app.command(name, help=text, epilog=examples(*lines))(verb)
+    Args:
+        work: the function; its docstring is the help text.
+        shown: examples.
+        name: name of the command; None: that of the function.
+        panel: heading in the list of commands.
+    """
+    register = app.command(name or work.__name__, cls=Command, epilog=examples(*shown), rich_help_panel=panel)
+    register(command(work))
 
 
-_campaign_command(
-    "run",
-    """Run a campaign: calibrate, then learn to pour. Journal, figures and recording are written to runs/ID/.
-
-Ctrl-C pauses the run: a pour that has started is finished and weighed first. `--resume` continues it.
-""",
+_add(
+    campaign_commands.run,
     "decant run configs/campaigns/quickstart.yaml",
     "decant run configs/campaigns/quickstart.yaml --live   # open the printed address in a browser",
     "decant run my.yaml --resume   # after a stop, a crash or a power failure; finished work is not repeated",
 )
-
-_campaign_command(
-    "calibrate",
-    """Only calibrate: find the θ whose simulated spillage matches the weighed pours (C1 to C4), scored on other pours.
-
-The recommended θ is written to runs/ID/theta.json in SI units (cohesion in N/m, viscosity in 1/s), for `--parameters`.
-""",
+_add(
+    campaign_commands.calibrate,
     "decant calibrate configs/campaigns/recorded.yaml --json",
     "decant calibrate my.yaml && decant plan my.yaml --parameters runs/my-20300131-1/theta.json",
 )
-
-
-@app.command(
-    epilog=examples(
-        "decant plan my.yaml --parameters theta.json",
-        "decant plan my.yaml --parameters theta.json --receiver vase.yaml --json",
-    )
+_add(
+    campaign_commands.plan,
+    "decant plan my.yaml --parameters theta.json",
+    "decant plan my.yaml --parameters theta.json --receiver vase.yaml --json",
 )
-def plan(
-    campaign: Campaign,
-    parameters: Parameters = None,
-    receiver: Receiver = None,
-    iterations: Annotated[int | None, typer.Option(min=2, help="Iterations of the optimiser.")] = None,
-    seed: Seed = None,
-    seeds: Annotated[
-        int, typer.Option(min=2, max=1000, help="Simulations of the planned action, for its prediction interval.")
-    ] = 5,
-    thetas: Thetas = None,
-    laboratory: OtherLaboratory = None,
-    in_process: InProcess = False,
-    as_json: Json = False,
-    quiet: Quiet = False,
-) -> None:
-    """Plan a pour in simulation (D1), for the campaign's receivers or for a new one.
-
-    By default, fifteen actions are simulated, in parallel on all cores. The planned action is then simulated with
-    further seeds, which give its prediction and prediction interval. Nothing is poured.
-
-    Actions are shown in deg, deg/s, mm and s.
-    """
-    options = given(locals(), "campaign")
-    from orchestrator.cli import campaign_commands as campaigns
-
-    call(campaigns.plan_pour, campaign, **options)
-
-
-@app.command(
-    epilog=examples(
-        "decant study configs/studies/quick.yaml",
-        "decant study configs/studies/paper.yaml --dry-run   # estimate the cost",
-        "decant study configs/studies/paper.yaml --jobs 2    # continues a stopped study",
-    )
+_add(
+    study_command.study,
+    "decant study configs/studies/quick.yaml",
+    "decant study configs/studies/paper.yaml --dry-run   # estimate the cost",
+    "decant study configs/studies/paper.yaml --jobs 2    # continues a stopped study",
 )
-def study(
-    file: Annotated[Path, typer.Argument(help="Study file (YAML).", metavar="STUDY", show_default=False)],
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Number of parallel processes; default: one per core.", show_default=False)
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="List the unfinished cells with an estimate of their cost; start nothing.")
-    ] = False,
-    report_only: Annotated[
-        bool, typer.Option("--report", help="Only write figures, tables and page from the existing results.")
-    ] = False,
-    as_json: Json = False,
-    quiet: Quiet = False,
-) -> None:
-    """Compare C1 to C4 and D1 to D3 with repetitions, on virtual benches that differ more or less from the simulator.
-
-    Figures (PNG, SVG, CSV), tables and a page are written to runs/study-NAME/report/. Run the same command again to
-    continue a study that was stopped or killed.
-    """
-    from orchestrator.cli import study_command as verb
-
-    call(verb.study, file, jobs=jobs, dry_run=dry_run, report_only=report_only, as_json=as_json)
-
-
-app.command(
-    epilog=examples(
-        "decant simulate my.yaml --set angular_velocity=40 --set x_offset=90   # deg/s and mm",
-        "decant simulate my.yaml --set 'angular_velocity=0.7 rad/s' --set 'x_offset=9 cm' --png pour.png",
-        "decant simulate my.yaml --from pours.csv --parameters theta.json --csv scored.csv --png scored.png",
-    )
-)(simulate_command.simulate)
-
-
-@app.command(
-    epilog=examples("decant validate my.yaml vase.yaml", "decant validate configs/campaigns/*.yaml"),
+_add(
+    simulate_command.simulate,
+    "decant simulate my.yaml --set angular_velocity=40 --set x_offset=90   # deg/s and mm",
+    "decant simulate my.yaml --set 'angular_velocity=0.7 rad/s' --set 'x_offset=9 cm' --png pour.png",
+    "decant simulate my.yaml --from pours.csv --parameters theta.json --csv scored.csv --png scored.png",
 )
-def validate(
-    files: Annotated[
-        list[Path], typer.Argument(help="Campaign, study, vessel or laboratory files.", show_default=False)
-    ],
-    quiet: Quiet = False,
-) -> None:
-    """Check files without starting anything: keys, units, bounds, vessels, and whether some action can be poured."""
-    from orchestrator.cli import file_commands as verb
-
-    call(verb.validate, files)
-
-
-@app.command(epilog=examples("decant migrate my.yaml rig.yaml"))
-def migrate(
-    files: Annotated[
-        list[Path],
-        typer.Argument(help="Campaign, study, vessel, laboratory or daemon files; rewritten.", show_default=False),
-    ],
-) -> None:
-    """Rename what earlier versions called otherwise, in place; comments and layout stay."""
-    from orchestrator.cli import file_commands as verb
-
-    call(verb.migrate, files)
-
-
-@app.command(epilog=examples("decant init lab", "decant run lab/campaigns/quickstart.yaml"))
-def init(directory: Annotated[Path, typer.Argument(help="An empty folder, or one that does not exist yet.")]) -> None:
-    """Copy example files into a folder: campaigns, laboratories, studies, vessels and weighed pours."""
-    from orchestrator.cli import file_commands as starting
-
-    call(starting.init, directory)
-
-
-@app.command(
-    epilog=examples("decant schema > campaign.json", "decant schema result > result.json"),
+_add(file_commands.validate, "decant validate my.yaml vase.yaml", "decant validate configs/campaigns/*.yaml")
+_add(file_commands.migrate, "decant migrate my.yaml rig.yaml")
+_add(file_commands.init, "decant init lab", "decant run lab/campaigns/quickstart.yaml")
+_add(file_commands.schema, "decant schema > campaign.json", "decant schema result > result.json")
+_add(
+    robot_commands.doctor,
+    "decant doctor configs/laboratories/virtual.yaml",
+    "decant doctor configs/laboratories/ur10-kern.yaml --accept-safety   # after reading them on the teach pendant",
 )
-def schema(
-    which: Annotated[str, typer.Argument(help="campaign, study, vessel, laboratory, or result.")] = "campaign",
-) -> None:
-    """Print the JSON schema of campaign files (editors use it for completion), of other files, or of summary.json."""
-    from orchestrator.cli import pour_prediction as single
-
-    call(single.schema, which)
-
-
-app.command(
-    epilog=examples(
-        "decant doctor configs/laboratories/virtual.yaml",
-        "decant doctor configs/laboratories/ur10-kern.yaml --accept-safety   # after reading them on the teach pendant",
-    )
-)(robot_commands.doctor)
-
-app.command(
-    epilog=examples(
-        "decant jog configs/laboratories/virtual.yaml         # practise without a robot",
-        "decant jog configs/laboratories/ur10-kern.yaml --arm",
-    )
-)(robot_commands.jog)
-
-app.command(
-    epilog=examples(
-        "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --dry-run --png path.png",
-        "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --empty --slow 0.2 --arm",
-        "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --arm",
-    )
-)(robot_commands.pour)
-
-app.command(epilog=report.EXAMPLES)(report.report)
-app.command(epilog=view.EXAMPLES)(view.view)
+_add(
+    robot_commands.jog,
+    "decant jog configs/laboratories/virtual.yaml         # practise without a robot",
+    "decant jog configs/laboratories/ur10-kern.yaml --enable-motion",
+)
+_add(
+    pour_command.pour,
+    "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --dry-run --png path.png",
+    "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --empty --slow 0.2 --enable-motion",
+    "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --enable-motion",
+)
+_add(
+    report_command.report,
+    "decant report quickstart-20300131-1              # a run in the folder runs/",
+    "decant report runs/quickstart-20300131-1 --pdf -o for-the-lab-meeting.html",
+    "decant report configs/studies/quick.yaml         # or the study's folder",
+)
+_add(
+    view_command.view,
+    "decant view quickstart-20300131-1                    # a run of the folder runs/",
+    "decant view runs/first runs/second                   # side by side",
+    "decant view runs/first --pour 7 --particles 5000     # simulate pour 7 again with 5000 particles",
+)
 app.add_typer(run_commands.runs)
-
-
-@app.command(epilog=examples("decant plugins", "decant plugins --json"))
-def plugins(as_json: Json = False) -> None:
-    """List the plug-ins of installed packages: strategies, objectives, balances, arms and sources of vessels.
-
-    Exit code 1 if a plug-in can't be used; the output gives its package and the reason.
-    """
-    from orchestrator.cli import file_commands as verb
-
-    call(verb.plugins, as_json=as_json)
-
-
-@app.command(
-    epilog=examples("decant physics", "decant physics outflow walls --full", "decant physics --full --write docs"),
+_add(file_commands.plugins, "decant plugins", "decant plugins --json")
+_add(
+    physics_command.physics,
+    "decant physics",
+    "decant physics outflow walls --full",
+    "decant physics --full --write docs",
 )
-def physics(
-    cases: Annotated[list[str] | None, typer.Argument(help="Names of cases; default: all.", show_default=False)] = None,
-    full: Annotated[bool, typer.Option("--full", help="Use all resolutions and seeds; takes several minutes.")] = False,
-    pours: Annotated[
-        int | None, typer.Option(min=1, help="Number of random pours in the case 'walls'.", show_default=False)
-    ] = None,
-    write: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for the page validation.md, its data and figures. Cases that are not run keep their "
-            "previous results.",
-            show_default=False,
-        ),
-    ] = None,
-    list_cases: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
-    as_json: Json = False,
-) -> None:
-    """Validate the solver against theory, experiments and other solvers; each case has a criterion.
 
-    Exit code 1 if a criterion is not met.
-    """
-    from orchestrator.cli import solver_validation as verb
-
-    call(verb.physics, cases or [], full=full, pours=pours, write=write, as_json=as_json, list_cases=list_cases)
-
-
-queue_commands.register(app)
-vessel_command.register(app)
+_DAEMON = "Daemon"
+_add(
+    queue_commands.serve,
+    "decant serve",
+    "decant serve lab.yaml --port 0",
+    "decant serve --state /tmp/try --in-process",
+    panel=_DAEMON,
+)
+_add(
+    queue_commands.submit,
+    "decant submit configs/campaigns/quickstart.yaml",
+    "decant submit my.yaml --rig left --priority 5",
+    "decant submit my.yaml --task plan --parameters theta.json --receiver configs/vessels/bowl.yaml",
+    panel=_DAEMON,
+)
+_add(queue_commands.list_campaigns, "decant list", "decant list --json", name="list", panel=_DAEMON)
+_add(queue_commands.show, "decant show quickstart-3f2a1c", panel=_DAEMON)
+_add(queue_commands.logs, "decant logs -f", "decant logs quickstart-3f2a1c --json", panel=_DAEMON)
+_add(queue_commands.pause, "decant pause quickstart-3f2a1c", "decant pause   # the queue", panel=_DAEMON)
+_add(queue_commands.resume, "decant resume quickstart-3f2a1c", "decant resume   # the queue", panel=_DAEMON)
+_add(queue_commands.stop, "decant stop quickstart-3f2a1c", panel=_DAEMON)
+_add(
+    queue_commands.abort,
+    "decant abort quickstart-3f2a1c",
+    "decant abort --all",
+    "decant abort --rig left",
+    "decant abort --clear",
+    panel=_DAEMON,
+)
+_add(
+    queue_commands.answer,
+    "decant answer",
+    "decant answer 7 done",
+    "decant answer 8 weighed 3.2 0.4",
+    panel=_DAEMON,
+)
+_add(queue_commands.enable, "decant enable narrow-1b2c3d", panel=_DAEMON)
+_add(queue_commands.move, "decant move narrow-1b2c3d --first", panel=_DAEMON)
+_add(queue_commands.shutdown, "decant shutdown", panel=_DAEMON)
+_add(
+    vessel_command.vessel,
+    "decant vessel cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
+    "decant vessel cup.yaml --photo side.png --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
+    "decant vessel mug.yaml --mesh scan.stl --wall '3 mm'",
+)
 
 
 def main() -> None:

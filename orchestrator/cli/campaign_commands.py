@@ -1,19 +1,33 @@
-"""`decant run`, `decant calibrate`, `decant plan`: the verbs that run stages in a laboratory."""
+"""The commands `decant run`, `decant calibrate` and `decant plan`, which run stages in a laboratory."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, print_json
-from orchestrator.cli.foreground_run import (
-    check_campaign_can_run,
-    check_laboratory_answers,
-    read_campaign,
-    run_in_front_of_people,
+import typer
+
+from orchestrator.cli.command_options import (
+    Answer,
+    Campaign,
+    EnableMotion,
+    InProcess,
+    Json,
+    Live,
+    LiveAt,
+    OtherLaboratory,
+    Parameters,
+    Quiet,
+    Receiver,
+    Resume,
+    RunId,
+    Seed,
+    Thetas,
 )
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_note
 
 if TYPE_CHECKING:
     from orchestrator.journal.run_record import CampaignResult
@@ -33,51 +47,94 @@ _TOLD = {
 }
 """Fields of a receiver's summary that a plan for it prints beside the action."""
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RunOptions:
-    """What `run` and `calibrate` are given on the command line beside their campaign."""
-
-    resume: bool = False
-    run_id: str | None = None
-    """With resume: which run; None is the newest unfinished one."""
-    answer: str | None = None
-    """With resume: what came of the pour that was under way; None lets a person be asked."""
-    in_process: bool = False
-    laboratory: Path | None = None
-    """In place of the campaign's."""
-    seed: int | None = None
-    """In place of the campaign's."""
-    as_json: bool = False
-    arm: bool = False
-    """Hardware may move in this run."""
-    live: bool = False
-    """A live view is served while it runs …"""
-    live_at: str | None = None
-    """… at this ADDRESS[:PORT], where one is given."""
+"""Fields of a receiver's summary that `decant plan` prints besides the action."""
 
 
-def run(path: Path, options: RunOptions) -> None:
-    """The whole campaign."""
-    from orchestrator.results.run_summary import summary_json
+def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[..., None]:
+    """Make the command of a task; both have the same options."""
 
-    result, published = _run("run", path, options)
-    if options.as_json:
-        summary = summary_json(published.summary)
-        print_json({"run": result.directory.name, "report": published.report, **summary})
+    def work(
+        campaign: Campaign,
+        resume: Resume = False,
+        run_id: RunId = None,
+        answer: Answer = None,
+        in_process: InProcess = False,
+        enable_motion: EnableMotion = False,
+        live: Live = False,
+        live_at: LiveAt = None,
+        laboratory: OtherLaboratory = None,
+        seed: Seed = None,
+        as_json: Json = False,
+        quiet: Quiet = False,
+    ) -> None:
+        from orchestrator.cli.foreground_run import (
+            check_campaign_can_run,
+            check_laboratory_answers,
+            check_somebody_is_there,
+            read_campaign,
+            run_in_front_of_people,
+        )
+        from orchestrator.cli.motion_control import enable_campaign_motion
+        from orchestrator.cli.view_command import live_view
+        from orchestrator.results.run_summary import summary_json
+        from orchestrator.run_service import RunResources, RunTaskError, task_request
+
+        with Refused(RunTaskError):
+            request = task_request(read_campaign(campaign, laboratory, seed), task)
+        plan = request.campaign
+        check_campaign_can_run(request)
+        if answer is not None and not resume:
+            raise RefusalError(f"--answer {answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT)
+        checksum = enable_campaign_motion(plan, request.stages, enabled=enable_motion, task=task)
+        if request.pours:
+            check_somebody_is_there(plan.laboratory)
+        resources = RunResources(in_process=in_process, approved_checksum=checksum or "")
+        check_laboratory_answers(request, resources)
+        view = live_view(plan, live=live, at=live_at)
+        directory = run_directory(plan, resume=resume, run_id=run_id)
+        flag = "" if laboratory is None else f" --laboratory {laboratory}"
+        flag += "" if seed is None else f" --seed {seed}"
+        flag += " --enable-motion" if plan.laboratory.mode == "hardware" else ""
+        again = f"decant {task} {campaign} --resume --run {directory.name}{flag}"
+        result, published = run_in_front_of_people(
+            dataclasses.replace(request, folder=directory, resume="yes" if resume else "no"),
+            resources,
+            again=again,
+            answer=answer,
+            live=view,
+        )
+        if published.theta is not None:
+            print_note(f"the parameters to use are in {published.theta}; give them with --parameters")
+        if as_json and task == "calibrate":
+            print_json(calibration_json(result, published))
+        elif as_json:
+            print_json({"run": directory.name, "report": published.report, **summary_json(published.summary)})
+
+    work.__name__, work.__doc__ = task, text
+    return work
 
 
-def calibrate(path: Path, options: RunOptions) -> None:
-    """Only what finds θ*, and how good it is beside its rivals."""
-    result, published = _run("calibrate", path, options)
-    if options.as_json:
-        print_json(calibration_json(result, published))
+run = _task_command(
+    "run",
+    """Run a campaign: calibrate, then learn to pour. Journal, figures and recording are written to runs/ID/.
+
+Ctrl-C pauses the run: a pour that has started is finished and weighed first. `--resume` continues it.
+""",
+)
+
+calibrate = _task_command(
+    "calibrate",
+    """Only calibrate: find the θ whose simulated spillage matches the weighed pours (C1 to C4), scored on other pours.
+
+The recommended θ is written to runs/ID/theta.json in SI units (cohesion in N/m, xsph_rate in 1/s), for `--parameters`.
+""",
+)
 
 
 def calibration_json(result: CampaignResult, published: Published) -> dict[str, Any]:
     """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see
     `CalibrationEvaluation`."""
-    from orchestrator.journal.stage_results import result_of
+    from orchestrator.journal.codec import result_of
     from orchestrator.results.stage_views import rival_scores
     from orchestrator.runs.stages import CALIBRATION, EVALUATION, calibrated_theta, deployed_theta
     from orchestrator.strategies.calibration.calibration_base import Calibrated
@@ -109,46 +166,60 @@ def calibration_json(result: CampaignResult, published: Published) -> dict[str, 
     }
 
 
-def plan_pour(
-    path: Path,
-    *,
-    parameters: Path | None,
-    receiver: Path | None,
-    iterations: int | None,
-    seed: int | None,
-    seeds: int,
-    thetas: int | None,
-    laboratory: Path | None,
-    in_process: bool,
-    as_json: bool,
+def plan(
+    campaign: Campaign,
+    parameters: Parameters = None,
+    receiver: Receiver = None,
+    iterations: Annotated[int | None, typer.Option(min=2, help="Iterations of the optimiser.")] = None,
+    seed: Seed = None,
+    seeds: Annotated[
+        int, typer.Option(min=2, max=1000, help="Simulations of the planned action, for its prediction interval.")
+    ] = 5,
+    thetas: Thetas = None,
+    laboratory: OtherLaboratory = None,
+    in_process: InProcess = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
-    """D1 for one receiver: the action that the calibrated simulator would pour with, and what to expect of it."""
-    from orchestrator.cli.prediction_inputs import foretelling
-    from orchestrator.journal.stage_results import result_of
+    """Plan a pour in simulation (D1), for the campaign's receivers or for a new one.
+
+    By default, fifteen actions are simulated, in parallel on all cores. The planned action is then simulated with
+    further seeds, which give its prediction and prediction interval. Nothing is poured.
+
+    Actions are shown in deg, deg/s, mm and s.
+    """
+    from orchestrator.cli.foreground_run import (
+        check_campaign_can_run,
+        check_laboratory_answers,
+        read_campaign,
+        run_in_front_of_people,
+    )
+    from orchestrator.cli.simulate_command import prediction_inputs
+    from orchestrator.journal.codec import result_of
     from orchestrator.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
     from orchestrator.strategies.deployment.deployment_result import Deployed
     from orchestrator.strategies.single_action import PredictedPour
 
-    plan = planning_plan(read_campaign(path, laboratory, seed), parameters, receiver, iterations)
-    assert plan.deployment is not None
-    planning = deployment_stages(plan, plan.deployment)
-    request = RunRequest(plan, planning, as_written=receiver is None)
+    chosen = planning_plan(read_campaign(campaign, laboratory, seed), parameters, receiver, iterations)
+    assert chosen.deployment is not None
+    planning = deployment_stages(chosen, chosen.deployment)
+    request = RunRequest(chosen, planning, as_written=receiver is None)
     check_campaign_can_run(request)
-    known = foretelling(plan, parameters, thetas, seeds)
+    known = prediction_inputs(chosen, parameters, thetas, seeds)
     count = max(seeds, len(known.drawn))
-    stages = [*planning, *prediction_stages(plan, plan.deployment, count, known.drawn)]
+    stages = [*planning, *prediction_stages(chosen, chosen.deployment, count, known.drawn)]
     resources = RunResources(in_process=in_process, brief=True)
     check_laboratory_answers(request, resources)
-    directory = run_directory(plan, resume=False, run_id=None)
+    directory = run_directory(chosen, resume=False, run_id=None)
     if parameters is None:
-        mention(
-            f"note: no --parameters given; planning with the campaign's ({json.dumps(plan.parameters.model_dump())})"
+        print_note(
+            f"note: no --parameters given; planning with the campaign's ({json.dumps(chosen.parameters.model_dump())})"
         )
     run_result, published = run_in_front_of_people(
         dataclasses.replace(request, stages=stages, folder=directory),
         resources,
-        again=f"Plan anew: decant plan {path}",
+        again=f"Plan anew: decant plan {campaign}",
         not_resumed="this planning is not resumed; what was simulated",
     )
     answers = []
@@ -170,11 +241,11 @@ def plan_pour(
                 "predicted_spillage": None if spillage is None else spillage.mean,
                 "predicted_spillage_deviation": None if spillage is None else spillage.deviation,
                 "predicted_deviation": recommended.predicted_deviation,
-                "loss": plan.deployment.loss_name,
+                "loss": chosen.deployment.loss_name,
                 **told.model_dump(mode="json", include=_TOLD),
             }
         )
-    theta = plan.parameters.model_dump()
+    theta = chosen.parameters.model_dump()
     if as_json:
         totals = {"simulations": run_result.simulations, "cpu_s": run_result.cpu_s, "run": str(directory)}
         first = answers[0]
@@ -204,43 +275,6 @@ def planning_plan(
     with Refused(ConfigError, RunTaskError):
         given = None if parameters is None else read_theta(parameters, plan)
         return planned(plan, given, None if receiver is None else load_vessel(receiver), iterations)
-
-
-def _run(task: Literal["run", "calibrate"], path: Path, options: RunOptions) -> tuple[CampaignResult, Published]:
-    from orchestrator.cli.foreground_run import check_somebody_is_there
-    from orchestrator.cli.motion_approval import arm_campaign
-    from orchestrator.cli.view_command import live_view
-    from orchestrator.run_service import RunResources, RunTaskError, task_request
-
-    with Refused(RunTaskError):
-        request = task_request(read_campaign(path, options.laboratory, options.seed), task)
-    plan = request.campaign
-    check_campaign_can_run(request)
-    if options.answer is not None and not options.resume:
-        raise RefusalError(
-            f"--answer {options.answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT
-        )
-    checksum = arm_campaign(plan, request.stages, armed=options.arm, verb=task)
-    if request.pours:
-        check_somebody_is_there(plan.laboratory)
-    resources = RunResources(in_process=options.in_process, approved_checksum=checksum or "")
-    check_laboratory_answers(request, resources)
-    live = live_view(plan, live=options.live, at=options.live_at)
-    directory = run_directory(plan, resume=options.resume, run_id=options.run_id)
-    flag = "" if options.laboratory is None else f" --laboratory {options.laboratory}"
-    flag += "" if options.seed is None else f" --seed {options.seed}"
-    flag += " --arm" if plan.laboratory.mode == "hardware" else ""
-    again = f"decant {task} {path} --resume --run {directory.name}{flag}"
-    result, published = run_in_front_of_people(
-        dataclasses.replace(request, folder=directory, resume="yes" if options.resume else "no"),
-        resources,
-        again=again,
-        answer=options.answer,
-        live=live,
-    )
-    if published.theta is not None:
-        mention(f"the parameters to use are in {published.theta}; give them with --parameters")
-    return result, published
 
 
 def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:

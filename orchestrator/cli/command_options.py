@@ -1,15 +1,20 @@
-"""Arguments and options that several commands share, and `call`, which runs a command."""
+"""Arguments and options that several commands share, and the classes of the application's commands.
+
+`command` turns a function with such parameters into a command. `Commands` and `Command` refuse names that earlier
+versions used, and give the new name (`RETIRED`).
+"""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from orchestrator.cli.console import BAD_INPUT, INTERRUPTED, RefusalError, fail, hush
+from orchestrator.cli.console import BAD_INPUT, INTERRUPTED, RefusalError, fail, set_quiet
 
 Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
@@ -33,7 +38,7 @@ Quiet = Annotated[
     typer.Option(
         "--quiet",
         "-q",
-        callback=hush,
+        callback=set_quiet,
         help="Print only results, questions, warnings and errors: no progress, no notes.",
     ),
 ]
@@ -60,10 +65,10 @@ SceneName = Annotated[
     str | None,
     typer.Option("--scene", help="'calibration', 'transfer' or a receiver's name; default: the first receiver."),
 ]
-Arm = Annotated[
+EnableMotion = Annotated[
     bool,
     typer.Option(
-        "--arm",
+        "--enable-motion",
         help="Enable motion of the hardware for this run only: shows what will move, requires the laboratory's name.",
     ),
 ]
@@ -95,19 +100,40 @@ Receiver = Annotated[
 ]
 
 
+RETIRED = {"arm": "enable", "--arm": "--enable-motion", "--verb": "--task"}
+"""Commands and options of earlier versions, with their new names."""
+
+
+class Commands(TyperGroup):
+    """The group of all commands."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Refuse a retired command."""
+        if args and args[0] not in self.commands:
+            _refuse_retired(args[:1])
+        return super().parse_args(ctx, args)
+
+
+class Command(TyperCommand):
+    """One command."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Refuse retired options."""
+        known = {name for parameter in self.params for name in parameter.opts}
+        options = (arg.partition("=")[0] for arg in args[: args.index("--") if "--" in args else len(args)])
+        _refuse_retired(option for option in options if option.startswith("--") and option not in known)
+        return super().parse_args(ctx, args)
+
+
+def _refuse_retired(names: Iterable[str]) -> None:
+    for name in names:
+        if name in RETIRED:
+            fail(RefusalError(f"{name}: is called {RETIRED[name]} now", BAD_INPUT))
+
+
 def examples(*commands: str) -> str:
     """Format the examples at the end of a command's help."""
     return "Examples:\n\n" + "\n\n".join(f"`{command}`" for command in commands)
-
-
-def given(options: dict[str, Any], *left_out: str) -> dict[str, Any]:
-    """Return a command's options by name, for the function that does its work.
-
-    Args:
-        options: `locals()` at the beginning of the command.
-        left_out: names that the function does not take; `--quiet` has already been applied.
-    """
-    return {name: value for name, value in options.items() if name not in ("quiet", *left_out)}
 
 
 def _expanded(path: Path) -> Path:
@@ -125,17 +151,27 @@ def _in_home(value: Any) -> Any:
         return _expanded(value)
     if isinstance(value, list | tuple):
         return type(value)(_in_home(item) for item in value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        paths = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-        return dataclasses.replace(value, **{name: _in_home(item) for name, item in paths.items()})
     return value
 
 
-def call(verb: Callable[..., None], *args: Any, **kwargs: Any) -> None:
+def call(work: Callable[..., None], /, *args: Any, **kwargs: Any) -> None:
     """Run a command; a refusal is printed and sets the exit code. `~` in paths is the home directory."""
     try:
-        verb(*map(_in_home, args), **{name: _in_home(value) for name, value in kwargs.items()})
+        work(*map(_in_home, args), **{name: _in_home(value) for name, value in kwargs.items()})
     except RefusalError as refusal:
         fail(refusal)
     except KeyboardInterrupt:
         fail(RefusalError("interrupted before anything had begun", INTERRUPTED))
+
+
+def command(work: Callable[..., None]) -> Callable[..., None]:
+    """Make a command of a function whose parameters declare its arguments and options.
+
+    The command does what `call` does; `--quiet` has been applied by its own callback.
+    """
+
+    @functools.wraps(work)
+    def run(*args: Any, **kwargs: Any) -> None:
+        call(work, *args, **kwargs)
+
+    return run

@@ -1,6 +1,6 @@
 """Console output of the commands: messages on stderr, results on stdout, refusals with exit codes, and progress.
 
-- `say` and `mention` print messages; `--quiet` suppresses the latter.
+- `print_message` and `print_note` print on stderr; `--quiet` suppresses the latter.
 - `print_json` prints a result as one line.
 - `RefusalError` ends a command with a message and an exit code.
 - `WaitingIndicator` and `waiting_for` report slow work: nothing for some seconds, then a line that is kept current.
@@ -52,7 +52,7 @@ class Refused:
             raise RefusalError(f"{self._at}{error}", self._code) from None
 
 
-def say(text: str) -> None:
+def print_message(text: str) -> None:
     """Print a message on stderr; stdout is for results."""
     with contextlib.suppress(OSError):  # a closed terminal must not interrupt a command that moves an arm
         print(text, file=sys.stderr, flush=True)
@@ -61,8 +61,8 @@ def say(text: str) -> None:
 _quiet = False
 
 
-def hush(quiet: bool) -> bool:
-    """Set whether `mention` prints nothing; questions, warnings of motion, and errors are always printed."""
+def set_quiet(quiet: bool) -> bool:
+    """Set whether `print_note` prints nothing; questions, warnings of motion, and errors are always printed."""
     global _quiet
     _quiet = quiet
     return quiet
@@ -73,10 +73,10 @@ def is_quiet() -> bool:
     return _quiet
 
 
-def mention(text: str) -> None:
+def print_note(text: str) -> None:
     """Print a note or a progress message, unless `--quiet` was given."""
     if not _quiet:
-        say(text)
+        print_message(text)
 
 
 def print_json(data: dict[str, Any]) -> None:
@@ -113,7 +113,7 @@ def stdout_for_results() -> Iterator[None]:
 
 def fail(refusal: RefusalError) -> NoReturn:
     """Print a refusal and exit with its code."""
-    say(f"decant: {refusal}" if refusal.code != BAD_INPUT else str(refusal))
+    print_message(f"decant: {refusal}" if refusal.code != BAD_INPUT else str(refusal))
     raise SystemExit(refusal.code)
 
 

@@ -1,28 +1,45 @@
-"""The commands `decant validate`, `decant migrate`, `decant init` and `decant plugins`.
+"""The commands for files: `decant validate`, `migrate`, `init`, `schema` and `plugins`.
 
 - `validate` reads files, builds vessels and tries actions; it starts nothing.
 - `migrate` rewrites files of earlier versions.
 - `init` copies example files into a folder.
+- `schema` prints JSON schemas.
 - `plugins` lists the plug-ins of installed packages, including those that can't be used.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import sys
 from pathlib import Path
+from typing import Annotated
 
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, WaitingIndicator, mention, print_json, say
-from orchestrator.installed_plugins import broken, installed
-from orchestrator.shipped import starting_set
+import typer
+
+from orchestrator.cli.command_options import Json, Quiet
+from orchestrator.cli.console import (
+    BAD_INPUT,
+    FAILED,
+    RefusalError,
+    WaitingIndicator,
+    print_json,
+    print_message,
+    print_note,
+)
 
 
-def validate(paths: list[Path]) -> None:
-    """Check files and print all their problems; exit code 2 if there is one. Implausible values are warnings."""
+def validate(
+    files: Annotated[
+        list[Path], typer.Argument(help="Campaign, study, vessel or laboratory files.", show_default=False)
+    ],
+    quiet: Quiet = False,
+) -> None:
+    """Check files without starting anything: keys, units, bounds, vessels, and whether some action can be poured."""
     from orchestrator.config.yaml.yaml_errors import ConfigError
     from sim_engine.vessel.shapes import VesselError
 
     bad = 0
-    for path in paths:
+    for path in files:
         try:
             with WaitingIndicator() as doing:
                 note, problems = _checked(path, doing)
@@ -32,11 +49,11 @@ def validate(paths: list[Path]) -> None:
             problems = [f"{path}: {error}"]
         if problems:
             bad += 1
-            say("\n".join(problems))
+            print_message("\n".join(problems))
         else:
             print(f"{path}: ok ({note})", flush=True)
     if bad:
-        raise RefusalError(f"{bad} of {len(paths)} file(s) can't be used", BAD_INPUT)
+        raise RefusalError(f"{bad} of {len(files)} file(s) can't be used", BAD_INPUT)
 
 
 def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
@@ -70,16 +87,17 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             warned: list[str] = []
             problems = check_campaign(plan, warn=lambda problem: warned.append(f"warning: {problem}"), doing=doing)
             for text in dict.fromkeys(warned):
-                mention(text)
+                print_note(text)
             return f"campaign, seed {plan.seed}", [str(problem) for problem in problems]
 
 
-def migrate(paths: list[Path]) -> None:
-    """Rename retired keys and values in files, in place; comments and layout are kept.
-
-    Raises:
-        RefusalError: a file can't be read, or has problems that a person has to solve (exit code 2).
-    """
+def migrate(
+    files: Annotated[
+        list[Path],
+        typer.Argument(help="Campaign, study, vessel, laboratory or daemon files; rewritten.", show_default=False),
+    ],
+) -> None:
+    """Rename what earlier versions called otherwise, in place; comments and layout stay."""
     from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
     from orchestrator.config.migration import migrate_file
     from orchestrator.config.yaml.file_access import resolved
@@ -98,12 +116,12 @@ def migrate(paths: list[Path]) -> None:
 
     kinds = {"vessel": load_vessel, "laboratory": load_laboratory, "study": load_study, "campaign": load_campaign}
     left = 0
-    for path in paths:
+    for path in files:
         try:
             kind = kind_of(Document.read(resolved(path)).data)
             result = migrate_file(path, load_daemon if kind is None else kinds[kind])
         except (ConfigError, OSError) as error:
-            say(str(error))
+            print_message(str(error))
             left += 1
             continue
         for line, old, new in result.renamed:
@@ -112,17 +130,15 @@ def migrate(paths: list[Path]) -> None:
             print(f"{path}: nothing to rename")
         if result.problems:
             left += 1
-            say("\n".join(map(str, result.problems)))
+            print_message("\n".join(map(str, result.problems)))
     if left:
-        raise RefusalError(f"{left} of {len(paths)} file(s) have problems that can't be solved by renaming", BAD_INPUT)
+        raise RefusalError(f"{left} of {len(files)} file(s) have problems that can't be solved by renaming", BAD_INPUT)
 
 
-def init(directory: Path) -> None:
-    """Copy the example campaigns and the files they refer to.
+def init(directory: Annotated[Path, typer.Argument(help="An empty folder, or one that does not exist yet.")]) -> None:
+    """Copy example files into a folder: campaigns, laboratories, studies, vessels and weighed pours."""
+    from orchestrator.shipped import starting_set
 
-    Raises:
-        RefusalError: the folder is not empty, or can't be written (exit code 2).
-    """
     try:
         campaigns = starting_set(directory)
     except FileExistsError as error:
@@ -133,15 +149,13 @@ def init(directory: Path) -> None:
         print(path)
 
 
-def plugins(*, as_json: bool) -> None:
-    """List strategies, objectives, balances, arms and sources of vessels by the names that files use.
+def plugins(as_json: Json = False) -> None:
+    """List the plug-ins of installed packages: strategies, objectives, balances, arms and sources of vessels.
 
-    Args:
-        as_json: print one line of JSON instead of the table.
-
-    Raises:
-        RefusalError: a plug-in can't be used (exit code 1).
+    Exit code 1 if a plug-in can't be used; the output gives its package and the reason.
     """
+    from orchestrator.installed_plugins import broken, installed
+
     found, unusable = installed(), broken()
     if as_json:
         print_json(
@@ -156,3 +170,14 @@ def plugins(*, as_json: bool) -> None:
             print(f"{plugin.group:<{width[0]}}  {plugin.name:<{width[1]}}  {plugin.package}")
     if unusable:
         raise RefusalError("\n".join(map(str, unusable)), FAILED)
+
+
+def schema(
+    which: Annotated[str, typer.Argument(help="campaign, study, vessel, laboratory, or result.")] = "campaign",
+) -> None:
+    """Print the JSON schema of campaign files (editors use it for completion), of other files, or of summary.json."""
+    from orchestrator.config.json_schema import SCHEMAS, schema_text
+
+    if which not in SCHEMAS:
+        raise RefusalError(f"no schema '{which}'; there are {', '.join(SCHEMAS)}", BAD_INPUT)
+    sys.stdout.write(schema_text(SCHEMAS[which]()))

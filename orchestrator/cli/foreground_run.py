@@ -26,8 +26,8 @@ from orchestrator.cli.console import (
     Refused,
     WaitingIndicator,
     is_quiet,
-    mention,
-    say,
+    print_message,
+    print_note,
     stdout_for_results,
 )
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from orchestrator.live_view.rerun_subscriber import RerunMonitor
     from orchestrator.results.publishing import Published
     from orchestrator.run_service import RunHandle, RunRequest, RunResources
-    from orchestrator.runs.unknown_pours import AskOperator
+    from orchestrator.runs.resume import AskOperator
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
 
@@ -67,7 +67,7 @@ def check_campaign_can_run(request: RunRequest) -> None:
     with WaitingIndicator() as doing:
         report = RunService().check(request, doing=doing)
     for text in report.warnings:
-        mention(f"warning: {text}")
+        print_note(f"warning: {text}")
     with Refused(RunTaskError):
         report.require()
 
@@ -83,7 +83,7 @@ def check_laboratory_answers(request: RunRequest, resources: RunResources) -> No
 
     laboratory = resources.settings(request.campaign)
     if laboratory.ray is not None and not laboratory.in_process:
-        mention(f"looking at the Ray cluster at {laboratory.ray.address} …")
+        print_note(f"looking at the Ray cluster at {laboratory.ray.address} …")
     with Refused(LaboratoryError):
         RunService().check_laboratory(request, resources)
 
@@ -162,15 +162,15 @@ def run_in_front_of_people(
 
     plan, directory = request.campaign, request.folder
     assert directory is not None
-    mention(f"run {directory}  ({plan.laboratory.mode} bench)" if request.pours else f"run {directory}")
+    print_note(f"run {directory}  ({plan.laboratory.mode} bench)" if request.pours else f"run {directory}")
     if request.resume == "no":
-        for line in not_simulated(plan, say):
-            mention(line)
+        for line in not_simulated(plan, print_message):
+            print_note(line)
 
     def recorder(plan: CampaignPlan, run: Path) -> RerunMonitor | None:
         if live is not None and can_record(plan):
-            mention(f"live view: {live.open()}")
-        return recorder_of(plan, run, say, live)
+            print_note(f"live view: {live.open()}")
+        return recorder_of(plan, run, print_message, live)
 
     handle: RunHandle | None = None
     result: CampaignResult | None = None
@@ -209,15 +209,15 @@ def run_in_front_of_people(
         if result is None:
             _close(handle, live)
             if (page := report_of_what_stands(plan, directory)) is not None:
-                mention(f"report of what stands  {page}")
+                print_note(f"report of what stands  {page}")
     try:
         _close(handle, live)
         published = handle.publish()
-        print_summary(plan, published.summary)
+        print_summary(published.summary)
     except KeyboardInterrupt:
         raise RefusalError(f"interrupted{finished_without_report(directory)}", INTERRUPTED) from None
     if published.report is not None:
-        mention(f"report  {published.report}")
+        print_note(f"report  {published.report}")
     return result, published
 
 
@@ -247,12 +247,12 @@ async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], *, res
         asked += 1
         if asked == 1:
             doing = "pausing" if resumable else "ending"
-            say(f"\n{doing}: {begun} is finished and weighed first; once more to give it up")
+            print_message(f"\n{doing}: {begun} is finished and weighed first; once more to give it up")
         else:
             left = (
                 "will have to be accounted for on resume" if resumable else "stays unknown: weigh by hand what can be"
             )
-            say(f"\nstopping now; {begun} {left}")
+            print_message(f"\nstopping now; {begun} {left}")
         task.cancel()
 
     loop = asyncio.get_running_loop()
@@ -296,12 +296,12 @@ def interruption(directory: Path, plan: CampaignPlan, again: str) -> str:
 
 def finished_without_report(directory: Path) -> str:
     """Follows 'interrupted' if all stages of a run are done and its results may not be published; empty otherwise."""
-    from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
     from orchestrator.journal.journal_file import JournalError
+    from orchestrator.journal.run_record import read_record
     from orchestrator.states import State
 
-    with contextlib.suppress(JournalError), JournalReader(directory / JOURNAL_NAME) as journal:
-        if journal.state() is State.FINISHED:
+    with contextlib.suppress(JournalError):
+        if read_record(directory).state is State.FINISHED:
             return (
                 " after the last stage, while the results were written; the run is finished, and nothing is lost. "
                 f"Write its summary, figures and report with: decant report {directory}"
@@ -311,20 +311,12 @@ def finished_without_report(directory: Path) -> str:
 
 def given_up_pours(directory: Path) -> list[str]:
     """Pours of a run that had begun and have no outcome: 'pour 3 of stage deployment:narrow'."""
-    from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
     from orchestrator.journal.journal_file import JournalError
-    from orchestrator.requests import Pour
-    from orchestrator.runs.replay import read_history
+    from orchestrator.journal.run_record import read_record
 
-    found: list[str] = []
-    with contextlib.suppress(JournalError), JournalReader(directory / JOURNAL_NAME) as journal:
-        for stage in [entry.stage for entry in journal.entries(kinds=[Kind.STAGE_OPENED])]:
-            history = read_history(journal, stage)
-            for key in history.unknown_pours():
-                request = history.request(key)
-                assert isinstance(request, Pour)
-                found.append(f"pour {request.number} of stage {stage}")
-    return found
+    with contextlib.suppress(JournalError):
+        return [f"pour {one.request.number} of stage {one.stage}" for one in read_record(directory).unknown_pours]
+    return []
 
 
 def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
@@ -333,21 +325,20 @@ def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
     Whatever goes wrong with it, a further Ctrl-C too, is no reason to say less about the run itself.
     """
     from orchestrator.journal.codec import digest
-    from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-    from orchestrator.journal.run_record import read_result
+    from orchestrator.journal.run_record import read_header, read_result
     from orchestrator.results.publishing import report_on
     from orchestrator.runs.fingerprint import fingerprint
 
-    with contextlib.suppress(Exception, KeyboardInterrupt), JournalReader(directory / JOURNAL_NAME) as journal:
-        if digest(journal.header.fingerprint) != digest(fingerprint(plan)):
+    with contextlib.suppress(Exception, KeyboardInterrupt):
+        if digest(read_header(directory).fingerprint) != digest(fingerprint(plan)):
             return None  # it was refused, since this is another campaign
-        return report_on(plan, read_result(journal, directory), draw=plan.outputs.figures)[0]
+        return report_on(plan, read_result(directory), draw=plan.outputs.figures)[0]
     return None
 
 
 def file_trouble(error: OSError, directory: Path) -> str:
     """What went wrong with a file of a run: which one, and how much room there should be where the disk is full."""
-    from orchestrator.journal.disk_reserve import MB, TO_BEGIN, free_space
+    from orchestrator.journal.journal_file import MB, TO_BEGIN, free_space
 
     where = error.filename or directory
     text = f"{where}: {error.strerror}"
@@ -399,5 +390,5 @@ def asked_about_unknown_pours(answer: str | None) -> AskOperator | None:
 
 
 async def _ask_on_terminal(question: str, options: Sequence[str]) -> str:
-    say(f"\n{question}\n  answer with one of: {' | '.join(options)}")
+    print_message(f"\n{question}\n  answer with one of: {' | '.join(options)}")
     return (await asyncio.to_thread(input, "> ")).strip()

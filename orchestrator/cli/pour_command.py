@@ -1,11 +1,7 @@
-"""`decant pour`: one pour that a person has chosen; planned only, with an empty pourer and slowly, or for real.
-
-The whole cycle of a pour with an empty pourer, slowly, nothing weighed: what one tries before any liquid.
-"""
+"""The command `decant pour`: one chosen pour, which is planned only, tried with an empty pourer, or weighed."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import math
@@ -14,26 +10,83 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from actors.arm.arm_interface import PathReport, PlannedPour
-from actors.interfaces import LaboratoryError
-from actors.laboratory import reached
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, mention, print_json, say
-from orchestrator.cli.foreground_run import check_output, read_campaign
-from orchestrator.cli.motion_approval import confirm, connected, require_flag, stoppable, typed_line
-from orchestrator.cli.pour_prediction import scene_to_simulate, wanted_in
-from orchestrator.runs.motion_envelope import report_lines
-from orchestrator.runs.safety_approval import SafetyRecordError, required_checksum
+import typer
+
+from orchestrator.cli.command_options import (
+    Assignments,
+    Campaign,
+    EnableMotion,
+    InProcess,
+    Json,
+    OtherLaboratory,
+    Quiet,
+    SceneName,
+)
+from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message, print_note
 
 if TYPE_CHECKING:
-    from actors.arm.arm_interface import Arm, Executed
+    from actors.arm.arm_interface import Executed, PathReport, PlannedPour
     from orchestrator.strategies.campaign_plan import CampaignPlan
     from orchestrator.strategies.single_action import WeighedPour
     from sim_engine.action import Action
     from sim_engine.scene import Scene
 
-STAGE = "pour"
+STAGE, RECORD = "pour", "pour.json"
+
+
+def pour(
+    campaign: Campaign,
+    assignments: Assignments = None,
+    scene: SceneName = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Plan, check and show the whole path of the arm; move nothing.")
+    ] = False,
+    connect: Annotated[
+        bool, typer.Option("--connect", help="With --dry-run: also check whether the arm is at home.")
+    ] = False,
+    png: Annotated[
+        Path | None, typer.Option(help="Draw the arm's path from the side and from above.", show_default=False)
+    ] = None,
+    empty: Annotated[
+        bool, typer.Option("--empty", help="Run the whole cycle with an empty pourer, without weighing.")
+    ] = False,
+    slow: Annotated[float, typer.Option(min=0.05, max=1.0, help="With --empty: fraction of the planned speed.")] = 1.0,
+    laboratory: OtherLaboratory = None,
+    in_process: InProcess = False,
+    enable_motion: EnableMotion = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Pour once with a given action on the campaign's bench, only plan the pour, or try it with an empty pourer.
+
+    A pour with liquid is recorded in a journal and weighed, as a small run; `--empty` writes a record, pour.json.
+    """
+    from orchestrator.cli.foreground_run import check_output
+    from orchestrator.cli.motion_control import require_flag
+
+    _check_options(dry_run=dry_run, connect=connect, empty=empty, slow=slow)
+    check_output(png, "--png", ".png")
+    chosen = _chosen(campaign, laboratory, assignments or [], scene)
+    bench = chosen.plan.laboratory
+    if chosen.path is None and (dry_run or empty or png is not None):
+        raise RefusalError(
+            f"laboratory {bench.name} has no arm whose path could be planned; its bench is made of numbers",
+            BAD_INPUT,
+        )
+    if png is not None:
+        _draw(chosen, png)
+    if dry_run:
+        _dry_run(chosen, connect=connect, as_json=as_json)
+        return
+    again = f"decant pour {campaign}" + ("" if laboratory is None else f" --laboratory {laboratory}")
+    require_flag(bench, enabled=enable_motion, again=f"{again} … --enable-motion")
+    if empty:
+        assert chosen.path is not None
+        pour_empty(chosen.plan, chosen.action, chosen.path.slowed(slow), slow=slow, as_json=as_json)
+        return
+    _pour(chosen, in_process=in_process, again=f"Another pour: {again} …", as_json=as_json)
 
 
 @dataclass(frozen=True)
@@ -49,63 +102,6 @@ class Chosen:
     scene: Scene
     action: Action
     path: PlannedPour | None
-
-
-def pour(
-    path: Path,
-    *,
-    assignments: list[str] | None,
-    scene: str | None,
-    dry_run: bool,
-    connect: bool,
-    png: Path | None,
-    empty: bool,
-    slow: float,
-    arm: bool,
-    laboratory: Path | None,
-    in_process: bool,
-    as_json: bool,
-) -> None:
-    """One pour.
-
-    Args:
-        path: campaign.
-        assignments: of the action, `name=value`.
-        scene: 'calibration', 'transfer' or a receiver's name; the first receiver if not given.
-        dry_run: plan and check the whole path, and move nothing.
-        connect: with `dry_run`: also read where the arm stands.
-        png: picture of the path.
-        empty: the whole cycle with an empty pourer, nothing weighed.
-        slow: with `empty`, fraction of the planned speed.
-        arm: whether `--arm` was given.
-        laboratory: file in place of the campaign's.
-        in_process: without Ray.
-        as_json: print the result as JSON.
-
-    Raises:
-        RefusalError: it can't be made (exit code 2), or did not go as it should (1).
-    """
-    _check_options(dry_run=dry_run, connect=connect, empty=empty, slow=slow)
-    check_output(png, "--png", ".png")
-    chosen = _chosen(path, laboratory, assignments or [], scene)
-    bench = chosen.plan.laboratory
-    if chosen.path is None and (dry_run or empty or png is not None):
-        raise RefusalError(
-            f"laboratory {bench.name} has no arm whose path could be planned; its bench is simulated",
-            BAD_INPUT,
-        )
-    if png is not None:
-        _draw(chosen, png)
-    if dry_run:
-        _dry_run(chosen, connect=connect, as_json=as_json)
-        return
-    verb = f"decant pour {path}" + ("" if laboratory is None else f" --laboratory {laboratory}")
-    require_flag(bench, armed=arm, again=f"{verb} … --arm")
-    if empty:
-        assert chosen.path is not None
-        pour_empty(chosen.plan, chosen.action, chosen.path.slowed(slow), slow=slow, as_json=as_json)
-        return
-    _pour(chosen, in_process=in_process, again=f"Another pour: {verb} …", as_json=as_json)
 
 
 def _check_options(*, dry_run: bool, connect: bool, empty: bool, slow: float) -> None:
@@ -127,6 +123,8 @@ def _chosen(path: Path, laboratory: Path | None, assignments: list[str], scene_n
         RefusalError: it can't be made (exit code 2).
     """
     from actors.interfaces import InvalidActionError
+    from orchestrator.cli.foreground_run import read_campaign
+    from orchestrator.cli.simulate_command import scene_to_simulate, wanted_in
     from orchestrator.config.action_assignments import assigned_action
     from orchestrator.config.campaign_checks import check_vessels
 
@@ -156,15 +154,15 @@ def report_json(report: PathReport) -> dict[str, Any]:
 def _draw(chosen: Chosen, png: Path) -> None:
     from actors.arm.arm_settings import UrArmSettings
     from actors.arm.planned_pour import PourPath
-    from orchestrator.results.arm_path_figures import path_png
+    from orchestrator.results import figure_style
+    from orchestrator.results.pour_figures import draw_path
     from sim_engine.vessel.vessel import build_vessel
 
     arm = chosen.plan.laboratory.arm
     if not isinstance(chosen.path, PourPath) or not isinstance(arm, UrArmSettings):
         raise RefusalError("--png: draws the joints of an arm, and this arm's path has none", BAD_INPUT)
     pourer, receiver = build_vessel(chosen.scene.pourer), build_vessel(chosen.scene.receiver)
-    drawn = path_png(
-        png,
+    figure = draw_path(
         chosen.path,
         arm,
         pourer,
@@ -172,14 +170,16 @@ def _draw(chosen: Chosen, png: Path) -> None:
         title=f"{chosen.scene.pourer.name} into {chosen.scene.receiver.name}, laboratory {chosen.plan.laboratory.name}",
         note=chosen.action.display(),
     )
-    mention(f"picture: {drawn}")
+    print_note(f"picture: {figure_style.save(figure, png)}")
 
 
 def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
+    from orchestrator.runs.motion_approval import report_lines
+
     planned, laboratory = chosen.path, chosen.plan.laboratory
     assert planned is not None
     assert laboratory.arm is not None
-    mention(f"{chosen.scene.name}: {chosen.action.display()}; laboratory {laboratory.name}, {laboratory.mode}")
+    print_note(f"{chosen.scene.name}: {chosen.action.display()}; laboratory {laboratory.name}, {laboratory.mode}")
     home = _stands_at_home(chosen) if connect else None
     if as_json:
         print_json(
@@ -194,7 +194,7 @@ def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
     else:
         for line in [*report_lines(planned.report), *_way_lines(planned)]:
             print(line)
-    say("nothing was moved")
+    print_message("nothing was moved")
 
 
 def _way_lines(planned: PlannedPour) -> list[str]:
@@ -212,10 +212,13 @@ def _stands_at_home(chosen: Chosen) -> bool:
     Raises:
         RefusalError: it can't be read.
     """
+    from actors.interfaces import LaboratoryError
+    from actors.laboratory import reached
+
     with Refused(LaboratoryError, code=FAILED), reached(chosen.plan.laboratory) as ready:
         assert ready.arm is not None
         check = ready.arm.diagnostics().at_home()
-    say(f"the arm stands {check.found}" + (f" → {check.advice}" if check.advice else ""))
+    print_message(f"the arm stands {check.found}" + (f" → {check.advice}" if check.advice else ""))
     return check.state == "ok"
 
 
@@ -227,8 +230,10 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
         check_somebody_is_there,
         run_in_front_of_people,
     )
-    from orchestrator.journal.stage_results import result_of
+    from orchestrator.cli.motion_control import confirm
+    from orchestrator.journal.codec import result_of
     from orchestrator.run_service import RunRequest, RunResources
+    from orchestrator.runs.motion_approval import SafetyRecordError, report_lines, required_checksum
     from orchestrator.runs.stages import StageDefinition
     from orchestrator.strategies.single_action import OnePour, OnePoured
 
@@ -287,9 +292,6 @@ def told(weighed: WeighedPour) -> str:
     return f"{masses}, delivered {weighed.delivered_g:.1f} g ({weighed.delivered_ml:.1f} mL); {r}"
 
 
-RECORD = "pour.json"
-
-
 def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: float, as_json: bool) -> None:
     """Approach, tilt, return, retreat.
 
@@ -303,6 +305,10 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
     Raises:
         RefusalError: refused (exit code 2), or stopped on the way (1).
     """
+    from actors.interfaces import LaboratoryError
+    from actors.laboratory import reached
+    from orchestrator.cli.motion_control import EmptyCycle, confirm, connected
+    from orchestrator.runs.motion_approval import SafetyRecordError, report_lines, required_checksum
     from orchestrator.runs.run_folder import create_run
 
     laboratory = plan.laboratory
@@ -316,7 +322,7 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
     if hardware:
         confirm(laboratory, lines)
     else:
-        say(f"laboratory {laboratory.name}, virtual: nothing moves but numbers\n" + "\n".join(lines))
+        print_message(f"laboratory {laboratory.name}, virtual: nothing moves but numbers\n" + "\n".join(lines))
     try:
         directory = create_run(dataclasses.replace(plan, name=f"{plan.name}-empty"))
         with reached(laboratory) as ready:
@@ -324,7 +330,7 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
             # this command announces each movement itself, by counting down before it lets the arm move
             driver = ready.with_values(arm=ready.arm.with_values(warning_time=0.0))
             with connected(driver, checksum) as (arm, facts):
-                cycle = _Cycle(arm, path, ready.arm.on_clock(laboratory.arm.warning_time), ask=hardware)
+                cycle = EmptyCycle(arm, path, ready.arm.on_clock(laboratory.arm.warning_time), ask=hardware)
                 executed = cycle.run()
     except LaboratoryError as error:
         raise RefusalError(str(error), FAILED) from None
@@ -346,66 +352,7 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
         print_json({"run": str(directory), **record})
     else:
         print(_told(executed))
-    say(f"record: {directory / RECORD}")
-
-
-class _Cycle:
-    """One cycle, with a person's consent to each movement where there is hardware."""
-
-    def __init__(self, arm: Arm, path: PlannedPour, announcement: float, *, ask: bool) -> None:
-        self._arm, self._path, self._announcement, self._ask = arm, path, announcement, ask
-
-    def run(self) -> Executed:
-        """Raises LaboratoryError where it is refused, or stopped."""
-        self._arm.hands_in()
-        self._consent(
-            "Put the EMPTY pourer into the gripper, and take hands and tools out of the cell. Emergency stop in hand?"
-        )
-        self._moving("approach", lambda: self._arm.move_to_start(self._path))
-        try:
-            executed: Executed = self._moving("pour", lambda: self._arm.execute(self._path))
-        except LaboratoryError as error:
-            self._upright(error)
-            raise
-        self._moving("retreat", lambda: self._arm.retreat(self._path))
-        return executed
-
-    def _moving(self, name: str, motion: Callable[[], Any]) -> Any:
-        say(f"{name} …")
-        return stoppable(self._arm, motion)
-
-    def _upright(self, error: LaboratoryError) -> None:
-        """After a stop with the pourer tilted: upright and home, if somebody says so."""
-        say(str(error))
-        if not self._ask:
-            return
-        if not _yes("Find the cause and mend it. Shall the arm bring the pourer upright, slowly, and go home?"):
-            return
-        with contextlib.suppress(LaboratoryError):
-            self._arm.release()
-            say(f"ready again: {self._arm.recover() or 'nothing had to be done'}")
-        self._released()
-        self._moving("upright", self._arm.untilt)
-        self._released()
-        self._moving("retreat", lambda: self._arm.retreat(self._path))
-
-    def _consent(self, text: str) -> None:
-        if self._ask and not _yes(text):
-            raise LaboratoryError("not confirmed; nothing has moved")
-        self._released()
-
-    def _released(self) -> None:
-        left = self._announcement
-        while left > 0.0:
-            say(f"the arm moves in {left:.0f} s; Ctrl-C stops it" if left >= 0.5 else "the arm moves")
-            time.sleep(min(left, 1.0))
-            left -= 1.0
-        self._arm.release()
-
-
-def _yes(text: str) -> bool:
-    say(f"\n{text}")
-    return typed_line("type 'yes' to go on > ").strip().lower() == "yes"
+    print_message(f"record: {directory / RECORD}")
 
 
 def _told(executed: Executed) -> str:

@@ -1,13 +1,17 @@
-"""Options and help texts of the daemon's commands: `serve`, `submit`, `list`, `show` and others.
+"""The daemon's commands: `decant serve`, and the commands that call the daemon over HTTP.
 
-Their work is done in `queue_actions`.
+The HTTP client is in `orchestrator.daemon.daemon_client`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,12 +22,13 @@ from orchestrator.cli.command_options import (
     Parameters,
     Receiver,
     Seed,
-    call,
-    examples,
-    given,
 )
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message, print_note
 
-Key = Annotated[
+if TYPE_CHECKING:
+    from orchestrator.daemon.daemon_client import Client
+
+CampaignId = Annotated[
     str,
     typer.Argument(metavar="CAMPAIGN_ID", help="Id as shown by 'decant list', or a prefix of it.", show_default=False),
 ]
@@ -57,14 +62,60 @@ def serve(
     stopped, and asks the operator about a pour that had started. SIGTERM or Ctrl-C stops it at the next safe point, a
     second signal at once.
     """
-    from orchestrator.cli import queue_actions as verb
+    from orchestrator.config.yaml.file_access import resolved
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.run_errors import RunError
 
-    call(verb.serve, settings, state=state, port=port, simulators=simulators, in_process=in_process)
+    _require_extra()
+    from orchestrator.daemon import server_process
+    from orchestrator.daemon.daemon_settings import load_settings
+
+    try:
+        chosen = load_settings(
+            settings,
+            state=None if state is None else resolved(state),
+            port=port,
+            simulators=simulators,
+            in_process=in_process or None,
+        )
+        server_process.log_lines()
+        text = f"state in {chosen.state}. 'decant submit CAMPAIGN' queues one"
+        server_process.serve(chosen, lambda url: print_message(f"serving {url}; {text}"))
+    except ConfigError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    except RunError as error:
+        raise RefusalError(str(error), error.exit_code) from None
+    except OSError as error:
+        where = error.filename or "state directory"
+        cure = "--state or $DECANT_STATE names another folder"
+        raise RefusalError(f"{where}: {error.strerror}; {cure}", BAD_INPUT) from None
+
+
+def _require_extra() -> None:
+    from sim_engine.resources import MissingExtraError, require
+
+    for module in ("fastapi", "uvicorn", "httpx", "prometheus_client", "pythonjsonlogger"):
+        with Refused(MissingExtraError):
+            require(module, "the daemon")
+
+
+@contextmanager
+def connected_client(url: str | None, state: Path | None) -> Iterator[Client]:
+    """Open a client of the daemon; its refusals end the command."""
+    _require_extra()
+    from orchestrator.daemon.daemon_client import Client
+    from orchestrator.run_errors import RunError
+
+    try:
+        with Client(url, state) as client:
+            yield client
+    except RunError as error:
+        raise RefusalError(str(error), error.exit_code) from None
 
 
 def submit(
     campaign: Campaign,
-    verb: Annotated[str, typer.Option("--verb", help="Task: run, calibrate or plan.")] = "run",
+    task: Annotated[str, typer.Option(help="Task: run, calibrate or plan.")] = "run",
     rig: Annotated[str, typer.Option(help="Rig to run on, if several match.", show_default=False)] = "",
     priority: Annotated[int, typer.Option(help="Higher priorities run first.")] = 0,
     laboratory: OtherLaboratory = None,
@@ -73,31 +124,107 @@ def submit(
     receiver: Receiver = None,
     iterations: Annotated[
         int | None,
-        typer.Option(min=1, help="With --verb plan: simulations instead of the campaign's.", show_default=False),
+        typer.Option(min=1, help="With --task plan: simulations instead of the campaign's.", show_default=False),
     ] = None,
     url: Url = None,
     state: State = None,
     as_json: Json = False,
 ) -> None:
     """Add a campaign to the daemon's queue, with copies of all files that it refers to."""
-    options = given(locals(), "campaign", "verb", "url", "state")
-    from orchestrator.cli import queue_actions as module
+    from orchestrator.cli.foreground_run import read_campaign
+    from orchestrator.daemon.submissions import pack
 
-    call(module.submit, campaign, wanted=verb, at=(url, state), **options)
+    plan = read_campaign(campaign, laboratory, seed)
+    if (parameters, receiver, iterations) != (None, None, None):
+        from orchestrator.cli.campaign_commands import planning_plan
+
+        if task != "plan":
+            raise RefusalError("--parameters, --receiver and --iterations go with --task plan", BAD_INPUT)
+        plan = planning_plan(plan, parameters, receiver, iterations)
+    try:
+        packed, files = pack(plan, parameters)
+    except OSError as error:
+        raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
+    with connected_client(url, state) as client:
+        body = {"text": packed, "files": files, "task": task, "rig": rig, "priority": priority}
+        found = client.post("/campaigns", body)
+    if as_json:
+        print_json(found)
+        return
+    print(found["id"])
+    print_note(f"queued for {found['rig']}; follow it with: decant logs -f {found['id']}")
+    if found["needs_enabling"]:
+        print_message(f"hardware: it waits until its motion is enabled: decant enable {found['id']}")
 
 
 def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) -> None:
     """List campaigns, rigs, open questions and problems."""
-    from orchestrator.cli import queue_actions as verb
+    with connected_client(url, state) as client:
+        status, campaigns = client.get("/status"), client.get("/campaigns", limit=50)
+        questions = client.get("/questions")
+    if as_json:
+        print_json({"status": status, "campaigns": campaigns, "questions": questions})
+        return
+    stops = [("", status["emergency"]), *((f" of {rig['name']}", rig["emergency"]) for rig in status["rigs"])]
+    for of, stop in stops:
+        if stop:
+            print_message(
+                f"EMERGENCY STOP{of} by {stop['by']}, {_clock(stop['time'])}: {stop['reason'] or 'no reason given'}"
+            )
+    for problem in status["problems"]:
+        print_message(f"problem: {problem}")
+    for rig in status["rigs"]:
+        if (arm := rig["arm"]) and arm["state"] != "ok":
+            print_message(f"arm of {rig['name']}: {arm['text']}" + (f" → {arm['advice']}" if arm["advice"] else ""))
+    if status["queue_paused"]:
+        print_message("the queue is paused: decant resume")
+    rows = [("CAMPAIGN", "STATE", "RIG", "SUBMITTED", "")]
+    for one in campaigns:
+        rows.append((one["id"], one["state"], one["rig"], _clock(one["created"]), _standing(one)))
+    widths = [max(len(row[i]) for row in rows) for i in range(4)]
+    for row in rows:
+        print("  ".join([*(text.ljust(width) for text, width in zip(row[:4], widths, strict=True)), row[4]]).rstrip())
+    for question in questions:
+        _print_question(question)
 
-    call(verb.list_campaigns, at=(url, state), as_json=as_json)
+
+def _standing(one: dict[str, Any]) -> str:
+    progress = one["progress"]
+    if one["needs_enabling"]:
+        return f"waits for: decant enable {one['id']}"
+    if progress is None:
+        return str(one["reason"]).split("\n", maxsplit=1)[0][:100]
+    parts = [f"{progress['stage']} ({progress['stage_index']}/{progress['stage_count']})"] if progress["stage"] else []
+    if progress["of_pours"]:
+        parts.append(f"{progress['pours']}/{progress['of_pours']} pours")
+    if progress["of_simulations"]:
+        parts.append(f"{progress['simulations']}/{progress['of_simulations']} simulations")
+    parts += [progress["checkpoint_words"]] if progress["checkpoint_words"] else []
+    return " · ".join(parts)
 
 
-def show(key: Key, url: Url = None, state: State = None, as_json: Json = False) -> None:
+def show(key: CampaignId, url: Url = None, state: State = None, as_json: Json = False) -> None:
     """Show one campaign: its progress, its pours with predictions and weights, and the audit entries."""
-    from orchestrator.cli import queue_actions as verb
-
-    call(verb.show, key, at=(url, state), as_json=as_json)
+    with connected_client(url, state) as client:
+        found = client.get(f"/campaigns/{key}")
+    if as_json:
+        print_json(found)
+        return
+    print(f"{found['id']}: {found['state']}  ({found['task']} on {found['rig']}, {found['mode']})")
+    for name in ("reason", "run", "live"):
+        if found[name]:
+            print(f"  {name:10s} {found[name]}")
+    print(f"  submitted  {_clock(found['created'])} by {found['by']}")
+    if found["progress"] is not None:
+        print(f"  now        {_standing(found)}")
+        print(f"             {found['progress']['line']}")
+    for pour in found["pours_made"]:
+        told = pour["measured"] or {"unknown": "UNKNOWN"}.get(pour["state"], pour["state"])
+        told += f" ({pour['loss']})" if pour["state"] == "weighed" else ""
+        predicted = f"  predicted {pour['predicted']}" if pour["predicted"] else ""
+        print(f"  pour {pour['number']:<3d} into {pour['receiver']}  {pour['action']}{predicted}  → {told}")
+    for entry in found["audit"]:
+        print(f"  {_clock(entry['t'])}  {entry['by']}: {entry['what']} {entry['detail']}".rstrip())
 
 
 def logs(
@@ -110,9 +237,61 @@ def logs(
     state: State = None,
 ) -> None:
     """Print past events, and with -f also new events as they happen."""
-    from orchestrator.cli import queue_actions as verb
+    with connected_client(url, state) as client:
+        only = None if key is None else client.get(f"/campaigns/{key}")["id"]
+        try:
+            for told in client.events(0, only, follow=follow):
+                line = json.dumps({"id": told.id, **told.data}, ensure_ascii=False) if as_json else _line(told.data)
+                if line:
+                    print(line, flush=True)
+        except KeyboardInterrupt:
+            return
 
-    call(verb.logs, key, follow=follow, as_json=as_json, at=(url, state))
+
+_PASSING = ("PourProgressed", "StrategyProgressed", "SpeculationProgressed", "RequestStarted", "StageClosed")
+
+
+def _line(event: dict[str, Any]) -> str | None:
+    """Format an event for the user; None for events that are not shown."""
+    kind = event["type"]
+    match kind:
+        case _ if kind in _PASSING:
+            return None
+        case "LogLine":
+            text = f"{event['level']}: {event['text']}"
+        case "CampaignStateChanged":
+            text = f"{event['before']} → {event['after']}" + (f": {event['reason']}" if event["reason"] else "")
+        case "CampaignRests":
+            text = f"rests: {event['state']}" + (f": {event['reason']}" if event["reason"] else "")
+        case "StageOpened":
+            text = f"stage {event['stage']} ({event['index']}/{event['count']})"
+        case "RequestFinished":
+            text = _finished(event)
+        case "DecisionMade":
+            text = event["decision"]["text"]
+        case "QuestionAsked" | "QuestionAnswered" | "QuestionClosed":
+            question = event["question"]
+            said = f" → {question['answer']} ({question['by']})" if question["answer"] else ""
+            text = f"question {question['id']}: {question['text']}{said}"
+        case "AuditEntry":
+            text = f"{event['by']}: {event['what']} {event['detail']}".rstrip()
+        case _:
+            text = " ".join([kind, *(str(event[k]) for k in ("text", "rig", "state") if event.get(k))])
+    return f"{_clock(event['time'])}  {event['campaign'] or 'daemon'}  {text}"
+
+
+def _finished(event: dict[str, Any]) -> str:
+    request, outcome = event["request"], event["outcome"]
+    what = f"pour {request['number']}" if request["type"] == "Pour" else request["type"].lower()
+    match outcome["type"]:
+        case "Poured":
+            masses = outcome["measurement"]
+            return f"{what}: {1e3 * masses['spilled']:.1f} g spilled of {1e3 * masses['loaded']:.1f} g"
+        case "Simulated":
+            return f"{what}: {100 * outcome['outcome']['spilled']:.2f} % spilled"
+        case "Failed":
+            return f"{what}: failed: {outcome['reason']}"
+    return f"{what}: {outcome['type'].lower()}"
 
 
 def pause(
@@ -124,9 +303,7 @@ def pause(
 
     Without a campaign, the queue is paused: no campaign starts, and running ones continue.
     """
-    from orchestrator.cli import queue_actions as verb
-
-    call(verb.act, key, "pause", at=(url, state))
+    _change(key, "pause", url, state)
 
 
 def resume(
@@ -135,16 +312,22 @@ def resume(
     state: State = None,
 ) -> None:
     """Resume a paused campaign, or the queue."""
-    from orchestrator.cli import queue_actions as verb
-
-    call(verb.act, key, "resume", at=(url, state))
+    _change(key, "resume", url, state)
 
 
-def stop(key: Key, url: Url = None, state: State = None) -> None:
+def stop(key: CampaignId, url: Url = None, state: State = None) -> None:
     """Stop a campaign, or remove it from the queue. A started pour is finished; the results are published."""
-    from orchestrator.cli import queue_actions as verb
+    _change(key, "stop", url, state)
 
-    call(verb.act, key, "stop", at=(url, state))
+
+def _change(key: str | None, what: str, url: str | None, state: Path | None) -> None:
+    """Pause, resume or stop a campaign, or pause or resume the queue if none is given."""
+    with connected_client(url, state) as client:
+        found = client.post(f"/queue/{what}" if key is None else f"/campaigns/{key}/{what}")
+    if key is None:
+        print("queue paused" if found["queue_paused"] else "queue goes on")
+    else:
+        print(f"{found['id']}: {found['state']}, wanted: {found['desired_state']}")
 
 
 def abort(
@@ -163,9 +346,23 @@ def abort(
 
     A software stop is not a safety function: keep the robot's own emergency stop within reach.
     """
-    from orchestrator.cli import queue_actions as verb
-
-    call(verb.abort, key, everything=everything, clear=clear, rig=rig, at=(url, state))
+    if sum((key is not None, everything, clear or rig is not None)) != 1:
+        raise RefusalError(
+            "name one campaign, or --all for the emergency stop, or --rig for that of one rig, or --clear to end one",
+            BAD_INPUT,
+        )
+    with connected_client(url, state) as client:
+        if key is not None:
+            found = client.post(f"/campaigns/{key}/abort")
+            print(f"{found['id']}: {found['state']}, wanted: {found['desired_state']}")
+            return
+        client.post("/emergency-stop/clear" if clear else "/emergency-stop", {"rig": rig or ""})
+    of = f" of {rig}" if rig else ""
+    option = f" --rig {rig}" if rig else ""
+    if clear:
+        print(f"emergency stop{of} cleared: what was given up rests until it is resumed")
+    else:
+        print(f"EMERGENCY STOP{of}: the work is given up; nothing begins there before 'decant abort --clear{option}'")
 
 
 def answer(
@@ -175,20 +372,56 @@ def answer(
     state: State = None,
 ) -> None:
     """Answer a question, or list the open questions if none is given."""
-    from orchestrator.cli import queue_actions as verb
+    with connected_client(url, state) as client:
+        if question is None:
+            questions = client.get("/questions")
+            for one in questions:
+                _print_question(one)
+            if not questions:
+                print_message("no question is open")
+            return
+        if not text:
+            raise RefusalError(
+                f"question {question}: what is the answer? 'decant answer' lists the questions", BAD_INPUT
+            )
+        found = client.post(f"/questions/{question}/answer", {"answer": " ".join(text)})
+    print(f"question {found['id']}: {found['answer']}")
 
-    call(verb.answer, question, " ".join(text or ()), at=(url, state))
+
+def _print_question(question: dict[str, Any]) -> None:
+    print(f"\nquestion {question['id']} ({question['campaign']}, {question['rig']}), {_clock(question['asked'])}")
+    if question["problem"]:
+        print(f"  {question['problem']}")
+    print(f"  {question['text']}")
+    for name, value in question["details"].items():
+        print(f"    {name}: {value}")
+    wanted = " | ".join(question["options"]) or {"done": "done", "yes or no": "yes | no"}.get(
+        question["wants"], "a weight, such as '203.4 g'"
+    )
+    print(f"  decant answer {question['id']} …   ({wanted})")
 
 
-def arm(key: Key, url: Url = None, state: State = None) -> None:
+def enable(key: CampaignId, url: Url = None, state: State = None) -> None:
     """Enable motion for the coming part of a run: shows what will move, and requires the laboratory's name."""
-    from orchestrator.cli import queue_actions as verb
+    from orchestrator.cli.motion_control import announce
 
-    call(verb.arm, key, at=(url, state))
+    if not sys.stdin.isatty():
+        raise RefusalError(
+            "motion of hardware is enabled by an operator, who reads what it will do and types its name: that needs "
+            "a terminal",
+            BAD_INPUT,
+        )
+    with connected_client(url, state) as client:
+        print_message("planning paths from all over the actions …")
+        moves = client.get(f"/campaigns/{key}/motion")
+        announce(moves["laboratory"], moves["arm"], moves["lines"])
+        print("> ", end="", file=sys.stderr, flush=True)
+        found = client.post(f"/campaigns/{key}/enable", {"laboratory": sys.stdin.readline().strip()})
+    print_message(f"motion is enabled for the coming part of the run: {found['id']}")
 
 
 def move(
-    key: Key,
+    key: CampaignId,
     before: Annotated[str | None, typer.Option(help="Move in front of this campaign.", show_default=False)] = None,
     first: Annotated[bool, typer.Option("--first", help="Move to the head of the queue.")] = False,
     priority: Annotated[int | None, typer.Option(help="Higher priorities run first.", show_default=False)] = None,
@@ -196,46 +429,23 @@ def move(
     state: State = None,
 ) -> None:
     """Move a queued campaign to another place."""
-    from orchestrator.cli import queue_actions as verb
-
-    call(verb.move, key, before="" if first else before, priority=priority, at=(url, state))
+    before = "" if first else before
+    if before is None and priority is None:
+        raise RefusalError("where to? --first, --before CAMPAIGN_ID or --priority N", BAD_INPUT)
+    with connected_client(url, state) as client:
+        client.post(f"/campaigns/{key}/move", {"before": before, "priority": priority})
+        queue = client.get("/campaigns", state="queued")
+    for place, one in enumerate(queue, start=1):
+        print(f"{place:3d}  {one['id']}  (priority {one['priority']})")
 
 
 def shutdown(url: Url = None, state: State = None) -> None:
     """Shut the daemon down at the next safe point; a second time: at once. The queue is kept."""
-    from orchestrator.cli import queue_actions as verb
-
-    call(verb.shutdown, at=(url, state))
-
-
-_VERBS: dict[str, tuple[Callable[..., None], tuple[str, ...]]] = {
-    "serve": (serve, ("decant serve", "decant serve lab.yaml --port 0", "decant serve --state /tmp/try --in-process")),
-    "submit": (
-        submit,
-        (
-            "decant submit configs/campaigns/quickstart.yaml",
-            "decant submit my.yaml --rig left --priority 5",
-            "decant submit my.yaml --verb plan --parameters theta.json --receiver configs/vessels/bowl.yaml",
-        ),
-    ),
-    "list": (list_campaigns, ("decant list", "decant list --json")),
-    "show": (show, ("decant show quickstart-3f2a1c",)),
-    "logs": (logs, ("decant logs -f", "decant logs quickstart-3f2a1c --json")),
-    "pause": (pause, ("decant pause quickstart-3f2a1c", "decant pause   # the queue")),
-    "resume": (resume, ("decant resume quickstart-3f2a1c", "decant resume   # the queue")),
-    "stop": (stop, ("decant stop quickstart-3f2a1c",)),
-    "abort": (
-        abort,
-        ("decant abort quickstart-3f2a1c", "decant abort --all", "decant abort --rig left", "decant abort --clear"),
-    ),
-    "answer": (answer, ("decant answer", "decant answer 7 done", "decant answer 8 weighed 3.2 0.4")),
-    "arm": (arm, ("decant arm narrow-1b2c3d",)),
-    "move": (move, ("decant move narrow-1b2c3d --first",)),
-    "shutdown": (shutdown, ("decant shutdown",)),
-}
+    with connected_client(url, state) as client:
+        client.post("/shutdown")
+    print("ending at the next safe point; its queue is kept")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the application."""
-    for name, (verb, shown) in _VERBS.items():
-        app.command(name, epilog=examples(*shown), rich_help_panel="Daemon")(verb)
+def _clock(t: float) -> str:
+    same_day = time.strftime("%Y%m%d", time.localtime(t)) == time.strftime("%Y%m%d")
+    return time.strftime("%H:%M:%S" if same_day else "%Y-%m-%d %H:%M", time.localtime(t))

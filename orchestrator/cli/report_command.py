@@ -7,14 +7,8 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Json, Quiet, call, examples
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, print_json, say
-
-EXAMPLES = examples(
-    "decant report quickstart-20300131-1              # a run in the folder runs/",
-    "decant report runs/quickstart-20300131-1 --pdf -o for-the-lab-meeting.html",
-    "decant report configs/studies/quick.yaml         # or the study's folder",
-)
+from orchestrator.cli.command_options import Json, Quiet
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message, print_note
 
 RUNS = Path("runs")
 """Folder in which names without a folder are searched."""
@@ -43,10 +37,6 @@ def report(
     with its expected deviation, and lists open questions. Runs that are paused, failed or unknown have reports too,
     which state this.
     """
-    call(_report, what, output=output, pdf=pdf, as_json=as_json)
-
-
-def _report(what: Path, *, output: Path | None, pdf: bool, as_json: bool) -> None:
     from orchestrator.cli.foreground_run import check_output
     from orchestrator.journal.journal import JOURNAL_NAME
     from orchestrator.study.study_folder import SETTINGS
@@ -61,7 +51,7 @@ def _report(what: Path, *, output: Path | None, pdf: bool, as_json: bool) -> Non
         page, figures = _of_study(folder), []
     else:
         raise RefusalError(_nothing_there(folder), BAD_INPUT)
-    mention(f"report  {page}")
+    print_note(f"report  {page}")
     if as_json:
         print_json({"report": page, "figures": figures})
 
@@ -83,7 +73,7 @@ def _nothing_there(folder: Path) -> str:
 def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
     from orchestrator.config.file_loading import recorded_campaign
     from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+    from orchestrator.journal.journal import JOURNAL_NAME
     from orchestrator.journal.journal_check import check_journal
     from orchestrator.journal.run_record import read_result
     from orchestrator.results.html_report import REPORT_NAME
@@ -93,21 +83,20 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
 
     check = check_journal(folder / JOURNAL_NAME)
     for problem in check.problems:
-        say(f"warning: {problem}")
+        print_message(f"warning: {problem}")
     try:
         try:
             plan = recorded_campaign(folder / RESOLVED)
-            with JournalReader(folder / JOURNAL_NAME) as journal:
-                result = read_result(journal, folder)
+            result = read_result(folder)
         except (ConfigError, RunError) as error:
             reason = f"Its campaign or its results can't be read: {error}"
             if missing := missing_plugins(read_versions(folder)):
                 reason = f"Not installed here: {'; '.join(missing)}. Install what is missing for the whole report."
-            say(f"warning: the report is reduced to what the journal has. {reason}")
+            print_message(f"warning: the report is reduced to what the journal has. {reason}")
             return write_reduced_report(output or folder / REPORT_NAME, folder, reason), []
-        mention("drawing the figures …")
+        print_note("drawing the figures …")
         if publish_if_missing(plan, result):
-            mention("summary.json and theta.json were missing, and are written now")
+            print_note("summary.json and theta.json were missing, and are written now")
         page, figures = report_on(plan, result, output, formats)
     except RunError as error:
         raise RefusalError(str(error)) from None

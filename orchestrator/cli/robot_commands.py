@@ -1,28 +1,31 @@
-"""Options and help texts of the commands at a bench: `doctor`, `jog` and `pour`.
+"""The commands `decant doctor` and `decant jog`, which look at the robot of a laboratory and move it by small steps.
 
-Their work is done in `doctor`, `jogging` and `pour_command`.
+- `doctor` checks whether a bench is ready to pour, and advises how to solve each problem. Nothing moves; the balance is
+  tared only on request.
+- `jog` moves the arm by typed steps; the session itself is in `motion_control`.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import getpass
+import sys
+import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import (
-    Arm,
-    Assignments,
-    Campaign,
-    InProcess,
-    Json,
-    Laboratory,
-    OtherLaboratory,
-    Quiet,
-    SceneName,
-    call,
-    given,
-)
+from orchestrator.cli.command_options import EnableMotion, Json, Laboratory
+from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message
+
+if TYPE_CHECKING:
+    from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
+    from actors.interfaces import DeviceCheck
+    from actors.laboratory_settings import LaboratorySettings
+
+
+_MARKS = {"ok": ("ok", "green"), "warn": ("warn", "yellow"), "fail": ("FAIL", "bold red")}
 
 
 def doctor(
@@ -46,50 +49,170 @@ def doctor(
     Nothing moves and no setting is changed. For a virtual laboratory, controller and balance are started for the check.
     Exit code 1 if a check fails.
     """
-    from orchestrator.cli import doctor as verb
+    from actors.balance.balance_settings import balance_diagnostics
+    from actors.interfaces import DeviceCheck, LaboratoryError
+    from actors.laboratory import check_bench_packages, reached
+    from orchestrator.installed_plugins import broken
+    from orchestrator.runs.motion_approval import SafetyRecordError, read_record
 
-    call(verb.doctor, laboratory, accept_safety=accept_safety, tare=tare, as_json=as_json)
+    spec = read_laboratory(laboratory)
+    if spec.arm is None:
+        raise without_arm(
+            laboratory,
+            spec,
+            "looked at are an arm (whether it answers, its safety settings, tool and payload) and a balance",
+        )
+    virtual = spec.mode != "hardware"
+    print_message(
+        f"laboratory {spec.name}, {spec.mode}"
+        + (": no robot, no balance; both are started for this" if virtual else "")
+    )
+    try:
+        record = None if virtual else read_record(laboratory)
+    except SafetyRecordError as error:
+        if not accept_safety:
+            raise RefusalError(str(error), BAD_INPUT) from None
+        record = None
+    with Refused(LaboratoryError):
+        check_bench_packages(spec)
+    with Refused(LaboratoryError, code=FAILED), reached(spec) as ready:
+        assert ready.arm is not None
+        look = ready.arm.diagnostics()
+        if accept_safety and not virtual:
+            record = _accept(laboratory, look)
+        checks = look.checks(record, accept=f"decant doctor {laboratory} --accept-safety", virtual=virtual)
+        checks += balance_diagnostics(ready.balance, tare=tare)
+    checks += _packages(spec)
+    checks += [DeviceCheck("plug-in", "warn", str(one), f"mend or remove {one.package}") for one in broken()]
+    failed = [check for check in checks if check.state == "fail"]
+    if as_json:
+        table = [dataclasses.asdict(check) for check in checks]
+        print_json({"laboratory": spec.name, "mode": spec.mode, "ready": not failed, "checks": table})
+    else:
+        print_table(checks)
+    if failed:
+        raise RefusalError(f"{len(failed)} of {len(checks)} checks fail; nothing should move before they are mended")
+    print_message("ready" if all(check.state == "ok" for check in checks) else "ready, with warnings")
 
 
-def jog(laboratory: Laboratory, arm: Arm = False) -> None:
+def _packages(spec: LaboratorySettings) -> list[DeviceCheck]:
+    """Check the packages that a run needs, with the run's own check."""
+    from actors.interfaces import DeviceCheck, LaboratoryError
+    from actors.laboratory import check_laboratory
+
+    try:
+        check_laboratory(spec.with_values(ray=None), need_bench=True)
+    except LaboratoryError as error:
+        return [DeviceCheck("packages", "fail", str(error), "install them into the environment that Decant runs in")]
+    return []
+
+
+def without_arm(path: Path, spec: LaboratorySettings, asked: str) -> RefusalError:
+    """Return the refusal for a laboratory without an arm, with a suggestion.
+
+    Args:
+        asked: the command's purpose, as part of the message.
+    """
+    has = "its bench is simulated" if spec.bench is not None else "it has no bench"
+    return RefusalError(
+        f"{path}: laboratory {spec.name} has no 'arm', {has}: {asked}. Name a laboratory that has one, for example "
+        "laboratories/virtual.yaml",
+        BAD_INPUT,
+    )
+
+
+def read_laboratory(path: Path) -> LaboratorySettings:
+    """Load a laboratory's file.
+
+    Raises:
+        RefusalError: the file is invalid; lists all problems, exit code 2.
+    """
+    from orchestrator.config.file_loading import load_laboratory
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+
+    with Refused(ConfigError):
+        return load_laboratory(path)
+
+
+def print_table(checks: list[DeviceCheck]) -> None:
+    """Print the checks on stdout, each followed by its advice."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, show_header=False, padding=(0, 2, 0, 0))
+    for check in checks:
+        mark, style = _MARKS[check.state]
+        said = Text(check.found)
+        if check.advice:
+            said.append(f"\n→ {check.advice}", style="bold" if check.state == "fail" else "")
+        table.add_row(Text(mark, style=style), Text(check.name), said)
+    console = Console(highlight=False)
+    (console if console.is_terminal else Console(highlight=False, width=1000)).print(table)
+
+
+def _accept(path: Path, look: ArmDiagnostics) -> SafetyRecord:
+    """Record the current safety settings as accepted.
+
+    Raises:
+        RefusalError: the controller does not report them, or the record can't be written.
+    """
+    from actors.arm.arm_settings import SafetyRecord
+    from orchestrator.runs.motion_approval import record_path, write_record
+
+    if not look.checksum or not look.serial:
+        raise RefusalError(
+            "the controller doesn't tell its safety checksum and serial number, so nothing can be accepted; run "
+            f"'decant doctor {path}' without --accept-safety to see why",
+            FAILED,
+        )
+    record = SafetyRecord(
+        checksum=look.checksum,
+        serial=look.serial,
+        model=look.model,
+        software=look.software,
+        date=time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        accepted_by=getpass.getuser(),
+    )
+    try:
+        written = write_record(path, record)
+    except OSError as error:
+        raise RefusalError(f"{record_path(path)}: can't be written: {error.strerror}", BAD_INPUT) from None
+    print_message(
+        f"safety checksum {record.checksum} of robot {record.serial} is accepted by {record.accepted_by}: {written}\n"
+        "Compare it with the teach pendant, have a second person read the safety settings, and commit the file."
+    )
+    return record
+
+
+def jog(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
     """Move the arm by small, slow steps that are typed one by one, or bring it home.
 
     'j5 +2' turns joint 5 by 2 deg, 'z -5' moves the tool by 5 mm, 'home' goes home. The first step along an axis is
     confirmed with Enter; Ctrl-C stops the arm.
     """
-    from orchestrator.cli import jogging as verb
+    from actors.interfaces import LaboratoryError
+    from actors.laboratory import reached
+    from orchestrator.cli.motion_control import WARNING_TIME, Jogging, confirm, connected, require_flag, typed_line
+    from orchestrator.runs.motion_approval import SafetyRecordError, accepted_checksum
 
-    call(verb.jog, laboratory, armed=arm)
-
-
-def pour(
-    campaign: Campaign,
-    assignments: Assignments = None,
-    scene: SceneName = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Plan, check and show the whole path of the arm; move nothing.")
-    ] = False,
-    connect: Annotated[
-        bool, typer.Option("--connect", help="With --dry-run: also check whether the arm is at home.")
-    ] = False,
-    png: Annotated[
-        Path | None, typer.Option(help="Draw the arm's path from the side and from above.", show_default=False)
-    ] = None,
-    empty: Annotated[
-        bool, typer.Option("--empty", help="Run the whole cycle with an empty pourer, without weighing.")
-    ] = False,
-    slow: Annotated[float, typer.Option(min=0.05, max=1.0, help="With --empty: fraction of the planned speed.")] = 1.0,
-    laboratory: OtherLaboratory = None,
-    in_process: InProcess = False,
-    arm: Arm = False,
-    as_json: Json = False,
-    quiet: Quiet = False,
-) -> None:
-    """Pour once with a given action on the campaign's bench, only plan the pour, or try it with an empty pourer.
-
-    A pour with liquid is recorded in a journal and weighed, as a small run; `--empty` writes a record, pour.json.
-    """
-    options = given(locals(), "campaign")
-    from orchestrator.cli import pour_command as verb
-
-    call(verb.pour, campaign, **options)
+    spec = read_laboratory(laboratory)
+    if spec.arm is None:
+        raise without_arm(laboratory, spec, "steps are typed for an arm that a driver moves")
+    require_flag(spec, enabled=enable_motion, again=f"decant jog {laboratory} --enable-motion")
+    if not sys.stdin.isatty():
+        raise RefusalError("jogging is typed at a terminal, step by step, with nothing piped into it", BAD_INPUT)
+    with Refused(SafetyRecordError):
+        accepted = accepted_checksum(laboratory) if spec.mode == "hardware" else None
+    if spec.mode == "hardware":
+        confirm(spec, ["steps          one at a time, as typed: at most 10 deg at 5 deg/s, or 50 mm at 20 mm/s"])
+    else:
+        print_message(f"laboratory {spec.name}, virtual: nothing moves but numbers")
+    with Refused(LaboratoryError, code=FAILED), reached(spec) as ready:
+        assert ready.arm is not None
+        soon = ready.with_values(arm=ready.arm.with_values(warning_time=WARNING_TIME))
+        with connected(soon, accepted) as (driver, facts):
+            print_message(
+                f"{facts.model} {facts.serial}, {spec.mode}; nothing moves before a step is typed and confirmed"
+            )
+            Jogging(driver, typed_line).run()

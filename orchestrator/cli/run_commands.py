@@ -19,7 +19,7 @@ import typer
 
 from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.cli.command_options import Json, call, examples
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, mention, print_json, say
+from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, print_json, print_message, print_note
 
 if TYPE_CHECKING:
     from orchestrator.catalogue.catalogue import Catalogue, CatalogueClient
@@ -149,7 +149,7 @@ def list_runs(conditions: dict[str, Any], state: State = None, daemon: Daemon = 
         print_json({"runs": found})
         return
     if not found:
-        mention("no run; `decant runs add FOLDER` enters runs that the catalogue doesn't know")
+        print_note("no run; `decant runs add FOLDER` enters runs that the catalogue doesn't know")
         return
     rows = [
         {
@@ -186,7 +186,7 @@ def pours(conditions: dict[str, Any], state: State = None, daemon: Daemon = Fals
     elif found:
         _print_pours(found)
     else:
-        mention("no pour that this holds for")
+        print_note("no pour that this holds for")
 
 
 @_command("decant runs show quickstart-20300301-1")
@@ -252,7 +252,7 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
                 "complete": not found.problems,
                 "problems": found.problems,
                 "entries": found.entries,
-                "entries_without_chain": found.unchecked,
+                "entries_without_chain": 0 if found.chained else found.entries,
                 "pours": found.pours,
             }
         )
@@ -347,7 +347,7 @@ def export(
     if as_json:
         print_json(found)
         return
-    mention(f"{found['runs']} runs, {found['pours']} pours")
+    print_note(f"{found['runs']} runs, {found['pours']} pours")
     print("\n".join(found["files"]))
 
 
@@ -497,10 +497,10 @@ def _client(daemon: bool = False) -> Iterator[CatalogueClient]:
     """Open a client of this machine's catalogue or of the daemon's."""
     try:
         if daemon:
-            from orchestrator.cli.queue_actions import talking
+            from orchestrator.cli.queue_commands import connected_client
             from orchestrator.daemon.daemon_client import RemoteCatalogueClient
 
-            with talking((None, None)) as client, _refusing():
+            with connected_client(None, None) as client, _refusing():
                 yield RemoteCatalogueClient(client)
         else:
             with _catalogue() as catalogue, _refusing():
@@ -519,17 +519,17 @@ def _catalogue(*, rebuild: bool = False) -> Iterator[Catalogue]:
 
         def progress(number: int, count: int) -> None:
             if time.monotonic() - begin > 2.0 and (number % 20 == 0 or number == count):
-                mention(f"reading runs: {number} of {count}")
+                print_note(f"reading runs: {number} of {count}")
 
         with Catalogue() as catalogue:
             if catalogue.warning:
-                say(f"note: {catalogue.warning}")
+                print_message(f"note: {catalogue.warning}")
             refreshed = catalogue.refresh(progress, rebuild=rebuild)
             yield catalogue
     for problem in refreshed.problems:
-        say(f"note: {problem}")
+        print_message(f"note: {problem}")
     if refreshed.missing:
-        mention(
+        print_note(
             f"note: {refreshed.missing} known run{'s are' if refreshed.missing > 1 else ' is'} not where it was; what "
             "was last known of it is shown (`decant runs add` after a move, `decant runs rebuild` forgets it)"
         )

@@ -7,9 +7,12 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from orchestrator.cli.console import INTERRUPTED, RefusalError, Refused, mention, print_json
+import typer
+
+from orchestrator.cli.command_options import Json, Quiet
+from orchestrator.cli.console import INTERRUPTED, RefusalError, Refused, print_json, print_note
 
 if TYPE_CHECKING:
     from orchestrator.study.study_plan import StudyCell, StudyPlan
@@ -18,16 +21,29 @@ if TYPE_CHECKING:
 SHOWN_FAILURES = 5
 
 
-def study(path: Path, *, jobs: int | None, dry_run: bool, report_only: bool, as_json: bool) -> None:
-    """Run the unfinished cells of a study, and write its report.
+def study(
+    file: Annotated[Path, typer.Argument(help="Study file (YAML).", metavar="STUDY", show_default=False)],
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Number of parallel processes; default: one per core.", show_default=False)
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="List the unfinished cells with an estimate of their cost; start nothing.")
+    ] = False,
+    report_only: Annotated[
+        bool, typer.Option("--report", help="Only write figures, tables and page from the existing results.")
+    ] = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare C1 to C4 and D1 to D3 with repetitions, on virtual benches that differ more or less from the simulator.
 
-    Raises:
-        RefusalError: the file can't be used (2), a cell failed (1), or it was interrupted (130).
+    Figures (PNG, SVG, CSV), tables and a page are written to runs/study-NAME/report/. Run the same command again to
+    continue a study that was stopped or killed.
     """
     from orchestrator.study.study_folder import StudyError, check_settings, opened
     from orchestrator.study.study_plan import cells_of
 
-    plan = read_study(path)
+    plan = read_study(file)
     cells = cells_of(plan)
     with Refused(StudyError):
         if dry_run:
@@ -35,7 +51,7 @@ def study(path: Path, *, jobs: int | None, dry_run: bool, report_only: bool, as_
             _print_remaining(plan, cells, as_json)
             return
         with opened(plan) as folder:
-            status = None if report_only else _run(plan, folder, jobs or os.cpu_count() or 1, path)
+            status = None if report_only else _run(plan, folder, jobs or os.cpu_count() or 1, file)
             page = _report(plan, folder)
     if as_json:
         finished = len(status.finished) if status is not None else None
@@ -44,7 +60,7 @@ def study(path: Path, *, jobs: int | None, dry_run: bool, report_only: bool, as_
         shown = list(status.failed.items())[:SHOWN_FAILURES]
         lines = [f"{len(status.failed)} of {len(cells)} cells failed, {len(status.skipped)} need one of them:"]
         lines += [f"  {name}: {why}" for name, why in shown]
-        lines.append(f"finished cells are kept; correct that and continue with: decant study {path}")
+        lines.append(f"finished cells are kept; correct that and continue with: decant study {file}")
         raise RefusalError("\n".join(lines))
 
 
@@ -115,8 +131,8 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> CellStatus:
     cells = cells_of(plan)
     finished = finished_results(folder, cells)
     if len(finished) < len(cells) and (text := code_warning(finished)) is not None:
-        mention(text)
-    mention(f"study {folder}, {jobs} at a time")
+        print_note(text)
+    print_note(f"study {folder}, {jobs} at a time")
     columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[left]}")]
     try:
         with Progress(*columns, console=Console(stderr=True)) as bar, _ending_like_ctrl_c():
@@ -156,5 +172,5 @@ def _report(plan: StudyPlan, folder: Path) -> Path:
     from orchestrator.study.study_page import write_report
 
     page = write_report(plan, folder)
-    mention(f"figures, tables and a page: {page}")
+    print_note(f"figures, tables and a page: {page}")
     return page

@@ -1,13 +1,66 @@
-"""Options and help text of `decant vessel`. The work is done in `vessel_measurement`."""
+"""The command `decant vessel`: makes a vessel file from measurements of a cup.
+
+Turned vessels are fitted to all given measurements; a mesh is repaired and used alone. `Sources` holds them,
+`Made` the result. Tables and images are read in `vessel_tables`; the fits are in `sim_engine.vessel_acquisition`.
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
-from orchestrator.cli.command_options import Json, Quiet, call, examples, given
+from orchestrator.cli.command_options import Json, Quiet
+from orchestrator.cli.console import BAD_INPUT, RefusalError, print_json, print_message, print_note, waiting_for
+
+if TYPE_CHECKING:
+    from sim_engine.vessel.shapes import LengthUnit
+    from sim_engine.vessel_acquisition.measurements import Radii
+    from sim_engine.vessel_acquisition.outline_fit import Evidence, FittedOutline
+    from sim_engine.vessel_acquisition.point_cloud import Scan
+
+CALLIPERS = 2e-4
+"""Standard deviation of a radius measured with callipers [m]."""
+
+HEIGHT = 3e-4
+"""Standard deviation of the rim's height [m]; for a depth image, at least one pixel."""
+
+RULER, BALANCE, ANGLE = 5e-4, 5e-4, 0.005
+"""Standard deviations of a level [m], of a mass [kg] and of a tilt [rad] in tables."""
+
+DOUBTFUL = 3.0
+"""Number of standard deviations above which a check fails."""
+
+BAND = 2.0
+"""Standard deviations that the band shows to either side."""
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Options of the command line as given; see `vessel`."""
+
+    height: str | None = None
+    diameters: str | None = None
+    photo: Path | None = None
+    known_height: str | None = None
+    known_width: str | None = None
+    points: Path | None = None
+    depth: Path | None = None
+    focal: float | None = None
+    centre: str | None = None
+    mesh: Path | None = None
+    unit: str | None = None
+    up: str = "z"
+    fill: Path | None = None
+    tilt: Path | None = None
+    brimful: str | None = None
+    density: str = "998 kg/m^3"
+    wall: str | None = None
+    floor: str | None = None
 
 
 def vessel(
@@ -46,19 +99,401 @@ def vessel(
     Several sources of a turned vessel can be combined; each is weighted by its uncertainty. A picture with the section,
     its uncertainty and the measurements is written next to the file. The measurements are summarised in the file.
     """
-    sources = given(locals(), "out", "name", "as_json")
-    from orchestrator.cli import vessel_measurement as verb
+    from sim_engine.settings.quantity import QuantityError
+    from sim_engine.vessel.shapes import VesselError
 
-    call(verb.vessel, out, verb.Sources(**sources), name=name, as_json=as_json)
+    sources = Sources(
+        height, diameters, photo, known_height, known_width, points, depth, focal, centre, mesh, unit, up,
+        fill, tilt, brimful, density, wall, floor,
+    )  # fmt: skip
+    called = name or out.stem
+    if out.suffix not in (".yaml", ".yml"):
+        raise RefusalError(f"{out}: a vessel file is YAML; write {out.with_suffix('.yaml')}", BAD_INPUT)
+    if not out.parent.is_dir():
+        raise RefusalError(f"{out}: the folder {out.parent} does not exist; make it first", BAD_INPUT)
+    if out.exists():
+        raise RefusalError(f"{out}: exists already; choose another name, or remove it first", BAD_INPUT)
+    try:
+        with waiting_for(lambda: "measuring the vessel"):
+            found = _from_mesh(out, called, sources) if sources.mesh is not None else _turned(out, called, sources)
+    except (VesselError, QuantityError) as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    except OSError as error:
+        raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
+    for note in found.notes:
+        print_note(f"note: {note}")
+    for doubt in found.doubts:
+        print_message(f"warning: {doubt}")
+    print_note(f"{out} holds {1e6 * found.capacity:.0f} ± {1e6 * found.deviation:.1f} mL; its picture: {found.picture}")
+    if as_json:
+        print_json(
+            {
+                "file": out,
+                "picture": found.picture,
+                "capacity_mL": 1e6 * found.capacity,
+                "capacity_deviation_mL": 1e6 * found.deviation,
+                "radius_deviation_mm": None if found.radius_deviation is None else 1e3 * found.radius_deviation,
+                "notes": found.notes,
+                "doubts": found.doubts,
+            }
+        )
 
 
-EXAMPLES = examples(
-    "decant vessel cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
-    "decant vessel cup.yaml --photo side.png --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
-    "decant vessel mug.yaml --mesh scan.stl --wall '3 mm'",
-)
+@dataclass(frozen=True)
+class Made:
+    """A vessel that was made.
+
+    Attributes:
+        capacity, deviation: volume to the brim and its standard deviation [m³].
+        radius_deviation: mean over the height [m]; None for a mesh.
+        picture: path of the picture.
+        notes, doubts: messages for the user.
+    """
+
+    capacity: float
+    deviation: float
+    radius_deviation: float | None
+    picture: Path
+    notes: Sequence[str]
+    doubts: Sequence[str]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the application."""
-    app.command(epilog=EXAMPLES)(vessel)
+def _quantity(text: str | None, what: str, unit: str, example: str) -> float | None:
+    if text is None:
+        return None
+    from sim_engine.settings.quantity import QuantityError, parse_quantity
+
+    try:
+        return parse_quantity(text, unit, example)
+    except QuantityError as error:
+        raise RefusalError(f"{what} {text!r}: {error}", BAD_INPUT) from None
+
+
+def _volume(sources: Sources, mass: float) -> float:
+    density = _quantity(sources.density, "--density", "kg/m^3", "998 kg/m^3")
+    assert density is not None
+    return mass / density
+
+
+# -- turned vessels ----------------------------------------------------------------------------------------------------
+
+
+def _turned(out: Path, name: str, sources: Sources) -> Made:
+    """Make a surface of revolution from all measurements."""
+    from sim_engine.vessel.shapes import VesselSpec
+    from sim_engine.vessel.vessel import build_vessel
+    from sim_engine.vessel_acquisition.outline_fit import find_outline
+
+    notes: list[str] = []
+    wall = _quantity(sources.wall, "--wall", "m", "3 mm")
+    floor = _quantity(sources.floor, "--floor", "m", "4 mm")
+    height = _quantity(sources.height, "--height", "m", "95 mm")
+    seen = _points(sources, wall, floor, notes) if sources.points or sources.depth else None
+    if isinstance(seen, _Uneven):
+        return _written_mesh(out, name, seen.vertices, seen.faces, sources, notes)
+    if seen is not None:
+        wall = wall or seen.wall
+    if wall is None:
+        raise RefusalError("how thick is the wall? Say it with --wall, for example --wall '3 mm'", BAD_INPUT)
+    floor = wall if floor is None else floor
+    evidence: list[Evidence] = []
+    off = HEIGHT
+    if seen is not None:
+        evidence.append(seen.radii)
+        if height is None:
+            height, off = seen.height, max(off, seen.pixel)
+    if sources.photo is not None:
+        radii, inside = _photographed(sources, wall, floor)
+        evidence.append(radii)
+        height = height or inside
+    if height is None:
+        raise RefusalError(
+            "how deep is it inside, from floor to rim? Say it with --height, for example --height '95 mm'", BAD_INPUT
+        )
+    evidence += _measured(sources, height)
+    outline = find_outline(height, evidence, wall, floor, height_deviation=off)
+    spec = VesselSpec(name=name, shape=outline.shape())
+    build_vessel(spec)
+    doubts = _doubts(outline, sources)
+    used = [f"{fit.count} from the {fit.name}, {fit.rms:.1f} of their own deviations off" for fit in outline.fits]
+    picture = _draw_outline(name, outline, evidence, out.with_suffix(".png"))
+    out.write_text(_profile_file(name, outline, used, doubts))
+    return Made(outline.capacity, outline.capacity_deviation, outline.radius_deviation, picture, notes + used, doubts)
+
+
+def _measured(sources: Sources, height: float) -> list[Evidence]:
+    """Read callipers and tables."""
+    import numpy as np
+
+    from orchestrator.cli.vessel_tables import read_diameters, read_fill_table, read_tilt_table
+    from sim_engine.vessel_acquisition.measurements import FillTable, Radii, TiltTable
+
+    found: list[Evidence] = []
+    if sources.diameters is not None:
+        heights, widths = read_diameters(sources.diameters, height)
+        found.append(Radii("callipers", heights, widths / 2.0, np.full(len(heights), CALLIPERS)))
+    balance = _volume(sources, BALANCE)
+    if sources.fill is not None:
+        levels, masses = read_fill_table(
+            sources.fill,
+            height=1e3 * height,
+            density=1e-6 * BALANCE / balance,
+            ruler=1e3 * RULER,
+            balance=1e3 * BALANCE,
+        )
+        volumes = np.array([_volume(sources, mass) for mass in masses / 1e3])
+        radius = float(np.sqrt(volumes.max() / (np.pi * levels.max() / 1e3)))
+        found.append(FillTable(levels / 1e3, volumes, RULER, balance, radius))
+    if sources.tilt is not None:
+        tilts, masses = read_tilt_table(sources.tilt, angle=float(np.degrees(ANGLE)), balance=1e3 * BALANCE)
+        volumes = np.array([_volume(sources, mass) for mass in masses / 1e3])
+        found.append(TiltTable(np.radians(tilts), volumes, ANGLE, balance))
+    return found
+
+
+def _doubts(outline: FittedOutline, sources: Sources) -> list[str]:
+    """Describe inconsistencies between the measurements."""
+    import numpy as np
+
+    doubts = [
+        f"the {fit.name} and the rest disagree ({fit.rms:.0f} times their own deviations): look at the picture"
+        for fit in outline.fits
+        if fit.rms > DOUBTFUL
+    ]
+    brimful = _quantity(sources.brimful, "--brimful", "kg", "322 g")
+    if brimful is not None:
+        held = _volume(sources, brimful)
+        apart = (held - outline.capacity) / float(np.hypot(outline.capacity_deviation, 1e-6 + 0.003 * held))
+        if abs(apart) > DOUBTFUL:
+            doubts.append(
+                f"brimful it held {1e6 * held:.0f} mL, and the shape has {1e6 * outline.capacity:.0f} ± "
+                f"{1e6 * outline.capacity_deviation:.1f} mL: check the wall's thickness and the scale"
+            )
+    return doubts
+
+
+@dataclass(frozen=True)
+class _Seen:
+    radii: Radii
+    height: float
+    wall: float | None
+    pixel: float
+
+
+@dataclass(frozen=True)
+class _Uneven:
+    vertices: Any
+    faces: Any
+
+
+def _points(sources: Sources, wall: float | None, floor: float | None, notes: list[str]) -> _Seen | _Uneven:
+    from sim_engine.vessel_acquisition.point_cloud import mesh_of, radii_of, wall_between
+
+    scan, pixel = _scanned(sources)
+    between = wall_between(scan)
+    thick = wall or between
+    surfaces = {"both": "both surfaces", "inner": "the inner surface", "outer": "the outer surface"}[scan.seen]
+    notes.append(
+        f"{len(scan.points):,} points of {surfaces}, {1e3 * scan.scatter:.2f} mm about it, "
+        f"{1e3 * scan.out_of_round:.2f} mm out of round"
+    )
+    if not scan.round:
+        notes.append("it is not round: the points became a mesh")
+        return _Uneven(*mesh_of(scan, wall, floor))
+    if thick is None:
+        raise RefusalError(
+            "the points are of one surface: how thick is the wall? Say it with --wall, for example --wall '3 mm'",
+            BAD_INPUT,
+        )
+    below = thick if floor is None else floor
+    radii = radii_of(scan, thick, below)
+    if sources.depth is not None:
+        radii = replace(radii, name="depth image")
+    return _Seen(radii, scan.height - (0.0 if scan.seen == "inner" else below), between, pixel)
+
+
+def _scanned(sources: Sources) -> tuple[Scan, float]:
+    """Return the scan, and the size of a depth image's pixel on it [m]; 0 for points."""
+    from orchestrator.cli.vessel_tables import read_depth, read_points
+    from sim_engine.vessel_acquisition.point_cloud import points_on_table, scan_of
+
+    if sources.points is not None and sources.depth is not None:
+        raise RefusalError("--depth goes without --points: give one of them", BAD_INPUT)
+    if sources.points is not None:
+        return scan_of(read_points(sources.points, _unit(sources), sources.up)), 0.0
+    assert sources.depth is not None
+    if sources.focal is None:
+        raise RefusalError(
+            "a depth image needs its camera's focal length in pixels: --focal 615; the camera's software tells it (fx)",
+            BAD_INPUT,
+        )
+    points = points_on_table(read_depth(sources.depth, _unit(sources)), sources.focal, _centre(sources.centre))
+    return scan_of(points, "outer", underside=0.0), float(points[:, 1].min()) / sources.focal
+
+
+def _centre(text: str | None) -> tuple[float, float] | None:
+    """Parse column and row of '318.2, 241.5'."""
+    if text is None:
+        return None
+    try:
+        column, row = map(float, text.split(","))
+    except ValueError:
+        raise RefusalError(
+            f"--centre {text!r}: should be a column and a row, such as '318.2, 241.5'", BAD_INPUT
+        ) from None
+    return column, row
+
+
+def _photographed(sources: Sources, wall: float, floor: float) -> tuple[Radii, float]:
+    from orchestrator.cli.vessel_tables import read_photograph
+    from sim_engine.resources import require
+    from sim_engine.vessel_acquisition.photograph import radii_within, silhouette
+
+    assert sources.photo is not None
+    require("skimage", "a photograph")
+    tall = _quantity(sources.known_height, "--known-height", "m", "99 mm")
+    wide = _quantity(sources.known_width, "--known-width", "m", "78 mm")
+    if (tall is None) == (wide is None):
+        raise RefusalError(
+            "a photograph needs one known outer length for its scale: --known-height '99 mm' or --known-width '78 mm'",
+            BAD_INPUT,
+        )
+    grey = read_photograph(sources.photo)
+    known: Literal["height", "width"] = "height" if tall is not None else "width"
+    shape = silhouette(grey, known, cast(float, tall or wide))
+    return radii_within(shape, wall, floor), shape.height - floor
+
+
+def _unit(sources: Sources) -> LengthUnit | None:
+    if sources.unit is None:
+        return None
+    if sources.unit not in ("m", "cm", "mm", "in"):
+        raise RefusalError(f"--unit {sources.unit!r}: should be m, cm, mm or in", BAD_INPUT)
+    return cast("LengthUnit", sources.unit)
+
+
+def _profile_file(name: str, outline: FittedOutline, used: Sequence[str], doubts: Sequence[str]) -> str:
+    shape = outline.shape()
+    points = ", ".join(f"[{1e3 * r:.4g}, {1e3 * z:.4g}]" for r, z in shape.inner)
+    lines = [
+        f"# Measured: {'; '.join(used)}.",
+        f"# It holds {1e6 * outline.capacity:.0f} ± {1e6 * outline.capacity_deviation:.1f} mL; its inner radius is "
+        f"known to ± {1e3 * outline.radius_deviation:.2f} mm (one standard deviation).",
+        *(f"# Doubtful: {doubt}." for doubt in doubts),
+        f"name: {json.dumps(name, ensure_ascii=False)}",  # without quotes, YAML reads "12" and "no" as other types
+        "profile:",
+        "  unit: mm",
+        f"  inner: [{points}]",
+        f"  wall: {1e3 * shape.wall:.4g} mm",
+        f"  floor: {1e3 * shape.floor:.4g} mm",
+        f"  height_deviation: {1e3 * shape.height_deviation:.3g} mm",
+        "  radius_deviations:",
+        *(f"    - [{', '.join(f'{1e3 * x:.3g}' for x in row)}]" for row in shape.radius_deviations),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _draw_outline(name: str, outline: FittedOutline, evidence: Sequence[Evidence], path: Path) -> Path:
+    """The section of a turned vessel with its band, and the radii and levels that were measured."""
+    import numpy as np
+
+    from orchestrator.results import figure_style
+    from sim_engine.vessel.profile import outer_profile
+    from sim_engine.vessel_acquisition.measurements import FillTable, Radii
+
+    figure, axes = figure_style.new_figure(size=(6.0, 5.0))
+    shape = outline.shape()
+    inner = np.array(shape.inner)
+    outer = outer_profile(inner, shape.wall, shape.floor)
+    solid = 1e3 * np.vstack([inner, outer[::-1], [0.0, -shape.floor]])
+    for side in (1.0, -1.0):
+        axes.fill(side * solid[:, 0], solid[:, 1], color=figure_style.PALE, lw=0, zorder=1)
+    z, r, sd = 1e3 * outline.heights, 1e3 * outline.radii, 1e3 * BAND * outline.deviations
+    for side in (1.0, -1.0):
+        axes.fill_betweenx(
+            z, side * (r - sd), side * (r + sd), color=figure_style.PREDICTED, alpha=0.35, lw=0, zorder=2
+        )
+        axes.plot(side * r, z, color=figure_style.INK, lw=1.6, zorder=3)
+    axes.plot([-r[0], r[0]], [0.0, 0.0], color=figure_style.INK, lw=1.6, zorder=3)
+    axes.fill([], [], color=figure_style.PREDICTED, alpha=0.35, label=f"± {BAND:g} standard deviations of the radius")
+    marks = iter(("o", "s", "^"))
+    for piece in evidence:
+        if isinstance(piece, Radii):
+            axes.plot(
+                1e3 * piece.observed,
+                1e3 * piece.heights,
+                next(marks),
+                color=figure_style.MEASURED,
+                ms=4 if len(piece.observed) < 15 else 2.5,
+                label=piece.name,
+                zorder=4,
+            )
+        elif isinstance(piece, FillTable):
+            levels = 1e3 * piece.levels
+            axes.plot(
+                0.0 * levels, levels, "_", color=figure_style.MEASURED, ms=12, label=f"levels of the {piece.name}"
+            )
+    title = f"{name}: {1e6 * outline.capacity:.0f} ± {1e6 * outline.capacity_deviation:.1f} mL"
+    figure_style.dress(axes, title=title, x="distance from the axis [mm]", y="height above the inner floor [mm]")
+    axes.set_aspect("equal")
+    axes.margins(0.08)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False, fontsize=8)
+    return figure_style.save(figure, path)
+
+
+# -- meshes ------------------------------------------------------------------------------------------------------------
+
+
+def _from_mesh(out: Path, name: str, sources: Sources) -> Made:
+    from sim_engine.resources import require
+    from sim_engine.vessel_acquisition.mesh_repair import mended
+
+    require("manifold3d", "mending a mesh")
+    others = {
+        "--diameters": sources.diameters,
+        "--photo": sources.photo,
+        "--points": sources.points,
+        "--depth": sources.depth,
+    }
+    others |= {"--fill": sources.fill, "--tilt": sources.tilt}
+    if given := [option for option, value in others.items() if value is not None]:
+        raise RefusalError(f"{given[0]} goes with turned vessels; a mesh says all of its shape itself", BAD_INPUT)
+    assert sources.mesh is not None
+    wall = _quantity(sources.wall, "--wall", "m", "3 mm")
+    result = mended(sources.mesh, unit=_unit(sources), wall=wall)
+    return _written_mesh(out, name, result.vertices, result.faces, sources, list(result.notes), up=sources.up)
+
+
+def _written_mesh(
+    out: Path, name: str, vertices: Any, faces: Any, sources: Sources, notes: list[str], *, up: str = "z"
+) -> Made:
+    """Write a mesh in millimetres next to the vessel's file, after checking that it holds liquid."""
+    import trimesh
+
+    from orchestrator.results import figure_style
+    from orchestrator.results.pour_figures import draw_solid
+    from sim_engine.vessel.shapes import MeshShape, VesselError, VesselSpec
+    from sim_engine.vessel.vessel import build_vessel
+
+    path = out.with_suffix(".stl")
+    if path.exists():
+        raise RefusalError(f"{path}: exists already; choose another name, or remove it first", BAD_INPUT)
+    trimesh.Trimesh(1e3 * vertices, faces, process=False).export(path)
+    try:
+        built = build_vessel(VesselSpec(name=name, shape=MeshShape(path=path, unit="mm", up=cast(Any, up))))
+    except VesselError:
+        path.unlink()
+        raise
+    doubts = []
+    brimful = _quantity(sources.brimful, "--brimful", "kg", "322 g")
+    deviation = 0.01 * built.capacity
+    if brimful is not None and abs(_volume(sources, brimful) - built.capacity) > DOUBTFUL * deviation:
+        doubts.append(
+            f"brimful it held {1e6 * _volume(sources, brimful):.0f} mL, and the mesh has {1e6 * built.capacity:.0f} "
+            "mL: check its unit, and whether its inside was seen"
+        )
+    picture = figure_style.save(draw_solid(name, built), out.with_suffix(".png"))
+    lines = [f"# {note}." for note in (*notes, *doubts)]
+    lines += [f"name: {json.dumps(name, ensure_ascii=False)}", f"mesh: {path.name}", "unit: mm", f"up: {up}"]
+    out.write_text("\n".join(lines) + "\n")
+    return Made(built.capacity, deviation, None, picture, notes, doubts)

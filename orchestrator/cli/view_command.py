@@ -16,18 +16,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import LiveAt, Quiet, call, examples
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, mention, say
+from orchestrator.cli.command_options import LiveAt, Quiet
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_message, print_note
 
 if TYPE_CHECKING:
     from orchestrator.live_view.live_server import LiveView
     from orchestrator.strategies.campaign_plan import CampaignPlan
-
-EXAMPLES = examples(
-    "decant view quickstart-20300131-1                    # a run of the folder runs/",
-    "decant view runs/first runs/second                   # side by side",
-    "decant view runs/first --pour 7 --particles 5000     # simulate pour 7 again with 5000 particles",
-)
 
 
 def view(
@@ -60,23 +54,11 @@ def view(
     Several runs are shown side by side, on the timeline of simulated time. With --pour, the liquid of one pour is
     simulated again from the journal; -o keeps that recording.
     """
-    call(_view, recordings, pour=pour, particles=particles, stage=stage, output=output, at=at)
-
-
-def _view(
-    recordings: list[Path],
-    *,
-    pour: int | None,
-    particles: int | None,
-    stage: str | None,
-    output: Path | None,
-    at: str | None,
-) -> None:
     from orchestrator.cli.foreground_run import check_output
     from sim_engine.resources import installed
 
     if not installed("rerun"):
-        raise RefusalError("view: needs Rerun, which is not installed: pip install 'decant[live]'", BAD_INPUT)
+        raise RefusalError("view: needs Rerun, which is not installed: pip install 'decant-pouring[live]'", BAD_INPUT)
     if pour is None and (particles is not None or stage is not None):
         raise RefusalError("--particles and --stage go with --pour", BAD_INPUT)
     if pour is not None and len(recordings) != 1:
@@ -90,7 +72,7 @@ def _view(
         else:
             shown = _recording_of(recordings[0])
         if output is not None:
-            mention(f"recording  {shown}")
+            print_note(f"recording  {shown}")
             return
         _serve(shown, at)
 
@@ -108,7 +90,7 @@ def _serve(shown: Path, at: str | None) -> None:
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with LiveView(address=address, web_port=port, shown=(shown,)) as live:
-            say(f"{live.url}\nCtrl-C ends it.")
+            print_message(f"{live.url}\nCtrl-C ends it.")
             while not stopped and live.alive:
                 time.sleep(0.2)
             if not stopped:
@@ -122,8 +104,7 @@ def _serve(shown: Path, at: str | None) -> None:
 
 def _again(what: Path, number: int, particles: int | None, stage: str | None, path: Path) -> Path:
     from orchestrator.cli.console import waiting_for
-    from orchestrator.live_view.repeated_pour import NoSuchPourError, find_pour, task_of
-    from orchestrator.live_view.simulation_view import simulation_rrd
+    from orchestrator.live_view.simulation_view import NoSuchPourError, find_pour, simulation_rrd, task_of
     from orchestrator.run_errors import RunError
     from sim_engine.simulator import PourSimulator
 
@@ -140,8 +121,11 @@ def _again(what: Path, number: int, particles: int | None, stage: str | None, pa
     with contextlib.closing(simulator), waiting_for(lambda: f"simulating, {time.monotonic() - begin:.0f} s so far"):
         result = simulator.simulate(task)
     said = f"{1e3 * task.scene.liquid.mass * result.outcome.spilled:.1f} g spilled in this simulation"
-    mention(f"{pour.title}; {said}, {result.outcome.particles} particles")
-    return simulation_rrd(path, task, result, pour.title)
+    assert pour.measured is not None
+    weighed = f"{1e3 * pour.measured.spilled:.1f} g spilled when it was poured"
+    title = f"pour {pour.request.number} of {pour.stage}, simulated again ({weighed})"
+    print_note(f"{title}; {said}, {result.outcome.particles} particles")
+    return simulation_rrd(path, task, result, title)
 
 
 def _beside(what: list[Path], path: Path) -> Path:
@@ -170,7 +154,7 @@ def _recording_of(what: Path) -> Path:
     found = sorted(run.glob("campaign*.rrd"), key=lambda path: path.stat().st_mtime)
     found = [path for path in found if "optimising" not in path.name]
     if not found:
-        raise RefusalError(f"{run}: has no recording; was it run with 'outputs: {{rrd: false}}'?", BAD_INPUT)
+        raise RefusalError(f"{run}: has no recording; was it run with 'outputs: {{recording: false}}'?", BAD_INPUT)
     return found[-1]
 
 
@@ -209,10 +193,10 @@ def live_view(plan: CampaignPlan, *, live: bool, at: str | None) -> LiveView | N
     if not live and at is None:
         return None
     if not installed("rerun"):
-        raise RefusalError("--live: needs Rerun, which is not installed: pip install 'decant[live]'", BAD_INPUT)
-    if not plan.outputs.rrd:
+        raise RefusalError("--live: needs Rerun, which is not installed: pip install 'decant-pouring[live]'", BAD_INPUT)
+    if not plan.outputs.recording:
         raise RefusalError(
-            f"--live: {plan.source} says 'outputs: {{rrd: false}}', and a live view shows what is recorded; "
+            f"--live: {plan.source} says 'outputs: {{recording: false}}', and a live view shows what is recorded; "
             "leave that out",
             BAD_INPUT,
         )

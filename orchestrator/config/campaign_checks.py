@@ -4,7 +4,6 @@
   and not touch; the arm must be able to make some action.
 - `senseless` finds settings that can run but waste pours: streams that miss the receiver (range of a free jet), and
   tilt speeds that the arm refuses.
-- `check_ranges` checks the searched parameters and their measured values for consistency.
 
 No pour and no simulation is made.
 """
@@ -22,14 +21,11 @@ import numpy as np
 from actors.arm.arm_settings import ArmSettings
 from actors.bench.pour_feasibility import vessel as built
 from actors.interfaces import InvalidActionError, UnreachablePlaceError
-from orchestrator.config.campaign_file import CampaignFile
-from orchestrator.config.search_ranges import EXAMPLES, ParameterRangeSection, ParametersBase
 from orchestrator.config.yaml.file_access import why_not_writable
 from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
-from orchestrator.config.yaml.yaml_source import Document, Loc, Place, Report
+from orchestrator.config.yaml.yaml_source import Document, Loc
 from orchestrator.strategies.calibration.action_prior import actions_all_over
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
-from orchestrator.strategies.strategy_registry import calibrations
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.collision import contact_during, describe_contact
 from sim_engine.hydrostatics import level
@@ -89,7 +85,7 @@ def _misses(
             action = scene.action({"x_offset": 0.0, **values})
         except ValueError:
             continue  # no such action, which is reported elsewhere
-        key = (scene.pourer, scene.liquid, scene.pivot, scene.hold_cap, action)
+        key = (scene.pourer, scene.liquid, scene.pivot, scene.max_hold_time, action)
         if key not in known:
             known[key] = _landing(scene, action, pourer, receiver)
         landing = known[key]
@@ -482,57 +478,3 @@ def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str
     return describe_contact(
         contact, tilt=tilt, pourer=f"pourer '{scene.pourer.name}'", receiver=f"receiver '{scene.receiver.name}'"
     )
-
-
-def check_ranges(file: CampaignFile, root: Place, report: Report) -> None:
-    """Report ranges that are not searched, calibrations without ranges, and incomplete measured values."""
-    parameters: ParametersBase | None = file.simulator.parameters
-    place = root.at("simulator", "parameters")
-    sections = {} if parameters is None else parameters.ranges()
-    for name, section in sections.items():
-        _check(section, place.at(name), report)
-    if file.calibration is None and not report.is_broken(root.at("calibration")):
-        for name in sections:
-            if not report.is_broken(place.at(name)):
-                report.add(
-                    place.at(name),
-                    "is a range, and nothing searches it; write one value, or add a 'calibration' section",
-                )
-    in_parameters = any(loc[:2] == place.loc for _, loc in report.broken)
-    if file.calibration is not None and not sections and not in_parameters:
-        report.add(
-            root.at("calibration"),
-            "has nothing to search; give a range to at least one of simulator.parameters, "
-            "for example 'cohesion: [0 N/m, 0.1 N/m]'",
-            key=True,
-        )
-    if file.calibration is not None and not file.calibration.settings.has_prior:
-        owners = " and ".join(name for name, settings in calibrations().items() if settings.has_prior)
-        for name, section in sections.items():
-            if section.measured is not None:
-                strategy = file.calibration.settings.strategy
-                text = f"belongs to {owners}; {strategy} takes all values for alike. Write a range"
-                report.add(place.at(name, "measured"), text, key=True)
-
-
-def _check(section: ParameterRangeSection, at: Place, report: Report) -> None:
-    """A measured value must have a tolerance and lie in its range."""
-    if any(loc[: len(at.loc)] == at.loc for _, loc in report.broken):
-        return
-    info, value, tolerance = section.info, section.measured, section.tolerance
-    unit = "" if info.shown == "1" else f" {info.shown}"
-    if section.range is None and value is None and tolerance is None:
-        report.add(at, "names nothing to search; add a 'range', or what was 'measured' with its 'tolerance'", key=True)
-    elif value is None and tolerance is not None:
-        report.add(at, f"has a tolerance of nothing; add for example 'measured: {EXAMPLES[info.name]}'", key=True)
-    elif value is not None and tolerance is None:
-        usual = f"{(info.tolerance or (info.upper - info.lower) / 20.0) / info.factor:.2g}{unit}"
-        text = f"has no 'tolerance'; add for example 'tolerance: {usual}', or write the value alone to fix it"
-        report.add(at, text, key=True)
-    elif section.scale == "log" and tolerance is not None:
-        report.add(at.at("scale"), "a tolerance is the same to both sides, and needs the scale 'linear'")
-    elif value is not None and section.range is not None and not section.range[0] <= value <= section.range[1]:
-        low, high = (f"{end / info.factor:g}" for end in section.range)
-        report.add(
-            at.at("measured"), f"{value / info.factor:g}{unit} is outside the range beside it, {low} … {high}{unit}"
-        )

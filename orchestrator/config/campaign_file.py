@@ -7,8 +7,8 @@ a plan.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, create_model
 
@@ -27,6 +27,7 @@ from sim_engine.liquids import LiquidSettings
 from sim_engine.outcome import Loss
 from sim_engine.settings.model import (
     MADE,
+    Example,
     FilePath,
     Name,
     PathOr,
@@ -34,6 +35,7 @@ from sim_engine.settings.model import (
     PositivePourCount,
     PositiveSimulationCount,
     PourCount,
+    Problems,
     Seed,
     Settings,
     SimulationCount,
@@ -44,22 +46,39 @@ from sim_engine.settings.model import (
 from sim_engine.settings.quantity import Quantity
 
 
-class TransferSection(Settings):
-    """Weighed pours in another scene, used only to evaluate the calibration."""
-
-    required: ClassVar[dict[str, str]] = {"from": "transfer.csv", "receiver": "cone.yaml"}
+class PoursFromFile(Settings):
+    """Weighed pours in a CSV file."""
 
     source: FilePath | None = Field(default=None, alias="from")
+    """CSV file of weighed pours, with a column `split`."""
+
+    lip_radius: Annotated[float, Quantity("m", "40 mm", 0.0, 0.5)] | None = None
+    """The pourer's inner radius at the lip, if the CSV has lip_to_receiver_axis_mm instead of x_offset_mm."""
+
+    columns: dict[Text, Text] = Field(default_factory=dict)
+    """Columns that have another name in the CSV: {Decant's name: name in the file}."""
+
+    def check_exclusive(self, problems: Problems, keys: Sequence[str], text: str) -> None:
+        """Refuse keys that have a value."""
+        for key in keys:
+            if self.value(key) not in (None, {}):
+                problems.add(text, key, key=True)
+
+
+class TransferSettings(Settings):
+    """Weighed pours in another scene, used only to evaluate the calibration."""
+
+    source: Annotated[FilePath, Example("transfer.csv")] = Field(alias="from")
     """CSV file."""
 
-    receiver: PathOr[VesselFile] | None = None
+    receiver: Annotated[PathOr[VesselFile], Example("cone.yaml")]
     """Receiver of these pours."""
 
     motion: Motion | None = None
     """Values of the motion that differ from calibration's."""
 
 
-class PoursSection(Settings):
+class PoursSettings(PoursFromFile):
     """Pours to calibrate on: to be made (`count`), or weighed already (`from`, `from_run`)."""
 
     count: PositivePourCount | None = None
@@ -77,26 +96,48 @@ class PoursSection(Settings):
     holdout_receivers: list[PathOr[VesselFile]] | None = None
     """Receivers for the test pours, used in turn: they measure how well calibration transfers to other vessels."""
 
-    source: FilePath | None = Field(default=None, alias="from")
-    """CSV file of weighed pours; its column `split` marks the test pours."""
-
     from_run: FilePath | None = None
     """Folder of a previous run: its weighed pours in the same scene, with their splits."""
 
-    lip_radius: Annotated[float, Quantity("m", "40 mm", 0.0, 0.5)] | None = None
-    """The pourer's inner radius at the lip, if the CSV has lip_to_receiver_axis_mm instead of x_offset_mm."""
-
-    columns: dict[Text, Text] = Field(default_factory=dict)
-    """Columns that have another name in the CSV: {Decant's name: name in the file}."""
-
-    transfer: TransferSection | None = None
+    transfer: TransferSettings | None = None
     """Weighed pours in another scene, used only for evaluation."""
 
+    def check_values(self, problems: Problems) -> None:
+        """Check that the pours are from one source, and that some are left to fit."""
+        if self.source is None:
+            text = "belongs to pours that are read 'from' a CSV file"
+            self.check_exclusive(problems, ("lip_radius", "transfer", "columns"), text)
+        if self.source is not None or self.from_run is not None:
+            origin = "a file" if self.source is not None else "a run"
+            text = f"belongs to pours that are still to be made; these are read 'from' {origin}"
+            active = ("design",) if self.design == "active" else ()
+            self.check_exclusive(problems, ("count", "holdout", "holdout_receivers", *active, "simulations"), text)
+            if self.source is not None and self.from_run is not None:
+                problems.add("stands beside 'from'; keep one of them", "from_run", key=True)
+            return
+        if self.simulations is not None and self.design != "active":
+            problems.add("belongs to 'design: active'; remove it, or add that", "simulations", key=True)
+        if self.count is None and problems.valid("count", "from", "from_run"):
+            text = "needs 'count' (pours to make on the bench), 'from' (a CSV file of weighed pours) or 'from_run'"
+            problems.add(text, key=True)
+        if self.count is not None and self.held_out >= self.count:
+            text = f"keeps {self.held_out} of {self.count} pours for testing, so that none is left to fit"
+            problems.add(text, "holdout")
 
-class CalibrationSection(Settings):
-    """Common keys of every calibration, which finds the simulation parameters that reproduce the weighed spillage."""
+    @property
+    def held_out(self) -> int:
+        """Number of pours to be made that are kept for testing."""
+        count = self.count or 0
+        return max(1, count // 8) if self.holdout is None and count > 1 else self.holdout or 0
 
-    required: ClassVar[dict[str, str]] = {"pours": "{count: 32, holdout: 4}"}
+    @property
+    def design_simulations(self) -> int:
+        """Number of simulations that an active design spends on its choice."""
+        return (self.simulations or 64) if self.design == "active" and self.count else 0
+
+
+class StageSettings(Settings):
+    """Keys of calibration and deployment that replace those of the campaign."""
 
     pourer: PathOr[VesselFile] | None = None
     """Pourer; the campaign's unless given."""
@@ -105,7 +146,7 @@ class CalibrationSection(Settings):
     """Receiver; the campaign's unless given."""
 
     receivers: list[PathOr[VesselFile]] | None = None
-    """Several receivers, used in turn for calibration pours."""
+    """Several receivers: calibration pours alternate between them, deployment treats one after the other."""
 
     motion: Motion | None = None
     """Values that differ from the campaign's `motion`."""
@@ -113,7 +154,11 @@ class CalibrationSection(Settings):
     actions: Actions | None = None
     """Searched dimensions; the campaign's `actions` unless given."""
 
-    pours: PoursSection | None = None
+
+class CalibrationSection(StageSettings):
+    """Common keys of every calibration, which finds the simulation parameters that reproduce the weighed spillage."""
+
+    pours: Annotated[PoursSettings, Example("{count: 32, holdout: 4}")]
     """Pours to calibrate on."""
 
     random_baseline: SimulationCount = 0
@@ -125,7 +170,7 @@ class CalibrationSection(Settings):
         return settings_in(self, CalibrationSettings)  # type: ignore[type-abstract]
 
 
-class DataSection(Settings):
+class DataSettings(PoursFromFile):
     """Pours from before the campaign that deployment uses as data: from a CSV file, or from a previous run."""
 
     source: FilePath | None = Field(default=None, alias="from")
@@ -140,33 +185,23 @@ class DataSection(Settings):
     counts: Switch = False
     """Whether these pours count against the budget."""
 
-    lip_radius: Annotated[float, Quantity("m", "40 mm", 0.0, 0.5)] | None = None
-    """The pourer's inner radius at the lip, if the CSV has lip_to_receiver_axis_mm instead of x_offset_mm."""
-
-    columns: dict[Text, Text] = Field(default_factory=dict)
-    """Columns that have another name in the CSV: {Decant's name: name in the file}."""
+    def check_values(self, problems: Problems) -> None:
+        """Check that the pours are from one source."""
+        if self.source is not None and self.run is not None:
+            problems.add("stands beside 'from'; keep one of them", "run", key=True)
+        elif self.run is not None:
+            text = "belongs to a CSV file; a run knows it"
+            self.check_exclusive(problems, ("receiver", "lip_radius", "columns"), text)
+        elif self.source is None and problems.valid("from", "run"):
+            text = "needs 'from' (a CSV file of weighed pours) or 'run' (the folder of a former run)"
+            problems.add(text, key=True)
 
 
 AnyObjective: Any = tagged(OBJECTIVES.all)
 
 
-class DeploymentSection(Settings):
+class DeploymentSection(StageSettings):
     """Common keys of every deployment, which finds actions for vessels that calibration did not use."""
-
-    pourer: PathOr[VesselFile] | None = None
-    """Pourer; the campaign's unless given."""
-
-    receiver: PathOr[VesselFile] | None = None
-    """Receiver; the campaign's unless given."""
-
-    receivers: list[PathOr[VesselFile]] | None = None
-    """Several receivers, one after the other."""
-
-    motion: Motion | None = None
-    """Values that differ from the campaign's `motion`."""
-
-    actions: Actions | None = None
-    """Searched dimensions; the campaign's `actions` unless given."""
 
     loss: Loss | None = None
     """Loss that is minimised."""
@@ -184,6 +219,25 @@ class DeploymentSection(Settings):
     confirm: PourCount = 0
     """Pours of the recommended action at the end, which measure its outcome and do not influence the choice."""
 
+    def check_values(self, problems: Problems) -> None:
+        """Check that the objectives replace the loss, and that each is named once."""
+        super().check_values(problems)
+        if self.objectives is None:
+            for key in ("pareto", "floor"):
+                if self.value(key) is not None and problems.valid("objectives"):
+                    problems.add("belongs to 'objectives'; name some, or remove it", key, key=True)
+            return
+        if self.loss is not None:
+            problems.add("stands beside 'objectives'; keep one of them", "loss", key=True)
+        if not self.objectives:
+            problems.add("is empty; name at least one, for example '- {name: spillage}'", "objectives")
+        if self.pareto and len(self.objectives) == 1:
+            problems.add("needs two objectives that can't both be had", "pareto", key=True)
+        names = [part.name for part in self.objectives]
+        for i, name in enumerate(names):
+            if name in names[:i] and problems.within("objectives", i).valid("name"):
+                problems.add(f"{name} stands twice in the list; keep one of them", "objectives", i)
+
     @property
     def settings(self) -> DeploymentSettings:
         """The strategy's own settings."""
@@ -193,7 +247,7 @@ class DeploymentSection(Settings):
 class LearningSection(DeploymentSection):
     """A deployment that learns from real pours."""
 
-    data: DataSection | None = None
+    data: DataSettings | None = None
     """Pours from before the campaign."""
 
 
@@ -236,22 +290,16 @@ class SimulatorSection(Settings):
 class CampaignFile(Settings):
     """A campaign: calibrate the simulator, deploy with the calibrated parameters, or both."""
 
-    required: ClassVar[dict[str, str]] = {
-        "name": "narrow-cup",
-        "laboratory": "../laboratories/virtual.yaml",
-        "liquid": "{name: water, mass: 200 g}",
-    }
-
-    name: Name | None = None
+    name: Annotated[Name, Example("narrow-cup")]
     """Its name in run directories and figures."""
 
     seed: Seed = 0
     """Seed of every random choice: same campaign, seed and outcomes → same requests."""
 
-    laboratory: PathOr[LaboratorySettings] | None = None
+    laboratory: Annotated[PathOr[LaboratorySettings], Example("../laboratories/virtual.yaml")]
     """Laboratory in which it runs."""
 
-    liquid: PathOr[LiquidSettings] | None = None
+    liquid: Annotated[PathOr[LiquidSettings], Example("{name: water, mass: 200 g}")]
     """Liquid that is poured."""
 
     pourer: PathOr[VesselFile] | None = None
@@ -287,3 +335,35 @@ class CampaignFile(Settings):
 
     outputs: OutputSettings = OutputSettings()
     """Outputs in addition to the journal."""
+
+    def check_values(self, problems: Problems) -> None:
+        """Check that there is something to do, and that calibration searches the ranges of parameters."""
+        calibration, stages = self.calibration, problems.valid("calibration", "deployment")
+        if calibration is None and self.deployment is None and stages:
+            problems.add("there is nothing to do; add a 'calibration' or a 'deployment' section")
+        ranges = {} if self.simulator.parameters is None else self.simulator.parameters.ranges()
+        at = ("simulator", "parameters")
+        inner = problems.within(*at)
+        if calibration is None and problems.valid("calibration"):
+            for name in ranges:
+                if inner.valid(name):
+                    text = "is a range, and nothing searches it; write one value, or add a 'calibration' section"
+                    inner.add(text, name)
+        if calibration is None:
+            return
+        if not ranges and problems.within("simulator").valid("parameters"):
+            text = (
+                "has nothing to search; give a range to at least one of simulator.parameters, for example "
+                "'cohesion: [0 N/m, 0.1 N/m]'"
+            )
+            problems.within("calibration").add(text, key=True)
+        if not calibration.settings.has_prior:
+            text = f"belongs to {owners_of_priors()}; {calibration.strategy} takes all values for alike. Write a range"
+            for name, section in ranges.items():
+                if section.measured is not None:
+                    inner.add(text, name, "measured", key=True)
+
+
+def owners_of_priors() -> str:
+    """Names of the calibrations that average over a prior."""
+    return " and ".join(name for name, settings in calibrations().items() if settings.has_prior)

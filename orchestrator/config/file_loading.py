@@ -7,7 +7,7 @@ from bisect import bisect_right
 from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import create_model
 
@@ -22,7 +22,7 @@ from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
 from orchestrator.journal.upgrade import upgraded_campaign
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from sim_engine.liquids import SimulationParameters
+from sim_engine.liquids import RETIRED_PARAMETERS, SimulationParameters
 from sim_engine.settings.model import MADE, Settings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.vessel.shapes import VesselSpec
@@ -120,6 +120,8 @@ class _LooseQuantity(Quantity):
 class _ThetaBase(Settings):
     """Parameters as `decant calibrate` writes them: numbers in SI, or quantities with units."""
 
+    retired: ClassVar[dict[str, str]] = RETIRED_PARAMETERS
+
 
 def _theta_model() -> type[_ThetaBase]:
     fields: Any = {}
@@ -213,7 +215,7 @@ def load_parameters(path: Path, base: SimulationParameters | None = None) -> Sim
     """θ from a file: the output of `decant calibrate --json`, or a file written by hand.
 
     The file is JSON or YAML: a mapping of parameter names, or a mapping that contains one under `theta` (or
-    `parameters`). Values are numbers in SI units (cohesion in N/m, viscosity in 1/s) or quantities with units.
+    `parameters`). Values are numbers in SI units (cohesion in N/m, xsph_rate in 1/s) or quantities with units.
 
     Args:
         path: the file.

@@ -153,7 +153,7 @@ class SceneBuilder:
             constants_win: the record's scene only inherits the motion, so that its constants have priority.
         """
         fixed: dict[str, float | None] = {k: v for k, v in DEFAULTS.items() if k not in NEEDED}
-        pivot, hold_cap = Pivot(), 5.0
+        pivot, max_hold_time = Pivot(), 5.0
         origin: dict[str, Place] = {}
         for motion, at in ((self.file.motion, self.root.at("motion")), *motions):
             if motion is None:
@@ -162,7 +162,7 @@ class SceneBuilder:
             fixed |= given
             origin |= {dimension: at.at(dimension) for dimension in given}
             pivot = motion.pivot_value() or pivot
-            hold_cap = hold_cap if motion.hold_cap is None else motion.hold_cap
+            max_hold_time = max_hold_time if motion.max_hold_time is None else motion.max_hold_time
         ok = True
         for dimension, value in (constants or {}).items():
             stated = fixed.get(dimension)
@@ -189,7 +189,7 @@ class SceneBuilder:
                 )
         if pourer is None or receiver is None or self.liquid is None or not ok:
             return None
-        return Scene(name, pourer, receiver, self.liquid, pivot, fixed, hold_cap)
+        return Scene(name, pourer, receiver, self.liquid, pivot, fixed, max_hold_time)
 
     def pourer(self, value: Any, place: Place) -> VesselSpec | None:
         """A section's pourer, or the campaign's."""

@@ -18,10 +18,10 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 from orchestrator.strategies.campaign_plan import NormalPrior
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
-from sim_engine.liquids import ParameterInfo, SimulationParameters
+from sim_engine.liquids import RETIRED_PARAMETERS, ParameterInfo, SimulationParameters
 from sim_engine.scene import Pivot
 from sim_engine.search_space import Axis, Scale, Space
-from sim_engine.settings.model import MADE, Settings, Text
+from sim_engine.settings.model import MADE, Problems, Settings, Text
 from sim_engine.settings.quantity import Quantity
 
 EXAMPLES = {
@@ -153,12 +153,10 @@ def _action_range(dimension: Dimension) -> Any:
 class PivotPoint(Settings):
     """A horizontal line in the frame of the upright pourer."""
 
-    required: ClassVar[dict[str, str]] = {"x": "0 mm", "z": "50 mm"}
-
-    x: Annotated[float, Quantity("m", "0 mm", -1.0, 1.0)] | None = None
+    x: Annotated[float, Quantity("m", "0 mm", -1.0, 1.0)]
     """Distance from the pourer's axis towards the receiver."""
 
-    z: Annotated[float, Quantity("m", "50 mm", -1.0, 1.0)] | None = None
+    z: Annotated[float, Quantity("m", "50 mm", -1.0, 1.0)]
     """Height above the pourer's underside."""
 
 
@@ -169,6 +167,8 @@ def _pivot_form(value: Any) -> str:
 class MotionBase(Settings):
     """Values of the motion that are not searched."""
 
+    retired: ClassVar[dict[str, str]] = {"hold_cap": "max_hold_time"}
+
     pivot: (
         Annotated[
             Annotated[Literal["lip"], Tag("word")] | Annotated[PivotPoint, Tag("point")], Discriminator(_pivot_form)
@@ -177,7 +177,7 @@ class MotionBase(Settings):
     ) = None
     """Line about which the pourer turns: 'lip', or {x: ..., z: ...} in the frame of the upright pourer."""
 
-    hold_cap: Annotated[float, Quantity("s", "5 s", 0.0, 60.0)] | None = None
+    max_hold_time: Annotated[float, Quantity("s", "5 s", 0.0, 60.0)] | None = None
     """Maximum duration of a hold 'until_flow_ends'."""
 
     def fixed(self) -> dict[str, float | None]:
@@ -193,8 +193,6 @@ class MotionBase(Settings):
             return None
         if isinstance(self.pivot, str):
             return Pivot()
-        if self.pivot.x is None or self.pivot.z is None:
-            return None
         return Pivot("point", self.pivot.x, self.pivot.z)
 
 
@@ -250,6 +248,29 @@ class ParameterRangeSection(RangeSection):
 
     info: ClassVar[ParameterInfo]
 
+    def check_values(self, problems: Problems) -> None:
+        """Check that a measured value has a tolerance and lies in the range."""
+        if problems.any:
+            return
+        info, value, tolerance = self.info, self.measured, self.tolerance
+        unit = "" if info.shown == "1" else f" {info.shown}"
+        if self.range is None and value is None and tolerance is None:
+            text = "names nothing to search; add a 'range', or what was 'measured' with its 'tolerance'"
+            problems.add(text, key=True)
+        elif value is None and tolerance is not None:
+            text = f"has a tolerance of nothing; add for example 'measured: {EXAMPLES[info.name]}'"
+            problems.add(text, key=True)
+        elif value is not None and tolerance is None:
+            usual = f"{(info.tolerance or (info.upper - info.lower) / 20.0) / info.factor:.2g}{unit}"
+            text = f"has no 'tolerance'; add for example 'tolerance: {usual}', or write the value alone to fix it"
+            problems.add(text, key=True)
+        elif self.scale == "log" and tolerance is not None:
+            problems.add("a tolerance is the same to both sides, and needs the scale 'linear'", "scale")
+        elif value is not None and self.range is not None and not self.range[0] <= value <= self.range[1]:
+            low, high = (f"{end / info.factor:g}" for end in self.range)
+            text = f"{value / info.factor:g}{unit} is outside the range beside it, {low} … {high}{unit}"
+            problems.add(text, "measured")
+
     def searched(self) -> Axis | None:
         """The searched axis; None after a problem."""
         info = self.info
@@ -288,6 +309,8 @@ def _parameter_form(value: Any) -> str:
 
 class ParametersBase(Settings):
     """Parameters: a value fixes one; a range, or a measured value with a tolerance, makes calibration search it."""
+
+    retired: ClassVar[dict[str, str]] = RETIRED_PARAMETERS
 
     def fixed(self) -> dict[str, float]:
         """Parameters with a value, SI."""

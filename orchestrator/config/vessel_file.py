@@ -71,9 +71,7 @@ VesselFile: Any = _vessel_file()
 
 def resolve_vessel(section: VesselBase, place: Place, report: Report) -> VesselSpec | None:
     """The vessel of a file; None after a problem. A problem of a mesh's path is added to the report."""
-    shape: Shape | None = next(
-        (shape for key in ("profile", *further_sources()) if (shape := section.value(key)) is not None), None
-    )
+    shape: Shape | None = next(filter(None, map(section.value, ("profile", *further_sources()))), None)
     if section.mesh is not None and shape is None:
         path = resolved(place.directory / section.mesh)
         if path.suffix.lower() not in MESH_SUFFIXES:

@@ -11,13 +11,13 @@ import csv
 import io
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.config.campaign_file import DataSection, PoursSection
+from orchestrator.config.campaign_file import DataSettings, PoursFromFile, PoursSettings
 from orchestrator.config.scene_builder import SceneBuilder
 from orchestrator.config.search_ranges import MotionBase
 from orchestrator.config.yaml.file_access import UnreadableError, missing_file, out_of_bounds, read_text, resolved
@@ -30,6 +30,7 @@ from orchestrator.runs.prior_data import PreviousRun, fitting, pours_in, read_fo
 from orchestrator.strategies.campaign_plan import ExistingPours, RecordedPour, RecordSet
 from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
 from sim_engine.errors import did_you_mean
+from sim_engine.liquids import Liquid
 from sim_engine.scene import Scene
 from sim_engine.search_space import Space
 from sim_engine.settings.model import MOST_POURS
@@ -68,11 +69,13 @@ class RecordTable:
     """A CSV file of weighed pours.
 
     Attributes:
+        path: the file.
         rows: action dimensions [SI], masses [kg] and split of every valid line.
         dimensions: action dimensions that have a column.
         problems: all problems found.
     """
 
+    path: Path
     rows: list[PourRecordRow] = field(default_factory=list)
     dimensions: tuple[str, ...] = ()
     problems: list[Problem] = field(default_factory=list)
@@ -132,7 +135,7 @@ def read_records(
     Returns:
         The table; its `problems` describe what is wrong with the file.
     """
-    table = RecordTable()
+    table = RecordTable(path)
     try:
         text = read_text(path, encoding="utf-8-sig")
     except UnreadableError as error:
@@ -312,7 +315,7 @@ LIP_RADIUS_TOLERANCE = 1e-3
 
 
 def resolve_records(
-    pours: PoursSection,
+    pours: PoursSettings,
     place: Place,
     builder: SceneBuilder,
     table: RecordTable | None,
@@ -331,22 +334,17 @@ def resolve_records(
                 place.at("from"),
                 f"{name} varies in the file and is not searched; add it to {dotted(place.loc[:-1])}.actions",
             )
-        for name in actions.names:
-            if name not in table.dimensions:
-                column = LIP_COLUMN if name == "x_offset" else column_name(ACTION_DIMENSIONS[name])
-                report.add(
-                    place.at("from"), f"{name} is searched and the file has no column '{column}'; fix it under motion"
-                )
+        _check_columns(table, actions, place.at("from"), report)
         splits = {row.split for row in table.rows}
         if "train" not in splits:
             report.add(place.at("from"), "has no pour with split 'train' to calibrate on")
         if "transfer" in splits:
             report.add(place.at("from"), "has pours with split 'transfer'; they belong to 'transfer: {from: ...}'")
     if table is not None and scene is not None:
-        records = _record_set(table, scene, place.at("from"), pours, pours.source, builder)
+        records = _record_set(table, scene, place.at("from"), pours, builder)
     section, at = pours.transfer, place.at("transfer")
     if section is not None:
-        receiver = None if section.receiver is None else builder.references.vessel(section.receiver, at.at("receiver"))
+        receiver = builder.references.vessel(section.receiver, at.at("receiver"))
         other = read_table(pours, section.source, at.at("from"), builder)
         if other is not None:
             where = (*motions, (section.motion, at.at("motion")))
@@ -364,39 +362,53 @@ def resolve_records(
                 constants_win=True,
             )
             if moved is not None:
-                transfer = _record_set(other, moved, at.at("from"), pours, section.source, builder)
+                transfer = _record_set(other, moved, at.at("from"), pours, builder)
     return records, transfer
 
 
-def read_table(pours: PoursSection, source: str | None, place: Place, builder: SceneBuilder) -> RecordTable | None:
-    """A CSV file of weighed pours; None if not given, or after a problem."""
+def read_table(pours: PoursFromFile, source: str | None, place: Place, builder: SceneBuilder) -> RecordTable | None:
+    """A CSV file of calibration's pours; None if not given, or after a problem."""
     if source is None or builder.liquid is None:
         return None
-    path = _path(source, place)
+    return _read(resolved(place.directory / source), pours, builder.liquid, place, builder.report)
+
+
+def _read(
+    path: Path, pours: PoursFromFile, liquid: Liquid, place: Place, report: Report, split: str | None = None
+) -> RecordTable | None:
     if (missing := missing_file(path)) is not None:
-        builder.report.add(place, missing)
+        report.add(place, missing)
         return None
-    table = read_records(path, loaded=builder.liquid.mass, lip_radius=pours.lip_radius, columns=pours.columns)
-    builder.report.problems.extend(table.problems)
+    table = read_records(path, loaded=liquid.mass, lip_radius=pours.lip_radius, columns=pours.columns, split=split)
+    report.problems.extend(table.problems)
     return None if table.problems else table
 
 
-def _path(source: str, place: Place) -> Path:
-    return resolved(place.directory / source)
+def _check_columns(table: RecordTable, actions: Space, place: Place, report: Report) -> bool:
+    """Whether the file has a column for each searched dimension; missing ones are reported."""
+    missing = [name for name in actions.names if name not in table.dimensions]
+    for name in missing:
+        column = LIP_COLUMN if name == "x_offset" else column_name(ACTION_DIMENSIONS[name])
+        report.add(place, f"{name} is searched and the file has no column '{column}'; fix it under motion")
+    return not missing
+
+
+def _pours(table: RecordTable, scene: Scene, place: Place, report: Report) -> tuple[RecordedPour, ...] | None:
+    try:
+        return tuple(row.pour(scene.fixed) for row in table.rows)
+    except ValueError as error:
+        report.add(place, str(error))
+        return None
 
 
 def _record_set(
-    table: RecordTable, scene: Scene, place: Place, pours: PoursSection, source: str | None, builder: SceneBuilder
+    table: RecordTable, scene: Scene, place: Place, pours: PoursSettings, builder: SceneBuilder
 ) -> RecordSet | None:
-    try:
-        records = tuple(row.pour(scene.fixed) for row in table.rows)
-    except ValueError as error:
-        builder.report.add(place, str(error))
-        return None
-    return RecordSet(scene, records, _path(str(source), place), pours.lip_radius, dict(pours.columns))
+    found = _pours(table, scene, place, builder.report)
+    return None if found is None else RecordSet(scene, found, table.path, pours.lip_radius, dict(pours.columns))
 
 
-def _check_lip_radius(pours: PoursSection, place: Place, builder: SceneBuilder, pourer: VesselSpec | None) -> None:
+def _check_lip_radius(pours: PoursSettings, place: Place, builder: SceneBuilder, pourer: VesselSpec | None) -> None:
     if pours.lip_radius is None or pourer is None or not isinstance(pourer.shape, ProfileShape):
         return
     rim = pourer.shape.outline().inner[-1][0]
@@ -409,7 +421,7 @@ def _check_lip_radius(pours: PoursSection, place: Place, builder: SceneBuilder, 
 
 
 def resolve_data(
-    section: DataSection,
+    section: DataSettings,
     place: Place,
     scenes: tuple[Scene, ...],
     actions: Space,
@@ -417,26 +429,14 @@ def resolve_data(
     report: Report,
 ) -> ExistingPours | None:
     """Existing pours of the deployment by scene; None after a problem, which is added to the report."""
-    given = [key for key in ("from", "run") if section.value(key) is not None]
-    if len(given) == 2:
-        report.add(place.at("run"), "stands beside 'from'; keep one of them", key=True)
-        return None
-    if not given:
-        if not any(report.is_broken(place.at(key)) for key in ("from", "run")):
-            report.add(
-                place, "needs 'from' (a CSV file of weighed pours) or 'run' (the folder of a former run)", key=True
-            )
-        return None
-    found: dict[str, tuple[RecordedPour, ...]] | None
-    if section.run is not None:
-        for key in ("receiver", "lip_radius", "columns"):
-            if place.at(key).loc in place.document.marks:
-                report.add(place.at(key), "belongs to a CSV file; a run knows it", key=True)
-        path, found = _of_run(section.run, place.at("run"), scenes, laboratory, report)
-        at = place.at("run")
-    else:
-        path, found = _of_file(section, place, scenes, actions, report)
+    found: Mapping[str, Sequence[RecordedPour]] | None = None
+    if section.source is not None and section.run is None:
         at = place.at("from")
+        path = resolved(place.directory / section.source)
+        found = _of_file(path, section, place, scenes, actions, report)
+    elif section.run is not None and section.source is None:
+        at = place.at("run")
+        path, found = _of_run(section.run, at, scenes, laboratory, report)
     if found is None:
         return None
     used: dict[str, tuple[RecordedPour, ...]] = {}
@@ -453,39 +453,23 @@ def resolve_data(
 
 
 def _of_file(
-    section: DataSection, place: Place, scenes: tuple[Scene, ...], actions: Space, report: Report
-) -> tuple[Path, dict[str, tuple[RecordedPour, ...]] | None]:
-    path = resolved(place.directory / str(section.source))
+    path: Path, section: DataSettings, place: Place, scenes: tuple[Scene, ...], actions: Space, report: Report
+) -> dict[str, tuple[RecordedPour, ...]] | None:
     receivers = {scene.receiver.name: scene for scene in scenes}
     if section.receiver is None and len(scenes) > 1:
         report.add(place, f"says not into which receiver; add 'receiver:' and one of {', '.join(receivers)}", key=True)
-        return path, None
+        return None
     if section.receiver is not None and section.receiver not in receivers:
         guess = did_you_mean(section.receiver, receivers)
         hint = f"did you mean '{guess}'?" if guess else f"receivers are {', '.join(receivers)}"
         report.add(place.at("receiver"), f"deployment has no receiver '{section.receiver}'; {hint}")
-        return path, None
-    if (why := missing_file(path)) is not None:
-        report.add(place.at("from"), why)
-        return path, None
-    scene = scenes[0] if section.receiver is None else receivers[section.receiver]
-    table = read_records(
-        path, loaded=scene.liquid.mass, lip_radius=section.lip_radius, columns=section.columns, split="train"
-    )
-    report.problems.extend(table.problems)
-    if table.problems:
-        return path, None
-    missing = [name for name in actions.names if name not in table.dimensions]
-    for name in missing:
-        column = column_name(ACTION_DIMENSIONS[name])
-        report.add(place.at("from"), f"{name} is searched and the file has no column '{column}'")
-    if missing:
-        return path, None
-    try:
-        return path, {scene.name: tuple(row.pour(scene.fixed) for row in table.rows)}
-    except ValueError as error:
-        report.add(place.at("from"), str(error))
-        return path, None
+        return None
+    scene, at = scenes[0] if section.receiver is None else receivers[section.receiver], place.at("from")
+    table = _read(path, section, scene.liquid, at, report, split="train")
+    if table is None or not _check_columns(table, actions, at, report):
+        return None
+    pours = _pours(table, scene, at, report)
+    return None if pours is None else {scene.name: pours}
 
 
 def _of_run(

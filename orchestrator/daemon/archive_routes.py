@@ -31,7 +31,7 @@ from sim_engine.resources import MissingExtraError
 
 T = TypeVar("T")
 
-router = APIRouter(tags=["former runs"])
+router = APIRouter(tags=["previous runs"])
 
 _TYPES: dict[str, Any] = {
     "text": str | None,
@@ -55,11 +55,11 @@ def _several(model: Any) -> Any:
     return list[model]
 
 
-PreviousRunOut = _row("FormerRun", TABLES["run"], "One run of this machine, made by the daemon or the command line.")
-PreviousPour = _row("FormerPour", TABLES["pour"], "One pour that has started.")
+PreviousRunOut = _row("PreviousRun", TABLES["run"], "One run of this machine, made by the daemon or the command line.")
+PreviousPour = _row("PreviousPour", TABLES["pour"], "One pour that has started.")
 _DETAILS: dict[str, Any] = {"notes": (list[Note], ...), "list_of_pours": (_several(PreviousPour), ...)}
 PreviousRunDetail = create_model(
-    "FormerRunDetail", __base__=PreviousRunOut, __doc__="One run with its notes and its pours.", **_DETAILS
+    "PreviousRunDetail", __base__=PreviousRunOut, __doc__="One run with its notes and its pours.", **_DETAILS
 )
 
 

@@ -20,24 +20,22 @@ from orchestrator.daemon.access_control import Admin, Daemon, Operator, Viewer
 from orchestrator.daemon.daemon_store import ENDED, QueueItem
 from orchestrator.daemon.query_routes import campaign_out, found_item, status
 from orchestrator.daemon.remote_operator import AnswerError, question_json
-from orchestrator.daemon.rig_worker import job_of
 from orchestrator.daemon.schemas import (
     AnswerIn,
-    ArmIn,
     CampaignOut,
     ClearIn,
     EmergencyIn,
+    EnableIn,
     MoveIn,
     QuestionOut,
     StatusOut,
     SubmissionIn,
     WhatMovesOut,
 )
-from orchestrator.daemon.submissions import Submission, SubmissionError, prepare
+from orchestrator.daemon.submissions import Submission, SubmissionError, prepare, run_request
 from orchestrator.daemon.supervisor import RequestRefusedError, Supervisor
 from orchestrator.run_errors import RunError
-from orchestrator.runs.motion_envelope import campaign_pours, envelope, envelope_lines, pour_count
-from orchestrator.runs.safety_approval import required_checksum
+from orchestrator.runs.motion_approval import campaign_pours, envelope, envelope_lines, pour_count, required_checksum
 
 
 class MotionNotEnabledError(RunError):
@@ -51,11 +49,11 @@ def what_moves(daemon: Supervisor, item: QueueItem) -> WhatMovesOut:
         MotionNotEnabledError: nothing would move, or motion is not allowed.
     """
     if item.mode != "hardware":
-        raise MotionNotEnabledError(f"{item.id} has nothing to arm: its rig is {item.mode}")
+        raise MotionNotEnabledError(f"{item.id} has no motion to enable: its rig is {item.mode}")
     if item.state in ENDED:
         raise MotionNotEnabledError(f"{item.id} is {item.state}")
     try:
-        work = job_of(daemon.settings, item, daemon.settings.rig(item.rig))
+        work = run_request(daemon.settings, item, daemon.settings.rig(item.rig))
         required_checksum(work.campaign)
         arm = work.campaign.laboratory.arm
         assert arm is not None
@@ -70,7 +68,7 @@ def what_moves(daemon: Supervisor, item: QueueItem) -> WhatMovesOut:
     return WhatMovesOut(laboratory=work.campaign.laboratory.name, arm=arm.title, lines=lines)
 
 
-def arm(daemon: Supervisor, item: QueueItem, moves: WhatMovesOut, typed: str, by: str) -> QueueItem:
+def enable_motion(daemon: Supervisor, item: QueueItem, moves: WhatMovesOut, typed: str, by: str) -> QueueItem:
     """Enable motion.
 
     Raises:
@@ -78,10 +76,10 @@ def arm(daemon: Supervisor, item: QueueItem, moves: WhatMovesOut, typed: str, by
     """
     if typed != moves.laboratory:
         raise MotionNotEnabledError(
-            f"not armed: '{typed}' was typed, and the laboratory is {moves.laboratory}; nothing moves"
+            f"motion is not enabled: '{typed}' was typed, and the laboratory is {moves.laboratory}; nothing moves"
         )
-    daemon.store.change(item.id, armed=True)
-    daemon.note(by, "arm", item.id, moves.laboratory)
+    daemon.store.change(item.id, motion_enabled=True)
+    daemon.note(by, "enable motion", item.id, moves.laboratory)
     daemon.wake()
     return daemon.item(item.id)
 
@@ -161,21 +159,21 @@ def _refusing() -> Iterator[None]:
         raise HTTPException(409, str(error)) from None
 
 
-@router.get("/campaigns/{key}/arming", operation_id="arming")
-async def arming(daemon: Daemon, person: Operator, key: str) -> WhatMovesOut:
+@router.get("/campaigns/{key}/motion", operation_id="motion")
+async def motion(daemon: Daemon, person: Operator, key: str) -> WhatMovesOut:
     """Describe the motion of this campaign, to be read before motion is enabled."""
     item = found_item(daemon, key)
     with _refusing():
         return await asyncio.to_thread(what_moves, daemon, item)
 
 
-@router.post("/campaigns/{key}/arm", operation_id="arm")
-async def arm_it(request: Request, daemon: Daemon, person: Operator, key: str, body: ArmIn) -> CampaignOut:
+@router.post("/campaigns/{key}/enable", operation_id="enable")
+async def enable(request: Request, daemon: Daemon, person: Operator, key: str, body: EnableIn) -> CampaignOut:
     """Enable motion in the coming part of this campaign's run."""
     item = found_item(daemon, key)
     with _refusing():
         moves = await asyncio.to_thread(what_moves, daemon, item)
-        return campaign_out(request, daemon, arm(daemon, item, moves, body.laboratory, person.name))
+        return campaign_out(request, daemon, enable_motion(daemon, item, moves, body.laboratory, person.name))
 
 
 @router.post("/questions/{number}/answer", operation_id="answer")

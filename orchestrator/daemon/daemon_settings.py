@@ -30,7 +30,7 @@ PORT = 8377
 ANY_RIG = "virtual"
 """The rig of a daemon whose settings name none: each campaign's own laboratory, which must be virtual."""
 
-DESK = "desk"
+NO_RIG = "none"
 """The rig of campaigns that pour nothing: they need simulators only."""
 
 Port = Annotated[int, Field(strict=True, ge=0, le=65535)]
@@ -142,7 +142,7 @@ class Rig:
     @property
     def mode(self) -> str:
         """'virtual' or 'hardware'; 'none' for the rig of campaigns that pour nothing."""
-        if self.name == DESK:
+        if self.name == NO_RIG:
             return "none"
         return "virtual" if self.spec is None else self.spec.mode
 
@@ -170,6 +170,9 @@ class DaemonSettings:
     quick_start: bool = field(default=True, compare=False)
     """Whether simulators start at once instead of with the first campaign."""
 
+    arm_interval: float = field(default=5.0, compare=False)
+    """Interval at which the state of an idle arm is read [s]."""
+
     @property
     def runs(self) -> Path:
         """Folder of the runs' folders."""
@@ -192,7 +195,7 @@ class DaemonSettings:
 
     def rig(self, name: str) -> Rig:
         """Return a rig by its name. Raises KeyError."""
-        return next(rig for rig in (*self.rigs, Rig(DESK)) if rig.name == name)
+        return next(rig for rig in (*self.rigs, Rig(NO_RIG)) if rig.name == name)
 
 
 def load_settings(path: Path | None, **given: Any) -> DaemonSettings:
@@ -255,8 +258,8 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> DaemonSettings:
     for name, text in (file.rigs or {}).items():
         at = place.at("rigs", name)
         source = resolved(place.directory / text)
-        if name == DESK:
-            report.add(at, f"'{DESK}' is where campaigns run that pour nothing; give the rig another name", key=True)
+        if name == NO_RIG:
+            report.add(at, f"'{NO_RIG}' stands for campaigns that pour nothing; give the rig another name", key=True)
         elif (missing := missing_file(source)) is not None:
             report.add(at, missing)
         else:

@@ -21,13 +21,14 @@ from orchestrator.catalogue.run_registry import make_state_directory
 from orchestrator.journal.journal_file import locked_alone
 from orchestrator.run_errors import RunError
 
-FORMAT = 1
+FORMAT = 2
 
 _SCHEMA = """
 create table campaign (
-    id text primary key, name text not null, verb text not null, rig text not null, mode text not null,
-    priority integer not null, rank real not null, state text not null, wish text not null, reason text not null,
-    by text not null, created real not null, begun real, ended real, run text, armed integer not null,
+    id text primary key, name text not null, task text not null, rig text not null, mode text not null,
+    priority integer not null, rank real not null, state text not null, desired_state text not null,
+    reason text not null,
+    by text not null, created real not null, begun real, ended real, run text, motion_enabled integer not null,
     answers text not null check (json_valid(answers))
 ) strict;
 create index campaign_by_state on campaign (state, rig);
@@ -39,12 +40,14 @@ create table question (
 ) strict;
 create index question_open on question (closed, answered);
 create table flag (name text primary key, value text not null check (json_valid(value))) strict;
-create table deed (
+create table audit (
     id integer primary key, t real not null, by text not null, what text not null, campaign text not null,
     detail text not null
 ) strict;
-create trigger deed_is_never_changed before update on deed begin select raise(abort, 'deeds are append-only'); end;
-create trigger deed_is_never_deleted before delete on deed begin select raise(abort, 'deeds are append-only'); end;
+create trigger audit_is_never_changed before update on audit begin
+    select raise(abort, 'audit entries are append-only'); end;
+create trigger audit_is_never_deleted before delete on audit begin
+    select raise(abort, 'audit entries are append-only'); end;
 """
 
 
@@ -80,35 +83,35 @@ class QueueItem:
 
     Attributes:
         id: unique and short enough to type.
-        verb: task: 'run', 'calibrate' or 'plan'.
-        rig: rig that it leases; 'desk' if it pours nothing.
+        task: task: 'run', 'calibrate' or 'plan'.
+        rig: rig that it leases; 'none' if it pours nothing.
         mode: mode of that rig: 'virtual', 'hardware' or 'none'.
         priority: higher priorities run first.
         rank: order within one priority, smallest first.
         state: state of the run (`orchestrator.states`), or 'stopped', 'withdrawn'.
-        wish: desired state.
+        desired_state: desired state.
         reason: reason of the state, for the operator.
         by: user who submitted it.
         run: name of its run's folder; None before the run starts.
-        armed: whether motion is enabled for the coming part of its run.
+        motion_enabled: whether motion is enabled for the coming part of its run.
     """
 
     id: str
     name: str
-    verb: str
+    task: str
     rig: str
     mode: str
     priority: int
     rank: float
     state: str
-    wish: str
+    desired_state: str
     reason: str
     by: str
     created: float
     begun: float | None = None
     ended: float | None = None
     run: str | None = None
-    armed: bool = False
+    motion_enabled: bool = False
     answers: dict[str, Any] = field(default_factory=dict)
 
 
@@ -148,7 +151,7 @@ class StoredQuestion:
 
 
 _JSON = {"answers", "options", "details"}
-_BOOLEAN = {"armed", "hands"}
+_BOOLEAN = {"motion_enabled", "hands"}
 
 
 class Store:
@@ -308,13 +311,13 @@ class Store:
 
     def note(self, by: str, what: str, campaign: str = "", detail: str = "") -> None:
         """Append an audit entry: who did what."""
-        self._write("insert into deed (t, by, what, campaign, detail) values (?, ?, ?, ?, ?)",
+        self._write("insert into audit (t, by, what, campaign, detail) values (?, ?, ?, ?, ?)",
                     time.time(), by, what, campaign, detail)  # fmt: skip
 
-    def deeds(self, campaign: str | None = None, limit: int = 200) -> list[dict[str, Any]]:
+    def audit(self, campaign: str | None = None, limit: int = 200) -> list[dict[str, Any]]:
         """Return the audit entries, newest first."""
         where, arguments = ("", []) if campaign is None else ("where campaign = ?", [campaign])
-        query = f"select t, by, what, campaign, detail from deed {where} order by id desc limit ?"
+        query = f"select t, by, what, campaign, detail from audit {where} order by id desc limit ?"
         return [dict(row) for row in self._db.execute(query, [*arguments, limit])]
 
     def _write(self, statement: str, *arguments: Any) -> int:

@@ -26,14 +26,14 @@ from orchestrator.requests import Suggest, Suggested
 from orchestrator.runs.events import (
     CampaignOpened,
     Event,
-    MadeAhead,
     PourProgressed,
     RequestFinished,
     RequestStarted,
+    SpeculationProgressed,
     StrategyProgressed,
 )
 
-PASSING = (PourProgressed, StrategyProgressed, MadeAhead)
+PASSING = (PourProgressed, StrategyProgressed, SpeculationProgressed)
 """Progress events. Each replaces the one before it, so they are not stored on disk."""
 
 
@@ -149,16 +149,18 @@ class Feed:
         """Number of the newest event."""
         return self._next - 1
 
-    def watcher(self, campaign: str) -> Callable[[Event], None]:
+    def subscriber(self, campaign: str) -> Callable[[Event], None]:
         """Return a subscriber that adds a campaign's events to the feed."""
 
-        def watch(event: Event) -> None:
+        def receive(event: Event) -> None:
             data = event_json(event)
-            self.tell(data.pop("type"), data, campaign, kept=not isinstance(event, PASSING), t=event.time)
+            self.publish(data.pop("type"), data, campaign, kept=not isinstance(event, PASSING), t=event.time)
 
-        return watch
+        return receive
 
-    def tell(self, kind: str, data: dict[str, Any], campaign: str = "", *, kept: bool = True, t: float = 0.0) -> None:
+    def publish(
+        self, kind: str, data: dict[str, Any], campaign: str = "", *, kept: bool = True, t: float = 0.0
+    ) -> None:
         """Add an event."""
         t = t or time.time()
         number, self._next = self._next, self._next + 1

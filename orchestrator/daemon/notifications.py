@@ -43,7 +43,7 @@ _EVENTS_WITH_DATA = (
     "QuestionAsked",
     "QuestionAnswered",
     "QuestionClosed",
-    "Deed",
+    "AuditEntry",
 )
 """Events whose data are read; of all other events only the arrival counts."""
 
@@ -178,7 +178,7 @@ class Notifier:
                 message = self._rests(data, campaign)
                 self._news.pop(campaign, None)
                 return message
-            case "Deed" if data.get("what") == "emergency stop":
+            case "AuditEntry" if data.get("what") == "emergency stop":
                 lines = [f"By {data.get('by')}.", str(data.get("detail") or ""), "Nothing begins before it is cleared."]
                 return self._made("emergency", "", "EMERGENCY STOP", lines)
         return None

@@ -1,32 +1,40 @@
 """Read-only routes of the HTTP API: status, campaigns, questions, rigs, events, reports and metrics.
 
-Commands are in `command_routes`; previous runs are in `archive_routes`.
+Commands are in `command_routes`; previous runs are in `archive_routes`. `measures` reads the metrics from the daemon at
+each request, so that nothing is counted twice or stored.
 """
 
 from __future__ import annotations
 
 import asyncio
 import importlib.metadata
+import os
+import resource
+import threading
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse, StreamingResponse
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import GaugeMetricFamily, Metric
 
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.access_control import Daemon, Viewer
 from orchestrator.daemon.daemon_store import QueueItem
-from orchestrator.daemon.metrics import measures
 from orchestrator.daemon.remote_operator import question_json
-from orchestrator.daemon.rig_worker import job_of
 from orchestrator.daemon.run_readout import REPORT, summary_of
 from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, RigOut, StatusOut
+from orchestrator.daemon.submissions import run_request
 from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.journal.journal_file import free_space
+from orchestrator.results.run_summary import PourSummary
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.resources import DISTRIBUTION
 
 READERS = 400
 """Largest number of concurrent event streams."""
@@ -43,7 +51,7 @@ async def status(request: Request, daemon: Daemon, person: Viewer) -> StatusOut:
     emergency = daemon.emergency
     return StatusOut.model_validate(
         {
-            "version": importlib.metadata.version("decant"),
+            "version": importlib.metadata.version(DISTRIBUTION),
             "time": time.time(),
             "began": daemon.began,
             "stopping": daemon.stopping,
@@ -70,11 +78,11 @@ async def rigs(daemon: Daemon, person: Viewer) -> list[RigOut]:
 def rigs_out(daemon: Supervisor) -> list[RigOut]:
     """Convert the rigs to their response models."""
     found = []
-    for name, worker in daemon.lanes.items():
+    for name, worker in daemon.workers.items():
         running = worker.running
         checkpoint = "" if running is None else running.checkpoint
         campaign = None if running is None else running.item.id
-        stop = daemon.emergencies.get(name)
+        stop, arm = daemon.emergencies.get(name), worker.arm
         found.append(
             RigOut.model_validate(
                 {
@@ -83,6 +91,14 @@ def rigs_out(daemon: Supervisor) -> list[RigOut]:
                     "campaign": campaign,
                     "checkpoint": checkpoint,
                     "emergency": stop,
+                    "arm": None
+                    if arm is None
+                    else {
+                        "state": arm.check.state,
+                        "text": arm.check.found,
+                        "advice": arm.check.advice,
+                        "time": arm.time,
+                    },
                 }
             )
         )
@@ -106,26 +122,26 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
     """Return one campaign with its pours and its summary."""
     item = found_item(daemon, key)
     summary: dict[str, Any] | None = None
-    pours: list[dict[str, Any]] = []
+    pours: list[PourSummary] = []
     if item.run is not None:
         directory = daemon.settings.runs / item.run
 
-        def read() -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
-            def plan() -> CampaignPlan:
-                return job_of(daemon.settings, item, daemon.settings.rig(item.rig)).campaign
+        # A process that was killed leaves a journal that ends in the middle of the pour.
+        live = daemon.progress(item) is not None
 
-            return daemon.pours.of(directory, plan), summary_of(directory)
+        def read() -> tuple[list[PourSummary], dict[str, Any] | None]:
+            def plan() -> CampaignPlan:
+                return run_request(daemon.settings, item, daemon.settings.rig(item.rig)).campaign
+
+            return daemon.pours.of(directory, plan, live=live), summary_of(directory)
 
         try:
             pours, summary = await asyncio.to_thread(read)
         except (ConfigError, RunError, KeyError):  # for example, a rig that the settings no longer contain
             summary = await asyncio.to_thread(summary_of, directory)
     table = campaign_out(request, daemon, item).model_dump()
-    if daemon.progress(item) is None:  # the process was killed, so the journal ends in the middle of the pour
-        for pour in pours:
-            pour["state"] = "unknown" if pour["state"] == "under way" else pour["state"]
-    deeds = daemon.store.deeds(item.id)
-    return CampaignDetailOut.model_validate({**table, "pours_made": pours, "summary": summary, "deeds": deeds})
+    audit = daemon.store.audit(item.id)
+    return CampaignDetailOut.model_validate({**table, "pours_made": pours, "summary": summary, "audit": audit})
 
 
 @router.get(
@@ -226,9 +242,77 @@ def campaign_out(request: Request, daemon: Supervisor, item: QueueItem) -> Campa
     return CampaignOut.model_validate(
         {
             **table,
-            "needs_arming": item.mode == "hardware" and not item.armed and waits,
+            "needs_enabling": item.mode == "hardware" and not item.motion_enabled and waits,
             "progress": daemon.progress(item),
             "report": run is not None and (run / REPORT).is_file(),
             "live": request.app.state.live(item.id) if daemon.progress(item) is not None else None,
         }
     )
+
+
+class _Collector:
+    """Reads the current values when Prometheus collects them."""
+
+    def __init__(self, daemon: Supervisor) -> None:
+        self._daemon = daemon
+
+    def collect(self) -> Iterable[Metric]:
+        """Yield the metrics, as prometheus_client's collectors do."""
+        daemon = self._daemon
+        campaigns = GaugeMetricFamily("decant_campaigns", "Campaigns in each state.", labels=["state"])
+        for state, count in daemon.store.counts().items():
+            campaigns.add_metric([state], count)
+        yield campaigns
+        busy = GaugeMetricFamily("decant_rig_busy", "Whether a campaign has the rig.", labels=["rig"])
+        for name, worker in daemon.workers.items():
+            busy.add_metric([name], float(worker.running is not None))
+        yield busy
+        words = GaugeMetricFamily(
+            "decant_notifications", "Notifications sent to receivers.", labels=["receiver", "outcome"]
+        )
+        for receiver, counts in daemon.notification_counts.items():
+            for outcome, count in asdict(counts).items():
+                words.add_metric([receiver, outcome], count)
+        yield words
+        single = {
+            "decant_questions_open": ("Questions that wait for an answer.", len(daemon.store.questions())),
+            "decant_emergency_stop": (
+                "Whether an emergency stop is latched.",
+                daemon.emergency is not None or bool(daemon.emergencies),
+            ),
+            "decant_queue_paused": ("Whether no campaign is begun.", daemon.queue_paused),
+            "decant_simulators": ("Simulators in the pool.", daemon.warm.size),
+            "decant_events_last": ("Number of the newest event.", daemon.feed.last),
+            "decant_readers": ("Readers of events.", daemon.feed.readers),
+            "decant_problems": ("Things that people should mend.", len(daemon.problems)),
+            "decant_disk_free_bytes": ("Room on the state directory's disk.", free_space(daemon.settings.state)),
+            "decant_threads": ("Threads of the daemon's process.", threading.active_count()),
+            "decant_open_files": ("Open files of the daemon's process.", _open_files()),
+            "decant_resident_bytes": ("Memory of the daemon's process.", _resident()),
+            "decant_cpu_seconds_total": ("CPU time of the daemon's process.", _cpu()),
+        }
+        for name, (text, value) in single.items():
+            yield GaugeMetricFamily(name, text, value=float(value))
+
+
+def measures(daemon: Supervisor) -> bytes:
+    """Return all metrics in Prometheus' text format."""
+    registry = CollectorRegistry()
+    registry.register(_Collector(daemon))
+    return generate_latest(registry)
+
+
+def _open_files() -> int:
+    return len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else 0  # noqa: PTH208  no Path is made
+
+
+def _resident() -> int:
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    except OSError:
+        return 0
+
+
+def _cpu() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime

@@ -16,7 +16,7 @@ from actors.balance.readings import typed_weight
 from actors.interfaces import LaboratoryError
 from actors.interfaces import OperatorQuestion as BenchQuestion
 from orchestrator.daemon.daemon_store import Store, StoredQuestion
-from orchestrator.runs.unknown_pours import parse_answer
+from orchestrator.runs.resume import parse_answer
 
 GIVE_UP = "give up"
 
@@ -41,11 +41,11 @@ class Asking:
 
     Args:
         store: store of the questions.
-        tell: callback for events: the event's name, its data, and the campaign.
+        publish: callback for events: the event's name, its data, and the campaign.
     """
 
-    def __init__(self, store: Store, tell: Callable[[str, dict[str, Any], str], None]) -> None:
-        self._store, self._tell = store, tell
+    def __init__(self, store: Store, publish: Callable[[str, dict[str, Any], str], None]) -> None:
+        self._store, self._publish = store, publish
         self._waiting: dict[int, asyncio.Future[str]] = {}
         for left in store.questions():
             store.close_question(left.id, "the daemon ended")
@@ -58,7 +58,7 @@ class Asking:
         """
         question = self._store.ask(**values)
         self._waiting[question.id] = asyncio.get_running_loop().create_future()
-        self._tell("QuestionAsked", {"question": question_json(question)}, question.campaign)
+        self._publish("QuestionAsked", {"question": question_json(question)}, question.campaign)
         try:
             return await self._waiting[question.id]
         finally:
@@ -66,7 +66,7 @@ class Asking:
             self._store.close_question(question.id, "withdrawn")
             found = self._store.question(question.id)
             if found is not None and found.answer is None:
-                self._tell("QuestionClosed", {"question": question_json(found)}, question.campaign)
+                self._publish("QuestionClosed", {"question": question_json(found)}, question.campaign)
 
     def answer(self, key: int, answer: str, by: str) -> StoredQuestion:
         """Answer a question.
@@ -89,7 +89,7 @@ class Asking:
         waiting.set_result(meant)
         found = self._store.question(key)
         assert found is not None
-        self._tell("QuestionAnswered", {"question": question_json(found)}, question.campaign)
+        self._publish("QuestionAnswered", {"question": question_json(found)}, question.campaign)
         return found
 
 

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from actors.interfaces import LaboratoryError
+from actors.arm.arm_settings import ArmSettings
+from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.laboratory import WarmSimulators
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.daemon_settings import DaemonSettings, Rig
@@ -22,20 +23,19 @@ from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, DesiredSta
 from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.remote_operator import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.run_readout import prune_recordings
-from orchestrator.daemon.submission_bundle import CAMPAIGN, THETA, load_confined
-from orchestrator.journal.disk_reserve import MB, free_space
-from orchestrator.journal.journal_file import JournalError
+from orchestrator.daemon.submissions import run_request
+from orchestrator.journal.journal_file import MB, JournalError, free_space
 from orchestrator.journal.run_record import CampaignResult
 from orchestrator.live_view.live_server import LiveView, recorder_of
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
 from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState
 from orchestrator.results.publishing import not_simulated
 from orchestrator.run_errors import RunError
-from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService, read_theta, task_request
+from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService
 from orchestrator.runs.events import CampaignStateChanged, StageOpened
 from orchestrator.runs.request_executor import PourUnknownError, RequestExecutorError
+from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.stages import scenes_of
-from orchestrator.runs.unknown_pours import OperatorNeededError
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Common:
+class SharedServices:
     """What all campaigns of a daemon share."""
 
     settings: DaemonSettings
@@ -52,23 +52,6 @@ class Common:
     asking: Asking
     warm: WarmSimulators
     live: LiveView | None = None
-
-
-def job_of(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunRequest:
-    """The run of a submitted campaign, from its snapshot. Takes a moment, and no event loop.
-
-    Raises:
-        ConfigError, RunTaskError, JournalError: it can't be used.
-    """
-    folder = settings.snapshots / item.id
-    plan = load_confined(folder / CAMPAIGN, [folder.resolve()], rig.source)
-    given = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
-    # A daemon never repeats a pour by itself: whoever is there is asked, whatever the campaign says.
-    plan = replace(plan, on_unknown="ask", outputs=plan.outputs.model_copy(update={"directory": str(settings.runs)}))
-    request = task_request(plan, item.verb, given=given)  # type: ignore[arg-type]  # written by us
-    if item.run is None:
-        return request
-    return replace(request, folder=settings.runs / item.run, resume="if begun")
 
 
 def _prepared(request: RunRequest) -> tuple[RunRequest, list[str]]:
@@ -100,9 +83,9 @@ class Running:
         rig: that it has leased.
     """
 
-    def __init__(self, common: Common, item: QueueItem, rig: Rig) -> None:
-        self._common, self.item, self._rig = common, item, rig
-        self._tally: ProgressState | None = None
+    def __init__(self, common: SharedServices, item: QueueItem, rig: Rig) -> None:
+        self._shared, self.item, self._rig = common, item, rig
+        self._progress: ProgressState | None = None
         self._stage = StageOpened(stage="", index=0, count=0)
         self._handle: RunHandle | None = None
         self._asked_to_end = False
@@ -111,21 +94,21 @@ class Running:
         """Run until it rests.
 
         Args:
-            checksum: of the safety settings that were accepted, where hardware was armed.
+            checksum: of the safety settings that were accepted, where motion of hardware is enabled.
 
         Raises:
             asyncio.CancelledError: it was paused, stopped, aborted.
             RunError, LaboratoryError, ConfigError, OSError: it can't go on.
         """
-        found = await asyncio.to_thread(job_of, self._common.settings, self.item, self._rig)
+        found = await asyncio.to_thread(run_request, self._shared.settings, self.item, self._rig)
         request, warned = await asyncio.to_thread(_prepared, found)
         assert request.folder is not None
         for text in warned:
             self._log_warning(text)
-        await self._common.warm.open()
+        await self._shared.warm.open()
         if self.item.run != request.folder.name:
             self.note_run(request.folder)
-        self._tally = ProgressState(request.campaign)
+        self._progress = ProgressState(request.campaign)
         self._handle = handle = RunService().start(request, self._resources(request, checksum))
         if self._asked_to_end:
             handle.pause()
@@ -137,33 +120,33 @@ class Running:
         return result
 
     def _resources(self, request: RunRequest, checksum: str) -> RunResources:
-        asking, key, rig = self._common.asking, self.item.id, self._rig.name
-        plan, live = request.campaign, self._common.live
+        asking, key, rig = self._shared.asking, self.item.id, self._rig.name
+        plan, live = request.campaign, self._shared.live
         load = next(iter(scenes_of(plan).values())).liquid.mass  # a campaign has one liquid
         asks = request.pours and plan.laboratory.needs_person
-        assert self._tally is not None
+        assert self._progress is not None
 
         def recorder(plan: CampaignPlan, run: Path) -> RerunMonitor | None:
             return recorder_of(plan, run, self._log_warning, live if live is not None and live.alive else None)
 
         return RunResources(
-            in_process=self._common.settings.in_process,
-            simulators=self._common.warm.share(),
-            optimizer=self._common.warm.optimizer(),
+            in_process=self._shared.settings.in_process,
+            simulators=self._shared.warm.share(),
+            optimizer=self._shared.warm.optimizer(),
             operator=RemoteOperator(asking, key, rig, self._announce) if asks else None,
-            ask_operator=RunQuestions(asking, self._common.store, key, rig, load, lambda: self._look(plan)),
+            ask_operator=RunQuestions(asking, self._shared.store, key, rig, load, lambda: self._look(plan)),
             approved_checksum=checksum,
-            subscribers=[self._common.feed.watcher(key), self._tally, self._note_state],
+            subscribers=[self._shared.feed.subscriber(key), self._progress, self._note_state],
             recorder=recorder,
         )
 
     def note_run(self, directory: Path) -> None:
         """Write down which folder the run has, before anything happens in it."""
         self.item = replace(self.item, run=directory.name)
-        self._common.store.change(self.item.id, run=directory.name)
+        self._shared.store.change(self.item.id, run=directory.name)
 
     def _log_warning(self, text: str) -> None:
-        self._common.feed.tell("LogLine", {"level": "warning", "text": text, "stage": ""}, self.item.id)
+        self._shared.feed.publish("LogLine", {"level": "warning", "text": text, "stage": ""}, self.item.id)
 
     def _note_state(self, event: Any) -> None:
         if isinstance(event, StageOpened):
@@ -172,10 +155,10 @@ class Running:
             # Finished is what has been published: killed before that, it is taken up again for it.
             done = event.after == State.FINISHED
             state, reason = ("running", "being published") if done else (event.after, event.reason)
-            self._common.store.change(self.item.id, state=state, reason=reason)
+            self._shared.store.change(self.item.id, state=state, reason=reason)
 
     def _announce(self, text: str, seconds: float) -> None:
-        self._common.feed.tell("Announced", {"rig": self._rig.name, "text": text, "seconds": seconds}, self.item.id)
+        self._shared.feed.publish("Announced", {"rig": self._rig.name, "text": text, "seconds": seconds}, self.item.id)
 
     def _look(self, plan: CampaignPlan) -> dict[str, str]:
         from orchestrator.daemon.run_readout import found_at
@@ -209,7 +192,7 @@ class Running:
         except (LaboratoryError, TimeoutError) as error:
             text = f"the arm of {self._rig.name} did not confirm that it was stopped ({error}): use its own button"
             _log.error(text)
-            self._common.feed.tell("LogLine", {"level": "error", "text": text, "stage": ""}, self.item.id)
+            self._shared.feed.publish("LogLine", {"level": "error", "text": text, "stage": ""}, self.item.id)
 
     async def give_up(self) -> None:
         """Paused already: now abandon the pour as well; see `RunHandle.abandon_pour`."""
@@ -220,7 +203,7 @@ class Running:
         """After a stop: publish the results so far, as those of a finished run."""
 
         def work() -> None:
-            RunService().publish_so_far(job_of(self._common.settings, self.item, self._rig))
+            RunService().publish_so_far(run_request(self._shared.settings, self.item, self._rig))
 
         if self.item.run is not None:
             await asyncio.to_thread(work)
@@ -235,12 +218,12 @@ class Running:
 
         None before it has begun.
         """
-        tally = self._tally
-        if tally is None:
+        progress = self._progress
+        if progress is None:
             return None
-        stage = tally.stages.get(self._stage.stage)
+        stage = progress.stages.get(self._stage.stage)
         done = stage.progress if stage is not None else None
-        pour = tally.pour
+        pour = progress.pour
         return {
             "stage": self._stage.stage,
             "stage_index": self._stage.index,
@@ -249,13 +232,13 @@ class Running:
             "of_simulations": done.of_simulations if done else 0,
             "pours": done.pours if done else 0,
             "of_pours": done.of_pours if done else 0,
-            "simulators_busy": tally.busy,
-            "line": tally.counts_line(),
-            "pour": tally.pour_line(),
+            "simulators_busy": progress.busy,
+            "line": progress.counts_line(),
+            "pour": progress.pour_line(),
             "checkpoint": self.checkpoint,
             "checkpoint_words": CHECKPOINT_WORDS.get(self.checkpoint, ""),
             "fraction": pour.progress.fraction if pour is not None and pour.progress is not None else None,
-            "seconds_left": tally.forecast.left(time.time()),
+            "seconds_left": progress.forecast.left(time.time()),
         }
 
     @property
@@ -268,7 +251,27 @@ RETRY = 30.0
 """Before a lane that was kept from beginning looks again [s]."""
 
 
-class Whole(Protocol):
+@dataclass(frozen=True)
+class ArmStatus:
+    """Whether the arm of a rig can move, as last read while no campaign used it.
+
+    Attributes:
+        check: result and remedy, as in `decant doctor`.
+        time: of the first reading with this result, in seconds since 1970.
+    """
+
+    check: DeviceCheck
+    time: float
+
+
+def _readiness(arm: ArmSettings) -> DeviceCheck | None:
+    try:
+        return arm.readiness()
+    except (LaboratoryError, OSError, ValueError) as error:
+        return DeviceCheck("motion", "fail", str(error), "see 'decant doctor'")
+
+
+class DaemonState(Protocol):
     """What a lane needs of the daemon that it is a part of.
 
     Attributes:
@@ -277,7 +280,7 @@ class Whole(Protocol):
         suspect: the simulators may be gone.
     """
 
-    lanes: dict[str, Lane]
+    workers: dict[str, RigWorker]
     stopping: bool
     suspect: bool
 
@@ -295,7 +298,7 @@ class Whole(Protocol):
         ...
 
 
-class Lane:
+class RigWorker:
     """What happens at one rig: one campaign after the other.
 
     Args:
@@ -304,11 +307,13 @@ class Lane:
         common: what all of them share.
     """
 
-    def __init__(self, daemon: Whole, rig: Rig, common: Common) -> None:
-        self._daemon, self.rig, self._common = daemon, rig, common
+    def __init__(self, daemon: DaemonState, rig: Rig, common: SharedServices) -> None:
+        self._daemon, self.rig, self._shared = daemon, rig, common
         self.running: Running | None = None
         self.wake = asyncio.Event()
         self.latched = daemon.is_stopped(rig.name)
+        self.arm: ArmStatus | None = None
+        self._reading_arm = asyncio.Lock()
         self._background: set[asyncio.Task[None]] = set()
         self._resting = asyncio.Event()
         self._resting.set()
@@ -321,18 +326,43 @@ class Lane:
         """Until cancelled."""
         while True:
             self.wake.clear()
-            item = self._next()
-            if item is None:
+            async with self._reading_arm:  # no run begins during a reading, and no reading during a run
+                item = self._next()
+                self.running = None if item is None else Running(self._shared, item, self.rig)
+            if item is None or self.running is None:
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(RETRY):
                         await self.wake.wait()
                 continue
             self._resting.clear()
             try:
-                await self._run(item)
+                await self._run(self.running)
             finally:
                 self.running = None
                 self._resting.set()
+
+    async def watch_arm(self) -> None:
+        """Keep `arm` current while no campaign uses the rig, until cancelled.
+
+        A reading changes nothing on the controller, and no run begins before it has ended.
+        """
+        spec = self.rig.spec
+        if spec is None or spec.arm is None or spec.mode != "hardware":
+            return
+        while True:
+            async with self._reading_arm:
+                if self.running is None and not self._daemon.stopping:
+                    check = await asyncio.to_thread(_readiness, spec.arm)
+                    self._show_arm(check)
+            await asyncio.sleep(self._shared.settings.arm_interval)
+
+    def _show_arm(self, check: DeviceCheck | None) -> None:
+        if check is None:
+            self.arm = None
+        elif self.arm is None or self.arm.check != check:
+            self.arm = ArmStatus(check, time.time())
+            body = {"rig": self.rig.name, "state": check.state, "text": check.found, "advice": check.advice}
+            self._shared.feed.publish("ArmStatusChanged", body)
 
     async def close(self) -> None:
         """Come to rest."""
@@ -347,21 +377,23 @@ class Lane:
         task.add_done_callback(self._background.discard)
 
     def _next(self) -> QueueItem | None:
-        if self.latched or self._daemon.stopping or self._common.warm.lost:
+        if self.latched or self._daemon.stopping or self._shared.warm.lost:
             return None
-        store = self._common.store
-        mine = [one for one in store.items([*AT_REST]) if one.rig == self.rig.name and one.wish == DesiredState.RUN]
+        store = self._shared.store
+        mine = [
+            one for one in store.items([*AT_REST]) if one.rig == self.rig.name and one.desired_state == DesiredState.RUN
+        ]
         begun = sorted(
             (one for one in mine if one.run is not None and one.state not in ENDED), key=lambda one: one.begun or 0.0
         )
         queued = [one for one in mine if one.state == "queued"]
         if self._daemon.queue_paused:
             queued = []
-        found = next((one for one in (*begun, *queued) if one.mode != "hardware" or one.armed), None)
+        found = next((one for one in (*begun, *queued) if one.mode != "hardware" or one.motion_enabled), None)
         return found if found is not None and self._has_room() else None
 
     def _has_room(self) -> bool:
-        settings = self._common.settings
+        settings = self._shared.settings
         free = free_space(settings.state)
         text = (
             f"{free / MB:.0f} MB are free on the disk of {settings.state}, and no campaign is begun below "
@@ -370,15 +402,15 @@ class Lane:
         self._daemon.problem("disk", text if free < settings.keep_free else None)
         return free >= settings.keep_free
 
-    async def _run(self, item: QueueItem) -> None:
-        store, feed = self._common.store, self._common.feed
-        self.running = running = Running(self._common, item, self.rig)
-        store.change(item.id, state="preparing", reason="", begun=item.begun or time.time(), armed=False)
-        feed.tell("CampaignLeased", {"rig": self.rig.name}, item.id)
-        if self._daemon.suspect and not any(one.running for one in self._daemon.lanes.values() if one is not self):
+    async def _run(self, running: Running) -> None:
+        store, feed, item = self._shared.store, self._shared.feed, running.item
+        self._show_arm(None)
+        store.change(item.id, state="preparing", reason="", begun=item.begun or time.time(), motion_enabled=False)
+        feed.publish("CampaignLeased", {"rig": self.rig.name}, item.id)
+        if self._daemon.suspect and not any(one.running for one in self._daemon.workers.values() if one is not self):
             self._daemon.suspect = False
-            await self._common.warm.close()
-        state, reason, wish = "failed", "", DesiredState.PAUSE
+            await self._shared.warm.close()
+        state, reason, desired = "failed", "", DesiredState.PAUSE
         result: CampaignResult | None = None
         try:
             result = await running.run(self._checksum(item))
@@ -387,11 +419,11 @@ class Lane:
             task = asyncio.current_task()
             if task is not None and task.cancelling():
                 raise
-            state, reason, wish = self._ended_by_people(item)
+            state, reason, desired = self._ended_by_people(item)
         except OperatorNeededError as error:
-            state, reason, wish = "paused", str(error), self._kept_wish(item)
+            state, reason, desired = "paused", str(error), self._kept_desired_state(item)
         except PourUnknownError as error:
-            state, reason, wish = "unknown", str(error), self._kept_wish(item)
+            state, reason, desired = "unknown", str(error), self._kept_desired_state(item)
         except (RunError, LaboratoryError, ConfigError, OSError) as error:
             needs_person = getattr(error, "exit_code", 1) == 3
             self._daemon.suspect |= isinstance(error, LaboratoryError | RequestExecutorError)
@@ -399,35 +431,35 @@ class Lane:
         except Exception as error:
             state, reason = "failed", f"{type(error).__name__}: {error}"
             _log.exception("campaign %s failed", item.id)
-        if state in ("failed", "paused") and (lost := self._common.warm.lost):
-            # No fault of the campaign's, and nobody's wish: it goes on when there is a Ray again.
-            state, reason, wish = "paused", f"Ray had lost its {lost}", self._kept_wish(item)
-        await self._leave(running, state, reason, wish)
+        if state in ("failed", "paused") and (lost := self._shared.warm.lost):
+            # No fault of the campaign's, and no operator's: it continues when there is a Ray again.
+            state, reason, desired = "paused", f"Ray had lost its {lost}", self._kept_desired_state(item)
+        await self._leave(running, state, reason, desired)
         if result is None and state != "finished":
             _log.warning("campaign %s: %s: %s", item.id, state, reason, extra={"campaign": item.id})
 
     def _checksum(self, item: QueueItem) -> str:
         if self.rig.source is None or self.rig.mode != "hardware":
             return ""
-        from orchestrator.runs.safety_approval import accepted_checksum
+        from orchestrator.runs.motion_approval import accepted_checksum
 
         return accepted_checksum(self.rig.source) or ""
 
-    def _kept_wish(self, item: QueueItem) -> DesiredState:
+    def _kept_desired_state(self, item: QueueItem) -> DesiredState:
         """Somebody has to answer before it goes on: it goes on to ask, unless people want something else of it."""
-        found = self._common.store.item(item.id)
-        return DesiredState.RUN if found is None else DesiredState(found.wish)
+        found = self._shared.store.item(item.id)
+        return DesiredState.RUN if found is None else DesiredState(found.desired_state)
 
     def _ended_by_people(self, item: QueueItem) -> tuple[str, str, DesiredState]:
-        found = self._common.store.item(item.id)
-        wish = DesiredState.PAUSE if found is None else DesiredState(found.wish)
+        found = self._shared.store.item(item.id)
+        desired = DesiredState.PAUSE if found is None else DesiredState(found.desired_state)
         state = "unknown" if found is not None and found.state == "unknown" else "paused"
         reason = found.reason if found is not None else ""
-        return state, reason, wish
+        return state, reason, desired
 
-    async def _leave(self, running: Running, state: str, reason: str, wish: DesiredState) -> None:
-        store, key = self._common.store, running.item.id
-        if wish is DesiredState.STOP and state != "finished":
+    async def _leave(self, running: Running, state: str, reason: str, desired: DesiredState) -> None:
+        store, key = self._shared.store, running.item.id
+        if desired is DesiredState.STOP and state != "finished":
             state = STOPPED
             try:
                 await running.tidy()
@@ -435,10 +467,10 @@ class Lane:
                 reason = f"what came of it could not be published: {error}"
                 _log.exception("campaign %s: not published", key)
         ended = time.time() if state in ENDED else None
-        store.change(key, state=state, reason=reason, wish=str(wish), ended=ended)
+        store.change(key, state=state, reason=reason, desired_state=str(desired), ended=ended)
         self.running = None  # whoever hears that it rests may have it go on
-        self._common.feed.tell("CampaignRests", {"state": state, "reason": reason, "rig": self.rig.name}, key)
+        self._shared.feed.publish("CampaignRests", {"state": state, "reason": reason, "rig": self.rig.name}, key)
         with contextlib.suppress(OSError):
-            busy = {one.running.item.run for one in self._daemon.lanes.values() if one.running is not None}
-            await asyncio.to_thread(prune_recordings, self._common.settings, {name for name in busy if name})
-            await self._common.warm.tidy()
+            busy = {one.running.item.run for one in self._daemon.workers.values() if one.running is not None}
+            await asyncio.to_thread(prune_recordings, self._shared.settings, {name for name in busy if name})
+            await self._shared.warm.tidy()

@@ -21,15 +21,12 @@ from actors.interfaces import LaboratoryError
 from actors.laboratory import reached
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.daemon.daemon_settings import DaemonSettings
-from orchestrator.journal.codec import CodecError, decode_outcome, decode_request
-from orchestrator.journal.journal import JOURNAL_NAME, Entry, JournalReader, Kind
+from orchestrator.journal.codec import CodecError
 from orchestrator.journal.journal_file import JournalError
-from orchestrator.requests import Failed, Pour, Poured
-from orchestrator.results import figure_style as style
+from orchestrator.journal.run_record import RecordReader
 from orchestrator.results.html_report import REPORT_NAME as REPORT
-from orchestrator.results.loss_units import is_calibration, loss_of_pour, unit_of_pour
-from orchestrator.results.stage_views import receiver_name
-from orchestrator.states import RESTING, State
+from orchestrator.results.run_summary import PourSummary
+from orchestrator.results.summarise import pour_summaries
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
 __all__ = ["REPORT", "Pours", "summary_of"]
@@ -46,92 +43,27 @@ class Pours:
 
     def __init__(self, keep: int = 16) -> None:
         self._keep = keep
-        self._read: OrderedDict[Path, _Read] = OrderedDict()
+        self._read: OrderedDict[Path, tuple[CampaignPlan, RecordReader]] = OrderedDict()
         self._guard = Lock()
 
-    def of(self, directory: Path, plan: Callable[[], CampaignPlan]) -> list[dict[str, Any]]:
+    def of(self, directory: Path, plan: Callable[[], CampaignPlan], *, live: bool) -> list[PourSummary]:
         """Return the requested pours of a run in order, with predictions and measurements.
 
         Args:
             directory: folder of the run.
             plan: makes the campaign's plan; called once. Its errors are passed on.
+            live: whether the run is in progress.
         """
         with self._guard:
-            read = self._read.pop(directory, None) or _Read(plan())
+            known = self._read.pop(directory, None) or (plan(), RecordReader())
             try:
-                read.on(directory)
+                record = known[1].read(directory)
             except (JournalError, CodecError, OSError):
-                return read.rows()  # being created, or of another version: read from its start at the next call
-            self._read[directory] = read
+                return []  # being created, or of another version: read from its start at the next call
+            self._read[directory] = known
             if len(self._read) > self._keep:
                 self._read.popitem(last=False)
-            return read.rows()
-
-
-class _Read:
-    """The state read from one run's journal."""
-
-    def __init__(self, plan: CampaignPlan) -> None:
-        self._plan, self._last = plan, 0
-        self._pours: dict[int, dict[str, Any]] = {}
-        self._requests: dict[int, Pour] = {}
-
-    def rows(self) -> list[dict[str, Any]]:
-        return [dict(pour) for pour in self._pours.values()]
-
-    def on(self, directory: Path) -> None:
-        kinds = [*(Kind.REQUESTED, Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED, Kind.CAMPAIGN_STATE)]
-        with JournalReader(directory / JOURNAL_NAME) as journal:
-            for entry in journal.entries(after=self._last, kinds=kinds):
-                self._take(entry)
-                self._last = entry.seq
-
-    def _take(self, entry: Entry) -> None:
-        if entry.kind == Kind.CAMPAIGN_STATE:
-            if entry.body["after"] in (*RESTING, State.PREPARING):  # the process that poured has ended
-                for pour in self._pours.values():
-                    if pour["state"] == "under way":
-                        pour["state"] = "unknown"
-            return
-        key = entry.body["id"]
-        if entry.kind == Kind.REQUESTED:
-            if entry.body["request"]["type"] == Pour.__name__:
-                request = decode_request(entry.body["request"])
-                assert isinstance(request, Pour)
-                self._requests[key], self._pours[key] = request, _requested(self._plan, entry.stage, request)
-        elif entry.kind == Kind.POUR_FINISHED:
-            outcome = decode_outcome(entry.body["outcome"])
-            self._pours[key] |= {"time": entry.t, **_outcome(self._plan, self._requests[key], outcome)}
-        else:
-            begun = entry.kind == Kind.POUR_STARTED
-            self._pours[key] |= {"state": "under way" if begun else "asked", "time": entry.t}
-
-
-def _requested(plan: CampaignPlan, stage: str, pour: Pour) -> dict[str, Any]:
-    section = plan.calibration if is_calibration(plan, pour) else plan.deployment
-    names = section.actions.names if section is not None else ("angular_velocity", "x_offset")
-    predicted = "" if pour.predicted is None else unit_of_pour(plan, pour).prediction(pour.predicted)
-    return {
-        "stage": stage,
-        "number": pour.number,
-        "receiver": receiver_name(plan, pour.scene),
-        "action": style.display_values({name: getattr(pour.action, name) for name in names}),
-        "predicted": predicted,
-        "measured": "",
-        "loss": unit_of_pour(plan, pour).meaning,
-        "spillage": None,
-        "state": "asked",
-        "time": None,
-    }
-
-
-def _outcome(plan: CampaignPlan, pour: Pour, outcome: object) -> dict[str, Any]:
-    if isinstance(outcome, Poured):
-        loss = loss_of_pour(plan, pour, outcome.measurement)
-        measured = "too little was poured" if loss is None else unit_of_pour(plan, pour).text(loss)
-        return {"state": "weighed", "measured": measured, "spillage": outcome.measurement.fractions.spilled}
-    reason = outcome.reason if isinstance(outcome, Failed) else ""
-    return {"state": "failed", "measured": reason}
+            return pour_summaries(known[0], record, live=live)
 
 
 def summary_of(directory: Path) -> dict[str, Any] | None:

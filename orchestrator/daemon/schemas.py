@@ -9,6 +9,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from orchestrator.results.run_summary import PourSummary
+
 
 class _In(BaseModel):
     model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
@@ -30,7 +32,7 @@ class SubmissionIn(_In):
     path: str = Field(default="", max_length=1000)
     """Instead of `text` and `files`: a file in one of the folders that the daemon's settings list as roots."""
 
-    verb: Literal["run", "calibrate", "plan"] = "run"
+    task: Literal["run", "calibrate", "plan"] = "run"
     rig: str = Field(default="", max_length=60)
     """Rig to run on; '' selects the matching one."""
 
@@ -54,7 +56,7 @@ class MoveIn(_In):
     priority: int | None = Field(default=None, ge=-1000, le=1000)
 
 
-class ArmIn(_In):
+class EnableIn(_In):
     """Enables motion in the coming part of a run."""
 
     laboratory: str = Field(max_length=80)
@@ -114,7 +116,7 @@ class CampaignOut(_Out):
 
     id: str
     name: str
-    verb: str
+    task: str
     rig: str
     mode: str
     """'virtual', 'hardware', or 'none' if nothing is poured."""
@@ -125,8 +127,8 @@ class CampaignOut(_Out):
     stopped, withdrawn.
     """
 
-    wish: str
-    """Desired state: run, pause, stop, abort."""
+    desired_state: str
+    """run, pause, stop or abort."""
 
     reason: str
     by: str
@@ -136,9 +138,9 @@ class CampaignOut(_Out):
     run: str | None
     """Name of its run's folder."""
 
-    armed: bool
-    needs_arming: bool
-    """The campaign uses hardware and waits for `decant arm` to enable motion."""
+    motion_enabled: bool
+    needs_enabling: bool
+    """The campaign uses hardware and waits for `decant enable` to enable motion."""
 
     progress: ProgressOut | None
     """Progress while the campaign runs."""
@@ -150,39 +152,14 @@ class CampaignOut(_Out):
     """URL of the live view."""
 
 
-class PourOut(_Out):
-    """A requested pour."""
-
-    stage: str
-    number: int
-    receiver: str
-    action: str
-    """Values of the action with their units."""
-
-    predicted: str
-    measured: str
-    """'' until the pour is weighed."""
-
-    loss: str
-    """Meaning of `predicted` and `measured`, such as 'spilled / poured': each loss has its own denominator."""
-
-    spillage: float | None
-    """Fraction of the load that was spilled: spilled / loaded."""
-
-    state: Literal["asked", "under way", "weighed", "failed", "unknown"]
-    """'unknown': the run ended during the pour, so it has no outcome; the operator enters it at the next resume."""
-
-    time: float | None
-
-
 class CampaignDetailOut(CampaignOut):
     """A submitted campaign with its results so far."""
 
-    pours_made: list[PourOut]
+    pours_made: list[PourSummary]
     summary: dict[str, Any] | None
     """`summary.json` of its run, after publication."""
 
-    deeds: list[dict[str, Any]]
+    audit: list[dict[str, Any]]
     """Audit entries of the campaign, newest first."""
 
 
@@ -224,6 +201,20 @@ class EmergencyOut(_Out):
     reason: str
 
 
+class ArmStatusOut(_Out):
+    """Whether an arm can move, with the text that a run or `decant doctor` would give."""
+
+    state: Literal["ok", "warn", "fail"]
+    """'ok': it can move; 'fail': it can't; 'warn': the controller doesn't report it."""
+
+    text: str
+    advice: str
+    """Remedy; '' if none is needed."""
+
+    time: float
+    """Time since which it has been so."""
+
+
 class RigOut(_Out):
     """A laboratory that one campaign at a time leases."""
 
@@ -237,6 +228,9 @@ class RigOut(_Out):
 
     emergency: EmergencyOut | None
     """Emergency stop of this rig alone; the stop of all rigs is part of the status."""
+
+    arm: ArmStatusOut | None
+    """Last reading while no campaign used the rig; null during a run and without hardware."""
 
 
 class WhatMovesOut(_Out):

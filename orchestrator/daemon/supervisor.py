@@ -19,12 +19,12 @@ from typing import Any
 from actors.interfaces import LaboratoryError
 from actors.laboratory import WarmSimulators
 from orchestrator.catalogue.run_registry import make_state_directory
-from orchestrator.daemon.daemon_settings import DESK, DaemonSettings, Rig
+from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, WITHDRAWN, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.notifications import Counts
 from orchestrator.daemon.remote_operator import Asking
-from orchestrator.daemon.rig_worker import Common, Lane, Running
+from orchestrator.daemon.rig_worker import RigWorker, Running, SharedServices
 from orchestrator.daemon.run_readout import Pours
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.run_errors import RunError
@@ -61,12 +61,14 @@ class Supervisor:
         self.settings = settings
         self.store = Store(settings.state / "daemon.sqlite")
         self.feed = Feed(settings.state / "events.sqlite", settings.events, self._feed_broken)
-        self.asking = Asking(self.store, self.feed.tell)
+        self.asking = Asking(self.store, self.feed.publish)
         self.warm = WarmSimulators(settings.simulators, in_process=settings.in_process, tell=self._warn)
-        self._common = Common(settings, self.store, self.feed, self.asking, self.warm, live)
-        self.lanes: dict[str, Lane] = {rig.name: Lane(self, rig, self._common) for rig in (*settings.rigs, Rig(DESK))}
+        self._shared = SharedServices(settings, self.store, self.feed, self.asking, self.warm, live)
+        self.workers: dict[str, RigWorker] = {
+            rig.name: RigWorker(self, rig, self._shared) for rig in (*settings.rigs, Rig(NO_RIG))
+        }
         self.problems: dict[str, str] = {}
-        self.words: dict[str, Counts] = {}
+        self.notification_counts: dict[str, Counts] = {}
         self.pours = Pours()
         self.stopping = False
         self.suspect = False
@@ -82,14 +84,18 @@ class Supervisor:
             if item.state not in AT_REST:
                 found = f"found {item.state} after the daemon had ended without a word"
                 self.store.change(item.id, state="paused", reason=found)
-                self.feed.tell("CampaignFound", {"state": item.state, "text": found}, item.id)
+                self.feed.publish("CampaignFound", {"state": item.state, "text": found}, item.id)
         self._tasks = [asyncio.create_task(self.feed.flushing(), name="feed")]
         self._tasks += [
-            asyncio.create_task(worker.work(), name=f"rig {worker.rig.name}") for worker in self.lanes.values()
+            asyncio.create_task(worker.work(), name=f"rig {worker.rig.name}") for worker in self.workers.values()
+        ]
+        self._tasks += [
+            asyncio.create_task(worker.watch_arm(), name=f"arm of {worker.rig.name}")
+            for worker in self.workers.values()
         ]
         if self.settings.quick_start:
             self._tasks.append(asyncio.create_task(self._warm_up(), name="simulators"))
-        self.feed.tell("DaemonStarted", {"rigs": [rig.name for rig in self.settings.rigs]})
+        self.feed.publish("DaemonStarted", {"rigs": [rig.name for rig in self.settings.rigs]})
 
     def _remove_unacknowledged(self, known: set[str]) -> None:
         """Delete snapshots of submissions that were not yet acknowledged when the daemon died."""
@@ -103,7 +109,7 @@ class Supervisor:
         except LaboratoryError as error:
             self._warn(f"the simulators don't start: {error}")
         else:
-            self.feed.tell("SimulatorsReady", {"simulators": self.warm.size})
+            self.feed.publish("SimulatorsReady", {"simulators": self.warm.size})
 
     # ---- restart after Ray has died: work on a dead Ray never ends by itself
 
@@ -115,7 +121,7 @@ class Supervisor:
     @property
     def pouring(self) -> bool:
         """Whether a pour is in progress on any rig."""
-        return any(worker.running is not None and worker.running.pouring for worker in self.lanes.values())
+        return any(worker.running is not None and worker.running.pouring for worker in self.workers.values())
 
     def leave(self, lost: str) -> None:
         """Stop as much work as possible in order to restart; sets `left` at the end."""
@@ -127,9 +133,9 @@ class Supervisor:
             self._tasks.append(asyncio.create_task(self._stop_for_restart(), name="leaving"))
 
     async def _stop_for_restart(self) -> None:
-        resting = [asyncio.ensure_future(worker.close()) for worker in self.lanes.values()]
+        resting = [asyncio.ensure_future(worker.close()) for worker in self.workers.values()]
         await asyncio.wait(resting, timeout=LEAVING)
-        for worker in self.lanes.values():
+        for worker in self.workers.values():
             if worker.running is not None and not worker.running.pouring:
                 worker.background(worker.running.give_up())
         await asyncio.wait(resting)
@@ -139,19 +145,19 @@ class Supervisor:
     async def close(self) -> None:
         """Stop all work at the next safe point, or at once after `hurry`."""
         self.stopping = True
-        await asyncio.gather(*(worker.close() for worker in self.lanes.values()))
+        await asyncio.gather(*(worker.close() for worker in self.workers.values()))
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         if not self.left.is_set():  # closing would block if Ray has died
             await self.warm.close()
-        self.feed.tell("DaemonStopped", {})
+        self.feed.publish("DaemonStopped", {})
         self.feed.close()
         self.store.close()
 
     def hurry(self) -> None:
         """Give all work up, after a second request to end."""
-        for worker in self.lanes.values():
+        for worker in self.workers.values():
             if worker.running is not None:
                 worker.background(worker.running.give_up())
 
@@ -263,21 +269,21 @@ class Supervisor:
         """Stop a campaign: finish the pour and publish the results so far."""
         return self._end(key, by, DesiredState.STOP)
 
-    def _end(self, key: str, by: str, wish: DesiredState) -> QueueItem:
+    def _end(self, key: str, by: str, desired: DesiredState) -> QueueItem:
         item = self.item(key)
         running = self._running(item)
         if running is None and item.state in ENDED:
             raise RequestRefusedError(f"{item.id} is {item.state} already")
         if running is not None:
             running.pause()
-        self.store.change(item.id, wish=str(wish))
-        self.note(by, str(wish), item.id)
+        self.store.change(item.id, desired_state=str(desired))
+        self.note(by, str(desired), item.id)
         if running is None:
             if item.state == "queued":
                 self.store.change(
-                    item.id, state=WITHDRAWN if wish is DesiredState.STOP else "paused", reason=f"by {by}"
+                    item.id, state=WITHDRAWN if desired is DesiredState.STOP else "paused", reason=f"by {by}"
                 )
-            elif wish is DesiredState.STOP:
+            elif desired is DesiredState.STOP:
                 self.store.change(item.id, state=STOPPED, ended=time.time(), reason=f"by {by}")
         self.wake()
         return self.item(item.id)
@@ -290,7 +296,7 @@ class Supervisor:
             raise RequestRefusedError(f"{item.id} is {item.state}: nothing of it moves")
         stopping = asyncio.create_task(running.abort())
         await asyncio.sleep(0)
-        self.store.change(item.id, wish=str(DesiredState.ABORT))
+        self.store.change(item.id, desired_state=str(DesiredState.ABORT))
         self.note(by, "abort", item.id)
         await stopping
         return self.item(item.id)
@@ -304,18 +310,18 @@ class Supervisor:
         item = self.item(key)
         self.refuse_new_work(item.rig)
         if item.state in (STOPPED, WITHDRAWN) and item.run is None:
-            self.store.change(item.id, state="queued", wish=str(DesiredState.RUN), reason="")
+            self.store.change(item.id, state="queued", desired_state=str(DesiredState.RUN), reason="")
         elif self._running(item) is not None or item.state in ("queued", "finished"):
             raise RequestRefusedError(f"{item.id} is {item.state}; only what rests can be resumed")
         else:
             state = "queued" if item.run is None else "paused" if item.state == STOPPED else item.state
-            self.store.change(item.id, state=state, wish=str(DesiredState.RUN), ended=None)
+            self.store.change(item.id, state=state, desired_state=str(DesiredState.RUN), ended=None)
         self.note(by, "resume", item.id)
         self.wake()
         return self.item(item.id)
 
     def _running(self, item: QueueItem) -> Running | None:
-        worker = self.lanes.get(item.rig)
+        worker = self.workers.get(item.rig)
         return worker.running if worker is not None and worker.running is not None and worker.holds(item.id) else None
 
     def progress(self, item: QueueItem) -> dict[str, Any] | None:
@@ -336,16 +342,16 @@ class Supervisor:
         Raises:
             KeyError: the rig does not exist.
         """
-        flag, lanes = self._stops(rig)
-        stops = [asyncio.create_task(worker.running.emergency()) for worker in lanes if worker.running]
-        for worker in lanes:
+        flag, workers = self._stops(rig)
+        stops = [asyncio.create_task(worker.running.emergency()) for worker in workers if worker.running]
+        for worker in workers:
             worker.latched = True
         await asyncio.sleep(0)
         with contextlib.suppress(RunError):  # a full disk must not prevent the stop
             self.store.set_flag(flag, {"by": by, "time": time.time(), "reason": reason})
-            for worker in lanes:
+            for worker in workers:
                 if worker.running is not None:
-                    self.store.change(worker.running.item.id, wish=str(DesiredState.ABORT))
+                    self.store.change(worker.running.item.id, desired_state=str(DesiredState.ABORT))
             where = f"rig {rig}" if rig else ""
             self.note(by, "emergency stop", detail=": ".join(filter(None, (where, reason))))
         await asyncio.gather(*stops, return_exceptions=True)
@@ -360,32 +366,32 @@ class Supervisor:
         Raises:
             KeyError: the rig does not exist.
         """
-        flag, lanes = self._stops(rig)
+        flag, workers = self._stops(rig)
         self.store.set_flag(flag, None)
-        for worker in lanes:
+        for worker in workers:
             worker.latched = self.is_stopped(worker.rig.name)
         self.note(by, "clear emergency stop", detail=f"rig {rig}" if rig else "")
         self.wake()
 
-    def _stops(self, rig: str) -> tuple[str, list[Lane]]:
+    def _stops(self, rig: str) -> tuple[str, list[RigWorker]]:
         """Return the flag of an emergency stop and the rig workers it affects. Raises KeyError."""
         if not rig:
-            return EMERGENCY, list(self.lanes.values())
+            return EMERGENCY, list(self.workers.values())
         if rig not in {one.name for one in self.settings.rigs}:
             raise KeyError(rig)
-        return _emergency_of(rig), [self.lanes[rig]]
+        return _emergency_of(rig), [self.workers[rig]]
 
     # ---- helpers
 
     def wake(self) -> None:
         """Wake all rig workers after a change."""
-        for worker in self.lanes.values():
+        for worker in self.workers.values():
             worker.wake.set()
 
     def note(self, by: str, what: str, campaign: str = "", detail: str = "") -> None:
         """Store, publish and log an audit entry."""
         self.store.note(by, what, campaign, detail)
-        self.feed.tell("Deed", {"by": by, "what": what, "detail": detail}, campaign)
+        self.feed.publish("AuditEntry", {"by": by, "what": what, "detail": detail}, campaign)
         _log.info("%s: %s %s", by, what, campaign, extra={"by": by, "what": what, "campaign": campaign})
 
     def problem(self, key: str, text: str | None) -> None:
@@ -398,7 +404,7 @@ class Supervisor:
 
     def _warn(self, text: str) -> None:
         _log.warning(text)
-        self.feed.tell("LogLine", {"level": "warning", "text": text, "stage": ""})
+        self.feed.publish("LogLine", {"level": "warning", "text": text, "stage": ""})
 
     def _feed_broken(self, text: str) -> None:
         self.problems["events"] = text

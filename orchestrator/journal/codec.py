@@ -1,8 +1,10 @@
-"""Exact conversion of values to JSON and back, for requests, outcomes and plans in the journal.
+"""Exact conversion of values to JSON and back: requests, outcomes and plans, and the results of stages.
 
 `to_json` and `from_json` follow the type annotations of the values, so a new field needs no code here. Floats are
 preserved bit for bit (shortest round-trip notation). Numbers that are not finite are written as {"$float": "nan"},
 because JSON cannot represent them.
+
+A result is a value with a `kind`, declared next to the strategy that produces it; `kinds` collects all of them.
 """
 
 from __future__ import annotations
@@ -13,17 +15,19 @@ import hashlib
 import json
 import math
 import types
-import typing
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from enum import StrEnum
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from pkgutil import resolve_name
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
-from orchestrator.journal.upgrade import upgraded_outcome, upgraded_request
+from orchestrator.journal.upgrade import upgraded_outcome, upgraded_request, upgraded_result
 from orchestrator.requests import Outcome, Request
 from orchestrator.run_errors import RunError
+from orchestrator.strategies.stage_result import StageResult
 
 T = TypeVar("T")
 _FLOAT = "$float"
@@ -36,22 +40,22 @@ class CodecError(RunError, ValueError):
 
 def encode_request(request: Request) -> dict[str, Any]:
     """JSON-ready mapping of a request, tagged with its type."""
-    return typing.cast("dict[str, Any]", to_json(request, Request))
+    return cast("dict[str, Any]", to_json(request, Request))
 
 
 def decode_request(data: Mapping[str, Any]) -> Request:
     """Inverse of `encode_request`. Raises CodecError."""
-    return typing.cast(Request, from_json(upgraded_request(data), Request))
+    return cast(Request, from_json(upgraded_request(data), Request))
 
 
 def encode_outcome(outcome: Outcome) -> dict[str, Any]:
     """JSON-ready mapping of an outcome, tagged with its type."""
-    return typing.cast("dict[str, Any]", to_json(outcome, Outcome))
+    return cast("dict[str, Any]", to_json(outcome, Outcome))
 
 
 def decode_outcome(data: Mapping[str, Any]) -> Outcome:
     """Inverse of `encode_outcome`. Raises CodecError."""
-    return typing.cast(Outcome, from_json(upgraded_outcome(data), Outcome))
+    return cast(Outcome, from_json(upgraded_outcome(data), Outcome))
 
 
 def canonical(data: Any) -> str:
@@ -117,7 +121,7 @@ def to_json(value: Any, hint: Any = Any) -> Any:
     if issubclass(hint, Path | StrEnum):
         return str(value)
     if issubclass(hint, BaseModel):
-        return typing.cast(BaseModel, value).model_dump(mode="json")
+        return cast(BaseModel, value).model_dump(mode="json")
     if dataclasses.is_dataclass(hint):
         return {name: to_json(getattr(value, name), h) for name, h in _fields(hint).items()}
     if dataclasses.is_dataclass(value):  # only a base class is annotated
@@ -162,13 +166,13 @@ def from_json(data: Any, hint: Any = Any) -> Any:
     if isinstance(hint, type) and issubclass(hint, BaseModel):
         return hint.model_validate(data)
     if dataclasses.is_dataclass(hint):
-        return _dataclass_from_json(data, typing.cast("type[Any]", hint))
+        return _dataclass_from_json(data, cast("type[Any]", hint))
     raise CodecError(f"no rule to read a value annotated {hint!r}")
 
 
 def _dataclass_from_json(data: Any, hint: type[Any]) -> Any:
     _expect(data, dict)
-    hints = _fields(typing.cast(typing.Hashable, hint))
+    hints = _fields(cast(Hashable, hint))
     if unknown := set(data) - set(hints) - {_TYPE}:
         raise CodecError(
             f"{hint.__name__} has no field {', '.join(sorted(unknown))}; was it written by a newer version?"
@@ -220,7 +224,7 @@ def _union_from_json(data: Any, arguments: tuple[Any, ...]) -> Any:
 
 @functools.cache
 def _fields(cls: Any) -> dict[str, Any]:
-    hints = typing.get_type_hints(cls)
+    hints = get_type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
 
 
@@ -288,3 +292,76 @@ def _name(hint: Any) -> str:
 def _short(value: Any, limit: int = 80) -> str:
     text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=repr)
     return text if len(text) <= limit else text[: limit - 1] + "…"
+
+
+L = TypeVar("L", bound=StageResult)
+
+Results = Mapping[str, StageResult]
+"""Results of the stages by name, in order."""
+
+DECLARED_IN = (
+    "orchestrator.strategies.calibration.pour_design",
+    "orchestrator.strategies.calibration.calibration_base",
+    "orchestrator.strategies.calibration.calibration_scores",
+    "orchestrator.strategies.deployment.deployment_result",
+    "orchestrator.strategies.single_action",
+    "orchestrator.study.study_strategies",
+)
+"""Modules that declare Decant's own kinds of results; named as text, so that results do not import strategies."""
+
+
+def kinds() -> tuple[type[StageResult], ...]:
+    """All kinds: Decant's own, and those of installed packages with strategies."""
+    strategies = resolve_name("orchestrator.strategies.strategy_registry:STRATEGIES").all.values()  # this loads them
+    packages = {settings.__module__.partition(".")[0] for settings in strategies}
+    for module in DECLARED_IN:
+        import_module(module)
+    ours = [found for module in DECLARED_IN for found in StageResult.KINDS.values() if found.__module__ == module]
+    theirs = {found for found in StageResult.KINDS.values() if found.__module__.partition(".")[0] in packages}
+    return (*ours, *sorted(theirs - set(ours), key=lambda found: found.__name__))
+
+
+def encode_result(result: StageResult) -> dict[str, Any]:
+    """JSON-ready mapping of a result; numbers that are not finite are encoded as in the journal."""
+    return cast("dict[str, Any]", to_json(result.model_dump()))
+
+
+def decode_result(data: Mapping[str, Any]) -> StageResult:
+    """Inverse of `encode_result`.
+
+    Raises:
+        RunError: the kind is unknown, or the data don't fit it.
+    """
+    kind = data.get("kind")
+    if kind not in StageResult.KINDS:
+        kinds()  # the kind may belong to a package that is not loaded yet
+    known = StageResult.KINDS.get(str(kind))
+    if known is None:
+        raise RunError(
+            f"a result of the kind '{kind}' is not known; is the package installed whose strategy learnt it? "
+            f"Known are: {', '.join(sorted(StageResult.KINDS))}"
+        )
+    try:
+        return known.model_validate(from_json(upgraded_result(data)))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise RunError(f"a result of the kind '{kind}' can't be read: {place}: {first['msg']}") from None
+
+
+def decode_results(data: Mapping[str, Mapping[str, Any]]) -> dict[str, StageResult]:
+    """Results by the names of their stages. Raises RunError as `decode_result` does."""
+    return {name: decode_result(result) for name, result in data.items()}
+
+
+def result_of(results: Results, stage: str, kind: type[L]) -> L:
+    """The result of a stage.
+
+    Raises:
+        RunError: there is no such stage, or its result is of another kind.
+    """
+    found = results.get(stage)
+    if not isinstance(found, kind):
+        what = "nothing" if found is None else f"a result of the kind '{found.kind}'"
+        raise RunError(f"stage {stage} should have learnt a {kind.__name__}, but there is {what}")
+    return found

@@ -6,10 +6,9 @@ Each `Entry` is one row: sequence number, stage, time, kind, JSON body. `Journal
 - Entries written together (`append_all`) are all present or all absent, whenever the process dies.
 - Pours are flushed to the disk before the arm moves and before their outcome is used (synchronous=FULL). All other
   entries survive the death of the process; a power cut can lose the most recent ones.
-- At a pour, the write-ahead log is copied into the file, and the entry is repeated in a ledger
-  (`orchestrator.journal.pour_ledger`). A lost or changed journal is thus detected
-  (`orchestrator.journal.journal_check`).
-- A full disk does not prevent the records of a pour (`orchestrator.journal.disk_reserve`).
+- At a pour, the write-ahead log is copied into the file, and the entry is repeated in a ledger. A lost or changed
+  journal is thus detected (`orchestrator.journal.journal_check`).
+- A full disk does not prevent the records of a pour (`orchestrator.journal.journal_file`).
 """
 
 from __future__ import annotations
@@ -28,25 +27,33 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 from orchestrator.journal.codec import canonical, digest, first_difference
-from orchestrator.journal.disk_reserve import MB, Reserve, free_space
-from orchestrator.journal.journal_check import check_journal, has_begun, traces_of_a_run
+from orchestrator.journal.journal_check import (
+    BEGUN,
+    LEDGER_NAME,
+    LedgerLine,
+    PourLedger,
+    check_journal,
+    has_begun,
+    read_ledger,
+    traces_of_a_run,
+)
 from orchestrator.journal.journal_file import (
-    WITHOUT_CHAIN,
+    MB,
     EventRow,
     Header,
     JournalError,
-    add_chain,
+    Reserve,
     chain_of,
     chained,
     check_format,
     checkpoint,
     connect,
     connect_writer,
+    free_space,
     has_tables,
     lay_out,
     take_lock,
 )
-from orchestrator.journal.pour_ledger import BEGUN, LEDGER_NAME, LedgerLine, PourLedger, read_ledger
 from orchestrator.journal.upgrade import upgraded_fingerprint
 from orchestrator.states import State
 
@@ -169,7 +176,7 @@ class JournalReader:
     def stage_results(self) -> dict[str, dict[str, Any]]:
         """Results of the closed stages by name, in the order in which the stages were closed.
 
-        See `orchestrator.journal.stage_results`.
+        See `orchestrator.journal.codec`.
         """
         return {entry.stage: entry.body["result"] for entry in self.entries(kinds=[Kind.STAGE_CLOSED])}
 
@@ -266,6 +273,7 @@ class Journal(JournalReader):
             connection = opened.enter_context(closing(connect_writer(path)))
             if not has_tables(connection, path):
                 lay_out(connection, header, path)
+            check_format(connection.execute("select format from header").fetchone()[0], path, resuming=True)
             journal = cls(path, lock, connection)
             journal._check_same_campaign(header)
             journal._ledger = journal._open_ledger()
@@ -349,7 +357,7 @@ class Journal(JournalReader):
             raise
 
     def _open_ledger(self) -> PourLedger:
-        """The ledger, with all entries of the journal about pours. A journal of an older version gets its hash chain.
+        """The ledger, with all entries of the journal about pours.
 
         Raises:
             JournalError: it can't be written.
@@ -357,17 +365,13 @@ class Journal(JournalReader):
         path = self.path.with_name(LEDGER_NAME)
         try:
             if not path.is_file():
-                old = self._lines_about_pours(after=0)
                 (seq, digest), created = self._last, self.header.created
                 body = {"name": self.header.name, "created": created, "entries": seq}
-                ledger = PourLedger.begin(path, [LedgerLine(seq, digest.hex(), created, BEGUN, "", body), *old])
+                ledger = PourLedger.begin(path, [LedgerLine(seq, digest.hex(), created, BEGUN, "", body)])
             else:
                 ledger = PourLedger.resume(path)
                 if missing := self._lines_about_pours(after=max(line.seq for line in read_ledger(path))):
                     ledger.append(missing)
-            if self._connection.execute("select format from header").fetchone()[0] == WITHOUT_CHAIN:
-                add_chain(self._connection)
-                checkpoint(self._connection)
             return ledger
         except (sqlite3.OperationalError, OSError) as error:
             raise JournalError(
@@ -375,17 +379,11 @@ class Journal(JournalReader):
             ) from error
 
     def _lines_about_pours(self, *, after: int) -> list[LedgerLine]:
-        found = [
+        return [
             LedgerLine(row[0], digest.hex(), row[2], row[3], row[1], json.loads(row[4]))
             for row, digest in chain_of(self._connection)
             if row[0] > after and row[3] in _IN_LEDGER
         ]
-        if any(line.kind == Kind.POUR_STARTED and "number" not in line.body for line in found):
-            asked = {entry.body["id"]: entry.body["request"] for entry in self.entries(kinds=[Kind.REQUESTED])}
-            for line in found:
-                if line.kind == Kind.POUR_STARTED:
-                    line.body["number"] = asked[line.body["id"]]["number"]
-        return found
 
     def close(self) -> None:
         """Release file, lock and reserve. May be called twice."""

@@ -1,12 +1,19 @@
-"""The file format of a journal: tables, header, hash chain and lock.
+"""The file of a journal: tables, header, hash chain, lock, and the disk space that a run reserves.
 
 Every entry has a digest of itself and of the digest before it. The first digest is that of the header. A changed,
 removed or inserted entry therefore changes all digests from there on. Only `journal.py` and `journal_check.py` read
 these tables.
+
+A file next to the journal occupies the space from the start of the run. If the disk fills up while a pour is running,
+the file is deleted and the pour's records use its space. The file must exist again before the next pour.
+
+Limitations: on file systems that copy on write or compress (btrfs, zfs), a file's length does not guarantee its space.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import fcntl
 import hashlib
 import os
@@ -19,14 +26,13 @@ from pathlib import Path
 from typing import IO, Any
 
 from orchestrator.journal.codec import canonical
-from orchestrator.journal.disk_reserve import MB, free_space
 from orchestrator.run_errors import RunError
 
 FORMAT = 3
 """Version of the tables and of the entries' bodies. A journal of another version is refused."""
 
 WITHOUT_CHAIN = 2
-"""The version before the hash chain. Such a journal can be read; resuming it adds the chain."""
+"""The format of version 0.2, before the hash chain. Such a journal can be read, and not resumed."""
 
 _CHAIN = """
 create table chain (seq integer primary key, digest blob not null) strict;
@@ -76,17 +82,19 @@ class Header:
     created: float = 0.0
 
 
-def check_format(found: int, path: Path) -> None:
-    """Check that this version of Decant can read a journal.
+def check_format(found: int, path: Path, *, resuming: bool = False) -> None:
+    """Check that this version of Decant can read a journal, or resume it.
 
     Raises:
         JournalError: another version wrote it.
     """
-    if found not in (FORMAT, WITHOUT_CHAIN):
-        raise JournalError(
-            f"{path}: written in format {found}, this version of Decant reads format {FORMAT}; "
-            "go on with the version that began the run (see versions.json beside it) or begin a new run"
-        )
+    if found == FORMAT or (found == WITHOUT_CHAIN and not resuming):
+        return
+    does = "resumes" if resuming else "reads"
+    raise JournalError(
+        f"{path}: written in format {found}, this version of Decant {does} format {FORMAT}; "
+        "go on with the version that began the run (see versions.json beside it) or begin a new run"
+    )
 
 
 EventRow = tuple[int, str, float, str, str]
@@ -116,15 +124,6 @@ def chain_of(connection: sqlite3.Connection) -> Iterator[tuple[EventRow, bytes]]
     for row in connection.execute("select seq, stage, t, kind, body from event order by seq"):
         digest = chained(digest, row)
         yield row, digest
-
-
-def add_chain(connection: sqlite3.Connection) -> None:
-    """Add the hash chain to a journal of the version before it, in one transaction."""
-    digests = [(row[0], digest) for row, digest in chain_of(connection)][1:]
-    connection.executescript(f"begin immediate; {_CHAIN}")
-    connection.executemany("insert into chain values (?, ?)", digests)
-    connection.execute("update header set format = ?", [FORMAT])
-    connection.execute("commit")
 
 
 def checkpoint(connection: sqlite3.Connection) -> None:
@@ -249,3 +248,107 @@ def whole_copy(path: Path) -> bytes:
         source.backup(copy)
         copy.execute("pragma journal_mode = delete")
         return copy.serialize()
+
+
+MB = 1_000_000
+
+RESERVE = 12 * MB
+"""Size of the reserve [bytes].
+
+A pour's records need about 200 kB, including all pages of the journal that they change. SQLite's write-ahead log grows
+to 4 MB before it is copied into the journal, and the journal then grows by the same amount.
+"""
+
+FOR_A_POUR = 8 * MB
+"""Free space needed in addition to the reserve when a pour begins, because recording and figures also grow [bytes]."""
+
+TO_BEGIN = RESERVE + FOR_A_POUR + 20 * MB
+"""Free space needed when a run begins: journal, recording and figures of a small campaign [bytes]."""
+
+
+class NoSpaceError(RunError):
+    """The disk has too little free space for the next step; nothing was begun, and nothing is lost."""
+
+    exit_code = 3
+
+
+def free_space(path: Path) -> int:
+    """Bytes that this user may still write on the disk of a path; the path need not exist."""
+    there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    found = os.statvfs(there)
+    return found.f_bavail * found.f_frsize
+
+
+def require_space(path: Path, needed: int, purpose: str) -> None:
+    """Check that there is enough free space.
+
+    Args:
+        path: file or folder on the disk.
+        needed: [bytes].
+        purpose: completes the message 'N MB are needed …'.
+
+    Raises:
+        NoSpaceError: with path, needed space and free space.
+    """
+    free = free_space(path)
+    if free < needed:
+        raise NoSpaceError(
+            f"{path}: {free / MB:.1f} MB are free on its disk, and {needed / MB:.0f} MB are needed {purpose}"
+        )
+
+
+class Reserve:
+    """The reserved space of one run.
+
+    Args:
+        path: path of the file that occupies it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._held = False
+
+    def take(self) -> None:
+        """Reserve the space, unless it is reserved already.
+
+        Raises:
+            NoSpaceError: there is not enough.
+        """
+        if self._held:
+            return
+        try:
+            with self._path.open("wb") as file:
+                os.posix_fallocate(file.fileno(), 0, RESERVE)
+        except OSError as error:
+            self._remove()
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            require_space(self._path.parent, RESERVE + FOR_A_POUR, _PURPOSE)
+            raise NoSpaceError(  # a quota, which the free space of the disk does not show
+                f"{self._path.parent}: {RESERVE / MB:.0f} MB are needed {_PURPOSE}, and can't be had "
+                f"({error.strerror}; {free_space(self._path) / MB:.0f} MB are free on the disk)"
+            ) from None
+        self._held = True
+
+    def check_pour(self) -> None:
+        """Check that the next pour can be recorded; reserve the space again if it was used.
+
+        Raises:
+            NoSpaceError: it can't be recorded.
+        """
+        require_space(self._path.parent, FOR_A_POUR + (0 if self._held else RESERVE), _PURPOSE)
+        self.take()
+
+    def release(self) -> bool:
+        """Free the reserved space for a write that needs it. Returns whether it was reserved."""
+        held, self._held = self._held, False
+        if held:
+            self._remove()
+        return held
+
+    def _remove(self) -> None:
+        with contextlib.suppress(OSError):
+            self._path.unlink(missing_ok=True)
+
+
+_PURPOSE = "before anything is poured, so that whatever comes of a pour can be written down"

@@ -1,8 +1,8 @@
 """What version 0.2 wrote and this one no longer has: journals, results and recorded campaigns are read without it.
 
-Version 0.2 had two further models of D3, `pooled` and `scaled`, a check of the simulator by the first pours (`trust`),
-and a price of simulations for as long as no outcome told one. Its runs can be listed and reported. One that used such a
-model or check can't be resumed.
+Version 0.2 had two further models of D3, `pooled` and `scaled`, and a check of the simulator by the first pours
+(`trust`). It had a price of simulations that was used until the first outcome. Some fields of its results had other
+names. Its runs can be listed and reported. One that used such a model or check can't be resumed.
 """
 
 from __future__ import annotations
@@ -10,7 +10,39 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sim_engine.liquids import RETIRED_PARAMETERS
+
 Data = Mapping[str, Any]
+
+NAMES = {
+    "hold_cap": "max_hold_time",
+    "per_axis": "points_per_axis",
+    "per_pour": "simulations_per_pour",
+    "gain_below": "min_gain",
+    "record_rate": "frame_rate",
+}
+"""Names of 0.2 that had one meaning, and those of this version."""
+
+NAMES_BESIDE = {
+    "strategy": {"initial": "initial_samples", "prices": "costs", "ignorance": "discrepancy_policy"},
+    "probability": {"otherwise": "fallback"},
+    "recorded_simulations": {"rrd": "recording"},
+}
+"""Names of 0.2 that changed in mappings with a certain key."""
+
+
+def renamed(data: Any) -> Any:
+    """Data of 0.2 with the names of this version."""
+    if isinstance(data, Mapping):
+        names = NAMES | RETIRED_PARAMETERS
+        for key, more in NAMES_BESIDE.items():
+            names |= more if key in data else {}
+        if "Pa*s" in str(data.get("viscosity")):  # of a liquid in a recorded campaign, and no parameter
+            names.pop("viscosity")
+        return {names.get(key, key): renamed(value) for key, value in data.items()}
+    if isinstance(data, list | tuple) and data and not isinstance(data[0], int | float):
+        return [renamed(item) for item in data]
+    return RETIRED_PARAMETERS.get(data, data) if isinstance(data, str) else data
 
 
 _SURROGATE = (
@@ -35,6 +67,7 @@ def upgraded_request(data: Data) -> Data:
 
     A pour of the models 'pooled' and 'scaled' becomes one of the model 'residual'.
     """
+    data = renamed(data)
     problem = data.get("problem")
     if not isinstance(problem, Mapping):
         return data
@@ -83,22 +116,34 @@ def _renamed(data: Data, names: Mapping[str, str]) -> dict[str, Any]:
     return {names.get(key, key): value for key, value in data.items()}
 
 
+_RENAMED = {
+    "deployment": {"trust": "model_check", "front": "pareto_front"},
+    "prediction": {"band": "interval"},
+}
+"""Fields of results by kind: the name of version 0.2 and today's."""
+
+
 def upgraded_result(data: Data) -> Data:
     """A stage's result as this version reads it.
 
     Of a comparison of pours with simulations, the scores are left. Of a study's table, the number of its simulations is
     left: their outcomes are in the journal, too.
     """
+    data = renamed(data)
     if data.get("kind") == "table":
         return {key: value for key, value in data.items() if key != "rows"}
-    trust = data.get("trust")
-    if not isinstance(trust, Mapping) or "mean_z" not in trust:
+    data = _renamed(data, _RENAMED.get(str(data.get("kind")), {}))
+    if data.get("kind") != "deployment":
         return data
-    return {**data, "trust": {key: trust[key] for key in ("z_scores", "alarm")}}
+    check = data.get("model_check")
+    if isinstance(check, Mapping) and "mean_z" in check:
+        data["model_check"] = {key: check[key] for key in ("z_scores", "alarm")}
+    return data | {"pours": [_renamed(row, {"predicted_band": "predicted_interval"}) for row in data.get("pours", ())]}
 
 
 def upgraded_fingerprint(data: dict[str, Any]) -> dict[str, Any]:
     """A fingerprint of a campaign or study, comparable with one of this version where it means the same in both."""
+    data = renamed(data)
     data = {**data, "deployment": _upgraded_plan(data["deployment"])} if "deployment" in data else data
     if isinstance(laboratory := data.get("laboratory"), Mapping) and "cell" not in laboratory:
         data = {**data, "laboratory": _upgraded_laboratory(laboratory)}
@@ -133,6 +178,7 @@ def _upgraded_plan(plan: Any) -> Any:
 
 def upgraded_campaign(data: Any) -> Any:
     """A recorded campaign as this version loads it, for all but resuming. A retired model becomes the default one."""
+    data = renamed(data)
     deployment = data.get("deployment") if isinstance(data, Mapping) else None
     if not isinstance(deployment, Mapping) or deployment.get("strategy") != "D3":
         return data
@@ -143,6 +189,6 @@ def upgraded_campaign(data: Any) -> Any:
 def _without_retired(settings: Data, *retired: str) -> dict[str, Any]:
     """D3's settings without some keys, and without the price of a simulation, which decided nothing."""
     kept = {key: value for key, value in settings.items() if key not in retired}
-    if isinstance(prices := kept.get("prices"), Mapping):
-        kept["prices"] = {key: value for key, value in prices.items() if key != "simulation"}
+    if isinstance(costs := kept.get("costs"), Mapping):
+        kept["costs"] = {key: value for key, value in costs.items() if key != "simulation"}
     return kept

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from actors.interfaces import PourProgress
 from orchestrator.live_view import rerun_shapes as shapes
-from orchestrator.live_view.playback import Track
-from orchestrator.live_view.recording_sink import RecordingSink, columns_of
+from orchestrator.live_view.recording_sink import RecordingSink, Track, columns_of
 from orchestrator.requests import Pour
 from orchestrator.results import figure_style as style
 from sim_engine.action import ACTION_DIMENSIONS, Action

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from actors.arm.arm_interface import ArmFigure
 from actors.interfaces import PourProgress
 from orchestrator.live_view import rerun_shapes as shapes
-from orchestrator.live_view.playback import Playback, PlaybackQueue, Track
-from orchestrator.live_view.recording_sink import Moment, RecordingSink
+from orchestrator.live_view.recording_sink import Moment, Playback, PlaybackQueue, RecordingSink, Track
 from orchestrator.live_view.simulation_view import MAXIMUM_RATE
 from orchestrator.requests import Pour
 from orchestrator.results import figure_style as style

@@ -200,7 +200,7 @@ def answers(host: str, port: int) -> bool:
 
 def can_record(plan: CampaignPlan) -> bool:
     """Whether runs of a campaign are recorded: recording is enabled and Rerun is installed."""
-    return plan.outputs.rrd and installed("rerun")
+    return plan.outputs.recording and installed("rerun")
 
 
 def recorder_of(
@@ -218,7 +218,7 @@ def recorder_of(
         OSError: the recording can't be written.
     """
     if not can_record(plan):
-        if plan.outputs.rrd:
-            tell("no recording: it needs Rerun, which is not installed (pip install 'decant[live]')")
+        if plan.outputs.recording:
+            tell("no recording: it needs Rerun, which is not installed (pip install 'decant-pouring[live]')")
         return None
     return RerunMonitor(run / RECORDING, plan) if live is None else live.watcher_for(plan, run)

@@ -1,6 +1,6 @@
 """Rows of the machine: activity of each worker, queue, simulation times, waits and dropped events; log and status page.
 
-`MachineView` writes the rows. `StatusView` collects the state of a campaign on a page with a few large lines, which can
+`MachineView` writes the rows. `StatusView` shows the progress of a campaign on a page with a few large lines, which can
 be read from a distance.
 """
 
@@ -10,21 +10,21 @@ import re
 
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
-from orchestrator.requests import Pour, Simulate
+from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState
+from orchestrator.requests import Pour
 from orchestrator.results import figure_style as style
 from orchestrator.results.figure_style import safe_name
+from orchestrator.results.stage_views import receiver_name
 from orchestrator.runs.events import (
     CampaignClosed,
-    CampaignOpened,
     CampaignStateChanged,
     Event,
     LogLine,
     PourProgressed,
     RequestFinished,
-    RequestStarted,
     StageOpened,
-    StrategyProgressed,
 )
+from orchestrator.states import RESTING
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
 PLACE = "/machine"
@@ -153,36 +153,17 @@ class MachineView:
         self._sink.number(f"{PLACE}/{name}", float(value))
 
 
-_DOING = {
-    "operator": "the operator refills and wipes",
-    "tare": "the balance is tared",
-    "approach": "the arm goes to its start",
-    "tilt": "the arm tilts",
-    "hold": "the arm holds",
-    "return": "the arm comes back upright",
-    "settle": "the last drops fall",
-    "weigh": "what was spilled is weighed",
-    "record": "the pour is written down",
-}
-
-
 class StatusView:
-    """Collects the content of the status page.
+    """The status page: the progress of a campaign in a few large lines.
 
     Args:
         plan: plan of the campaign.
     """
 
     def __init__(self, plan: CampaignPlan) -> None:
-        self._plan = plan
-        self._state, self._reason, self._stage = "preparing", "", ""
-        self._stages: tuple[str, ...] = ()
-        self._progress: dict[str, str] = {}
-        self._pour = self._doing = self._question = ""
-        self._simulating = 0
-        self._pours = self._simulations = 0
-        self.best: dict[str, str] = {}
-        self.trust = ""
+        self._plan, self._progress = plan, ProgressState(plan)
+        self._reason = self._stage = self._question = ""
+        self._pours = 0
 
     @property
     def reality(self) -> str:
@@ -191,58 +172,49 @@ class StatusView:
 
     def take(self, event: Event) -> None:
         """Process an event."""
+        self._progress(event)
         match event:
-            case CampaignOpened():
-                self._stages = event.stages
             case CampaignStateChanged():
-                self._state, self._reason = event.after, event.reason
+                self._reason = event.reason
             case CampaignClosed():
-                self._state, self._pour, self._stage = event.state, "", ""
+                self._stage = ""
             case StageOpened():
                 self._stage = f"{event.stage} ({event.index} of {event.count})"
-            case StrategyProgressed():
-                self._progress[event.stage] = str(event.progress)
             case LogLine() if event.asked:
                 self._question = event.text
-            case PourProgressed():
-                self._doing = _DOING.get(event.progress.checkpoint, event.progress.checkpoint)
-                if event.progress.checkpoint not in ("operator", "tare"):
-                    self._question = ""
-            case RequestStarted():
-                self._started(event)
-            case RequestFinished():
-                self._finished(event)
+            case PourProgressed() if event.progress.checkpoint not in ("operator", "tare"):
+                self._question = ""
+            case RequestFinished(request=Pour()):
+                self._pours += 1
 
-    def _started(self, event: RequestStarted) -> None:
-        if isinstance(event.request, Simulate):
-            self._simulating += 1
-        elif isinstance(event.request, Pour):
-            self._pour, self._doing = str(event.request.number), "it is prepared"
+    def page(self, trust: str = "") -> str:
+        """Return the page as Markdown.
 
-    def _finished(self, event: RequestFinished) -> None:
-        if isinstance(event.request, Simulate):
-            self._simulating = max(self._simulating - 1, 0)
-            self._simulations += 1
-        elif isinstance(event.request, Pour):
-            self._pour, self._doing, self._pours = "", "", self._pours + 1
-
-    def page(self) -> str:
-        """Return the page as Markdown."""
-        lines = [f"# {self.reality}: {_plain(self._state)}", f"## {_plain(self._stage or self._plan.name)}"]
+        Args:
+            trust: result of the model check.
+        """
+        now = self._progress
+        lines = [f"# {self.reality}: {_plain(now.state or 'preparing')}"]
+        lines.append(f"## {_plain(self._stage or self._plan.name)}")
         if self._question:
             lines.append(f"## A question is open\n\n{_plain(self._question)}")
-        if self._state in ("running", "pausing") or self._pour or self._simulating:
-            doing = [f"**Pour {self._pour}**: {self._doing}"] if self._pour else []
-            if self._simulating:
-                doing.append(f"**{self._simulating} simulation{'s' if self._simulating > 1 else ''}** under way")
-            lines += doing or ["The next step is being chosen"]
+        pour = None if now.pour is None or now.pour.result or now.state in RESTING else now.pour
+        if now.state in ("running", "pausing") or pour or now.running:
+            if pour is not None:
+                at = "preparing" if pour.progress is None else pour.progress.checkpoint
+                lines.append(f"**Pour {pour.number}**: {CHECKPOINT_WORDS.get(at, at)}")
+            if count := len(now.running):
+                lines.append(f"**{count} simulation{'s' if count > 1 else ''}** under way")
+            if pour is None and not now.running:
+                lines.append("The next step is being chosen")
         elif self._reason:
             lines.append(_plain(self._reason))
-        lines += [f"{_plain(stage)}: {said}" for stage, said in self._progress.items() if said]
-        lines += [f"**Best into {_plain(name)}: {value}**" for name, value in self.best.items()]
-        if self.trust:
-            lines.append(f"Trust: {_plain(self.trust)}")
-        lines.append(f"{self._pours} pours and {self._simulations} simulations so far")
+        lines += [f"{_plain(one.name)}: {said}" for one in now.stages.values() if (said := str(one.progress))]
+        for scene, best in now.best.items():
+            lines.append(f"**Best into {_plain(receiver_name(self._plan, scene))}: {best.unit.text(best.loss)}**")
+        if trust:
+            lines.append(f"Trust: {_plain(trust)}")
+        lines.append(f"{self._pours} pours and {now.simulations} simulations so far")
         return "\n\n".join(lines) + "\n"
 
 

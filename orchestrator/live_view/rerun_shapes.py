@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orchestrator.live_view.playback import Track
-from orchestrator.live_view.recording_sink import Columns, columns_of
+from orchestrator.live_view.recording_sink import Columns, Track, columns_of
 from orchestrator.results import figure_style as style
 
 if TYPE_CHECKING:

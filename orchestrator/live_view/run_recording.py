@@ -19,8 +19,7 @@ from orchestrator.live_view.blueprints import Moment, campaign_blueprint
 from orchestrator.live_view.cell_view import CellScene
 from orchestrator.live_view.learning_view import MAPPED, LearningStage
 from orchestrator.live_view.machine_view import MachineView, StatusView
-from orchestrator.live_view.playback import PlaybackQueue
-from orchestrator.live_view.recording_sink import RecordingSink
+from orchestrator.live_view.recording_sink import PlaybackQueue, RecordingSink
 from orchestrator.live_view.simulation_view import SimulatedStage
 from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Suggest, Suggested
 from orchestrator.results.loss_units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
@@ -39,8 +38,8 @@ from orchestrator.runs.events import (
     StageOpened,
     StrategyProgressed,
 )
+from orchestrator.runs.stages import scenes_of
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from sim_engine.scene import Scene
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -126,7 +125,7 @@ class CampaignRecording:
             case CampaignClosed():
                 self._learning.flush(event.time)
                 self._say(f"ended: {event.state}")
-                self._machine.outcome(self.status.page())
+                self._machine.outcome(self.status.page(self._learning.trust))
                 self._show("replaying")
             case StageOpened():
                 self._say(f"stage {event.stage} begins", source=event.stage)
@@ -144,14 +143,13 @@ class CampaignRecording:
                     self._machine.lane("arm", doing)
             case StrategyProgressed():
                 self._learning.learnt(event.result, event.time)
-                self.status.best, self.status.trust = self._learning.best, self._learning.trust
             case DecisionMade():
                 level = "warning" if event.decision.urgent else "info"
                 self._decided = event.decision.text
                 self._say(event.decision.text, level, event.stage)
             case LogLine():
                 self._say(event.text, event.level, event.stage)
-        self._machine.status(self.status.page())
+        self._machine.status(self.status.page(self._learning.trust))
 
     def _say(self, text: str, level: str = "info", source: str = "") -> None:
         self._machine.line(text, level, source or "campaign")
@@ -207,8 +205,7 @@ class CampaignRecording:
                 self._simulation(event, request, outcome)
             case Pour() as request, Poured() as outcome:
                 self._learning.about(event.stage, request.scene)
-                self._say(self._learning.poured(request, outcome), source=event.stage)
-                self.status.best = self._learning.best
+                self._say(self._learning.poured(event.stage, request, outcome), source=event.stage)
                 measured, shown = outcome.measurement, self._balance.finish(outcome.measurement)
                 self._cell.finish(
                     self._scenes[request.scene],
@@ -239,19 +236,6 @@ class CampaignRecording:
     def _action(self, pour: Pour) -> str:
         plan = self._plan.calibration if is_calibration(self._plan, pour) else self._plan.deployment
         return pour.action.display(*(plan.actions.names if plan is not None else ()))
-
-
-def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
-    """Return all scenes of a campaign by name."""
-    scenes: dict[str, Scene] = {}
-    if plan.calibration is not None:
-        for records in (plan.calibration.records, plan.calibration.transfer):
-            if records is not None:
-                scenes[records.scene.name] = records.scene
-        scenes.update({scene.name: scene for scene in plan.calibration.poured})
-    if plan.deployment is not None:
-        scenes.update({scene.name: scene for scene in plan.deployment.scenes})
-    return scenes
 
 
 def blueprint_of(plan: CampaignPlan, moment: Moment) -> rrb.Blueprint:

@@ -1,24 +1,30 @@
 """Rows of simulated pours: vessels, particles by their fate, and the fractions of the liquid.
 
 `SimulatedStage` adds simulations to the playback of a campaign's recording. `simulation_rrd` writes one simulated pour
-as a recording of its own, for `decant simulate --rrd`.
+as a recording of its own, for `decant simulate --rrd`. `find_pour` reads a weighed pour of a run, and `task_of` makes
+the task that simulates it again, with any number of particles.
 """
 
 from __future__ import annotations
 
+import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orchestrator.journal.run_record import RecordedPour, read_record
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.blueprints import simulation_blueprint
-from orchestrator.live_view.playback import Playback, PlaybackQueue, Track
-from orchestrator.live_view.recording_sink import RecordingSink, columns_of
+from orchestrator.live_view.recording_sink import Playback, PlaybackQueue, RecordingSink, Track, columns_of
 from orchestrator.results import figure_style as style
+from orchestrator.runs.stages import scenes_of
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import RecordedFrames, SimulatedPour
-from sim_engine.scene import PourTask, Scene
+from sim_engine.scene import PourTask, SampledMotion, Scene
 
 MAXIMUM_RATE = 10.0
 """Frames per second of playback: 3 000 particles take about 36 kB each."""
@@ -104,7 +110,7 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
 
     Args:
         path: `.rrd` to write; replaced if it exists.
-        task: simulated task, with `record_rate` > 0.
+        task: simulated task, with `frame_rate` > 0.
         result: result of the simulation.
         title: title of the recording; default: names of the vessels, and the seed.
 
@@ -142,3 +148,64 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
         sink.log(f"/log/{source}", rr.TextLog(text, level=level))
     sink.close()
     return path
+
+
+DETAIL = 30.0
+"""Frames per simulated second [1/s]."""
+
+
+class NoSuchPourError(ValueError):
+    """The journal has no such pour; the message lists the pours it has."""
+
+
+def find_pour(run: Path, number: int, stage: str | None = None) -> RecordedPour:
+    """Find a weighed pour of a run.
+
+    Args:
+        run: folder of the run.
+        number: number of the pour within its stage.
+        stage: stage that requested it; None: the last stage with such a pour.
+
+    Raises:
+        NoSuchPourError: the run has no such pour.
+        JournalError: the journal can't be read.
+    """
+    weighed = read_record(run).weighed
+    fitting = [pour for pour in weighed if pour.request.number == number and stage in (None, pour.stage)]
+    if not fitting:
+        stages: dict[str, list[str]] = {}
+        for pour in weighed:
+            stages.setdefault(pour.stage, []).append(str(pour.request.number))
+        known = "; ".join(f"{name}: {', '.join(numbers)}" for name, numbers in stages.items())
+        of = "" if stage is None else f" of stage {stage}"
+        found = f"weighed were {known}" if known else "none was"
+        raise NoSuchPourError(f"{run}: there is no weighed pour {number}{of}; {found}")
+    return fitting[-1]
+
+
+def task_of(plan: CampaignPlan, run: Path, pour: RecordedPour, particles: int | None = None) -> PourTask:
+    """Make the task that simulates a pour again, with the arm's executed motion, if it was recorded, and the run's θ*.
+
+    Args:
+        plan: plan of the run.
+        run: folder of the run.
+        pour: pour to simulate.
+        particles: number of particles instead of θ's.
+    """
+    measured = pour.measured
+    assert measured is not None
+    theta = plan.parameters
+    if (found := run / "theta.json").is_file():
+        theta = SimulationParameters.model_validate(json.loads(found.read_text(encoding="utf-8"))["theta"])
+    if particles is not None:
+        theta = theta.model_copy(update={"particles": particles})
+    scene = scenes_of(plan)[pour.request.scene]
+    scene = replace(scene, liquid=scene.liquid.model_copy(update={"mass": measured.loaded}))
+    task = PourTask(scene, pour.request.action, theta, pour.request.seed % 2**31, frame_rate=DETAIL)
+    arm, record = plan.laboratory.arm, measured.notes.get("executed")
+    figure = None if arm is None else arm.figure()
+    executed = None if figure is None or not record else figure.executed(record)
+    if figure is None or executed is None:
+        return task
+    times, joints = executed
+    return replace(task, motion=SampledMotion(times - times[0], figure.pourer(joints)))

@@ -9,20 +9,21 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from actors.interfaces import PourProgress
+from orchestrator.journal.run_record import RecordedPour
 from orchestrator.progress.time_estimate import Forecast, particles_of, work_of
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated
-from orchestrator.results import figure_style as style
 from orchestrator.results.loss_units import LossUnit, is_calibration, loss_of_pour, unit_of_pour
 from orchestrator.results.stage_views import receiver_name
+from orchestrator.results.summarise import pour_summary
 from orchestrator.runs.events import (
     CampaignClosed,
     CampaignOpened,
     CampaignStateChanged,
     Event,
-    MadeAhead,
     PourProgressed,
     RequestFinished,
     RequestStarted,
+    SpeculationProgressed,
     StageClosed,
     StageOpened,
     StrategyProgressed,
@@ -106,7 +107,7 @@ class ProgressState:
     simulators: int = 0
     stages: dict[str, StageProgressState] = field(default_factory=dict)
     running: set[int] = field(default_factory=set)
-    ahead: MadeAhead = field(default_factory=lambda: MadeAhead(running=0, waiting=0))
+    ahead: SpeculationProgressed = field(default_factory=lambda: SpeculationProgressed(running=0, waiting=0))
     simulations: int = 0
     failed_simulations: int = 0
     simulation_seconds: float = 0.0
@@ -152,7 +153,7 @@ class ProgressState:
                 self._started(event)
             case RequestFinished():
                 self._finished(event)
-            case MadeAhead():
+            case SpeculationProgressed():
                 self.ahead = event
             case PourProgressed() if self.pour is not None:
                 self.pour.progress = event.progress
@@ -165,20 +166,15 @@ class ProgressState:
             case Simulate():
                 self.running.add(event.id)
             case Pour() as pour:
-                section = self.plan.calibration if is_calibration(self.plan, pour) else self.plan.deployment
-                names = section.actions.names if section is not None else ("angular_velocity", "x_offset")
-                predicted = ""
-                if pour.predicted is not None:
-                    unit = unit_of_pour(self.plan, pour)
-                    predicted = unit.prediction(pour.predicted)
+                said = pour_summary(self.plan, RecordedPour(event.stage, event.id, pour))
                 self.pour = PourProgressState(
                     pour.number,
                     event.stage,
                     pour.scene,
-                    style.display_values({name: getattr(pour.action, name) for name in names}),
-                    predicted,
+                    said.action,
+                    said.predicted,
                     event.time,
-                    is_calibration(self.plan, pour),
+                    said.calibration,
                     pour.purpose == CONFIRM,
                 )
 
@@ -194,14 +190,14 @@ class ProgressState:
                 else:
                     self.failed_simulations += 1
             case Pour() as pour, Poured() as outcome:
-                unit = unit_of_pour(self.plan, pour)
                 loss = loss_of_pour(self.plan, pour, outcome.measurement)
                 if self.pour is not None:
-                    self.pour.result = "too little was poured" if loss is None else unit.text(loss)
+                    weighed = RecordedPour(event.stage, event.id, pour, "weighed", outcome.measurement)
+                    self.pour.result = pour_summary(self.plan, weighed).measured
                 if loss is not None and pour.purpose != CONFIRM and not is_calibration(self.plan, pour):
                     best = self.best.get(pour.scene)
                     if best is None or loss < best.loss:
-                        self.best[pour.scene] = Best(loss, pour.number, unit)
+                        self.best[pour.scene] = Best(loss, pour.number, unit_of_pour(self.plan, pour))
             case Pour(), Failed() as failed:
                 if self.pour is not None:
                     self.pour.result = f"failed: {failed.reason}"

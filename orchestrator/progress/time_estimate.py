@@ -264,7 +264,7 @@ def _work(plan: CampaignPlan, name: str) -> WorkEstimate:
         if name == CALIBRATION:
             return WorkEstimate(calibration.simulations, particles=particles_of(plan))
         if name == EVALUATION:
-            # Random θ and the uncalibrated one need no θ*: see `orchestrator.runs.speculative_requests`.
+            # Random θ and the uncalibrated one need no θ*: see `orchestrator.runs.speculation`.
             rivals = _weighed(calibration) + calibration.random_baseline * _unseen(calibration)
             return WorkEstimate(_scored(calibration), ahead=rivals if calibration.pour_count else 0)
     if deployment is not None and name.startswith((DEPLOYMENT, CONFIRMATION)):
@@ -324,7 +324,7 @@ def pour_time(laboratory: LaboratorySettings, scene: Scene, actions: Space) -> f
     angle, speed, back, hold = (
         values.get(name) for name in ("max_angle", "angular_velocity", "return_velocity", "hold_time")
     )
-    motion = (angle or 0.0) / (speed or math.inf) + (scene.hold_cap / 2.0 if hold is None else hold)
+    motion = (angle or 0.0) / (speed or math.inf) + (scene.max_hold_time / 2.0 if hold is None else hold)
     motion += (angle or 0.0) / back if back else 0.0
     bench = laboratory.bench
     liquid = 0.0 if bench is None else PRICE * bench.theta.particles  # a virtual bench simulates its liquid

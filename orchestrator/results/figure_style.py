@@ -5,10 +5,8 @@ Figures use Matplotlib's Agg canvas without pyplot and without a window system.
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterator
-from contextvars import ContextVar
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -84,7 +82,7 @@ def display_value(name: str, value: float | None) -> str:
     return f"{value / display_factor(name):.3g} {display_unit(name)}".rstrip()
 
 
-def display_values(values: dict[str, float | None]) -> str:
+def display_values(values: Mapping[str, float | None]) -> str:
     """Several named quantities in one line, from SI values: 'angular velocity 41.2 deg/s, x offset 104 mm'."""
     return ", ".join(f"{name.replace('_', ' ')} {display_value(name, value)}" for name, value in values.items())
 
@@ -116,6 +114,11 @@ def new_figure(
     figure = Figure(figsize=size, dpi=DPI, layout=layout, facecolor="white")
     FigureCanvasAgg(figure)
     return figure, figure.subplots(rows, columns, **kwargs)
+
+
+def entitle(figure: Figure, title: str) -> None:
+    """Set the title of a whole figure."""
+    figure.suptitle(title, fontsize=12.5, color=INK, x=0.02, ha="left")
 
 
 def dress(axes: Axes, *, title: str = "", x: str = "", y: str = "", grid: str | None = "y") -> None:
@@ -196,7 +199,7 @@ def number(value: float) -> str:
     return f"{value:.6g}" if abs(value) < 1000 else f"{value:,.0f}".replace(",", " ")
 
 
-def at_ends(values: dict[str, float | None], axes: tuple[Axis, ...]) -> list[str]:
+def at_ends(values: Mapping[str, float | None], axes: tuple[Axis, ...]) -> list[str]:
     """Searched values that lie at an end of their range: 'angular velocity at its upper end (150 deg/s)'.
 
     Args:
@@ -215,47 +218,21 @@ def at_ends(values: dict[str, float | None], axes: tuple[Axis, ...]) -> list[str
     return said
 
 
-_UNSAVED: ContextVar[list[Figure] | None] = ContextVar("unsaved figures", default=None)
+def save(figure: Figure, path: Path, formats: Sequence[str] = ()) -> Path:
+    """Write a PNG; the folder is made if needed.
 
-
-@contextlib.contextmanager
-def unsaved() -> Iterator[list[Figure]]:
-    """Collect figures instead of writing PNGs within this context, for notebooks."""
-    figures: list[Figure] = []
-    token = _UNSAVED.set(figures)
-    try:
-        yield figures
-    finally:
-        _UNSAVED.reset(token)
-
-
-_ALSO: ContextVar[tuple[str, ...]] = ContextVar("other formats", default=())
-
-
-@contextlib.contextmanager
-def also_as(*suffixes: str) -> Iterator[None]:
-    """Write every PNG in these additional formats within this context ('.svg' or '.pdf'), for print."""
-    token = _ALSO.set(suffixes)
-    try:
-        yield
-    finally:
-        _ALSO.reset(token)
-
-
-def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG (with other formats, inside `also_as`), unless `unsaved` collects it; the folder is made if needed.
+    Args:
+        path: PNG to write.
+        formats: suffixes of additional files next to it ('.svg' or '.pdf'), for print.
 
     Raises:
         OSError: a file can't be written.
     """
     from matplotlib import rc_context
 
-    if (figures := _UNSAVED.get()) is not None:
-        figures.append(figure)
-        return path
     path.parent.mkdir(parents=True, exist_ok=True)
     with rc_context({"svg.hashsalt": path.stem}):  # the same figure gives the same file
-        for suffix in (path.suffix, *_ALSO.get()):
+        for suffix in (path.suffix, *formats):
             undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
             figure.savefig(path.with_suffix(suffix), dpi=DPI, facecolor="white", metadata=undated)
             figure.set_layout_engine("none")  # keep the layout of the first format

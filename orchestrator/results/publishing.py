@@ -1,4 +1,4 @@
-"""What follows a run, whoever drove it: its recording is closed, its figures, summary, θ* and report are written."""
+"""Publishing of a run: its figures, result document, θ* and report are written into its folder."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from orchestrator.catalogue.run_reading import read_run
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import check_journal
 from orchestrator.journal.run_record import CampaignResult, read_record
 from orchestrator.results import validity_warnings as regimes
-from orchestrator.results.campaign_figures import draw_figures
-from orchestrator.results.html_report import REPORT_NAME, reduced_run_page, run_page
-from orchestrator.results.pool_occupancy import occupancies
-from orchestrator.results.run_summary import SUMMARY_NAME, PoolUse, RunSummary, Totals, write_summary
-from orchestrator.results.stage_views import evaluation_of, receiver_names, theta_of
-from orchestrator.results.summarise import summarise
+from orchestrator.results.html_report import REPORT_NAME, run_page
+from orchestrator.results.run_figures import draw_figures
+from orchestrator.results.run_summary import SUMMARY_NAME, RunSummary, Totals, write_summary
+from orchestrator.results.stage_views import evaluation_of, theta_of
+from orchestrator.results.summarise import pool_use, summarise, summarise_record
 from orchestrator.runs.run_folder import read_versions
 from orchestrator.states import State
 from orchestrator.strategies.calibration.calibration_base import CalibratedTheta
@@ -33,7 +32,7 @@ from orchestrator.strategies.campaign_plan import CampaignPlan
 
 W = TypeVar("W")
 
-FIGURES, THETA_FILE = "figures", "theta.json"
+FIGURES, THETA_FILE, RECORDING = "figures", "theta.json", "campaign.rrd"
 
 KEPT_THETAS = 50
 """Draws of the posterior in that file."""
@@ -43,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Published:
-    """What was written about a run.
+    """The files that were written about a run.
 
     Attributes:
         figures: by name.
@@ -63,13 +62,13 @@ def publish(
 ) -> Published:
     """Write a run's figures (if the plan wants any), `theta.json`, `summary.json` and the report.
 
-    A run that has not finished may be published, too: its report says where it stands. Safe to call again: the files
+    A run that has not finished may be published, too: its report describes its state. Safe to call again: the files
     are then written again.
 
     Args:
         plan: of the campaign.
         result: of the run, as `run_campaign` or `read_result` returns it.
-        recording: its file, closed; None if there is none.
+        recording: its file, closed; by default the one in the run's folder, if there is one.
         dropped_events: missing in the recording.
 
     Raises:
@@ -86,11 +85,11 @@ def publish(
         theta.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
     report: Path | None = directory / REPORT_NAME
     try:
-        write_report(directory / REPORT_NAME, plan, summary, directory)
+        _write_page(directory / REPORT_NAME, run_page(summary, plan.resolved))
     except Exception as error:  # days of pouring don't end in a traceback about a page
         _log.warning("the report was not written: %s: %s", type(error).__name__, error)
         report = None
-    return Published(summary, figures, recording, theta, report)
+    return Published(summary, figures, summary.recording, theta, report)
 
 
 def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
@@ -105,29 +104,55 @@ def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
     expected = [SUMMARY_NAME, *([] if theta_of(result.results) is None else [THETA_FILE])]
     if result.state is not State.FINISHED or all((result.directory / name).is_file() for name in expected):
         return False
-    recording = result.directory / "campaign.rrd"
-    publish(plan, result, recording if recording.is_file() else None)
+    publish(plan, result)
     return True
 
 
 def summary_of(
     plan: CampaignPlan,
     result: CampaignResult,
-    figures: Mapping[str, Path],
+    figures: Mapping[str, Path] | None = None,
     *,
     recording: Path | None = None,
     dropped_events: int = 0,
+    live: bool = False,
 ) -> RunSummary:
-    """The summary of a run as its folder holds it, of one that is not finished too."""
+    """The result document of a run as its folder holds it, of one that is not finished too.
+
+    Args:
+        figures: name → file.
+        recording: its file; by default the one in the run's folder, if there is one.
+        dropped_events: missing in the recording.
+        live: whether the run is in progress.
+
+    Raises:
+        OSError: a file can't be read.
+        RunError: the journal can't be read.
+    """
+    directory = result.directory
+    record = read_record(directory, slots=plan.parallel_simulations)
+    beside = directory / RECORDING
     return summarise(
         plan,
         result.results,
+        record=record,
+        run=directory.name,
+        live=live,
+        versions=read_versions(directory),
+        check=check_journal(directory / JOURNAL_NAME),
         figures=figures,
-        recording=recording,
+        recording=recording or (beside if beside.is_file() else None),
         dropped_events=dropped_events,
         not_covered=worked_out(lambda: regimes.campaign_warnings(plan)),
         best_not_covered=worked_out(lambda: regimes.best_action_warnings(plan, result.results)),
-        totals=_totals(plan, result),
+        totals=Totals(
+            mode=plan.laboratory.mode if record.pours or plan.laboratory.pours else "none",
+            simulations=result.simulations,
+            pours=result.pours,
+            cpu_s=result.cpu_s,
+            seconds=result.seconds,
+            occupancy=pool_use(record.occupancies),
+        ),
     )
 
 
@@ -139,7 +164,7 @@ def report_on(
     *,
     draw: bool = True,
 ) -> tuple[Path, dict[str, Path]]:
-    """Draw a run's figures anew, and write the page about it, wherever the run stands.
+    """Draw a run's figures again, and write the page about it, wherever the run stands.
 
     Args:
         path: of the page; in the run's folder unless given.
@@ -151,27 +176,8 @@ def report_on(
         RunError: the journal can't be read.
     """
     figures = draw_figures(result.directory / FIGURES, plan, result.results, formats) if draw else {}
-    summary = summary_of(plan, result, figures)
-    return write_report(path or result.directory / REPORT_NAME, plan, summary, result.directory), figures
-
-
-def write_report(path: Path, plan: CampaignPlan, summary: RunSummary, directory: Path) -> Path:
-    """Write the page about a run, whole or not at all.
-
-    Args:
-        path: of the page.
-        summary: with the figures that go into it.
-        directory: of the run.
-
-    Raises:
-        OSError: it can't be written, or a figure can't be read.
-        RunError: the journal can't be read.
-    """
-    check = check_journal(directory / JOURNAL_NAME)
-    with JournalReader(directory / JOURNAL_NAME) as journal:
-        record = read_record(journal)
-    versions = read_versions(directory)
-    return _write_page(path, run_page(plan, summary, record, directory, versions=versions, check=check))
+    page = run_page(summary_of(plan, result, figures), plan.resolved)
+    return _write_page(path or result.directory / REPORT_NAME, page), figures
 
 
 def write_reduced_report(path: Path, directory: Path, reason: str) -> Path:
@@ -186,14 +192,16 @@ def write_reduced_report(path: Path, directory: Path, reason: str) -> Path:
         OSError: it can't be written, or a figure can't be read.
         RunError: the journal can't be read.
     """
-    check = check_journal(directory / JOURNAL_NAME)
-    with JournalReader(directory / JOURNAL_NAME) as journal:
-        name, record = journal.header.name, read_record(journal)
-    found = read_run(directory).run
-    page = reduced_run_page(
-        name, record, directory, versions=read_versions(directory), check=check, reason=reason, found=found
+    summary = summarise_record(
+        read_record(directory),
+        directory.name,
+        reason=reason,
+        catalogued=read_run(directory).run,
+        versions=read_versions(directory),
+        check=check_journal(directory / JOURNAL_NAME),
+        figures={file.stem.replace("-", " "): file for file in sorted((directory / FIGURES).glob("*.png"))},
     )
-    return _write_page(path, page)
+    return _write_page(path, run_page(summary))
 
 
 def _write_page(path: Path, page: str) -> Path:
@@ -211,7 +219,7 @@ def theta_file(found: CalibratedTheta, scored: Scores | None = None) -> dict[str
 
     Args:
         found: by the calibration.
-        scored: θ* on the weighed pours; None: nobody knows what it left over.
+        scored: θ* on the weighed pours; None: the rest is unknown.
     """
     theta = found.theta.model_dump()
     data: dict[str, Any] = {"theta": recommended_theta(found.theta, scored).model_dump()}
@@ -229,27 +237,6 @@ def theta_file(found: CalibratedTheta, scored: Scores | None = None) -> dict[str
     return data
 
 
-def _totals(plan: CampaignPlan, result: CampaignResult) -> Totals:
-    with JournalReader(result.directory / JOURNAL_NAME) as journal:
-        found = occupancies(journal.entries(), plan.parallel_simulations)
-    return Totals(
-        mode=plan.laboratory.mode,
-        simulations=result.simulations,
-        pours=result.pours,
-        cpu_s=result.cpu_s,
-        seconds=result.seconds,
-        occupancy={
-            stage: PoolUse(
-                pool_busy=one.fraction,
-                pool_useful=one.useful / one.total if one.total > 0.0 else None,
-                arm_longest_wait_s=max(one.waits, default=None),
-                arm_mean_wait_s=sum(one.waits) / len(one.waits) if one.waits else None,
-            )
-            for stage, one in found.items()
-        },
-    )
-
-
 def worked_out(
     work: Callable[[], dict[str, list[W]]], tell: Callable[[str], None] = _log.warning
 ) -> dict[str, list[W]]:
@@ -262,11 +249,10 @@ def worked_out(
 
 
 def not_simulated(plan: CampaignPlan, tell: Callable[[str], None] = _log.warning) -> list[str]:
-    """What is not simulated in a campaign's action spaces: lines for the user before it begins.
+    """Effects that are not simulated in a campaign's action spaces: lines for the user before it begins.
 
     Args:
         plan: of the campaign.
         tell: called if that can't be worked out.
     """
-    warnings = worked_out(lambda: regimes.campaign_warnings(plan), tell)
-    return regimes.lines(warnings, receiver_names(plan))
+    return regimes.lines(worked_out(lambda: regimes.campaign_warnings(plan), tell))

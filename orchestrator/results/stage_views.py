@@ -6,15 +6,9 @@ Scenes are displayed by the names of their receivers; a scene's own name is the 
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
-import numpy as np
-
-from orchestrator.journal.stage_results import Results
-from orchestrator.requests import Prediction
-from orchestrator.results.loss_units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit, largest_loss
-from orchestrator.results.spillage_figures import DiscrepancyGroup, PourSeries
-from orchestrator.results.surrogate_figures import SurrogatePicture
+from orchestrator.journal.codec import Results
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.calibration_scores import (
     UNCALIBRATED,
@@ -25,7 +19,7 @@ from orchestrator.strategies.calibration.calibration_scores import (
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.single_action import Confirmed, PredictedPour
-from orchestrator.strategies.stage_result import DisplayedMap, StageResult
+from orchestrator.strategies.stage_result import StageResult
 from sim_engine.liquids import SimulationParameters
 
 
@@ -119,115 +113,4 @@ def rival_scores(evaluation: Scores) -> dict[str, dict[str, float | None]]:
         "random_theta": evaluation.random_median,
         "mean_predictor": evaluation.mean_predictor,
         "regression": evaluation.regression,
-    }
-
-
-def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:
-    """Scores by set of pours, for `draw_discrepancy`."""
-    label = calibrated_label(evaluation)
-    if label is None:
-        return []
-    groups = []
-    for split, name in SPLITS.items():
-        own = evaluation.discrepancy[label].get(split)
-        if own is None:
-            continue
-        rivals = [scores.get(split) for other, scores in evaluation.discrepancy.items() if other.startswith("random ")]
-        groups.append(
-            DiscrepancyGroup(
-                name,
-                sum(pair.split == split and pair.theta == label for pair in evaluation.pairs),
-                own,
-                evaluation.discrepancy.get(UNCALIBRATED, {}).get(split),
-                [value for value in rivals if value is not None],
-                evaluation.mean_predictor.get(split),
-                evaluation.regression.get(split),
-                evaluation.posterior_mean.get(split),
-            )
-        )
-    return groups
-
-
-def calibration_picture(plan: CampaignPlan, result: Calibrated) -> SurrogatePicture | None:
-    """The discrepancy over θ; None if the plan calibrates nothing or no trial has a discrepancy."""
-    if plan.calibration is None:
-        return None
-    known = [(trial.theta, trial.discrepancy) for trial in result.trials if trial.discrepancy is not None]
-    shown = None if result.found is None else result.found.map
-    if not known and shown is None:
-        return None
-    return SurrogatePicture(
-        title=f"Discrepancy over θ: {', '.join(scene.receiver.name for scene in plan.calibration.scenes)}",
-        cost=DISCREPANCY.label,
-        space=plan.calibration.parameters,
-        points=[theta for theta, _ in known],
-        costs=[DISCREPANCY.factor * discrepancy for _, discrepancy in known],
-        best=None if result.found is None else result.found.theta.model_dump(),
-        largest=DISCREPANCY.factor,
-        **_surrogate(shown, DISCREPANCY),
-    )
-
-
-def deployment_picture(plan: CampaignPlan, result: Deployed) -> SurrogatePicture | None:
-    """The loss over actions with numbered pours; None before the first data."""
-    if plan.deployment is None:
-        return None
-    unit = deployment_unit(plan.deployment)
-    known = [(pour, pour.loss) for pour in result.weighed if pour.loss is not None]
-    if not known and result.map is None:
-        return None
-    return SurrogatePicture(
-        title=f"Loss over actions: {receiver_name(plan, result.scene)} ({result.strategy})",
-        cost=unit.label,
-        space=plan.deployment.actions,
-        points=[pour.action_si for pour, _ in known],
-        costs=[unit.factor * loss for _, loss in known],
-        best=None if result.recommended is None else result.recommended.action_si,
-        best_name="best action",
-        numbers=[pour.number for pour, _ in known],
-        simulated=[one.action_si for one in result.simulated],
-        largest=unit.factor * largest_loss(plan.deployment),
-        **_surrogate(result.map, unit),
-    )
-
-
-def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[PourSeries]:
-    """Pours by receiver, for `draw_spillage`; refused ones (nothing was poured) are left out."""
-    series = []
-    for scene, result in deployments_of(results).items():
-        pours = [pour for pour in result.pours if pour.status in ("weighed", "failed")]
-        if not pours:
-            continue
-        losses = [
-            unit.factor * pour.loss if pour.status == "weighed" and pour.loss is not None else None for pour in pours
-        ]
-        predictions = [
-            None
-            if pour.predicted is None
-            else _prediction_interval(
-                Prediction(
-                    pour.predicted, pour.predicted_deviation or 0.0, pour.predicted_scatter, pour.predicted_band
-                ),
-                unit,
-            )
-            for pour in pours
-        ]
-        series.append(PourSeries(f"{receiver_name(plan, scene)} ({result.strategy})", losses, predictions))
-    return series
-
-
-def _prediction_interval(predicted: Prediction, unit: LossUnit) -> tuple[float, float, float]:
-    low, high = predicted.of_a_pour()
-    return unit.factor * at_least_nothing(predicted.mean), unit.factor * low, unit.factor * high
-
-
-def _surrogate(shown: DisplayedMap | None, unit: LossUnit) -> dict[str, Any]:
-    """The map of a figure: its axes, and the values of the other axes."""
-    if shown is None:
-        return {}
-    return {
-        "mean": unit.factor * np.maximum(np.asarray(shown.mean, float), 0.0),  # see `at_least_nothing`
-        "deviation": unit.factor * np.asarray(shown.deviation, float),
-        "over": shown.over,
-        "held": shown.held,
     }

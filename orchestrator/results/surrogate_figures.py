@@ -2,7 +2,7 @@
 
 - `draw_surrogate` and `draw_trials`: the discrepancy over θ, or the predicted loss over actions.
 - `draw_window`: the safe window in the loss map, and the loss along each dimension.
-- `posterior_lines` and `draw_posterior`: the posterior of θ as text and as a corner plot.
+- `draw_posterior`: the posterior of θ as a corner plot.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from orchestrator.results import figure_style as style
 from orchestrator.results.loss_units import LossUnit, at_least_nothing
-from orchestrator.strategies.calibration.posterior_summary import PosteriorFound, PosteriorSummary
+from orchestrator.strategies.calibration.posterior_summary import PosteriorFound
 from orchestrator.strategies.deployment.deployment_result import Deployed, RiskFound
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from sim_engine.search_space import Axis, Space
@@ -73,18 +72,14 @@ class SurrogatePicture:
         return Space(tuple(axis for axis in self.space.axes if not self.over or axis.name in self.over))
 
 
-def draw_surrogate(path: Path, picture: SurrogatePicture) -> Path:
-    """Write a surrogate's figure: maps of mean and deviation over two axes; without a map, as `draw_trials`.
+def draw_surrogate(picture: SurrogatePicture) -> Figure:
+    """Draw a surrogate: maps of mean and deviation over two axes; without a map, as `draw_trials`.
 
     With more than two axes the map is a section of the surrogate; observations from the whole space are projected on
     it.
 
     Args:
-        path: PNG to write.
         picture: at least one point or a map.
-
-    Returns:
-        `path`.
 
     Raises:
         ValueError: there is nothing to draw.
@@ -92,25 +87,21 @@ def draw_surrogate(path: Path, picture: SurrogatePicture) -> Path:
     if not picture.points and picture.mean is None:
         raise ValueError(f"'{picture.title}': neither a surrogate nor a single observation to draw")
     mapped = picture.space.dimension == 2 or (picture.mean is not None and picture.space.dimension > 2)
-    return style.save(_maps(picture) if mapped else _slices(picture), path)
+    return _maps(picture) if mapped else _slices(picture)
 
 
-def draw_trials(path: Path, picture: SurrogatePicture) -> Path:
-    """Write the observed costs against each searched axis, in adjacent panels.
+def draw_trials(picture: SurrogatePicture) -> Figure:
+    """Draw the observed costs against each searched axis, in adjacent panels.
 
     Args:
-        path: PNG to write.
         picture: at least one point.
-
-    Returns:
-        `path`.
 
     Raises:
         ValueError: there is nothing to draw.
     """
     if not picture.points:
         raise ValueError(f"'{picture.title}': not a single observation to draw")
-    return style.save(_slices(picture), path)
+    return _slices(picture)
 
 
 def _maps(picture: SurrogatePicture) -> Figure:
@@ -122,7 +113,7 @@ def _maps(picture: SurrogatePicture) -> Figure:
         ("observations", None)
     ]
     figure, axes = style.new_figure(1, len(shown), size=(5.6 * len(shown), 4.8), squeeze=False)
-    figure.suptitle(picture.title, fontsize=12.5, color=style.INK, x=0.02, ha="left")
+    style.entitle(figure, picture.title)
     for place, (name, grid) in enumerate(shown):
         _map_panel(figure, axes[0, place], picture, name, grid)
     marked = {name: h for h, name in zip(*axes[0, 0].get_legend_handles_labels(), strict=True)}
@@ -274,7 +265,7 @@ def _slices(picture: SurrogatePicture) -> Figure:
     """One axis or more than two: the cost against each of them, over all values of the other axes."""
     count = picture.space.dimension
     figure, axes = style.new_figure(1, count, size=(max(5.4, 3.4 * count), 4.1), squeeze=False, sharey=True)
-    figure.suptitle(picture.title, fontsize=12.5, color=style.INK, x=0.02, ha="left")
+    style.entitle(figure, picture.title)
     for place, axis in enumerate(picture.space.axes):
         panel = axes[0, place]
         panel.scatter(
@@ -316,23 +307,17 @@ def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
     return (low, high) if high - low > 1e-12 else (low - 0.5, low + 0.5)
 
 
-def draw_window(
-    path: Path, result: Deployed, picture: SurrogatePicture | None, *, unit: LossUnit, receiver: str
-) -> Path:
+def draw_window(result: Deployed, picture: SurrogatePicture | None, *, unit: LossUnit, receiver: str) -> Figure:
     """A loss map with action and window, and a panel for each dimension.
 
     The map is omitted if there is none. Each panel shows the surrogate's mean, the results of the checks and the
     tolerance.
 
     Args:
-        path: PNG to write.
         result: result of a deployment, with its window and its recommendation.
         picture: its loss map.
         unit: unit of the loss.
         receiver: for the title.
-
-    Returns:
-        `path`.
 
     Raises:
         ValueError: there is no window or no recommendation.
@@ -344,7 +329,7 @@ def draw_window(
     count = len(names) + mapped
     figure, axes = style.new_figure(1, count, size=(4.3 * count, 4.1), squeeze=False)
     measure = _measure(result.risk)
-    figure.suptitle(f"Safe window: {receiver}, {measure}", fontsize=12.5, color=style.INK, x=0.02, ha="left")
+    style.entitle(figure, f"Safe window: {receiver}, {measure}")
     if picture is not None and mapped:
         _window_map_panel(axes[0, 0], picture, window, unit)
     for panel, name in zip(axes[0, count - len(names) :], names, strict=True):
@@ -352,7 +337,7 @@ def draw_window(
         style.dress(panel, x=style.label(name), y=unit.label)
     handles, labels = axes[0, -1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8.5, frameon=False)
-    return style.save(figure, path)
+    return figure
 
 
 def _measure(risk: RiskFound | None) -> str:
@@ -410,47 +395,13 @@ def _profile(axes: Axes, name: str, window: WindowFound, best: float, unit: Loss
 BINS = 18
 
 
-def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
-    """Which parameters the pours determine and which they do not, one sentence per line.
-
-    Args:
-        posterior: posterior of a calibration's result.
-        space: searched θ.
-    """
-    known, unknown = [], []
-    for axis in space.axes:
-        words, searched = axis.name.replace("_", " "), _interval(axis.name, axis.lower, axis.upper)
-        if axis.name in posterior.open:
-            unknown.append(f"{words} ({searched})")
-        else:
-            known.append(f"{words} {_interval(axis.name, *posterior.region[axis.name])} (searched {searched})")
-    lines = []
-    if known:
-        lines.append(f"{100 * posterior.level:.0f} % of the θ that fit the pours have {', '.join(known)}")
-    if unknown:
-        lines.append(
-            f"the pours don't determine {', '.join(unknown)}: nearly all of what was searched fits them as well as θ*"
-        )
-    return [*lines, *posterior.directions]
-
-
-def _interval(name: str, low: float, high: float) -> str:
-    """'0.31 … 0.74 N/m'."""
-    first = style.display_value(name, low).removesuffix(style.display_unit(name)).rstrip()
-    return f"{first} … {style.display_value(name, high)}"
-
-
-def draw_posterior(path: Path, posterior: PosteriorFound, space: Space, theta: Mapping[str, float]) -> Path:
+def draw_posterior(posterior: PosteriorFound, space: Space, theta: Mapping[str, float]) -> Figure:
     """One histogram per searched parameter with its region, one cloud per pair, θ* marked; logarithmic axes are kept.
 
     Args:
-        path: PNG to write.
         posterior: posterior of a calibration's result.
         space: searched θ, the plot's range.
         theta: θ*.
-
-    Returns:
-        `path`.
 
     Raises:
         ValueError: there are no draws.
@@ -460,7 +411,7 @@ def draw_posterior(path: Path, posterior: PosteriorFound, space: Space, theta: M
         raise ValueError("posterior figure: no draws of θ")
     axes, d = space.axes, space.dimension
     figure, panels = style.new_figure(d, d, size=(max(1.8 + 2.3 * d, 6.0), 1.9 + 2.2 * d), squeeze=False, sharex="col")
-    figure.suptitle(f"θ that fit the pours\n{len(draws)} draws", fontsize=12.5, color=style.INK, x=0.02, ha="left")
+    style.entitle(figure, f"θ that fit the pours\n{len(draws)} draws")
     for row, up in enumerate(axes):
         for column, across in enumerate(axes):
             panel = panels[row, column]
@@ -484,7 +435,7 @@ def draw_posterior(path: Path, posterior: PosteriorFound, space: Space, theta: M
     for panel in panels.flat:
         handles |= {name: handle for handle, name in zip(*panel.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    return style.save(figure, path)
+    return figure
 
 
 def _histogram(panel: Axes, axis: Axis, posterior: PosteriorFound, theta: Mapping[str, float]) -> None:

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
-from orchestrator.journal.stage_results import Results
+from orchestrator.journal.codec import Results
 from orchestrator.results import figure_style as style
-from orchestrator.results.stage_views import deployments_of, recommended_theta_of
+from orchestrator.results.run_summary import NotSimulated
+from orchestrator.results.stage_views import deployments_of, receiver_names, recommended_theta_of
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan
 from sim_engine.action import Action
 from sim_engine.model_validity import ModelValidity, NotCovered, regimes
@@ -26,32 +25,6 @@ MOST_CORNERS = 32
 """Maximum number of corners of a space that are tried."""
 
 _vessel = lru_cache(maxsize=16)(build_vessel)
-
-
-@dataclass(frozen=True)
-class SpaceWarning:
-    """An effect that is not simulated in part of an action space.
-
-    Attributes:
-        worst: the finding of the tried action with the largest share.
-        values: searched values of that action [SI].
-        hit, tried: number of affected actions, and of all tried actions.
-    """
-
-    worst: NotCovered
-    values: dict[str, float]
-    hit: int
-    tried: int
-
-    @property
-    def text(self) -> str:
-        """Text for displays."""
-        at = style.display_values(dict(self.values))
-        return f"{self.worst.text} (at {at}; {self.hit} of {self.tried} actions tried)"
-
-    def as_json(self) -> dict[str, Any]:
-        """JSON-ready mapping."""
-        return {**self.worst.as_json(), "action_si": self.values, "hit": self.hit, "tried": self.tried}
 
 
 def regimes_of(scene: Scene, action: Action, particles: float) -> ModelValidity:
@@ -67,8 +40,11 @@ def regimes_of(scene: Scene, action: Action, particles: float) -> ModelValidity:
     return regimes(scene, action, _vessel(scene.pourer), _vessel(scene.receiver), spacing=distance)
 
 
-def space_warnings(scene: Scene, actions: Space, particles: float) -> list[SpaceWarning]:
+def space_warnings(scene: Scene, actions: Space, particles: float, receiver: str) -> list[NotSimulated]:
     """Effects that are not simulated at the middle and the corners of an action space, each kind once.
+
+    Args:
+        receiver: display name of the scene.
 
     Raises:
         ValueError, OSError: as `regimes_of`.
@@ -80,13 +56,23 @@ def space_warnings(scene: Scene, actions: Space, particles: float) -> list[Space
         for one in regimes_of(scene, scene.action(values), particles).not_covered:
             found.setdefault(one.kind, []).append((one, values))
     warnings = []
-    for hits in found.values():
+    for kind, hits in found.items():
         worst, values = max(hits, key=lambda hit: hit[0].share)
-        warnings.append(SpaceWarning(worst, values, len(hits), len(tried)))
+        warnings.append(
+            NotSimulated(
+                receiver=receiver,
+                kind=kind,
+                share=worst.share,
+                text=worst.text,
+                action_si=values,
+                hit=len(hits),
+                tried=len(tried),
+            )
+        )
     return warnings
 
 
-def campaign_warnings(plan: CampaignPlan) -> dict[str, list[SpaceWarning]]:
+def campaign_warnings(plan: CampaignPlan) -> dict[str, list[NotSimulated]]:
     """Effects that are not simulated in a campaign's action spaces, by scene; scenes without warnings are left out.
 
     If calibration searches the number of particles, the middle of its range is used.
@@ -95,13 +81,15 @@ def campaign_warnings(plan: CampaignPlan) -> dict[str, list[SpaceWarning]]:
         ValueError, OSError: as `regimes_of`.
     """
     spaces: list[tuple[Scene, Space, float]] = []
-    particles = float(plan.parameters.particles)
+    particles, names = float(plan.parameters.particles), receiver_names(plan)
     if plan.calibration is not None:
         particles = _middle(plan.calibration, particles)
         spaces += [(scene, plan.calibration.actions, particles) for scene in plan.calibration.scenes]
     if plan.deployment is not None:
         spaces += [(scene, plan.deployment.actions, particles) for scene in plan.deployment.scenes]
-    found = {scene.name: space_warnings(scene, actions, n) for scene, actions, n in spaces}
+    found = {
+        scene.name: space_warnings(scene, actions, n, names.get(scene.name, scene.name)) for scene, actions, n in spaces
+    }
     return {name: warnings for name, warnings in found.items() if warnings}
 
 
@@ -121,17 +109,14 @@ def best_action_warnings(plan: CampaignPlan, results: Results) -> dict[str, list
     return found
 
 
-def lines(warnings: Mapping[str, Sequence[SpaceWarning]], names: Mapping[str, str]) -> list[str]:
-    """Warnings of a campaign for the terminal.
-
-    Args:
-        names: display names of the scenes.
-    """
+def lines(warnings: Mapping[str, Sequence[NotSimulated]]) -> list[str]:
+    """Warnings of a campaign for the terminal."""
     if not warnings:
         return []
-    found = ["not simulated (docs/user-guide.md tells what to do about it):"]
-    for scene, several in warnings.items():
-        found += [f"  into {names.get(scene, scene)}, {one.worst.kind}: {one.text}" for one in several]
+    found = ["not simulated (docs/explanation/simulator.md has what to do):"]
+    for one in itertools.chain.from_iterable(warnings.values()):
+        at = f"(at {style.display_values(one.action_si)}; {one.hit} of {one.tried} actions tried)"
+        found.append(f"  into {one.receiver}, {one.kind}: {one.text} {at}")
     return found
 
 

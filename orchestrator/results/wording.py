@@ -1,33 +1,43 @@
-"""Results and settings of a run as plain sentences.
+"""Sentences and tables about a run, each made once.
 
-- `advice`: recommended action per receiver, its expected result, its tolerance, and open questions.
-- `risk_line` and `window_line`: effect of execution errors on a planned action.
-- `standing`: state of an unfinished run and the next steps.
-- `what_was_asked`: the campaign's settings, for readers who have not seen its file.
+Sentences are written when the result document is made (`orchestrator.results.summarise`): `advice`, `standing`,
+`open_questions`, `what_was_asked`, `cost`, `theta_sentences`, and one line each for a risk, a window, a prediction
+interval and the use of the pool. The tables arrange the document's values; the console and the page render them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from orchestrator.journal.run_record import Record
+from orchestrator.journal.run_record import RunRecord
 from orchestrator.results import figure_style as style
-from orchestrator.results.loss_units import DISCREPANCY, LossUnit, deployment_unit
-from orchestrator.results.run_summary import ReceiverSummary, RunSummary
+from orchestrator.results.loss_units import (
+    DISCREPANCY,
+    LossUnit,
+    at_least_nothing,
+    deployment_unit,
+    is_calibration,
+    loss_of_pour,
+)
+from orchestrator.results.run_summary import Advice, PoolUse, PourSummary, ReceiverSummary, RunSummary
 from orchestrator.results.stage_views import SPLITS
 from orchestrator.states import State
-from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan
-from orchestrator.strategies.deployment.deployment_result import RiskFound
+from orchestrator.strategies.calibration.calibration_scores import CalibrationGain
+from orchestrator.strategies.calibration.posterior_summary import PosteriorSummary
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.deployment.deployment_result import ParetoAction, RiskFound
 from orchestrator.strategies.deployment.model_monitoring import DOUBT, Believed
 from orchestrator.strategies.deployment.real_pours import PredictionCheck
 from orchestrator.strategies.deployment.safe_window import WindowFound
+from sim_engine.prediction_band import PredictionInterval
 from sim_engine.scene import Scene
-from sim_engine.search_space import Axis
+from sim_engine.search_space import Axis, Space
 
 
 def trust_line(trust: PredictionCheck | Believed) -> str | None:
-    """What the pours say of the simulator; None where that is nothing.
+    """The judgement of the pours about the simulator; None if there is none.
 
     Args:
         trust: of a deployment's result.
@@ -69,53 +79,36 @@ FEW = 5
 """Number of pours of an action below which their mean is not reliable."""
 
 
-@dataclass(frozen=True)
-class Advice:
-    """Advice for one receiver.
-
-    Attributes:
-        title: the receiver.
-        action: searched dimensions in display units; empty without a recommendation.
-        fixed: other dimensions, as in the campaign.
-        sentences: recommendation and expected result.
-        window: allowed deviation from the action, or a statement that it is unknown.
-        open: open questions.
-    """
-
-    title: str
-    action: dict[str, str]
-    fixed: dict[str, str]
-    sentences: list[str]
-    window: str
-    open: list[str]
-
-
-def advice(plan: CampaignPlan, summary: RunSummary) -> list[Advice]:
-    """Advice for each receiver with a deployment result."""
+def advice(plan: CampaignPlan, receivers: Mapping[str, ReceiverSummary]) -> tuple[Advice, ...]:
+    """Advice for each receiver with a deployment result, by scene."""
     if plan.deployment is None:
-        return []
+        return ()
     scenes = {scene.name: scene for scene in plan.deployment.scenes}
     unit = deployment_unit(plan.deployment)
-    return [_of(plan.deployment, scenes.get(name), row, unit) for name, row in summary.receivers.items()]
+    return tuple(_advice(scenes.get(name), row, unit) for name, row in receivers.items())
 
 
-def _of(deployment: DeploymentPlan, scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> Advice:
-    if row.best_action_si is None:
+def _advice(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> Advice:
+    window, open_points = "", tuple(_open(row))
+    if row.recommended is None:
         why = row.gave_up or "nothing was learnt that an action could be chosen by"
-        return Advice(row.receiver, {}, {}, [f"No action is recommended: {why}."], "", _open(row, unit))
-    chosen: dict[str, float | None] = dict(row.best_action_si)
-    action, fixed = _shown(chosen), {} if scene is None else _shown(scene.fixed)
-    window, open_points = "", _open(row, unit)
+        said = (f"No action is recommended: {why}.",)
+        return Advice(receiver=row.receiver, action={}, fixed={}, sentences=said, window="", open=open_points)
     if row.window is not None:
         window = _sentence(window_line(row.window, unit))
     else:
         window = (
-            "No safe window was looked for: nobody has checked how far this action may be missed. D1 looks for one "
+            "No safe window was looked for: how far this action may be missed is not known. D1 looks for one "
             "where the campaign has 'window: {tolerance: …}'."
         )
-    if ends := style.at_ends(chosen, deployment.actions.axes):
-        open_points.insert(0, f"Better actions may lie beyond what was searched: {', '.join(ends)}.")
-    return Advice(row.receiver, action, fixed, _sentences(scene, row, unit), window, open_points)
+    return Advice(
+        receiver=row.receiver,
+        action=_shown(row.recommended.action_si),
+        fixed={} if scene is None else _shown(scene.fixed),
+        sentences=tuple(_sentences(scene, row, unit)),
+        window=window,
+        open=open_points,
+    )
 
 
 def _shown(values: Mapping[str, float | None]) -> dict[str, str]:
@@ -125,72 +118,141 @@ def _shown(values: Mapping[str, float | None]) -> dict[str, str]:
 def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> list[str]:
     load = "" if scene is None else f" {1e3 * scene.liquid.mass:.0f} g of {scene.liquid.name}"
     cup = "" if scene is None else f" from {scene.pourer.name}"
-    said = [f"To pour{load}{cup} into {row.receiver}, use the action below."]
-    measure = unit.label.rsplit(" [", 1)[0]
-    if row.predicted_loss is not None:
-        mean = unit.text(max(row.predicted_loss, 0.0), row.predicted_deviation)
-        scatter = unit.scatter(row.predicted_scatter).removeprefix(", a pour ")
-        said.append(f"Expect {measure} of {mean}{scatter and f'; single pours differ from that by {scatter}'}.")
-    if row.prediction is not None and "spillage" in row.prediction:
-        seeds = row.prediction["spillage"]
-        said.append(
-            f"Simulated again with {seeds.count} fresh seeds, {seeds.percent(2)} of what left the pourer was spilled."
-        )
+    said = [f"To pour{load}{cup} into {row.receiver}, use the recommended action."]
+    if (expected := row.recommended) is not None:
+        mean = unit.text(expected.predicted_loss, expected.predicted_deviation)
+        scatter = unit.scatter(expected.predicted_scatter).removeprefix(", a pour ")
+        said.append(f"Expect {unit.meaning} of {mean}{scatter and f'; single pours differ from that by {scatter}'}.")
+    if row.prediction is not None:
+        said.append(_prediction(row))
+    if row.prediction_interval is not None:
+        said.append(_sentence(band_line(row.prediction_interval)))
     if row.confirmed is not None and row.confirmed.loss is not None:
         loss = row.confirmed.loss
         times = "once more" if loss.count == 1 else f"{loss.count} more times"
         said.append(f"Poured {times} after it was chosen, it came to {unit.text(loss.mean, loss.deviation)}.")
-    if row.best_loss is not None:
-        best = f"The best of {row.pours} weighed pours came to {unit.text(row.best_loss)} (pour {row.best_pour})"
+    if row.texts["best measured"]:
+        best = f"The best of {row.pours} weighed pours came to {row.texts['best measured']}"
         said.append(f"{best}; the least of several is a lucky one, so that it is not what to expect of the next.")
     if row.risk is not None:
         said.append(_sentence(risk_line(row.risk, unit)))
-    if _is_confirmed(row) and (trust := trust_line(row.trust)) is not None:
+    said += [f"Nothing beats {_compromise(one)}." for one in row.pareto_front or ()]
+    if row.ended:
+        said.append(f"The search ended: {row.ended.rstrip('.')}.")
+    if _is_confirmed(row) and (trust := trust_line(row.model_check)) is not None:
         said.append(_sentence(trust))
     return said
 
 
+def _prediction(row: ReceiverSummary) -> str:
+    """'Simulated again with 5 fresh seeds: spilled / poured 1.20 ± 0.40 %, retained …; delivered 193.2 g, 193.6 mL.'"""
+    assert row.prediction is not None
+    words = {"spillage": "spilled / poured", "spilled": "spilled", "retained": "retained"}
+    shown = {text: row.prediction[name] for name, text in words.items() if name in row.prediction}
+    if not shown:
+        return "No simulation of it with fresh seeds could be used."
+    count = max(spread.count for spread in shown.values())
+    shares = ", ".join(f"{text} {spread.percent(2)}" for text, spread in shown.items())
+    amount = amount_text(row.predicted_delivered_g, row.predicted_delivered_ml)
+    delivered = f"; delivered {amount} in the mean" if amount else ""
+    return f"Simulated again with {count} fresh seeds: {shares} (mean ± standard deviation){delivered}."
+
+
+def _compromise(one: ParetoAction) -> str:
+    """'spillage 1.2 ± 0.3 %, time 40.0 ± 1.0 % with angular velocity 41.2 deg/s, …'."""
+    parts = [
+        f"{name.replace('_', ' ')} {100 * at_least_nothing(mean):.1f} ± {100 * one.deviations[name]:.1f} %"
+        for name, mean in one.objectives.items()
+    ]
+    return f"{', '.join(parts)} with {style.display_values(one.action_si)}"
+
+
+def amount_text(grams: float | None, millilitres: float | None) -> str:
+    """'193.2 g, 193.6 mL'; '' if unknown."""
+    return "" if grams is None or millilitres is None else f"{grams:.1f} g, {millilitres:.1f} mL"
+
+
+def band_line(band: PredictionInterval) -> str:
+    """'nine single pours in ten spill 0.8 … 5.7 % of what is poured (simulations ± 0.3, …)'."""
+    causes = {"simulations": band.simulations, "left over by calibration": band.discrepancy}
+    causes["resolution"] = band.resolution
+    said = ", ".join(f"{name} ± {100 * value:.2f}" for name, value in causes.items() if value is not None)
+    lacking = "" if band.discrepancy is not None else "; what calibration left over is not known"
+    return f"nine single pours in ten spill {band.percent(2)} of what is poured ({said}{lacking})"
+
+
+def pool_line(busy: float | None, useful: float | None, longest_wait: float | None) -> str:
+    """'97 % busy while there was work (41 % of the time); between two pours the arm waited 0.06 s at most'."""
+    if busy is None:
+        return ""
+    text = f"{100 * busy:.0f} % busy"
+    if useful is not None and useful < 0.995:
+        text += f" while there was work ({100 * useful:.0f} % of the time)"
+    return text + ("" if longest_wait is None else f"; between two pours the arm waited {longest_wait:.2g} s at most")
+
+
 def _is_confirmed(row: ReceiverSummary) -> bool:
     """Whether the pours confirm the judgement about the simulator without doubt."""
-    trust = row.trust
+    trust = row.model_check
     return isinstance(trust, Believed) and bool(trust.after) and trust.after[-1].ignorance < DOUBT
 
 
-def _open(row: ReceiverSummary, unit: LossUnit) -> list[str]:
+def _open(row: ReceiverSummary) -> list[str]:
     said = []
-    if not _is_confirmed(row) and (alarm := trust_line(row.trust)) is not None:
+    if row.at_bounds:
+        said.append(f"Better actions may lie beyond what was searched: {', '.join(row.at_bounds)}.")
+    if not _is_confirmed(row) and (alarm := trust_line(row.model_check)) is not None:
         said.append(_sentence(alarm))
-    poured_again = 0 if row.confirmed is None or row.confirmed.loss is None else row.confirmed.loss.count
-    if not row.pours and not poured_again:
-        said.append("Nothing was poured into this receiver: what is expected of the action is simulated, not weighed.")
-    elif not poured_again:
-        said.append(
-            "The recommended action was not poured again after it was chosen ('confirm' in the campaign does that): "
-            "what is expected of it is a model's word."
-        )
-    elif poured_again < FEW:
-        pours = "one pour" if poured_again == 1 else f"{poured_again} pours"
-        said.append(f"What it comes to is known from {pours} of it; that many say little about how much pours differ.")
+    if row.gave_up and row.recommended is not None:
+        said.append(_sentence(row.gave_up))
+    if row.recommended is not None:
+        said += _poured_again(row)
     if row.failed_pours:
-        why = "; ".join(row.failures)
-        said.append(f"{row.failed_pours} of its pours failed{f' ({why})' if why else ''}: nobody weighed them.")
-    if row.risk is None:
+        what = "1 pour failed" if row.failed_pours == 1 else f"{row.failed_pours} pours failed"
+        why = f": {'; '.join(row.failures)}" if row.failures else ""
+        said.append(f"{what}{why}. They were not weighed.")
+    confirming = () if row.confirmed is None else row.confirmed.pours
+    if lost := [f"pour {pour.number}: {pour.failed}" for pour in confirming if pour.failed]:
+        said.append(f"Confirming pours that failed: {'; '.join(lost)}.")
+    if row.risk is None and row.recommended is not None:
         said.append("Errors of grip, placement and speed entered only as far as they happened in these pours.")
-    said += [f"Not simulated at this action, {one.kind}: {one.text}." for one in row.not_covered]
-    return said
+    return said + [f"Not simulated at this action, {one.kind}: {one.text}." for one in row.not_covered]
 
 
-def unknown_of_all(plan: CampaignPlan, summary: RunSummary, record: Record) -> list[str]:
-    """Open questions after this run that do not depend on the receiver."""
+def _poured_again(row: ReceiverSummary) -> list[str]:
+    """How well the recommended action is known from pours of it."""
+    count = 0 if row.confirmed is None or row.confirmed.loss is None else row.confirmed.loss.count
+    if not row.pours and not count:
+        return ["Nothing was poured into this receiver: what is expected of the action is simulated, not weighed."]
+    if not count:
+        return [
+            "The recommended action was not poured again after it was chosen ('confirm' in the campaign does that): "
+            "what is expected of it is a prediction."
+        ]
+    if count >= FEW:
+        return []
+    pours = "one pour" if count == 1 else f"{count} pours"
+    return [f"What it comes to is known from {pours} of it; that many say little about how much pours differ."]
+
+
+def open_questions(
+    plan: CampaignPlan, record: RunRecord, theta: Sequence[str], *, calibrated: bool, dropped_events: int
+) -> list[str]:
+    """Open questions after a run that do not depend on the receiver.
+
+    Args:
+        theta: open questions about θ*, see `about_theta`.
+        calibrated: whether θ* was found.
+        dropped_events: number of events missing in the recording.
+    """
     said = []
     if plan.laboratory.mode == "virtual" and (record.pours or plan.laboratory.pours):
         said.append(
             "The bench was VIRTUAL: no robot moved and no liquid was weighed. What the hidden liquid of that bench did "
-            "is another simulation's word, and a real cup may behave otherwise."
+            "is simulated, too, and a real cup may behave otherwise."
         )
-    if summary.theta is not None:
-        said += _about_theta(summary)
-    elif plan.calibration is None:
+    said += theta
+    if not calibrated and plan.calibration is None:
         said.append("The simulator was not calibrated in this run: its parameters were taken as the campaign has them.")
     liquids = {scene.liquid.name for scene in plan.deployment.scenes} if plan.deployment is not None else set()
     if liquids:
@@ -198,23 +260,34 @@ def unknown_of_all(plan: CampaignPlan, summary: RunSummary, record: Record) -> l
             f"All of this holds for {', '.join(sorted(liquids))}, this load, these vessels and what the campaign "
             "fixes of the motion. For other ones, plan anew."
         )
-    if summary.dropped_events:
-        said.append(f"The recording lacks {summary.dropped_events} events, because it could not keep up.")
+    if dropped_events:
+        said.append(f"The recording lacks {dropped_events} events, because it could not keep up.")
     return said
 
 
-def _about_theta(summary: RunSummary) -> list[str]:
+def about_theta(
+    gain: CalibrationGain | None,
+    posterior: PosteriorSummary | None,
+    discrepancy: Mapping[str, Mapping[str, float | None]],
+) -> list[str]:
+    """Open questions about θ*.
+
+    Args:
+        gain: whether the weighed pours justify θ*.
+        posterior: θ that fit as well.
+        discrepancy: mean |Δ| by split and predictor.
+    """
     said, used = [], "calibrated"
-    if summary.calibration_gain is not None and summary.calibration_gain.recommended != used:
-        said, used = [_sentence(summary.calibration_gain.text)], summary.calibration_gain.recommended
-    if summary.posterior is None:
+    if gain is not None and gain.recommended != used:
+        said, used = [_sentence(gain.text)], gain.recommended
+    if posterior is None:
         said.append("Which other θ fit the weighed pours as well was not asked: θ* may be one of many.")
-    elif summary.posterior.open:
-        names = ", ".join(name.replace("_", " ") for name in summary.posterior.open)
+    elif posterior.open:
+        names = ", ".join(name.replace("_", " ") for name in posterior.open)
         said.append(f"The pours don't determine {names}: nearly all of what was searched fits them as well as θ*.")
     unseen = [
         f"{DISCREPANCY.text(own)} on {SPLITS[split]}"
-        for split, row in summary.discrepancy.items()
+        for split, row in discrepancy.items()
         if split != "train" and (own := row.get(used)) is not None
     ]
     if unseen:
@@ -222,12 +295,123 @@ def _about_theta(summary: RunSummary) -> list[str]:
             f"On pours that calibration did not see, the simulator's spillage was off by {' and '.join(unseen)} in the "
             "mean."
         )
-    elif summary.discrepancy:
+    elif discrepancy:
         said.append("The simulator was not scored on pours that calibration did not see.")
     return said
 
 
-def standing(record: Record, run: str) -> list[str]:
+def theta_sentences(
+    expected: float | None,
+    deviation: float | None,
+    posterior: PosteriorSummary | None,
+    space: Space | None,
+    gain: CalibrationGain | None,
+) -> list[str]:
+    """The knowledge of θ*: its expected discrepancy, its posterior over the searched space, whether it is justified."""
+    said = []
+    if expected is not None:
+        said.append(f"Expected {DISCREPANCY.meaning} of θ*: {DISCREPANCY.text(expected, deviation or 0.0)}.")
+    if posterior is not None and space is not None:
+        said += map(_sentence, posterior_lines(posterior, space))
+    return said if gain is None else [*said, _sentence(gain.text)]
+
+
+def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
+    """Which parameters the pours determine and which they do not, one sentence per line.
+
+    Args:
+        posterior: posterior of a calibration's result.
+        space: searched θ.
+    """
+    known, unknown = [], []
+    for axis in space.axes:
+        words, searched = axis.name.replace("_", " "), _interval(axis.name, axis.lower, axis.upper)
+        if axis.name in posterior.open:
+            unknown.append(f"{words} ({searched})")
+        else:
+            known.append(f"{words} {_interval(axis.name, *posterior.region[axis.name])} (searched {searched})")
+    lines = []
+    if known:
+        lines.append(f"{100 * posterior.level:.0f} % of the θ that fit the pours have {', '.join(known)}")
+    if unknown:
+        lines.append(
+            f"the pours don't determine {', '.join(unknown)}: nearly all of what was searched fits them as well as θ*"
+        )
+    return [*lines, *posterior.directions]
+
+
+def _interval(name: str, low: float, high: float) -> str:
+    """'0.31 … 0.74 N/m'."""
+    return f"{_bare(name, low)} … {style.display_value(name, high)}"
+
+
+def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -> list[str]:
+    """The outcome of a run that recommends no action.
+
+    Args:
+        calibrated: whether θ* was found.
+    """
+    if plan.deployment is not None and any(name.startswith("deployment") for name in record.stages):
+        said = ["No action is recommended yet: what deployment has learnt is written down when its stage is closed."]
+        poured = [pour for pour in record.weighed if not is_calibration(plan, pour.request)]
+        losses = {loss_of_pour(plan, p.request, m): p for p in poured if (m := p.measured) is not None}
+        known = [loss for loss in losses if loss is not None]
+        if known:
+            action = losses[min(known)].request.action.values()
+            best = style.display_values({name: action[name] for name in plan.deployment.actions.names})
+            unit = deployment_unit(plan.deployment)
+            said.append(f"The best of {len(known)} pours so far came to {unit.text(min(known))}, with {best}.")
+        return said
+    if calibrated:
+        return [
+            "This run calibrated the simulator; it recommends no action. The parameters to use are in theta.json, "
+            "which 'decant plan CAMPAIGN --parameters' reads."
+        ]
+    return ["This run recommends no action."]
+
+
+def cost(record: RunRecord, occupancy: Mapping[str, PoolUse], time_scale: float | None = None) -> dict[str, str]:
+    """Costs of a run: pours, grams, minutes.
+
+    Args:
+        time_scale: how many times as fast as a real one a virtual bench runs; 0: it waits for nothing.
+    """
+    weighed = [p.measured for p in record.weighed if p.measured is not None]
+    begun = [pour for pour in record.pours if pour.state != "asked"]
+    found: dict[str, str] = {}
+    if begun:
+        failed, unknown = sum(p.state == "failed" for p in begun), len(record.unknown_pours)
+        more = "".join(f", {n} {word}" for n, word in ((failed, "failed"), (unknown, "of unknown outcome")) if n)
+        found["pours"] = f"{len(begun)} begun, {len(weighed)} weighed{more}"
+    if weighed:
+        loaded, spilled, retained = (
+            1e3 * sum(getattr(m, n) for m in weighed) for n in ("loaded", "spilled", "retained")
+        )
+        delivered = loaded - spilled - retained
+        found["liquid"] = (
+            f"{loaded:.0f} g: {delivered:.0f} g delivered, {spilled:.1f} g spilled, {retained:.1f} g retained"
+        )
+    found["program at work"] = minutes(record.at_work_s)
+    arm = [pour.seconds for pour in begun if pour.seconds]
+    if arm:
+        pace = f" (this bench runs {time_scale:g} times as fast as a real one)" if time_scale not in (None, 1.0) else ""
+        pace = " (this bench waits for nothing)" if time_scale == 0.0 else pace
+        found["of it pouring"] = f"{minutes(sum(arm))}, {sum(arm) / len(arm):.1f} s a pour{pace}"
+    if record.simulations:
+        each = f", {record.cpu_s / record.simulations:.1f} s each" if record.cpu_s else ""
+        found["simulations"] = f"{record.simulations}, {minutes(record.cpu_s)} of CPU time{each}"
+    pools = {f"pool beside the arm, {stage.rpartition(':')[2]}": use.text for stage, use in occupancy.items()}
+    return found | {name: text for name, text in pools.items() if text}
+
+
+def minutes(seconds: float) -> str:
+    """A duration in a suitable unit."""
+    if seconds < 90.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 5400.0 else f"{seconds / 3600:.1f} h"
+
+
+def standing(record: RunRecord, run: str) -> list[str]:
     """State of an unfinished run and the next steps; empty for a finished one.
 
     Args:
@@ -241,8 +425,8 @@ def standing(record: Record, run: str) -> list[str]:
     unknown = [f"pour {pour.request.number} of {pour.stage}" for pour in record.unknown_pours]
     if unknown:
         said.append(
-            f"{' and '.join(unknown).capitalize()} had begun, and nobody has said what came of it. It is not repeated "
-            "by software. Whoever can, weighs what was spilled and what is left in the pourer, and answers on resuming."
+            f"{' and '.join(unknown).capitalize()} had begun, and its outcome is not known. It is not repeated by "
+            "software. Weigh what was spilled and what is left in the pourer, and answer on resuming."
         )
     said += [f"A question is open: {q.text}" for q in record.questions if q.answer is None]
     match state:
@@ -254,8 +438,8 @@ def standing(record: Record, run: str) -> list[str]:
             said.append("Nothing was started yet.")
         case _:
             said.append(
-                "When this page was made a process had the run, or had died with it without a word: the page shows "
-                f"what the journal held at that moment. If nothing runs any more, go on by {again}."
+                "When this page was made, a process had the run, or had died with it: the page shows "
+                f"what the journal held at that moment. If it no longer runs, go on by {again}."
             )
     return said
 
@@ -264,7 +448,7 @@ def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
-def what_was_asked(plan: CampaignPlan) -> list[tuple[str, str]]:
+def what_was_asked(plan: CampaignPlan) -> dict[str, str]:
     """Names and values: the liquid, the calibration of the simulator, the search for pours."""
     found: list[tuple[str, str]] = []
     scenes = (list(plan.calibration.poured) if plan.calibration is not None else []) + (
@@ -282,26 +466,26 @@ def what_was_asked(plan: CampaignPlan) -> list[tuple[str, str]]:
             pours = f"{len(one.records.pours)} weighed pours of {one.records.path.name}"
         found += [
             ("calibration", f"{one.strategy} on {pours}; {one.simulations} simulations"),
-            ("… into", one.scene.receiver.name),
-            ("… actions", _ranges(one.actions.axes)),
-            ("… searched θ", _ranges(one.parameters.axes)),
-            ("… fixed", _fixed(one.scene)),
+            ("calibration: into", one.scene.receiver.name),
+            ("calibration: actions", _ranges(one.actions.axes)),
+            ("calibration: searched θ", _ranges(one.parameters.axes)),
+            ("calibration: fixed", _fixed(one.scene)),
         ]
     if plan.deployment is not None:
         two = plan.deployment
         found += [
             ("pouring", f"{two.strategy}, into each receiver: {two.settings.spending}"),
-            ("… into", _listed(scene.receiver.name for scene in two.scenes)),
-            ("… minimised", deployment_unit(two).label),
-            ("… actions", _ranges(two.actions.axes)),
-            ("… fixed", _fixed(two.scenes[0]) if two.scenes else ""),
+            ("pouring: into", _listed(scene.receiver.name for scene in two.scenes)),
+            ("pouring: minimised", deployment_unit(two).label),
+            ("pouring: actions", _ranges(two.actions.axes)),
+            ("pouring: fixed", _fixed(two.scenes[0]) if two.scenes else ""),
         ]
         if two.confirm:
-            found.append(("… afterwards", f"the recommended action is poured {two.confirm} more times"))
+            found.append(("pouring: afterwards", f"the recommended action is poured {two.confirm} more times"))
         if two.data is not None:
             count = sum(len(pours) for pours in two.data.pours.values())
-            found.append(("… known before", f"{count} pours of {two.data.path.name}"))
-    return [(name, value) for name, value in found if value]
+            found.append(("pouring: known before", f"{count} pours of {two.data.path.name}"))
+    return {name: value for name, value in found if value}
 
 
 def _ranges(axes: Iterable[Axis]) -> str:
@@ -321,3 +505,160 @@ def _fixed(scene: Scene) -> str:
 
 def _listed(names: Iterable[str]) -> str:
     return ", ".join(dict.fromkeys(names))
+
+
+# ---- tables
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """A row of a table; its first cell is the row's name.
+
+    Attributes:
+        look: 'best', 'bad' or ''.
+    """
+
+    cells: Sequence[str]
+    look: str = ""
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """A table of results.
+
+    Attributes:
+        caption: text above the table, read first by screen readers.
+        numbers: columns that are right-aligned.
+    """
+
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[ResultRow]
+    numbers: frozenset[int] = frozenset()
+
+    def filled(self) -> ResultTable:
+        """A copy without empty columns."""
+        kept = [i for i in range(len(self.header)) if i == 0 or any(row.cells[i].strip("—") for row in self.rows)]
+        rows = [ResultRow([row.cells[i] for i in kept], row.look) for row in self.rows]
+        numbers = frozenset(place for place, i in enumerate(kept) if i in self.numbers)
+        return ResultTable(self.caption, [self.header[i] for i in kept], rows, numbers)
+
+
+def stage_table(summary: RunSummary) -> ResultTable:
+    """Progress of each stage."""
+    rows = [
+        ResultRow(
+            [one.stage, one.state, *(str(n or "") for n in (one.pours, one.simulations, one.unusable_simulations))]
+        )
+        for one in summary.stages
+    ]
+    header = ["stage", "state", "pours", "simulations", "of them unusable"]
+    return ResultTable("Stages, in the order in which they ran", header, rows, frozenset({2, 3, 4})).filled()
+
+
+def cost_table(summary: RunSummary) -> ResultTable:
+    """Costs of the run."""
+    return ResultTable("Cost", ["what", "how much"], [ResultRow(pair) for pair in summary.cost.items()])
+
+
+def question_table(summary: RunSummary) -> ResultTable:
+    """Questions to the operator and their answers."""
+    rows = [
+        ResultRow(
+            [
+                time.strftime("%Y-%m-%d %H:%M", time.localtime(one.time)),
+                one.stage,
+                one.question,
+                "not answered" if one.answer is None else one.answer,
+            ],
+            "bad" if one.answer is None else "",
+        )
+        for one in summary.questions
+    ]
+    return ResultTable("Questions to the operator", ["when", "stage", "question", "answer"], rows)
+
+
+def theta_table(summary: RunSummary) -> ResultTable:
+    """θ* with its region."""
+    level = "region" if summary.posterior is None else f"{100 * summary.posterior.level:.0f} % of the θ that fit"
+    rows = [ResultRow([one.name, one.value, one.region, one.searched]) for one in summary.parameters]
+    return ResultTable("θ* with its region", ["parameter", "θ*", level, "searched"], rows).filled()
+
+
+def score_table(summary: RunSummary) -> ResultTable:
+    """Mean |Δ| of θ* and its rivals by set of pours."""
+    columns = {
+        "calibrated": "θ*",
+        "posterior": "mean over θ's posterior",
+        "uncalibrated": "uncalibrated θ",
+        "random_theta": "random θ (median)",
+        "mean_predictor": "mean of training pours",
+        "regression": "GP regression of training pours",
+    }
+    rows = [
+        ResultRow([SPLITS[split], *("—" if (v := row.get(name)) is None else f"{100 * v:.2f}" for name in columns)])
+        for split, row in summary.discrepancy.items()
+        if any(value is not None for value in row.values())
+    ]
+    caption = "Mean |measured − predicted| spillage [% of what was poured]: less is better"
+    return ResultTable(caption, ["pours", *columns.values()], rows, frozenset(range(1, len(columns) + 1))).filled()
+
+
+def receiver_table(summary: RunSummary) -> ResultTable:
+    """Comparison of the receivers; those without a result are left out."""
+    shown = [
+        row
+        for row in summary.receivers.values()
+        if row.recommended is not None or any(one is not None and one.loss is not None for one in (row.first, row.best))
+    ]
+    heads = list(dict.fromkeys(head for row in shown for head in row.texts))
+    rows = [
+        ResultRow([row.receiver, row.strategy, *(row.texts.get(head, "") or "—" for head in heads)]) for row in shown
+    ]
+    header = ["receiver", "strategy", *heads]
+    return ResultTable(summary.loss_label, header, rows, frozenset(range(2, len(header)))).filled()
+
+
+def pour_tables(summary: RunSummary) -> list[ResultTable]:
+    """Every requested pour, one table for each stage."""
+    stages = dict.fromkeys(pour.stage for pour in summary.pours_made)
+    return [_pour_table(stage, [pour for pour in summary.pours_made if pour.stage == stage]) for stage in stages]
+
+
+def _pour_table(stage: str, pours: Sequence[PourSummary]) -> ResultTable:
+    varied = [name for name in pours[0].action_si if len({pour.action_si[name] for pour in pours}) > 1]
+    searched = varied or ["angular_velocity", "x_offset"]
+    rows = []
+    for pour in pours:
+        cells = [
+            str(pour.number),
+            *(_bare(name, pour.action_si[name]) for name in searched),
+            *("—" if grams is None else f"{grams:.1f}" for grams in (pour.loaded_g, pour.spilled_g, pour.retained_g)),
+            "—" if pour.spilled_of_poured is None else f"{100 * pour.spilled_of_poured:.2f}",
+            pour.predicted or "—",
+            pour.measured if pour.state == "weighed" and not pour.calibration else "—",
+            pour.remark,
+        ]
+        look = "best" if pour.best else "bad" if pour.state in ("failed", "unknown") else ""
+        rows.append(ResultRow(cells, look))
+    header = ["pour", *(style.label(name) for name in searched), "loaded [g]", "spilled [g]", "retained [g]"]
+    header += ["spilled / poured [%]", "expected", "came to", "remark"]
+    what = "" if pours[0].calibration else f"; expected and came to: {pours[0].loss}"
+    what += "; the best is bold" if any(pour.best for pour in pours) else ""
+    caption = f"{stage}: {len(pours)} pours into {pours[0].receiver}{what}"
+    return ResultTable(caption, header, rows, frozenset(range(len(header) - 1))).filled()
+
+
+def _bare(name: str, value: float | None) -> str:
+    """A value without its unit, which is in the column's head."""
+    return style.display_value(name, value).removesuffix(style.display_unit(name)).rstrip()
+
+
+def validity_table(summary: RunSummary) -> ResultTable:
+    """Effects that are not simulated in the action spaces."""
+    rows = [
+        ResultRow([one.receiver, one.kind.replace("_", " "), f"{one.hit} of {one.tried}", one.text])
+        for several in summary.not_covered.values()
+        for one in several
+    ]
+    return ResultTable("At the middle and the corners of the ranges", ["into", "what", "actions", "meaning"], rows)

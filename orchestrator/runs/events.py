@@ -1,6 +1,6 @@
 """Events of a run: immutable values for displays, recordings and APIs that follow a run.
 
-`Watchers` sends each `Event` to its subscribers. A subscriber (`Watcher`) is any callable that takes an `Event`. It
+`Subscribers` sends each `Event` to its members. A subscriber (`Subscriber`) is any callable that takes an `Event`. It
 runs on the control loop and must return at once. If it raises an exception, the error is reported once and the
 subscriber is removed. The run never waits for a subscriber and never depends on one.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from actors.interfaces import PourProgress
-from orchestrator.journal.stage_results import Results
+from orchestrator.journal.codec import Results
 from orchestrator.requests import Decision, Outcome, Request
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Progress
@@ -129,7 +129,7 @@ class PourProgressed(Event):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MadeAhead(Event):
+class SpeculationProgressed(Event):
     """Number of speculative simulations, which use the idle pool while the arm pours.
 
     Attributes:
@@ -169,26 +169,26 @@ class LogLine(Event):
     asked: bool = False
 
 
-Watcher = Callable[[Event], object]
+Subscriber = Callable[[Event], object]
 
 
-class Watchers:
+class Subscribers:
     """Sends events to all subscribers. A subscriber that raises is reported once and removed."""
 
-    def __init__(self, watchers: Sequence[Watcher] = ()) -> None:
-        self._watchers = list(watchers)
+    def __init__(self, subscribers: Sequence[Subscriber] = ()) -> None:
+        self._subscribers = list(subscribers)
 
     def emit(self, event: Event) -> None:
         """Send an event to every remaining subscriber. Never raises."""
-        failed: list[tuple[Watcher, Exception]] = []
-        for watcher in self._watchers:
+        failed: list[tuple[Subscriber, Exception]] = []
+        for subscriber in self._subscribers:
             try:
-                watcher(event)
+                subscriber(event)
             except Exception as error:
-                failed.append((watcher, error))
-        for watcher, problem in failed:
-            self._watchers.remove(watcher)
-            name = getattr(watcher, "__qualname__", type(watcher).__qualname__)
+                failed.append((subscriber, error))
+        for subscriber, problem in failed:
+            self._subscribers.remove(subscriber)
+            name = getattr(subscriber, "__qualname__", type(subscriber).__qualname__)
             text = f"{name} can't watch any longer: {type(problem).__name__}: {problem}"
             _log.warning(text, exc_info=problem)
             self.emit(LogLine(level="warning", text=text))

@@ -46,9 +46,9 @@ def deciding(value: Any) -> Any:
         OSError: a file that is included by content can't be read.
         CodecError: the value contains something that JSON can't represent.
     """
+    if isinstance(value, ProfileShape) and value.unit != "m":
+        return deciding(value.outline())  # the same shape in another unit is the same
     if isinstance(value, BaseModel) or (dataclasses.is_dataclass(value) and not isinstance(value, type)):
-        if isinstance(value, ProfileShape):
-            value = value.outline()  # lengths in any unit are the same
         free = value.free_fields() if isinstance(value, Liquid | ProfileShape) else frozenset()
         fields = {
             name: (getattr(value, name), mark)

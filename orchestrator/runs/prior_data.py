@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from orchestrator.journal.codec import decode_outcome, decode_request
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.journal.stage_results import Results, decode_results
-from orchestrator.requests import Pour, Poured
+from orchestrator.journal.codec import Results, decode_results
+from orchestrator.journal.journal import JOURNAL_NAME
+from orchestrator.journal.run_record import read_record
 from orchestrator.runs.fingerprint import scene_by_content
 from orchestrator.strategies.calibration.pour_design import DesignPoured
 from orchestrator.strategies.campaign_plan import RecordedPour
@@ -56,27 +55,19 @@ def read_former_run(directory: Path) -> PreviousRun:
         JournalError: there is no run, or another version wrote it.
         CodecError: an entry can't be decoded.
     """
-    path = directory / JOURNAL_NAME
-    with JournalReader(path) as journal:
-        requests: dict[int, tuple[str, Pour]] = {}
-        weighed: list[tuple[str, Pour, PourMeasurement]] = []
-        for entry in journal.entries(kinds=[Kind.REQUESTED, Kind.POUR_FINISHED]):
-            if entry.kind == Kind.REQUESTED:
-                request = decode_request(entry.body["request"])
-                if isinstance(request, Pour):
-                    requests[entry.body["id"]] = (entry.stage, request)
-            elif isinstance(outcome := decode_outcome(entry.body["outcome"]), Poured) and is_sound(
-                outcome.measurement.fractions
-            ):
-                weighed.append((*requests[entry.body["id"]], outcome.measurement))
-        splits = _splits(decode_results(journal.stage_results()))
-        header = journal.header.fingerprint
+    record = read_record(directory)
+    header, splits = record.header.fingerprint, _splits(decode_results(record.results))
+    weighed = [pour for pour in record.pours if pour.measured is not None and is_sound(pour.measured.fractions)]
     pours = tuple(
-        (pour.scene, _recorded(pour.action, measured, splits.get((stage, pour.number), "train")))
-        for stage, pour, measured in weighed
+        (
+            pour.request.scene,
+            _recorded(pour.request.action, pour.measured, splits.get((pour.stage, pour.request.number), "train")),
+        )
+        for pour in sorted(weighed, key=lambda pour: pour.time or 0.0)
+        if pour.measured is not None
     )
     mode = str(header.get("laboratory", {}).get("mode", "virtual"))
-    return PreviousRun(path, mode, {scene["name"]: scene for scene in scenes_in(header)}, pours)
+    return PreviousRun(directory / JOURNAL_NAME, mode, {scene["name"]: scene for scene in scenes_in(header)}, pours)
 
 
 def _recorded(action: Action, measured: PourMeasurement, split: str) -> RecordedPour:
@@ -128,7 +119,7 @@ def _difference(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]
         there, here = theirs["liquid"][name], ours["liquid"][name]
         if not math.isclose(there, here, rel_tol=1e-6):
             found.append(f"its liquid has {there * factor:g} {unit}, here {here * factor:g} {unit}")
-    for name in ("pivot", "hold_cap"):
+    for name in ("pivot", "max_hold_time"):
         if theirs.get(name) != ours[name]:
             found.append(f"its motion.{name} is another one")
     return found

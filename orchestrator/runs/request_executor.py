@@ -84,15 +84,15 @@ class RequestExecutor:
     """Runs requests on a laboratory and converts errors of single requests into outcomes."""
 
     def __init__(
-        self, laboratory: Laboratory, scenes: Mapping[str, Scene], deadlines: Deadlines, record_rate: float
+        self, laboratory: Laboratory, scenes: Mapping[str, Scene], deadlines: Deadlines, frame_rate: float
     ) -> None:
         self._laboratory = laboratory
         self._scenes = scenes
         self.deadlines = deadlines
-        self._record_rate = record_rate
+        self._frame_rate = frame_rate
         self._real = asyncio.Lock()
         self._optimiser = asyncio.Lock()
-        self.ahead = SpeculativeExecution(self._speculate, laboratory.simulators.size)
+        self.speculation = SpeculativeExecution(self._speculate, laboratory.simulators.size)
 
     async def _speculate(self, request: Simulate) -> Outcome:
         return (await self._simulated(request))[0]
@@ -106,24 +106,24 @@ class RequestExecutor:
             record: whether frames are kept; does not affect the outcome. Speculative simulations have no frames.
             started: called when the simulation is handed to the pool.
         """
-        if not record and self.ahead.knows(request):
+        if not record and self.speculation.knows(request):
             started()
-            if (speculated := await self.ahead.take(request)) is not None:
+            if (speculated := await self.speculation.take(request)) is not None:
                 return speculated, None
         else:
             started()
-        with self.ahead.asked_for():
+        with self.speculation.asked_for():
             return await self._simulated(request, record=record)
 
     async def _simulated(self, request: Simulate, *, record: bool = False) -> tuple[Outcome, RecordedFrames | None]:
-        rate = self._record_rate if record else 0.0
+        rate = self._frame_rate if record else 0.0
         scene = self._scene(request.scene)
         task = PourTask(
             scene.drawn(request.seed) if request.drawn_shapes else scene,
             request.action,
             request.parameters,
             request.seed,
-            record_rate=rate,
+            frame_rate=rate,
             pose_error=request.pose_error,
         )
         try:
@@ -195,7 +195,11 @@ class RequestExecutor:
         return Poured(measurement)
 
     async def suggest(
-        self, request: Suggest, *, started: Callable[[], None], retrying: Callable[[str], None]
+        self,
+        request: Suggest,
+        *,
+        started: Callable[[], None] = lambda: None,
+        retrying: Callable[[str], None] = lambda text: None,
     ) -> Outcome:
         """Query the optimiser, up to `SUGGESTIONS` times. No layer below repeats a query.
 

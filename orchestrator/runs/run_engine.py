@@ -16,36 +16,37 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from actors.interfaces import Laboratory, Notice, Telling
-from orchestrator.journal.disk_reserve import NoSpaceError
+from orchestrator.journal.codec import Results, decode_results
 from orchestrator.journal.journal import JOURNAL_NAME, Journal, Kind
-from orchestrator.journal.journal_file import Header, JournalError
+from orchestrator.journal.journal_file import Header, JournalError, NoSpaceError
 from orchestrator.journal.run_record import CampaignResult, read_result
-from orchestrator.journal.stage_results import Results, decode_results
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import (
     CampaignClosed,
     CampaignOpened,
     CampaignStateChanged,
     LogLine,
-    MadeAhead,
+    SpeculationProgressed,
     StageClosed,
     StageOpened,
-    Watcher,
-    Watchers,
+    Subscriber,
+    Subscribers,
 )
 from orchestrator.runs.fingerprint import fingerprint
-from orchestrator.runs.replay import StageHistory, read_history, replayed_events
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor, RequestExecutorError
-from orchestrator.runs.run_folder import write_provenance
-from orchestrator.runs.speculative_requests import RequestForecast
-from orchestrator.runs.stage_scheduler import StageScheduler
-from orchestrator.runs.stages import StageDefinition, scenes_of, stage_seed, stages_of
-from orchestrator.runs.unknown_pours import (
+from orchestrator.runs.resume import (
     AskOperator,
     OperatorNeededError,
+    StageHistory,
+    read_history,
+    replayed_events,
     settle_open_questions,
     settle_unknown_pours,
 )
+from orchestrator.runs.run_folder import write_provenance
+from orchestrator.runs.speculation import RequestForecast
+from orchestrator.runs.stage_scheduler import StageScheduler
+from orchestrator.runs.stages import StageDefinition, scenes_of, stage_seed, stages_of
 from orchestrator.states import RESTING, State, check_transition
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.stage_result import StageResult
@@ -57,7 +58,7 @@ async def run_campaign(
     run_directory: Path,
     *,
     resume: bool = False,
-    watchers: Sequence[Watcher] = (),
+    subscribers: Sequence[Subscriber] = (),
     ask_operator: AskOperator | None = None,
     stages: Sequence[StageDefinition] | None = None,
     deadlines: Deadlines | None = None,
@@ -86,7 +87,7 @@ async def run_campaign(
         plan,
         laboratory,
         run_directory,
-        Watchers(watchers),
+        Subscribers(subscribers),
         ask_operator,
         tuple(stages_of(plan) if stages is None else stages),
         deadlines or _default_deadlines(plan),
@@ -109,7 +110,7 @@ class _Run:
     _plan: CampaignPlan
     _laboratory: Laboratory
     _directory: Path
-    _watchers: Watchers
+    _subscribers: Subscribers
     _ask_operator: AskOperator | None
     _stages: tuple[StageDefinition, ...]
     _deadlines: Deadlines
@@ -145,7 +146,7 @@ class _Run:
                 raise
             except Exception as error:
                 if self._is_finished():  # the results are complete; only the cleanup failed
-                    self._watchers.log("warning", f"while closing the laboratory: {error}")
+                    self._subscribers.log("warning", f"while closing the laboratory: {error}")
                 else:
                     self._come_to_rest(State.FAILED, f"{type(error).__name__}: {error}")
                     raise
@@ -168,9 +169,9 @@ class _Run:
             if isinstance(laboratory, Telling):
                 laboratory.listen(self._on_notice)
             self._check_bench(laboratory, histories)
-            executor = RequestExecutor(laboratory, self._scenes, self._deadlines, self._plan.outputs.record_rate)
-            executor.ahead.changed = lambda running, waiting: self._watchers.emit(
-                MadeAhead(running=running, waiting=waiting)
+            executor = RequestExecutor(laboratory, self._scenes, self._deadlines, self._plan.outputs.frame_rate)
+            executor.speculation.changed = lambda running, waiting: self._subscribers.emit(
+                SpeculationProgressed(running=running, waiting=waiting)
             )
             opened = CampaignOpened(
                 name=self._plan.name,
@@ -180,7 +181,7 @@ class _Run:
                 simulators=laboratory.simulators.size,
                 resumed=resume,
             )
-            self._watchers.emit(opened)
+            self._subscribers.emit(opened)
             self._log_idle_simulators(laboratory.simulators.size)
             self._enter(State.RUNNING)
             results: dict[str, StageResult] = {}
@@ -188,7 +189,7 @@ class _Run:
                 for index, stage in enumerate(self._stages, start=1):
                     results[stage.name] = await self._run_stage(stage, index, histories[stage.name], results, executor)
             finally:
-                await executor.ahead.close()
+                await executor.speculation.close()
             self._enter(State.FINISHED)
 
     async def _run_stage(
@@ -207,11 +208,11 @@ class _Run:
             resumed=history.seed is not None,
             replayed=done,
         )
-        self._watchers.emit(opened)
+        self._subscribers.emit(opened)
         if history.result is not None:
             for event in replayed_events(history, stage.name):
-                self._watchers.emit(event)
-            self._watchers.emit(StageClosed(stage=stage.name, replayed=True, result=history.result))
+                self._subscribers.emit(event)
+            self._subscribers.emit(StageClosed(stage=stage.name, replayed=True, result=history.result))
             return history.result
         seed = stage_seed(self._plan.seed, stage.name)
         if history.seed is None:
@@ -220,27 +221,26 @@ class _Run:
             stage.name,
             stage.build(results, seed),
             journal=self._journal,
-            lanes=executor,
-            watchers=self._watchers,
+            executor=executor,
+            subscribers=self._subscribers,
             capacity=self._plan.parallel_simulations,
             order=stage.order,
-            recordings=self._plan.outputs.recorded_simulations if self._plan.outputs.record_rate > 0.0 else 0,
+            recordings=self._plan.outputs.recorded_simulations if self._plan.outputs.frame_rate > 0.0 else 0,
             on_pausing=lambda reason: self._enter(State.PAUSING, reason),
             on_stopping=lambda reason: self._enter(State.STOPPING, reason),
         )
         scheduler.restore(history)
-        used = executor.ahead.used
+        used = executor.speculation.used
         try:
             with self._speculating(stage, index, results, executor):
                 result = await scheduler.run()
         finally:
             self._unknown_pours = bool(scheduler.unknown_pours)
-        if executor.ahead.used > used:
-            text = (
-                f"{executor.ahead.used - used} simulation(s) of {stage.name} were made while the arm was pouring before"
-            )
+        if executor.speculation.used > used:
+            count = executor.speculation.used - used
+            text = f"{count} simulation(s) of {stage.name} were made while the arm was pouring before"
             self._journal.append(Kind.NOTE, {"text": text}, stage=stage.name)
-        self._watchers.emit(StageClosed(stage=stage.name, result=result))
+        self._subscribers.emit(StageClosed(stage=stage.name, result=result))
         return result
 
     @contextmanager
@@ -253,13 +253,15 @@ class _Run:
         if not stage.pours or len(later) < 2 or not executor.simulators.separate:
             yield
             return
-        forecast = RequestForecast(later, results, self._plan.seed, self._plan.parallel_simulations, executor)
-        task = asyncio.create_task(forecast.run(), name=f"rehearsal beside {stage.name}")
+        forecast = RequestForecast(
+            later, results, self._plan.seed, self._plan.parallel_simulations, executor.speculation, executor.suggest
+        )
+        task = asyncio.create_task(forecast.run(), name=f"forecast during {stage.name}")
         try:
             yield
         finally:
             task.cancel()
-            executor.ahead.pause()
+            executor.speculation.pause()
             # Not awaited: an error in speculative execution appears again when its stage runs.
             task.add_done_callback(lambda task: task.cancelled() or task.exception())
 
@@ -302,7 +304,7 @@ class _Run:
     def _log_idle_simulators(self, simulators: int) -> None:
         slots = self._plan.parallel_simulations
         if simulators > slots:
-            self._watchers.log(
+            self._subscribers.log(
                 "info",
                 f"{simulators} simulators, but this campaign keeps at most {slots} simulation(s) in flight: "
                 f"{simulators - slots} will have nothing to do; 'parallel_simulations' in the campaign changes that",
@@ -313,10 +315,10 @@ class _Run:
         try:
             self._journal.append(Kind.NOTE, {"text": notice.text})
         except JournalError:  # the next important write ends the run; until then the display shows everything
-            self._watchers.log("error", f"can't be written down: {notice.text}")
+            self._subscribers.log("error", f"can't be written down: {notice.text}")
             return
         if notice.level != "note":
-            self._watchers.emit(LogLine(level=notice.level, text=notice.text, asked=notice.asked))
+            self._subscribers.emit(LogLine(level=notice.level, text=notice.text, asked=notice.asked))
 
     def _enter(self, state: State, reason: str = "") -> None:
         if state is self._state:
@@ -325,7 +327,7 @@ class _Run:
         before, self._state = self._state, state
         body = {"before": str(before), "after": str(state), "reason": reason, "pid": os.getpid()}
         self._journal.append(Kind.CAMPAIGN_STATE, body)
-        self._watchers.emit(CampaignStateChanged(before=str(before), after=str(state), reason=reason))
+        self._subscribers.emit(CampaignStateChanged(before=str(before), after=str(state), reason=reason))
 
     def _is_finished(self) -> bool:
         return self._state is State.FINISHED
@@ -336,11 +338,11 @@ class _Run:
         try:
             self._enter(state, reason)
         except JournalError as problem:  # the next process finds the run interrupted
-            self._watchers.log("error", f"can't write that the run is {state}: {problem}")
+            self._subscribers.log("error", f"can't write that the run is {state}: {problem}")
         results = decode_results(self._journal.stage_results())
-        self._watchers.emit(CampaignClosed(state=str(self._state), results=results))
+        self._subscribers.emit(CampaignClosed(state=str(self._state), results=results))
 
     def _close(self) -> CampaignResult:
-        result = read_result(self._journal, self._directory, seconds=time.monotonic() - self._begin)
-        self._watchers.emit(CampaignClosed(state=str(result.state), results=result.results))
+        result = read_result(self._directory, seconds=time.monotonic() - self._begin)
+        self._subscribers.emit(CampaignClosed(state=str(result.state), results=result.results))
         return result

@@ -19,14 +19,13 @@ from typing import Any
 from orchestrator.catalogue.run_registry import register
 from orchestrator.installed_plugins import packages as plugin_packages
 from orchestrator.journal.codec import digest
-from orchestrator.journal.disk_reserve import TO_BEGIN, require_space
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-from orchestrator.journal.journal_check import check_journal, has_begun
-from orchestrator.journal.journal_file import JournalError
-from orchestrator.journal.pour_ledger import LEDGER_NAME, readable_lines
+from orchestrator.journal.journal_check import LEDGER_NAME, check_journal, has_begun, readable_lines
+from orchestrator.journal.journal_file import TO_BEGIN, JournalError, require_space
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.resources import DISTRIBUTION
 
 RESOLVED, VERSIONS = "resolved.json", "versions.json"
 """Files with the resolved plan of a run and with the versions of the program that began it."""
@@ -73,9 +72,9 @@ def write_provenance(directory: Path, plan: CampaignPlan) -> None:
 def versions() -> dict[str, Any]:
     """Versions of Python, the platform, Decant, its dependencies, and packages that add plug-ins."""
     packages: dict[str, str] = {}
-    names = ["decant"]
+    names = [DISTRIBUTION]
     try:
-        names += [re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in importlib.metadata.requires("decant") or []]
+        names += [re.split(r"[^\w.-]", text, maxsplit=1)[0] for text in importlib.metadata.requires(DISTRIBUTION) or []]
     except importlib.metadata.PackageNotFoundError:
         names += ["numpy", "scipy", "scikit-learn", "taichi", "ray", "trimesh"]
     for name in names:

@@ -23,10 +23,9 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 from actors.interfaces import PourProgress
-from orchestrator.journal.codec import decode_outcome, encode_outcome, encode_request, to_json
+from orchestrator.journal.codec import decode_outcome, encode_outcome, encode_request, encode_result, to_json
 from orchestrator.journal.journal import Draft, Journal, Kind
 from orchestrator.journal.journal_file import JournalError
-from orchestrator.journal.stage_results import encode_result
 from orchestrator.requests import Ask, Decision, Order, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import (
@@ -35,11 +34,10 @@ from orchestrator.runs.events import (
     RequestFinished,
     RequestStarted,
     StrategyProgressed,
-    Watchers,
+    Subscribers,
 )
-from orchestrator.runs.replay import StageHistory, replay, replayed_events
 from orchestrator.runs.request_executor import RequestExecutor
-from orchestrator.runs.unknown_pours import needs_answer, weighed_by_hand
+from orchestrator.runs.resume import StageHistory, needs_answer, replay, replayed_events, weighed_by_hand
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Strategy
 from sim_engine.outcome import RecordedFrames
@@ -116,8 +114,8 @@ class StageScheduler:
         strategy: Strategy,
         *,
         journal: Journal,
-        lanes: RequestExecutor,
-        watchers: Watchers,
+        executor: RequestExecutor,
+        subscribers: Subscribers,
         capacity: int,
         order: Order,
         recordings: int = 0,
@@ -135,8 +133,8 @@ class StageScheduler:
         self._stage = stage
         self._strategy = strategy
         self._journal = journal
-        self._executor = lanes
-        self._watchers = watchers
+        self._executor = executor
+        self._subscribers = subscribers
         self._capacity = capacity
         self._order = order
         self._recordings = recordings
@@ -178,7 +176,7 @@ class StageScheduler:
         self._decisions = history.decisions
         self._ask_is_due = history.ask_is_due
         for event in replayed_events(history, self._stage):
-            self._watchers.emit(event)
+            self._subscribers.emit(event)
         if history.steps:
             self._report_progress()
 
@@ -262,7 +260,7 @@ class StageScheduler:
             else:
                 self._append(Kind.STARTED, {"id": pending.id})
             pending.started = True
-            self._watchers.emit(RequestStarted(stage=self._stage, id=pending.id, request=request))
+            self._subscribers.emit(RequestStarted(stage=self._stage, id=pending.id, request=request))
 
         match request:
             case Simulate():
@@ -271,7 +269,7 @@ class StageScheduler:
 
                 def progress(p: PourProgress) -> None:
                     event = PourProgressed(stage=self._stage, id=pending.id, number=request.number, progress=p)
-                    self._watchers.emit(event)
+                    self._subscribers.emit(event)
 
                 def withdrawn(reason: str) -> None:
                     self._append(Kind.POUR_WITHDRAWN, {"id": pending.id, "reason": reason})
@@ -283,7 +281,7 @@ class StageScheduler:
 
                 def retrying(text: str) -> None:
                     self._append(Kind.NOTE, {"text": text})
-                    self._watchers.log("warning", text, self._stage)
+                    self._subscribers.log("warning", text, self._stage)
 
                 outcome = await self._executor.suggest(request, started=started, retrying=retrying)
             case Ask():
@@ -312,7 +310,7 @@ class StageScheduler:
             seconds=seconds,
             frames=frames,
         )
-        self._watchers.emit(event)
+        self._subscribers.emit(event)
 
     async def _next(self) -> PendingRequest:
         """Wait until the next request to deliver has an outcome, and return it."""
@@ -350,7 +348,7 @@ class StageScheduler:
         self._journal.append_all(drafts)
         self._decisions += len(decisions)
         for decision in decisions:
-            self._watchers.emit(DecisionMade(stage=self._stage, decision=decision))
+            self._subscribers.emit(DecisionMade(stage=self._stage, decision=decision))
 
     def _report_progress(self, *, urgent: bool = True) -> None:
         """Emit the strategy's progress; limited in frequency unless urgent, because results grow large."""
@@ -358,7 +356,7 @@ class StageScheduler:
             return
         self._reported = time.monotonic()
         result = self._strategy.result()
-        self._watchers.emit(StrategyProgressed(stage=self._stage, progress=self._strategy.progress(), result=result))
+        self._subscribers.emit(StrategyProgressed(stage=self._stage, progress=self._strategy.progress(), result=result))
 
     def _append(self, kind: Kind, body: dict[str, Any]) -> None:
         self._journal.append(kind, body, stage=self._stage)
@@ -383,11 +381,11 @@ class StageScheduler:
         try:
             self._on_pausing(reason)
         except Exception as problem:  # for example a full disk: the pour must be awaited nevertheless
-            self._watchers.log("error", f"can't write that the run is pausing: {problem}", self._stage)
+            self._subscribers.log("error", f"can't write that the run is pausing: {problem}", self._stage)
         try:
             if pours:
                 grace = self._executor.deadlines.pour_grace
-                self._watchers.log(
+                self._subscribers.log(
                     "info", f"a pour is under way; it is finished first (up to {grace:g} s)", self._stage
                 )
                 await asyncio.wait(pours, timeout=grace)
@@ -402,4 +400,4 @@ class StageScheduler:
             await asyncio.wait(unfinished, timeout=self._executor.deadlines.cleanup)
         for task in (*pours, *others):
             if task.done() and not task.cancelled() and (late := task.exception()) is not None and late is not error:
-                self._watchers.log("warning", f"while winding down: {type(late).__name__}: {late}", self._stage)
+                self._subscribers.log("warning", f"while winding down: {type(late).__name__}: {late}", self._stage)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from orchestrator.journal.stage_results import Results, result_of
+from orchestrator.journal.codec import Results, result_of
 from orchestrator.requests import Order
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.calibration.action_prior import Contexts, drawn_benches
@@ -64,7 +64,7 @@ class StageDefinition:
         build: makes the strategy from the earlier stages' results and the stage's seed.
         order: order in which outcomes are delivered.
         pours: whether it needs a bench.
-        stand_in: placeholder for its result in speculative execution (`orchestrator.runs.speculative_requests`).
+        stand_in: placeholder for its result in speculative execution (`orchestrator.runs.speculation`).
     """
 
     name: str
@@ -279,9 +279,11 @@ def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationPar
     """
     if not deployment.settings.learns_of_benches or deployment.bench:
         return deployment
-    former = [learnt.bench for learnt in results.values() if isinstance(learnt, Deployed) and learnt.bench is not None]
-    if former:
-        return replace(deployment, bench=former[-1].displacements())
+    previous = [
+        result.bench for result in results.values() if isinstance(result, Deployed) and result.bench is not None
+    ]
+    if previous:
+        return replace(deployment, bench=previous[-1].displacements())
     found = calibrated_theta(results) if CALIBRATION in results else None
     known = set(SimulationParameters.nuisances()).intersection(() if found is None else found.searched)
     if found is None or found.posterior is None or not known:

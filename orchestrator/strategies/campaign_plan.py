@@ -451,16 +451,18 @@ class DeploymentPlan(StagePlan):
 class OutputSettings(Settings):
     """Outputs in addition to the journal."""
 
+    retired: ClassVar[dict[str, str]] = {"rrd": "recording", "record_rate": "frame_rate"}
+
     directory: FilePath | None = None
     """Folder of the runs; 'runs' in the working directory unless given."""
 
-    rrd: Switch = True
+    recording: Switch = True
     """Write a recording for the viewer."""
 
     figures: Switch = True
     """Write figures at the end."""
 
-    record_rate: Annotated[float, Quantity("1/s", "10 1/s", 0.0, 10.0)] = 10.0
+    frame_rate: Annotated[float, Quantity("1/s", "10 1/s", 0.0, 10.0)] = 10.0
     """Frames of particles per simulated second."""
 
     recorded_simulations: SimulationCount = 6

@@ -170,7 +170,7 @@ class PredictedPour(StageResult):
     over_seeds: dict[str, SampleStatistics]
     """Mean and standard deviation of every fraction, of 'spillage' r = spilled / poured, and of the 'loss'."""
 
-    band: PredictionInterval | None = None
+    interval: PredictionInterval | None = None
     """Prediction interval for r of a single pour; null if no simulation has an r."""
 
 
@@ -278,7 +278,7 @@ class RepeatedSimulation:
             thetas=self._thetas,
             touching=self._touching,
             over_seeds=over_seeds,
-            band=band_of(self._outcomes, self._discrepancy),
+            interval=band_of(self._outcomes, self._discrepancy),
         )
 
 

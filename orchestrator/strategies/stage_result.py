@@ -3,7 +3,7 @@
 - `StageResult` is the base class. Each kind is defined in the module of its strategy.
 - `displayed_action` and `displayed_map` convert actions and surrogates for display; the units are part of the keys.
 
-Reading and writing of results is in `orchestrator.journal.stage_results`.
+Reading and writing of results is in `orchestrator.journal.codec`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class ResultPart(BaseModel):
 class StageResult(ResultPart):
     """Result of a strategy so far. Each subclass declares its own unique `kind`.
 
-    Journals, study files and `summary.json` hold dumps; `orchestrator.journal.stage_results` reads them back by their
+    Journals, study files and `summary.json` hold dumps; `orchestrator.journal.codec` reads them back by their
     kind.
     """
 

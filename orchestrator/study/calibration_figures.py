@@ -105,8 +105,7 @@ class Drawn:
 
     def save(self, folder: Path) -> None:
         """Write PNG, SVG and CSV files."""
-        with style.also_as(".svg"):
-            style.save(self.figure, folder / f"{self.name}.png")
+        style.save(self.figure, folder / f"{self.name}.png", (".svg",))
         write_csv(folder / f"{self.name}.csv", self.header, self.rows)
 
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from orchestrator.config.run_snapshot import record_of
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.codec import Results, result_of
+from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.run_record import answers
-from orchestrator.journal.stage_results import Results, result_of
 from orchestrator.requests import Simulate
 from orchestrator.runs.stages import (
     CALIBRATION,
@@ -73,7 +73,7 @@ def _planned(
         seed=cell.seed,
         laboratory=base.laboratory.with_values(bench=bench),
         outputs=OutputSettings(
-            directory=str(directory), rrd=False, figures=False, record_rate=0.0, recorded_simulations=0
+            directory=str(directory), recording=False, figures=False, frame_rate=0.0, recorded_simulations=0
         ),
         on_unknown="repeat",
     )
@@ -168,8 +168,8 @@ def _calibration(
     stages = calibration_stages(plan.calibration)
     if cell.arm != "C1":
         return plan, stages
-    with JournalReader(directory.parent / GRID / JOURNAL_NAME) as journal:
-        table = [(a.request, a.outcome) for a in answers(journal, Simulate) if isinstance(a.request, Simulate)]
+    found = answers(directory.parent / GRID, Simulate)
+    table = [(one.request, one.outcome) for one in found if isinstance(one.request, Simulate)]
 
     def answered(stage: StageDefinition) -> StageDefinition:
         def build(results: Results, seed: int) -> Strategy:

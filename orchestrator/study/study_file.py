@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, create_model
 
@@ -98,28 +98,30 @@ def _arm(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
     return model
 
 
-C1Arm: Any = _arm(C1Settings, per_axis="10")
+C1Arm: Any = _arm(C1Settings, points_per_axis="10")
 C2Arm: Any = _arm(C2Settings, samples="18")
-C3Arm: Any = _arm(C3Settings, "initial", "kappa", iterations="59")
-C4Arm: Any = _arm(C4Settings, "initial", "kappa", simulations="108")
-D2Arm: Any = _arm(D2Settings, "mean", "initial", "kappa", pours="15")
+C3Arm: Any = _arm(C3Settings, "initial_samples", "kappa", iterations="59")
+C4Arm: Any = _arm(C4Settings, "initial_samples", "kappa", simulations="108")
+D2Arm: Any = _arm(D2Settings, "mean", "initial_samples", "kappa", pours="15")
 
 
-class D1ArmSettings(_arm(D1Settings, "simulations_per_iteration", "initial", "kappa")):  # type: ignore[misc]
+class D1ArmSettings(_arm(D1Settings, "simulations_per_iteration", "initial_samples", "kappa")):  # type: ignore[misc]
     """A compared strategy: its number of repetitions and its budget."""
 
     iterations: list[PositiveSimulationCount] = Field(default=[15], min_length=1)
     """Iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
 
 
-class D3ArmSettings(_arm(D3Settings, "prior_simulations", "initial", "kappa", pours="15")):  # type: ignore[misc]
+class D3ArmSettings(_arm(D3Settings, "prior_simulations", "initial_samples", "kappa", pours="15")):  # type: ignore[misc]
     """A compared strategy: its number of repetitions and its budget."""
 
-    per_pour: SimulationCount | None = None
+    retired: ClassVar[dict[str, str]] = D3Settings.retired
+
+    simulations_per_pour: SimulationCount | None = None
     """Simulations between two pours; not 'free', because the requests would then depend on the clock."""
 
 
-class C4ActiveArmSettings(_arm(C4Settings, "initial", "kappa", simulations="108")):  # type: ignore[misc]
+class C4ActiveArmSettings(_arm(C4Settings, "initial_samples", "kappa", simulations="108")):  # type: ignore[misc]
     """C4 with pours that it chooses itself, each by its expected information about the deployments."""
 
     pours: Annotated[PositivePourCount, Example("6")]
@@ -420,14 +422,14 @@ def _searched(file: StudyFile, base: CampaignPlan, root: Place, report: Report) 
 
 
 HARDWARE = (
-    "laboratory '{}' is hardware. An arm moves only for one run, after '--arm' and with a person next to it; the cells "
-    "of a study run in processes of their own, which ask no operator. Pour there with 'decant run', and name a "
-    "virtual laboratory here"
+    "laboratory '{}' is hardware. An arm moves only for one run, after '--enable-motion' and with a person next to it; "
+    "the cells of a study run in processes of their own, which ask no operator. Pour there with 'decant run', and "
+    "name a virtual laboratory here"
 )
 
 BUDGETS = (
-    *("grid", "per_axis", "samples", "simulations"),
-    *("pours", "iterations", "simulations_per_iteration", "prior_simulations", "per_pour", "prices", "mean"),
+    *("grid", "points_per_axis", "samples", "simulations"),
+    *("pours", "iterations", "simulations_per_iteration", "prior_simulations", "simulations_per_pour", "costs", "mean"),
     *("risk_limit", "stop", "good_enough"),
 )
 """Settings that an arm does not take from the base campaign, because the study defines each budget."""
@@ -503,11 +505,11 @@ def _calibration_arms(
             changes["averaging"] = "noise" if key == "C4_paper" else shared
         settings = kind.like(base.settings, without=BUDGETS, **changes)
         budget = next((name for name in ("iterations", "simulations") if getattr(settings, name, None)), "")
-        initial, most = getattr(settings, "initial", None), getattr(settings, budget, None)
+        initial, most = getattr(settings, "initial_samples", None), getattr(settings, budget, None)
         if initial is not None and most is not None and initial > most:
-            if "initial" in changes:
-                report.add(at.at("initial"), f"{initial} random θ don't fit into {budget}: {most}")
-            settings = settings.with_values(initial=most)
+            if "initial_samples" in changes:
+                report.add(at.at("initial_samples"), f"{initial} random θ don't fit into {budget}: {most}")
+            settings = settings.with_values(initial_samples=most)
         settled = settings.settled(base.parameters.names, train, PlacedProblems(at, report))
         if settled is None:
             continue

@@ -21,9 +21,8 @@ from typing import Any
 from pydantic import SerializeAsAny, field_validator
 
 from actors.runtime.ray_cluster import versions
-from orchestrator.journal.codec import digest, first_difference, from_json, to_json
+from orchestrator.journal.codec import decode_result, digest, first_difference, from_json, to_json
 from orchestrator.journal.journal_file import locked_alone
-from orchestrator.journal.stage_results import decode_result
 from orchestrator.journal.upgrade import upgraded_fingerprint
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.stage_result import ResultPart, StageResult

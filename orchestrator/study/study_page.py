@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from orchestrator.results import html_page as page
-from orchestrator.results.html_report import minutes
+from orchestrator.results import html_report as page
 from orchestrator.results.loss_units import deployment_unit
+from orchestrator.results.wording import ResultRow, ResultTable, minutes
 from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED
 from orchestrator.study.calibration_figures import Drawn, draw_calibrations, is_ours, level_words, write_csv
@@ -430,8 +430,8 @@ def _level(level: Level) -> str:
     )
 
 
-def _table(one: StudyTable) -> page.HtmlTable:
+def _table(one: StudyTable) -> ResultTable:
     cells = [[v.text() if isinstance(v, Estimate) else str(v) for v in row] for row in one.rows]
     columns = range(len(one.header))
     numbers = frozenset(i for i in columns if any(isinstance(row[i], int | float | Estimate) for row in one.rows))
-    return page.HtmlTable(one.title, one.header, [page.Row(row) for row in cells], numbers)
+    return ResultTable(one.title, one.header, [ResultRow(row) for row in cells], numbers)

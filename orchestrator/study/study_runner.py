@@ -26,7 +26,7 @@ from pathlib import Path
 from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ChildProcess, python_module
 from actors.simulators.local_worker import thread_pool
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.run_record import read_record
 from orchestrator.run_errors import RunError
 from orchestrator.run_service import RunRequest, RunResources, RunService
 from orchestrator.runs.stages import CALIBRATION
@@ -255,14 +255,8 @@ def run_cell(study: StudyPlan, cell: StudyCell, folder: Path, resources: RunReso
 
 def _expected(directory: Path) -> list[tuple[int, float]]:
     """For each θ that C4 chose: simulations requested until then, and the mean |Δ| that its surrogate expected."""
-    asked, found = 0, list[tuple[int, float]]()
-    with JournalReader(directory / JOURNAL_NAME) as journal:
-        for entry in journal.entries(stage=CALIBRATION, kinds=[Kind.REQUESTED, Kind.DECISION]):
-            if entry.kind == Kind.REQUESTED:
-                asked += entry.body["request"]["type"] == "Simulate"
-            elif "mean" in (entry.body.get("values") or {}):
-                found.append((asked, entry.body["values"]["mean"]))
-    return found
+    decisions = [one for one in read_record(directory).decisions if one.stage == CALIBRATION and "mean" in one.values]
+    return [(one.simulations_asked, one.values["mean"]) for one in decisions]
 
 
 def named_cells() -> Iterator[str]:

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from orchestrator.journal.stage_results import result_of
+from orchestrator.journal.codec import result_of
 from orchestrator.runs.stages import CALIBRATION, EVALUATION
 from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.calibration.calibration_scores import CALIBRATED, UNCALIBRATED, Scores

@@ -197,7 +197,7 @@ class FluidState:
         self.no_slip = ti.field(ti.f32, shape=scenes)  # 1: such a liquid sticks to walls, 0: it slips
         self.gravity = ti.field(ti.f32, shape=scenes)  # downwards [m/s²]
         self.longest_step = ti.field(ti.f32, shape=scenes)  # [s]
-        self.lip_drop = ti.field(ti.f32, shape=scenes)  # rims are lower for particles at rest, in spacings
+        self.rim_correction = ti.field(ti.f32, shape=scenes)  # rims are lower for particles at rest, in spacings
         self.wall_shift = ti.field(ti.f32, shape=scenes)  # walls act as if nearer by this distance, in supports h
         self.wait = ti.field(ti.f32, shape=scenes)  # interval at which viscosity acts [s]
         self.pull_wait = ti.field(ti.f32, shape=scenes)  # longest interval at which cohesion acts [s]
@@ -247,12 +247,12 @@ def of_parameters(setup: SceneSetup) -> dict[str, float]:
         "cohesion": cohesion_acceleration(tension, density, d),
         "adhesion": adhesion(setup.contact_angle, theta.wall_distance),
         "pull_wait": pull_interval(tension, density, d),
-        "viscosity": theta.viscosity,
-        "eddies": eddy_rate(theta.eddies),
-        "wait": relax_interval(theta.viscosity),
+        "viscosity": theta.xsph_rate,
+        "eddies": eddy_rate(theta.smagorinsky_constant),
+        "wait": relax_interval(theta.xsph_rate),
         "friction": theta.friction,
         "kinematic": setup.viscosity,
         "no_slip": 1.0 if setup.no_slip else 0.0,
-        "lip_drop": theta.lip_drop,
+        "rim_correction": theta.rim_correction,
         "wall_shift": (theta.wall_distance - NATURAL_WALL_DISTANCE) / SUPPORT,
     }

@@ -54,7 +54,7 @@ CONTACT = 0.2
 """Distance of particles' centres from solid, in spacings; the density constraint keeps about half a spacing."""
 WARM = 0.3
 """Fraction of the last step's multipliers with which a step starts. From one half on, oscillations grow in deep liquid,
-because the multipliers respond to the previous state (docs/how-it-works.md has the analysis)."""
+because the multipliers respond to the previous state (docs/notes/solver.md has the analysis)."""
 TREACLE = 0.7
 """Factor by which velocities shrink in every step before the start, so that a lattice settles without splashing."""
 

@@ -12,7 +12,7 @@ and its middle is e/2 above the lip. Particles' centres stay at least half a spa
 passes with its middle at d/2, and needs (d − e)/2 more head than liquid does. Near a rim the solid is therefore looked
 up that much higher. This lowers it for this particle, straight down in the world, by
 
-    lip_drop · max(d − u²/g, 0),    lip_drop = ½,
+    rim_correction · max(d − u²/g, 0),    rim_correction = ½,
 
 where u is the particle's speed relative to the vessel. For liquid at rest the lip is half a spacing lower, and the
 retained volume agrees with hydrostatics. For liquid faster than √(g d) the lip is unchanged, and the liquid leaves at
@@ -31,7 +31,7 @@ import taichi as ti
 
 from sim_engine.fluid.kernels import dot, length, square, turned, turned_back
 from sim_engine.fluid.state import VESSELS
-from sim_engine.liquids import LARGEST_LIP_DROP
+from sim_engine.liquids import LARGEST_RIM_CORRECTION
 
 FAR = 1.0
 """Distance [m] reported beyond a grid."""
@@ -41,7 +41,7 @@ TRACE_STEPS = 24
 LIP_BLEND = 6.0
 """Height below a rim over which its lowering builds up, in spacings."""
 
-STRETCH = 1.0 + LARGEST_LIP_DROP / LIP_BLEND
+STRETCH = 1.0 + LARGEST_RIM_CORRECTION / LIP_BLEND
 """Largest gradient of the stretched distance: solid within STRETCH times a displacement may be reached by it."""
 
 
@@ -252,7 +252,7 @@ def lower_rims(f: ti.template(), s, dt, thick: ti.template()):
                 film = square(u) / gravity
                 if ti.static(thick):
                     film = ti.max(film, ti.sqrt(3.0 * f.kinematic[s] * length(u) / gravity))
-                aim = f.lip_drop[s] * ti.max(d - film, 0.0)
+                aim = f.rim_correction[s] * ti.max(d - film, 0.0)
                 change = share * (aim - f.sag[i][b])
                 f.sag[i][b] = f.sag[i][b] + ti.min(ti.max(change, -SLOWLY * d), SLOWLY * d)
             else:

@@ -200,7 +200,7 @@ def puddle(particles: int, angle: float) -> tuple[float, float, int]:
     side = math.sqrt(VOLUME / LAID)
     start, d = block(np.array([0.04, -side / 2.0, 0.0]), np.array([0.04 + side, side / 2.0, LAID]), particles, 1)
     plane = box(0.08 + side, 0.08 + side, 0.04, 0.5 * d)
-    theta = SimulationParameters(cohesion=WATER_TENSION, viscosity=0.0)
+    theta = SimulationParameters(cohesion=WATER_TENSION, xsph_rate=0.0)
     for _ in run(start, d, plane, theta, np.array([2.0]), viscosity=VISCOSITY, no_slip=False, contact_angle=angle):
         pass
     return 2.0 * float(engine().particles()[0][:, 2].mean()), d, len(start)

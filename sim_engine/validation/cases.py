@@ -23,7 +23,7 @@ from sim_engine.validation import (
 )
 from sim_engine.validation.case_result import CaseResult, Figure, Measurement, at_least, collected
 
-PLAIN = SimulationParameters(cohesion=0.0, viscosity=1.0, friction=0.0)
+PLAIN = SimulationParameters(cohesion=0.0, xsph_rate=1.0, friction=0.0)
 """θ of the cases, as their references assume. Water's own viscosity has no effect in a cup, a liquid has no dry
 friction, and tension acts on drips only. A little XSPH viscosity replaces the effects that a finer solver would
 resolve."""
@@ -153,7 +153,7 @@ def _dam_break(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measu
 
 
 def _cohesion(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    free = PLAIN.model_copy(update={"viscosity": 0.0})
+    free = PLAIN.model_copy(update={"xsph_rate": 0.0})
     sphere = capillarity.cube_to_sphere(2_000, free)
     runs = {n: capillarity.oscillation(n, free) for n in ((2_000, 10_000) if effort.full else (2_000,))}
     found, curves = collected([(sphere, []), *(run[:2] for run in runs.values())])

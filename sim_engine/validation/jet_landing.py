@@ -90,7 +90,7 @@ def _of_one(simulator: PourSimulator, speed: float, parameters: SimulationParame
     """Landing of one pour; by frame, not in the order of time."""
     pour = ConvergencePour(CONE, speed, DISTANCE)
     scene = Scene("landing", POURER, CONE, Liquid(mass=0.1996))
-    task = PourTask(scene, pour.action(FALL), parameters, seed, record_rate=50.0, pose_error=PoseError(y=ASIDE))
+    task = PourTask(scene, pour.action(FALL), parameters, seed, frame_rate=50.0, pose_error=PoseError(y=ASIDE))
     frames = simulator.simulate(task).frames
     assert frames is not None
     x = np.stack(frames.positions).astype(float)

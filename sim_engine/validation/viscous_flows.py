@@ -285,7 +285,7 @@ def _mm2(viscosity: float) -> str:
     return f"{1e6 * viscosity:.0f} mm²/s"
 
 
-THETA = SimulationParameters(cohesion=0.0, viscosity=0.0)
+THETA = SimulationParameters(cohesion=0.0, xsph_rate=0.0)
 
 FLOOR = (
     "Taylor and Green's vortices in a tank with slippery walls die away as exp(−2νk²t), whatever their speed. What is "

@@ -68,7 +68,7 @@ def random_task(rng: np.random.Generator, most_particles: int) -> PourTask:
     parameters = SimulationParameters(
         particles=round(math.exp(rng.uniform(math.log(500), math.log(most_particles)))),
         cohesion=float(rng.uniform(0.0, 0.1)),
-        viscosity=float(rng.uniform(0.0, 5.0)),
+        xsph_rate=float(rng.uniform(0.0, 5.0)),
         friction=float(rng.uniform(0.0, 0.2)),
     )
     scene = Scene("random", pourer, receiver, Liquid(mass=load * 998.0, density=998.0))

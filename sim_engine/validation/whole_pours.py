@@ -161,7 +161,7 @@ def free_jet(
     rate, span = 50.0, 5  # frames are taken every 0.02 s at most
     theta = parameters.model_copy(update={"particles": particles})
     action = ACTION.with_values(height=FALL, x_offset=0.12)
-    frames = simulator.simulate(PourTask(SCENE, action, theta, 1, record_rate=rate)).frames
+    frames = simulator.simulate(PourTask(SCENE, action, theta, 1, frame_rate=rate)).frames
     assert frames is not None
     rim = 0.004 + 0.09
     z = np.stack(frames.positions)[:, :, 2].astype(float)

@@ -31,8 +31,8 @@ def action() -> Action:
 
 @pytest.fixture
 def task(action: Action) -> Callable[..., PourTask]:
-    def of(seed: int = 1, name: str = "tumbler", record_rate: float = 0.0) -> PourTask:
-        return PourTask(make_scene(name), action, SimulationParameters(), seed, record_rate=record_rate)
+    def of(seed: int = 1, name: str = "tumbler", frame_rate: float = 0.0) -> PourTask:
+        return PourTask(make_scene(name), action, SimulationParameters(), seed, frame_rate=frame_rate)
 
     return of
 

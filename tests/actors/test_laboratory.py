@@ -13,7 +13,7 @@ import pytest
 
 from actors.interfaces import LaboratoryError
 from actors.laboratory import check_laboratory, open_laboratory
-from actors.laboratory_settings import LaboratorySettings
+from actors.laboratory_settings import HiddenLiquid, LaboratorySettings
 from actors.optimizer.questions import Data, MinimumQuery
 from actors.runtime.remote_object import DeviceLostError
 from orchestrator.config.file_loading import load_laboratory
@@ -39,12 +39,6 @@ def laboratory(in_process, fake, **changes):
 def test_a_campaign_that_pours_is_refused_a_laboratory_without_a_bench():
     with pytest.raises(LaboratoryError, match="desk has no bench, but the campaign pours"):
         open_laboratory(LaboratorySettings(name="desk"), need_bench=True)
-
-
-@pytest.mark.realtime
-def test_an_unknown_mode_is_refused_before_anything_starts():
-    with pytest.raises(LaboratoryError, match="mode 'dream' is not known"):
-        open_laboratory(LaboratorySettings(name="desk", mode="dream"), need_bench=False)
 
 
 @pytest.mark.realtime
@@ -104,13 +98,13 @@ def test_optimiser_and_its_twin_propose_the_same_also_after_a_death(ray_running,
 def test_the_real_simulator_gives_the_same_bits_in_a_pool_a_twin_and_the_hidden_liquid(
     ray_running, bench_spec, scene, action
 ):
-    bench = bench_spec.with_values(liquid=SimulationParameters(particles=400))
+    bench = bench_spec.with_values(liquid=HiddenLiquid(particles=400))
     coarse = SimulationParameters(particles=300)
 
     async def play(in_process):
         spec = LaboratorySettings(name="desk", simulators=1, bench=bench, in_process=in_process)
         async with open_laboratory(spec, need_bench=True) as opened:
-            job = opened.simulators.simulate(PourTask(scene, action, coarse, 3, record_rate=4.0))
+            job = opened.simulators.simulate(PourTask(scene, action, coarse, 3, frame_rate=4.0))
             return await asyncio.gather(job, opened.bench.pour(scene, action, seed=5))
 
     (ours, measured), (twins, measured_twin) = asyncio.run(play(False)), asyncio.run(play(True))

@@ -342,7 +342,7 @@ def test_a_loss_is_told_with_what_is_repeated(ray_running, fake, task, tmp_path)
 @pytest.mark.realtime
 @pytest.mark.ray
 def test_both_pools_give_the_same_results_bit_for_bit(ray_running, fake, task):
-    tasks = [task(seed=s, record_rate=5.0) for s in range(3)]
+    tasks = [task(seed=s, frame_rate=5.0) for s in range(3)]
 
     async def play(pool):
         results = await asyncio.gather(*(pool.simulate(t) for t in tasks))

@@ -19,7 +19,7 @@ from actors.emulators.ur_controller.controller_process import VirtualController
 from orchestrator.daemon.access_control import Role, token_of
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.journal.journal import Kind
-from orchestrator.runs.safety_approval import SafetyRecord, write_record
+from orchestrator.runs.motion_approval import SafetyRecord, write_record
 from tests.end_to_end.test_daemon_killed import Laboratory, opened
 from tests.support import hardware_laboratory
 from tests.support.command_process import pour_under_way
@@ -99,17 +99,17 @@ def test_hardware_is_armed_over_the_api_and_after_a_crash_shows_where_it_stands_
     home = joints()
     key = laboratory.decant("submit", "rigged.yaml").stdout.strip()
     with client(laboratory) as people, client(laboratory, Role.VIEWER) as viewer:
-        assert people.get(f"/campaigns/{key}")["needs_arming"]
+        assert people.get(f"/campaigns/{key}")["needs_enabling"]
         with pytest.raises(DaemonError, match="takes operator"):
-            viewer.post(f"/campaigns/{key}/arm", {"laboratory": "rig"})
-        moves = people.get(f"/campaigns/{key}/arming")
+            viewer.post(f"/campaigns/{key}/enable", {"laboratory": "rig"})
+        moves = people.get(f"/campaigns/{key}/motion")
         assert moves["laboratory"] == "rig"
         assert any("deg" in line for line in moves["lines"])
-        with pytest.raises(DaemonError, match="not armed: 'yes' was typed"):
-            people.post(f"/campaigns/{key}/arm", {"laboratory": "yes"})
+        with pytest.raises(DaemonError, match="motion is not enabled: 'yes' was typed"):
+            people.post(f"/campaigns/{key}/enable", {"laboratory": "yes"})
         time.sleep(0.5)
         assert joints() == home
-        people.post(f"/campaigns/{key}/arm", {"laboratory": "rig"})
+        people.post(f"/campaigns/{key}/enable", {"laboratory": "rig"})
         answer_until(laboratory, people, balance, lambda: people.get("/rigs")[0]["checkpoint"] == "tilt")
         time.sleep(0.7)
         laboratory.kill()
@@ -129,8 +129,8 @@ def test_hardware_is_armed_over_the_api_and_after_a_crash_shows_where_it_stands_
 
     laboratory.start()
     with client(laboratory) as people:
-        assert people.get(f"/campaigns/{key}")["needs_arming"], "a crash takes the arming away"
-        people.post(f"/campaigns/{key}/arm", {"laboratory": "rig"})
+        assert people.get(f"/campaigns/{key}")["needs_enabling"], "a crash takes the arming away"
+        people.post(f"/campaigns/{key}/enable", {"laboratory": "rig"})
         (question,) = laboratory.until(lambda: people.get("/questions"))
         assert question["kind"] == "unknown"
         assert question["options"] == ["lost", "weighed SPILLED RETAINED [LOADED]"]

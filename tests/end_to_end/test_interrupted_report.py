@@ -11,7 +11,7 @@ from orchestrator.states import State
 from tests.support.command_process import Workplace
 from tests.support.small_campaign import CAMPAIGN, write_campaign
 
-SHORT = CAMPAIGN[: CAMPAIGN.index("deployment:")] + "outputs: {directory: runs, rrd: false}\n"
+SHORT = CAMPAIGN[: CAMPAIGN.index("deployment:")] + "outputs: {directory: runs, recording: false}\n"
 
 
 def test_a_run_interrupted_before_its_report_is_published_by_decant_report(tmp_path: Path) -> None:

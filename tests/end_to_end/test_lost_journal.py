@@ -20,14 +20,13 @@ from typer.testing import CliRunner
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.journal.journal import JOURNAL_NAME, Entry, Kind
-from orchestrator.journal.journal_check import JournalDamagedError
-from orchestrator.journal.pour_ledger import LEDGER_NAME, read_ledger
+from orchestrator.journal.journal_check import LEDGER_NAME, JournalDamagedError, read_ledger
 from orchestrator.runs.run_folder import find_run
 from tests.support import small_campaign
 from tests.support.command_process import Workplace, ended, started_after_they_were_finished
 from tests.support.waiting import PATIENCE
 
-CAMPAIGN = small_campaign.CAMPAIGN.replace("directory: runs,", "directory: runs, figures: false, rrd: false,")
+CAMPAIGN = small_campaign.CAMPAIGN.replace("directory: runs,", "directory: runs, figures: false, recording: false,")
 
 RUN = ("run", "small.yaml", "--in-process")
 RESUME = (*RUN, "--resume", "--run")

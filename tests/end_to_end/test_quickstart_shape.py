@@ -32,7 +32,7 @@ def test_paper_has_the_budgets_of_the_paper() -> None:
     assert deployment is not None
     assert (calibration.pour_count, calibration.holdout) == (32, 4)
     assert (calibration.strategy, calibration.simulations) == ("C4", 108)
-    assert deployment.settings == D3Settings(prior_simulations=37, pours=15, per_pour=2)
+    assert deployment.settings == D3Settings(prior_simulations=37, pours=15, simulations_per_pour=2)
     receivers = {scene.receiver.name for scene in deployment.scenes}
     assert len(receivers) == 3
     assert calibration.scene.receiver.name not in receivers
@@ -68,7 +68,7 @@ def test_what_is_real_differs_from_what_simulation_starts_with(name: str) -> Non
     bench = campaign.laboratory.bench
     assert campaign.calibration is not None
     assert bench is not None
-    hidden, assumed = bench.liquid.model_dump(), campaign.parameters.model_dump()
+    hidden, assumed = bench.theta.model_dump(), campaign.parameters.model_dump()
     assert any(hidden[axis] != assumed[axis] for axis in campaign.calibration.parameters.names)
     for axis in campaign.calibration.parameters.axes:
         assert 0.05 < axis.encode(hidden[axis.name]) < 0.95, f"{axis.name} can't be found at an end of what is searched"

@@ -81,8 +81,8 @@ def test_a_campaign_learns_from_calibration_to_its_last_pour(undisturbed: Finish
 
     summary = json.loads((undisturbed.directory / "summary.json").read_text(encoding="utf-8"))
     (narrow,) = summary["receivers"].values()
-    assert 0.0 <= narrow["best_spillage"] <= 1.0
-    assert narrow["best_loss"] <= narrow["first_loss"]
+    assert 0.0 <= narrow["best"]["spillage"] <= 1.0
+    assert narrow["best"]["loss"] <= narrow["first"]["loss"]
     assert 0.0 <= summary["theta"]["cohesion"] <= 0.1
     learnt = summary.pop("results")
     assert {"calibration", "deployment:narrow"} <= learnt.keys()

@@ -37,8 +37,8 @@ def write_wired(folder: Path) -> None:
     campaign["laboratory"] = "lab.yaml"
     campaign["motion"]["return_velocity"] = "100 deg/s"
     calibration, deployment = campaign["calibration"], campaign["deployment"]
-    calibration |= {"simulations": 3, "initial": 2}
-    deployment |= {"prior_simulations": 2, "per_pour": 1}
+    calibration |= {"simulations": 3, "initial_samples": 2}
+    deployment |= {"prior_simulations": 2, "simulations_per_pour": 1}
     for stage in (calibration, deployment):
         stage["motion"]["height"] = "80 mm"
         stage["actions"]["angular_velocity"] = ["60 deg/s", "100 deg/s"]

@@ -41,7 +41,7 @@ liquid: {name: water, mass: 100 g}
 pourer: beaker.yaml
 motion: {hold_time: 0.3 s, return_velocity: 180 deg/s}
 on_unknown: ask
-outputs: {directory: runs, rrd: false, figures: false}
+outputs: {directory: runs, recording: false, figures: false}
 """
 
 CALIBRATION = """\
@@ -53,7 +53,7 @@ calibration:
   actions: {angular_velocity: [60 deg/s, 180 deg/s], max_angle: [80 deg, 115 deg]}
   pours: POURS
   simulations: 8
-  initial: 4
+  initial_samples: 4
 """
 
 DEPLOYMENT = """\
@@ -78,7 +78,7 @@ name: learnt
 seed: 3
 {BENCH}{CALIBRATION.replace("POURS", "{count: 4, holdout: 1}")}\
 {DEPLOYMENT.replace("STRATEGY", "D3")}  prior_simulations: 6
-  per_pour: 2
+  simulations_per_pour: 2
 """
 
 WEIGHED = f"""\

@@ -24,7 +24,7 @@ from typer.testing import CliRunner
 
 import decant
 from orchestrator.cli.app import app
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.config.file_loading import load_campaign, recorded_campaign
 from orchestrator.daemon.event_feed import PASSING as PASSED_BY
 from orchestrator.daemon.event_feed import event_json
 from orchestrator.journal.codec import encode_request, first_difference
@@ -37,7 +37,7 @@ from orchestrator.results.publishing import publish
 from orchestrator.results.stage_views import deployments_of
 from orchestrator.runs.events import Event, PourProgressed, StrategyProgressed
 from orchestrator.runs.fingerprint import fingerprint
-from orchestrator.runs.replay import ToldStep, read_history
+from orchestrator.runs.resume import ToldStep, read_history
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import stages_of
 from orchestrator.strategies.deployment.real_pours import PredictionCheck
@@ -52,6 +52,7 @@ QUICKSTART, TWIN = ROOT / "configs/campaigns/quickstart.yaml", ROOT / "configs/l
 
 PASSING = {"time", "t", "seconds", "cpu_s", "pid", "created"}
 PASSING |= {"pool_busy", "pool_useful", "arm_longest_wait_s", "arm_mean_wait_s"}
+PASSING |= {"began_at", "ended_at", "cost", "occupancy", "settings"}
 """Keys of what depends on the day, the machine and the process."""
 
 UNPORTABLE = (
@@ -117,11 +118,11 @@ def test_a_run_writes_and_shows_the_same(golden: Golden, tmp_path: Path) -> None
     folder = tmp_path / "quickstart-20300131-1"
     folder.mkdir()
     plan = replace(
-        plan, outputs=plan.outputs.model_copy(update={"directory": str(tmp_path), "rrd": False, "figures": False})
+        plan, outputs=plan.outputs.model_copy(update={"directory": str(tmp_path), "recording": False, "figures": False})
     )
     events: list[Event] = []
     display = ProgressDisplay(plan, quiet=True)
-    work = run_campaign(plan, FormulaLaboratory(), folder, watchers=[events.append, display])
+    work = run_campaign(plan, FormulaLaboratory(), folder, subscribers=[events.append, display])
     result = replace(asyncio.run(work), seconds=12.0)
 
     passing = [
@@ -146,7 +147,7 @@ def test_a_run_writes_and_shows_the_same(golden: Golden, tmp_path: Path) -> None
     golden.check("one_run/theta.json", normalised(_indented(compact(theta)), places))
     golden.check("one_run/files.txt", "\n".join(sorted(path.name for path in folder.iterdir())))
     console = Console(file=io.StringIO(), width=120, no_color=True)
-    console.print(summary_table(plan, published.summary))
+    console.print(summary_table(published.summary))
     shown = re.sub(r"pool .* at most", "<how busy the pool was>", console.file.getvalue())
     golden.check("one_run/console.txt", normalised(shown, places))  # type: ignore[attr-defined]
 
@@ -218,12 +219,11 @@ def test_old_run_has_the_same_tables(name: str, runs: Path, golden: Golden) -> N
 @pytest.mark.parametrize("name", ["learnt", "weighed"])
 def test_old_run_is_published_again_as_it_was(name: str, runs: Path, golden: Golden) -> None:
     folder = runs / "runs" / name
-    plan = load_campaign(folder / "resolved.json")
-    with JournalReader(folder / JOURNAL_NAME) as journal:
-        result = read_result(journal, folder)
+    plan = recorded_campaign(folder / "resolved.json")
+    result = read_result(folder)
     published = publish(plan, result)
     console = Console(file=io.StringIO(), width=120, no_color=True)
-    console.print(summary_table(plan, published.summary))
+    console.print(summary_table(published.summary))
     places = [(str(runs), "<here>")]
     golden.check(f"old_runs/{name}-console.txt", normalised(console.file.getvalue(), places))  # type: ignore[attr-defined]
     for file in ("summary.json", "theta.json"):
@@ -243,7 +243,7 @@ def test_old_run_with_a_model_that_is_retired_is_listed_and_reported_but_not_res
     run = decant.open_run(folder)
     assert (run.result.state, run.result.pours, len(run.pours)) == ("finished", 4, 4)
     (found,) = deployments_of(run.result.results).values()
-    assert isinstance(found.trust, PredictionCheck)
+    assert isinstance(found.model_check, PredictionCheck)
     (runs / "pooled.yaml").write_text((folder / "resolved.json").read_text(encoding="utf-8"), encoding="utf-8")
     refused = typed(runs, "run", "pooled.yaml", "--resume")
     assert refused.endswith("exit 2\n\n")
@@ -255,7 +255,7 @@ def test_old_run_with_a_model_that_is_retired_is_listed_and_reported_but_not_res
 def test_old_run_is_replayed(name: str, runs: Path) -> None:
     """Strategies that are told what the journal has ask again for what it has."""
     folder = runs / "runs" / name
-    plan = load_campaign(folder / "resolved.json")
+    plan = recorded_campaign(folder / "resolved.json")
     asked = 0
     with JournalReader(folder / JOURNAL_NAME) as journal:
         results: dict[str, StageResult] = {}
@@ -287,7 +287,7 @@ def test_old_run_has_the_fingerprint_of_its_campaign(name: str, runs: Path) -> N
     folder = runs / "runs" / name
     with JournalReader(folder / JOURNAL_NAME) as journal:
         written = journal.header.fingerprint
-    assert first_difference(written, fingerprint(load_campaign(folder / "resolved.json"))) is None
+    assert first_difference(written, fingerprint(recorded_campaign(folder / "resolved.json"))) is None
 
 
 def _sorted(value: Any) -> str:

@@ -46,7 +46,7 @@ def test_first_simulations_and_rivals_are_there_when_the_calibration_pours_are_m
         if isinstance(event, StageClosed):
             made[event.stage] = len(bench.simulators.tasks)
 
-    run(tmp_path / "run", bench, watchers=[watch])
+    run(tmp_path / "run", bench, subscribers=[watch])
     # 4 places of the initial design; 3 random θ on 1 test pour; the uncalibrated θ on all 5
     assert made[POURS] == 4 + 3 + 5
     # of 5 simulations the last one is left, and the first two are made anew: they keep their frames
@@ -68,7 +68,7 @@ def test_the_next_receivers_prior_is_made_beside_this_ones_pours(tmp_path: Path)
         if isinstance(event, StageClosed) and event.stage == "deployment:cup":
             made.extend(bench.simulators.tasks)
 
-    run(tmp_path / "run", bench, plan=campaign(tmp_path, calibration=None), watchers=[watch])
+    run(tmp_path / "run", bench, plan=campaign(tmp_path, calibration=None), subscribers=[watch])
     first, second = (
         [e for e in events if isinstance(e, RequestFinished) and e.stage == stage]
         for stage in ("deployment:cup", "deployment:narrow")
@@ -98,7 +98,7 @@ def test_what_was_foreseen_makes_room_for_what_is_asked_for() -> None:
 
         ahead = SpeculativeExecution(work, width=2)
         for seed in (1, 2, 3):
-            ahead.foresee(simulate(seed))
+            ahead.predict(simulate(seed))
         await asyncio.sleep(0)
         assert begun == [1, 2]
         with ahead.asked_for():
@@ -125,7 +125,7 @@ def test_one_that_is_being_made_is_waited_for_and_not_made_twice() -> None:
             return Failed("invalid_action", "cups touch")
 
         ahead = SpeculativeExecution(work, width=1)
-        ahead.foresee(simulate(1))
+        ahead.predict(simulate(1))
         assert ahead.knows(simulate(1))
         assert await ahead.take(simulate(1)) == Failed("invalid_action", "cups touch")
         assert begun == [1]
@@ -143,10 +143,10 @@ def test_bad_luck_is_not_kept(outcome: Outcome | Exception) -> None:
             return outcome
 
         ahead = SpeculativeExecution(work, width=1)
-        ahead.foresee(simulate(1))
+        ahead.predict(simulate(1))
         await asyncio.sleep(0.01)
         assert not ahead.knows(simulate(1))
-        ahead.foresee(simulate(2))
+        ahead.predict(simulate(2))
         assert await ahead.take(simulate(2)) is None
 
     asyncio.run(check())

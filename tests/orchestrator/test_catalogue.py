@@ -24,6 +24,7 @@ from orchestrator.catalogue.catalogue import INDEX_NAME, Catalogue
 from orchestrator.catalogue.queries import moment
 from orchestrator.catalogue.run_reading import POURS, RUNS, RunRead, read_run
 from orchestrator.catalogue.run_registry import VARIABLE, state_directory
+from orchestrator.cli import console
 from orchestrator.cli.app import app
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.run_folder import create_run
@@ -36,6 +37,7 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A state directory of its own; runs are made beside it."""
     monkeypatch.setenv(VARIABLE, str(tmp_path / "state"))
     monkeypatch.setattr(registry, "_reported", False)
+    monkeypatch.setattr(console, "_quiet", False)  # of a command that a test ran before in this process
     return tmp_path / "state"
 
 

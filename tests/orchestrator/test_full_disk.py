@@ -14,9 +14,8 @@ from actors.interfaces import Notice, ProgressCallback
 from actors.runtime.child_process import child_environment
 from orchestrator.cli.campaign_commands import run_directory
 from orchestrator.cli.foreground_run import BAD_INPUT, RefusalError
-from orchestrator.journal.disk_reserve import MB, RESERVE, TO_BEGIN, NoSpaceError, Reserve
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.journal.journal_file import JournalError
+from orchestrator.journal.journal_file import MB, RESERVE, TO_BEGIN, JournalError, NoSpaceError, Reserve
 from orchestrator.requests import Poured
 from orchestrator.runs.events import Event, LogLine
 from orchestrator.strategies.campaign_plan import OutputSettings
@@ -122,7 +121,9 @@ def test_what_finds_no_room_even_in_the_reserve_is_on_the_screen(disk: Path) -> 
     with pytest.raises(
         JournalError, match=r"Pour 1 was made and weighed.*200.0 g loaded, \d.*answer: weighed [\d.]+ 1.0"
     ):
-        run(disk / "run", TellingLaboratory(bench=bench), stages=one_stage(Script(pour(1))), watchers=[events.append])
+        run(
+            disk / "run", TellingLaboratory(bench=bench), stages=one_stage(Script(pour(1))), subscribers=[events.append]
+        )
     shown = [event.text[:50] for event in events if isinstance(event, LogLine)]
     assert sum("weighed, " in text and "can't be written down" in text for text in shown) == 3
 

@@ -65,7 +65,7 @@ parameters = st.builds(
     SimulationParameters,
     particles=st.integers(200, 50_000),
     cohesion=st.floats(0, 0.2, allow_subnormal=False),
-    viscosity=st.floats(0, 60, allow_subnormal=False),
+    xsph_rate=st.floats(0, 60, allow_subnormal=False),
     friction=st.floats(0, 1, allow_subnormal=False),
 )
 

@@ -65,7 +65,7 @@ class Talking(ToyLaboratory):
 
 def test_what_happens_to_a_laboratory_is_in_the_journal(tmp_path):
     seen: list[Any] = []
-    run(tmp_path, Talking(), stages=one_stage(Script(simulate(1))), watchers=[seen.append])
+    run(tmp_path, Talking(), stages=one_stage(Script(simulate(1))), subscribers=[seen.append])
     with JournalReader(tmp_path / JOURNAL_NAME) as journal:
         notes = [entry.body["text"] for entry in journal.entries(kinds=[Kind.NOTE])]
     assert notes == ["machine b (10.0.0.4) is lost", "the arm was stopped"]
@@ -77,6 +77,6 @@ def test_what_happens_to_a_laboratory_is_in_the_journal(tmp_path):
 def test_simulators_that_a_campaign_will_leave_idle_are_pointed_out(tmp_path, simulators, pointed_out):
     seen: list[Any] = []
     laboratory = ToyLaboratory(simulators=ToySimulators(size=simulators))
-    run(tmp_path, laboratory, stages=one_stage(Script(simulate(1))), watchers=[seen.append])
+    run(tmp_path, laboratory, stages=one_stage(Script(simulate(1))), subscribers=[seen.append])
     lines = [event.text for event in seen if isinstance(event, LogLine)]
     assert any("14 will have nothing to do" in line for line in lines) == pointed_out

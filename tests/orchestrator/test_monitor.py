@@ -16,7 +16,7 @@ from actors.optimizer.questions import Data, MinimumQuery
 from actors.optimizer.suggest import propose, slices
 from actors.runtime.child_process import child_environment
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.live_view.map_images import slices_picture, surrogate_picture
+from orchestrator.live_view.learning_view import slices_picture, surrogate_picture
 from orchestrator.live_view.rerun_subscriber import QueueThread, RerunMonitor
 from orchestrator.live_view.run_recording import CampaignRecording
 from orchestrator.live_view.simulation_view import simulation_rrd
@@ -139,7 +139,7 @@ def test_two_axes_are_one_picture() -> None:
 def test_page_says_at_a_glance_whether_it_is_real_and_what_is_going_on(recorded: Contents) -> None:
     pages = [str(row[0]) for row in recorded.values("/status", "TextDocument:text")]  # type: ignore[index]
     assert all(page.startswith("# VIRTUAL: ") for page in pages)
-    assert any("**Pour 2**: the arm tilts" in page for page in pages)
+    assert any("**Pour 2**: tilting" in page for page in pages)
     assert "Best into narrow: 6.00 %" in pages[-1]
 
 
@@ -236,7 +236,7 @@ def test_event_log_tells_decisions_results_and_warnings(recorded: Contents) -> N
     assert lines.count("pour 2: least lower bound") == 1
     assert lines.count("after pour 1 the simulator is wrong here") == 1
     assert "the balance drifts" in lines
-    assert any(line.startswith("pour 3 of narrow: 6.00 %") for line in lines)
+    assert any(line.startswith("pour 3 into narrow: 6.00 %") for line in lines)
 
 
 def test_recording_brings_its_blueprint_and_passes_the_viewers_own_check(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from actors.interfaces import NotPouredError, UnknownPourError
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Poured
 from orchestrator.runs.request_executor import PourNotMadeError, PourUnknownError
-from orchestrator.runs.unknown_pours import OperatorNeededError
+from orchestrator.runs.resume import OperatorNeededError
 from tests.support.scripted_strategy import Script, one_stage, pour, run, states
 from tests.support.toy_campaign import ToyBench, ToyLaboratory, toy_plan
 

@@ -17,10 +17,10 @@ from orchestrator.runs.events import (
     CampaignClosed,
     CampaignOpened,
     LogLine,
-    MadeAhead,
     PourProgressed,
     RequestFinished,
     RequestStarted,
+    SpeculationProgressed,
     StageOpened,
     StrategyProgressed,
 )
@@ -93,8 +93,8 @@ def test_simulators_that_work_ahead_while_the_arm_pours_are_not_shown_as_idle() 
     display = ProgressDisplay(plan, console=plain, clock=lambda: now)
     display(CampaignOpened(time=0.0, name="x", run_directory=Path("x"), stages=(), mode="none", simulators=2))
     display(StageOpened(time=0.0, stage="pours", index=1, count=2))
-    display(MadeAhead(time=0.0, running=2, waiting=0))
-    display(MadeAhead(time=8.0, running=1, waiting=5))
+    display(SpeculationProgressed(time=0.0, running=2, waiting=0))
+    display(SpeculationProgressed(time=8.0, running=1, waiting=5))
     now = 10.0
     display(StrategyProgressed(time=now, stage="pours", progress=Progress(0, 0, 1, 8), result=LEARNT))
     assert "pool 90 % busy · 0 simulations · 5 more made ahead" in written(plain)

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import pytest
 
-from orchestrator.journal.stage_results import decode_result, encode_result, result_of
+from orchestrator.journal.codec import decode_result, encode_result, result_of
 from orchestrator.results.publishing import publish
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.calibration.calibration_base import Calibrated
@@ -81,7 +81,7 @@ def test_publishing_names_the_recording_and_can_be_done_again(tmp_path: Path, re
 
 
 def test_kinds_of_installed_strategies_are_in_the_schema_and_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    from orchestrator.journal import stage_results as module
+    from orchestrator.journal import codec as module
     from orchestrator.results.run_summary import summary_schema
     from tests.support.scripted_strategy import Scripted
 

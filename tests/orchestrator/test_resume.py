@@ -20,7 +20,7 @@ from actors.laboratory_settings import LaboratorySettings
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.journal.journal_file import JournalError, JournalLockedError
 from orchestrator.runs.events import Event, RequestFinished, StageClosed
-from orchestrator.runs.replay import ReplayError
+from orchestrator.runs.resume import ReplayError
 from orchestrator.runs.stages import StageDefinition
 from tests.support import toy_campaign
 from tests.support.hypothesis_examples import THOROUGH
@@ -142,7 +142,7 @@ def test_a_resumed_run_shows_watchers_what_went_before(tmp_path: Path) -> None:
     directory = tmp_path / "run"
     assert killed_at(60, after_commit=True, directory=directory)
     events: list[Event] = []
-    result = run(directory, resume=True, watchers=[events.append])
+    result = run(directory, resume=True, subscribers=[events.append])
     replayed = [e for e in events if isinstance(e, RequestFinished) and e.replayed]
     assert replayed
     with JournalReader(directory / JOURNAL_NAME) as journal:
@@ -167,7 +167,7 @@ def test_completion_order_is_replayed_exactly(tmp_path: Path) -> None:
                         task.cancel()
 
         with pytest.raises(asyncio.CancelledError):
-            run(directory, laboratory, stages=free, watchers=[stop])
+            run(directory, laboratory, stages=free, subscribers=[stop])
         before = logical_record(directory)
         run(directory, toy_campaign.slow_laboratory(0.01), stages=free, resume=True)
         assert logical_record(directory)[: len(before)] == before

@@ -28,7 +28,7 @@ from tests.support.toy_campaign import ToyLaboratory, logical_record, toy_plan
 from tests.support.toy_daemon import HeldLaboratory, held
 from tests.support.waiting import PATIENCE
 
-SHORT = CAMPAIGN.replace("outputs: {directory: runs,", "outputs: {directory: runs, rrd: false, figures: false,")
+SHORT = CAMPAIGN.replace("outputs: {directory: runs,", "outputs: {directory: runs, recording: false, figures: false,")
 
 
 def campaign(folder: Path, *changes: tuple[str, str]) -> decant.CampaignPlan:
@@ -48,7 +48,7 @@ def everything_in(folder: Path) -> list[tuple[Path, int]]:
 
 def test_a_check_reports_all_problems_and_warnings_and_leaves_the_disk_as_it_was(tmp_path: Path) -> None:
     risk = "  risk: {measure: cvar, level: 0.9, theta: posterior}\n"
-    only_d3 = "  prior_simulations: 4\n  pours: 2\n  per_pour: 2\n"
+    only_d3 = "  prior_simulations: 4\n  pours: 2\n  simulations_per_pour: 2\n"
     plan = campaign(tmp_path, ("[60 mm, 100 mm]", "[60 mm, 300 mm]"), ("strategy: D3", "strategy: D1"), (only_d3, risk))
     without = replace(plan, calibration=None)
     before = everything_in(tmp_path)

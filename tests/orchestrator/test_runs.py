@@ -47,4 +47,4 @@ def test_what_reproduces_a_run_is_kept_with_it(tmp_path: Path) -> None:
     versions = json.loads((tmp_path / "run" / "versions.json").read_text())
     assert versions["seed"] == 7
     assert versions["python"] == sys.version.split()[0]
-    assert {"numpy", "taichi", "ray", "decant"} <= set(versions["packages"])
+    assert {"numpy", "taichi", "ray", "decant-pouring"} <= set(versions["packages"])

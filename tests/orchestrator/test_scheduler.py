@@ -49,7 +49,7 @@ def test_simulations_go_on_while_the_arm_pours(tmp_path: Path) -> None:
     events: list[Event] = []
     laboratory = ToyLaboratory(ToySimulators(lambda: 0.001), ToyBench(lambda: 0.1))
     strategy = Script(pour(), *(simulate(seed) for seed in range(5)))
-    run(tmp_path / "run", laboratory, stages=one_stage(strategy), watchers=[events.append])
+    run(tmp_path / "run", laboratory, stages=one_stage(strategy), subscribers=[events.append])
     finished = [type(e.request) for e in events if isinstance(e, RequestFinished)]
     assert finished == [Simulate] * 5 + [Pour]  # more simulations than slots, all beside one pour
     assert [type(request) for request, _ in strategy.told] == [Simulate] * 5 + [Pour]
@@ -172,7 +172,7 @@ def failing(times: int) -> Callable[[], Exception | None]:
 def test_the_optimiser_may_die_once(tmp_path: Path) -> None:
     run(tmp_path / "undisturbed")
     events: list[Event] = []
-    run(tmp_path / "run", ToyLaboratory(optimizer=ToyOptimizer(fails=failing(1))), watchers=[events.append])
+    run(tmp_path / "run", ToyLaboratory(optimizer=ToyOptimizer(fails=failing(1))), subscribers=[events.append])
     assert logical_record(tmp_path / "run") == logical_record(tmp_path / "undisturbed")
     assert any(isinstance(e, LogLine) and "asked again, for the second time" in e.text for e in events)
 
@@ -205,7 +205,7 @@ def test_one_question_is_asked_as_often_as_the_error_says(tmp_path: Path) -> Non
     with pytest.raises(
         RequestExecutorError, match=r"asked the same question 3 times and failed each time \(DeviceLostError"
     ):
-        run(tmp_path / "run", laboratory, watchers=[events.append])
+        run(tmp_path / "run", laboratory, subscribers=[events.append])
     assert (device.calls, device.revived) == (3, 3)
     told = [event.text for event in events if isinstance(event, LogLine) and "asked again" in event.text]
     assert [text[-15:] for text in told] == ["the second time", " the third time"]
@@ -290,7 +290,7 @@ async def interrupt(directory: Path, laboratory: ToyLaboratory, strategy: Script
         if isinstance(event, PourProgressed):
             begun.set()
 
-    task = asyncio.create_task(run_toy(directory, laboratory, stages=one_stage(strategy), watchers=[watch]))
+    task = asyncio.create_task(run_toy(directory, laboratory, stages=one_stage(strategy), subscribers=[watch]))
     await begun.wait()
     for _ in range(cancels):
         await asyncio.sleep(0.01)

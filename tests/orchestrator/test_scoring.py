@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.results.prediction_figures import draw_scored, write_scored
-from orchestrator.results.prediction_scores import ScoredRow, rank_correlation, score, scores
+from orchestrator.results.figure_style import save
+from orchestrator.results.prediction_scores import ScoredRow, draw_scored, rank_correlation, score, scores, write_scored
 from sim_engine.action import DEG, Action
 from sim_engine.prediction_band import SampleStatistics, band
 from tests.support.example_results import is_picture
@@ -60,4 +60,4 @@ def test_the_table_says_what_was_foretold_of_each_line(tmp_path: Path) -> None:
 
 
 def test_measured_is_drawn_over_predicted(tmp_path: Path) -> None:
-    assert is_picture(draw_scored(tmp_path / "scored.png", ROWS, title="beaker into cup", note="bands of seeds"))
+    assert is_picture(save(draw_scored(ROWS, title="beaker into cup", note="bands of seeds"), tmp_path / "scored.png"))

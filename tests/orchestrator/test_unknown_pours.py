@@ -16,7 +16,7 @@ from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Failed, Poured
 from orchestrator.run_errors import RunError
 from orchestrator.runs.events import Event, RequestFinished
-from orchestrator.runs.unknown_pours import LOST, REPEAT, WEIGHED, OperatorNeededError, parse_answer
+from orchestrator.runs.resume import LOST, REPEAT, WEIGHED, OperatorNeededError, parse_answer
 from tests.support import toy_campaign
 from tests.support.killed_runs import SMALL, killed_when_last, run
 from tests.support.toy_campaign import ToyLaboratory, answering, logical_record, run_toy, toy_plan
@@ -45,7 +45,7 @@ def test_an_unknown_pour_is_put_to_the_operator(unknown: Callable[[], Path]) -> 
         return ["no idea", "weighed 3.2 g 0.5 g"][len(questions) - 1]
 
     events: list[Event] = []
-    run(directory, resume=True, plan=asking(directory), ask_operator=operator, watchers=[events.append])
+    run(directory, resume=True, plan=asking(directory), ask_operator=operator, subscribers=[events.append])
     assert "pour 1 of stage first (angular_velocity" in questions[0][0]
     assert "what came of it?" in questions[0][0]
     assert questions[0][1] == (REPEAT, LOST, WEIGHED)
@@ -89,7 +89,7 @@ def test_matter_is_not_repeated_on_a_real_bench(tmp_path: Path) -> None:
                 loop.call_later(0.02, task.cancel)
 
         loop, plan = asyncio.get_running_loop(), asking(directory, **hardware)
-        task = asyncio.create_task(run_toy(directory, laboratory(), plan=plan, stages=SMALL, watchers=[watch]))
+        task = asyncio.create_task(run_toy(directory, laboratory(), plan=plan, stages=SMALL, subscribers=[watch]))
         with pytest.raises(asyncio.CancelledError):
             await task
 

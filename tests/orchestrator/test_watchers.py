@@ -32,7 +32,7 @@ def test_a_watcher_that_raises_is_reported_once_and_changes_nothing(tmp_path: Pa
         calls.append(event)
         raise OSError("disk full")
 
-    run(tmp_path / "run", watchers=[broken, events.append])
+    run(tmp_path / "run", subscribers=[broken, events.append])
     assert len(calls) == 1
     complaints = [e for e in events if isinstance(e, LogLine) and "broken can't watch any longer: OSError" in e.text]
     assert len(complaints) == 1
@@ -41,7 +41,7 @@ def test_a_watcher_that_raises_is_reported_once_and_changes_nothing(tmp_path: Pa
 
 def test_watchers_see_the_whole_run(tmp_path: Path) -> None:
     events: list[Event] = []
-    result = run(tmp_path / "run", watchers=[events.append])
+    result = run(tmp_path / "run", subscribers=[events.append])
     started = {e.id: e.request for e in events if isinstance(e, RequestStarted)}
     finished = {e.id: e.request for e in events if isinstance(e, RequestFinished)}
     assert started == finished
@@ -59,22 +59,22 @@ def test_recorded_simulations_bring_frames_and_the_same_outcomes(tmp_path: Path)
 
         async def with_frames(task: PourTask) -> Any:
             result = await plain(task)
-            return replace(result, frames=RecordedFrames([0.0], [], [], []) if task.record_rate > 0 else None)
+            return replace(result, frames=RecordedFrames([0.0], [], [], []) if task.frame_rate > 0 else None)
 
         laboratory.simulators.simulate = with_frames  # type: ignore[method-assign]
         return laboratory
 
     events: list[Event] = []
-    run(tmp_path / "run", recording(ToyLaboratory()), watchers=[events.append])
+    run(tmp_path / "run", recording(ToyLaboratory()), subscribers=[events.append])
     for stage in ("first", "second"):
         done = [e for e in events if isinstance(e, RequestFinished) and e.stage == stage]
         simulated = sorted((e.id, e.frames is not None) for e in done if isinstance(e.request, Simulate))
         assert [number for number, (_, framed) in enumerate(simulated, start=1) if framed] == [1, 2]
     plan = toy_plan(tmp_path)
-    silent = replace(plan, outputs=plan.outputs.model_copy(update={"record_rate": 0.0}))
+    silent = replace(plan, outputs=plan.outputs.model_copy(update={"frame_rate": 0.0}))
     laboratory = ToyLaboratory()
     run(tmp_path / "silent", laboratory, plan=silent)
-    assert all(task.record_rate == 0.0 for task in laboratory.simulators.tasks)
+    assert all(task.frame_rate == 0.0 for task in laboratory.simulators.tasks)
     assert logical_record(tmp_path / "silent") == logical_record(tmp_path / "run")
 
 

@@ -201,7 +201,7 @@ study = load_study(written(folder, data))
 status = run_toy_study(study)
 page = write_report(study, study.folder)
 try:
-    data["deployment"]["hypercube"]["per_pour"] = 3
+    data["deployment"]["hypercube"]["simulations_per_pour"] = 3
     load_study(written(folder, data))
 except ConfigError as error:
     said = str(error)
@@ -228,4 +228,4 @@ def test_a_study_compares_it_with_ours(tmp_path: Path) -> None:
     assert told["failed"] == {}
     assert "final.small.hypercube.deployment-narrow.02.01" in told["finished"]
     assert "hypercube − D2" in told["page"]
-    assert "per_pour: belongs to D3, not to hypercube" in told["error"]
+    assert "simulations_per_pour: belongs to D3, not to hypercube" in told["error"]

@@ -10,14 +10,14 @@ from typing import Any
 
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
-from orchestrator.runs.events import Watcher
+from orchestrator.runs.events import Subscriber
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.reliability import clock, strikes
 from tests.reliability.case import AHEAD, BACK, CUT, FULL, KILLED, STOPPED, Case, every, first_of_kind
 from tests.reliability.program import ProgramRig
 from tests.reliability.rig import Life
 
-WRITER = "orchestrator.live_view.recording_writer"
+WRITER = "orchestrator.live_view.rerun_subscriber"
 
 
 class RecordingRig(ProgramRig):
@@ -40,7 +40,7 @@ class RecordingRig(ProgramRig):
         return [case for fault in faults for case in every(self.target, fault, few)]
 
     @contextlib.contextmanager
-    def watchers(self, life: Life, plan: CampaignPlan) -> Iterator[list[Watcher]]:
+    def subscribers(self, life: Life, plan: CampaignPlan) -> Iterator[list[Subscriber]]:
         folder = life.place / "disk" if life.case is not None and life.case.fault == FULL else life.directory
         with clock.adjustable(life.place / "clock"):
             monitor = RerunMonitor(folder / "campaign.rrd", plan, url=self._live_view.stream)

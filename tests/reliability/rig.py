@@ -26,7 +26,7 @@ import psutil
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.journal.journal import Journal, Kind
-from orchestrator.runs.events import Event, PourProgressed, Watcher
+from orchestrator.runs.events import Event, PourProgressed, Subscriber
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
@@ -132,7 +132,7 @@ class Rig:
         yield
 
     @contextlib.contextmanager
-    def watchers(self, life: Life, plan: CampaignPlan) -> Iterator[list[Watcher]]:
+    def subscribers(self, life: Life, plan: CampaignPlan) -> Iterator[list[Subscriber]]:
         """Who watches."""
         yield []
 
@@ -238,13 +238,13 @@ class Rig:
 
         moments = Moments(life, self._strike(life), self.pids)
         async with self.laboratory(life) as laboratory:
-            with self.watchers(life, plan) as watchers, moments.noted():
-                everybody = [*watchers, self._tilting(moments)]
+            with self.subscribers(life, plan) as subscribers, moments.noted():
+                everybody = [*subscribers, self._tilting(moments)]
                 await run_campaign(
-                    plan, laboratory, life.directory, resume=resume, ask_operator=answer, watchers=everybody
+                    plan, laboratory, life.directory, resume=resume, ask_operator=answer, subscribers=everybody
                 )
 
-    def _tilting(self, moments: Moments) -> Watcher:
+    def _tilting(self, moments: Moments) -> Subscriber:
         """The middle of a pour is a moment like a write."""
 
         def watch(event: Event) -> None:

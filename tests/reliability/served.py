@@ -21,7 +21,7 @@ from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.daemon.daemon_settings import load_settings
 from orchestrator.daemon.server_process import serve
-from orchestrator.daemon.submission_bundle import pack
+from orchestrator.daemon.submissions import pack
 from tests.reliability import strikes
 from tests.reliability.case import (
     AHEAD,
@@ -40,7 +40,7 @@ from tests.reliability.formula import LOG, Formula
 from tests.reliability.rig import PATIENCE, Life, Moments, Rig
 from tests.support.small_campaign import CAMPAIGN, write_campaign
 
-TEXT = CAMPAIGN.replace("recorded_simulations: 1", "figures: false, rrd: false").replace(
+TEXT = CAMPAIGN.replace("recorded_simulations: 1", "figures: false, recording: false").replace(
     "on_unknown: repeat", "on_unknown: ask"
 )
 

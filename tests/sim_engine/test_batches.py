@@ -41,7 +41,7 @@ def simulator() -> PourSimulator:
 def test_a_batch_pours_what_each_pour_does_alone_bit_for_bit(simulator: PourSimulator) -> None:
     tasks = [
         task(1),
-        task(2, speed=60.0, viscosity=8.0),
+        task(2, speed=60.0, xsph_rate=8.0),
         task(3, particles=450, cohesion=0.06),
         task(4, scene=OTHER, friction=0.2),
         task(1),
@@ -124,7 +124,7 @@ def test_a_process_keeps_to_one_backend(simulator: PourSimulator) -> None:
 
 
 def test_recorded_frames_show_the_liquid_from_the_start_of_a_slow_pour(simulator: PourSimulator) -> None:
-    slow = dataclasses.replace(task(1, speed=20.0), record_rate=5.0)
+    slow = dataclasses.replace(task(1, speed=20.0), frame_rate=5.0)
     run = simulator.simulate(slow)
     frames = run.frames
     assert frames is not None

@@ -103,8 +103,8 @@ def test_a_hold_until_the_flow_ends_is_longer_for_a_fast_turn_and_never_beyond_t
 
     fast = motion(hold_time=None, angular_velocity=120 * DEG)
     slow = motion(hold_time=None, angular_velocity=15 * DEG)
-    assert 0.0 <= hold(slow) < hold(fast) <= SCENE.hold_cap
-    short = Scene("short", CUP, GLASS, Liquid(mass=0.2), hold_cap=0.2)
+    assert 0.0 <= hold(slow) < hold(fast) <= SCENE.max_hold_time
+    short = Scene("short", CUP, GLASS, Liquid(mass=0.2), max_hold_time=0.2)
     assert hold(motion(short, hold_time=None, angular_velocity=120 * DEG)) == pytest.approx(0.2)
 
 

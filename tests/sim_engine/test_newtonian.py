@@ -16,7 +16,7 @@ from sim_engine.validation import viscous_flows as films
 from sim_engine.validation import viscous_flows as thick
 from sim_engine.vessel.shapes import cylinder
 
-PLAIN = SimulationParameters(cohesion=0.0, viscosity=0.0)
+PLAIN = SimulationParameters(cohesion=0.0, xsph_rate=0.0)
 SCENE = Scene(
     "scene",
     cylinder("cup", inner_radius=0.04, inner_height=0.1),

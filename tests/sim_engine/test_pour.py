@@ -30,7 +30,7 @@ def task(
     receiver: VesselSpec = GLASS,
     liquid: Liquid = WATER,
     seed: int = 1,
-    record_rate: float = 0.0,
+    frame_rate: float = 0.0,
     pose_error: PoseError | None = None,
     parameters: dict[str, float] | None = None,
     **action: float | None,
@@ -43,9 +43,9 @@ def task(
         "hold_time": 0.5,
         **action,
     }
-    theta = SimulationParameters.from_values({"particles": particles, "viscosity": 1.0, **(parameters or {})})
+    theta = SimulationParameters.from_values({"particles": particles, "xsph_rate": 1.0, **(parameters or {})})
     scene = Scene("test", pourer, receiver, liquid)
-    return PourTask(scene, Action.compose({}, values), theta, seed, record_rate, pose_error)
+    return PourTask(scene, Action.compose({}, values), theta, seed, frame_rate, pose_error)
 
 
 def run(simulator: PourSimulator, **kwargs: object) -> SimulatedPour:
@@ -54,7 +54,7 @@ def run(simulator: PourSimulator, **kwargs: object) -> SimulatedPour:
 
 @pytest.fixture(scope="module")
 def plain(simulator: PourSimulator) -> SimulatedPour:
-    return run(simulator, record_rate=20.0)
+    return run(simulator, frame_rate=20.0)
 
 
 def test_every_particle_is_accounted_for(plain: SimulatedPour) -> None:
@@ -109,7 +109,7 @@ def test_frames_follow_each_particle_and_the_cup(plain: SimulatedPour) -> None:
 
 
 def test_liquid_in_flight_falls_with_g(simulator: PourSimulator) -> None:
-    frames = run(simulator, record_rate=50.0, height=0.3, parameters={"viscosity": 0.0, "cohesion": 0.0}).frames
+    frames = run(simulator, frame_rate=50.0, height=0.3, parameters={"xsph_rate": 0.0, "cohesion": 0.0}).frames
     assert frames is not None
     accelerations = []
     for k in range(len(frames.times) - 2):
@@ -127,7 +127,7 @@ def test_liquid_in_flight_falls_with_g(simulator: PourSimulator) -> None:
 
 def test_a_cup_at_rest_holds_its_true_volume(simulator: PourSimulator) -> None:
     """200 mL in R = 40 mm stand 39.8 mm high: with the centres of mass at half of it."""
-    frames = run(simulator, particles=2000, max_angle=5 * DEG, hold_time=0.6, record_rate=20.0).frames
+    frames = run(simulator, particles=2000, max_angle=5 * DEG, hold_time=0.6, frame_rate=20.0).frames
     assert frames is not None
     still = frames.positions[-1].astype(float)  # upright again
     floor = frames.pourer_poses[-1, 2] + build_vessel(CUP).inner_floor
@@ -162,7 +162,7 @@ def test_a_receiver_out_of_reach_gets_nothing(simulator: PourSimulator) -> None:
 
 
 def test_drips_of_the_return_belong_to_the_pour(simulator: PourSimulator) -> None:
-    kept = run(simulator, max_angle=75 * DEG, hold_time=0.3, record_rate=20.0)
+    kept = run(simulator, max_angle=75 * DEG, hold_time=0.3, frame_rate=20.0)
     assert kept.frames is not None
     assert kept.frames.pourer_poses[-1, 5] == pytest.approx(0.0, abs=0.02)  # upright again
     assert kept.outcome.retained > 0.1
@@ -189,9 +189,9 @@ def test_thin_walls_hold_fast_liquid(simulator: PourSimulator, wall: float, part
 
 def test_viscosity_and_cohesion_are_felt(simulator: PourSimulator) -> None:
     easy = {"max_angle": 100 * DEG, "x_offset": 0.11}
-    thin = run(simulator, parameters={"viscosity": 0.0, "cohesion": 0.0}, **easy).outcome
-    thick = run(simulator, parameters={"viscosity": 40.0, "cohesion": 0.0}, **easy).outcome
-    sticky = run(simulator, parameters={"viscosity": 0.0, "cohesion": 0.2}, **easy).outcome
+    thin = run(simulator, parameters={"xsph_rate": 0.0, "cohesion": 0.0}, **easy).outcome
+    thick = run(simulator, parameters={"xsph_rate": 40.0, "cohesion": 0.0}, **easy).outcome
+    sticky = run(simulator, parameters={"xsph_rate": 0.0, "cohesion": 0.2}, **easy).outcome
     # What is not felt changes no bit of a pour.
     assert thick.curve_poured[: len(thin.curve_poured)] != thin.curve_poured
     assert sticky.curve_poured[: len(thin.curve_poured)] != thin.curve_poured[: len(sticky.curve_poured)]

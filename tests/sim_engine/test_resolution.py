@@ -22,7 +22,12 @@ INTO_THE_NARROW_CUP = FOUND[4]
 
 def test_without_a_viscosity_of_eddies_coarse_particles_scatter_their_stream(simulator: PourSimulator) -> None:
     without, with_theirs = (
-        spillage(simulator, INTO_THE_NARROW_CUP, SimulationParameters(particles=500, cohesion=0.0, eddies=c), seed=1)[0]
+        spillage(
+            simulator,
+            INTO_THE_NARROW_CUP,
+            SimulationParameters(particles=500, cohesion=0.0, smagorinsky_constant=c),
+            seed=1,
+        )[0]
         for c in (0.0, 0.17)
     )
     assert without > with_theirs + 0.02
@@ -31,7 +36,7 @@ def test_without_a_viscosity_of_eddies_coarse_particles_scatter_their_stream(sim
 def spilled(
     simulator: PourSimulator, pours: tuple[ConvergencePour, ...], particles: int, friction: float
 ) -> NDArray[np.float64]:
-    theta = SimulationParameters(particles=particles, cohesion=0.0, viscosity=1.0, friction=friction)
+    theta = SimulationParameters(particles=particles, cohesion=0.0, xsph_rate=1.0, friction=friction)
     return np.array([spillage(simulator, pour, theta, seed=1)[0] for pour in pours])
 
 

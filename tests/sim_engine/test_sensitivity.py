@@ -103,7 +103,7 @@ class MadeUp:
         theta = task.parameters
         spilled = 0.2 + 0.3 * theta.friction - 0.5 * theta.cohesion
         spilled += 0.002 * np.random.default_rng(task.seed).standard_normal()
-        leak = "it leaked" if theta.lip_drop == 1.0 else None
+        leak = "it leaked" if theta.rim_correction == 1.0 else None
         o = PourOutcome(
             1 - spilled, spilled, 0.0, 0.0, 0.0, theta.particles, 0.005, 0.0, 3.0, 1, 0.0, task.seed, invalid=leak
         )
@@ -127,8 +127,8 @@ def test_every_parameter_is_turned_alone_and_the_defaults_are_simulated_once() -
     assert known["friction", "slow"].change == pytest.approx(0.3, abs=0.01)
     assert known["cohesion", "fast"].effect == "spillage falls"
     assert known["cohesion", "fast"].where == "0 … 0.2 N/m"
-    assert known["viscosity", "fast"].effect.startswith("no effect")
-    assert known["lip_drop", "fast"].where == "0 … 0.75"  # what leaked does not count
+    assert known["xsph_rate", "fast"].effect.startswith("no effect")
+    assert known["rim_correction", "fast"].where == "0 … 0.75"  # what leaked does not count
     assert len(figure.titles) == len(INFOS)
     assert all(len(s.spread) == len(s.x) for s in figure.series if s.kind == "measured")
 

@@ -22,7 +22,7 @@ from sim_engine.validation import wall_tightness as walls
 from sim_engine.validation import whole_pours as pours
 from sim_engine.validation.case_result import Measurement, at_least, at_most, reported, within
 
-STICKY = SimulationParameters(cohesion=0.0, viscosity=1.0, friction=1.0)
+STICKY = SimulationParameters(cohesion=0.0, xsph_rate=1.0, friction=1.0)
 
 
 def failures(measurements: list[Measurement]) -> list[str]:
@@ -99,7 +99,7 @@ def test_few_particles_are_held_back_by_a_lip_no_more_than_liquid_is(
 
 
 def test_liquid_at_rest_needs_the_rim_lowered_and_a_stream_does_not(simulator: PourSimulator) -> None:
-    as_it_is = suite.PLAIN.model_copy(update={"lip_drop": 0.0})
+    as_it_is = suite.PLAIN.model_copy(update={"rim_correction": 0.0})
     measurements, _ = tilting.slow_tilt(tilting.straight_cup(), suite.LOAD, 500, as_it_is, tilting.ANGLES[:1])
     assert failures(measurements) != []
     few = [theta.model_copy(update={"particles": 500}) for theta in (as_it_is, suite.PLAIN)]
@@ -111,7 +111,7 @@ def test_a_liquid_that_turns_as_a_whole_is_not_held_back_and_one_that_is_sheared
     """Without gravity and walls: a cube that spins keeps its spin, layers that pass each other are slowed."""
     axis = (np.arange(10) - 4.5) * 5e-3
     x = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    calm = SimulationParameters(cohesion=0.0, viscosity=0.0)
+    calm = SimulationParameters(cohesion=0.0, xsph_rate=0.0)
     turning, shearing = np.zeros_like(x), np.zeros_like(x)
     turning[:, 0], turning[:, 1] = -20.0 * x[:, 1], 20.0 * x[:, 0]
     shearing[:, 0] = 0.05 * (-1.0) ** np.round(x[:, 2] / 5e-3 - 0.5)
@@ -139,7 +139,7 @@ def test_the_jet_lands_in_the_same_place_with_few_particles(simulator: PourSimul
 
 
 def test_outflow_is_told_from_that_of_a_thick_liquid(simulator: PourSimulator) -> None:
-    thick = SimulationParameters(cohesion=0.0, viscosity=40.0, friction=0.3)
+    thick = SimulationParameters(cohesion=0.0, xsph_rate=40.0, friction=0.3)
     measurements, _ = pours.outflow(simulator, 500, thick, seeds=1)
     assert len(failures(measurements)) >= 2
 
@@ -188,7 +188,7 @@ def test_sloshing_is_near_theory_and_rough_walls_bring_it_to_rest_sooner(simulat
     """The full case asks for 5 %; what a thousand particles reach is 15 %."""
     smooth, _ = sloshing.sloshing(1_000, suite.PLAIN)
     assert smooth[0].value == pytest.approx(sloshing.FREQUENCY, rel=0.15)
-    rough, _ = sloshing.sloshing(1_000, SimulationParameters(cohesion=0.0, viscosity=1.0, friction=0.3))
+    rough, _ = sloshing.sloshing(1_000, SimulationParameters(cohesion=0.0, xsph_rate=1.0, friction=0.3))
     assert rough[1].value > smooth[1].value > 0.0
 
 
@@ -221,7 +221,7 @@ def test_the_front_of_a_dam_break_runs_as_fast_as_in_the_experiment(simulator: P
 
 
 def test_cohesion_makes_a_cube_round_and_nothing_else_does(simulator: PourSimulator) -> None:
-    free = SimulationParameters(cohesion=0.0, viscosity=0.0, friction=0.0)
+    free = SimulationParameters(cohesion=0.0, xsph_rate=0.0, friction=0.0)
     measurement = droplet.cube_to_sphere(1000, free)[0]
     assert measurement.passed
     axis = np.arange(10) - 4.5
@@ -231,7 +231,7 @@ def test_cohesion_makes_a_cube_round_and_nothing_else_does(simulator: PourSimula
 
 
 def test_a_drop_oscillates_at_the_frequency_of_its_tension(simulator: PourSimulator) -> None:
-    free = SimulationParameters(cohesion=0.0, viscosity=0.0, friction=0.0)
+    free = SimulationParameters(cohesion=0.0, xsph_rate=0.0, friction=0.0)
     measurements, (curve,), _ = droplet.oscillation(1_000, free)
     assert failures(measurements) == []
     assert min(curve.y) < -0.4 * curve.y[0], "it creeps"

@@ -79,10 +79,10 @@ def campaign(*, pours: int = 3) -> CampaignPlan:
         pour_count=8,
         holdout=2,
         simulations=8,
-        initial=4,
+        initial_samples=4,
     )
     deployment = plans.deployment(
-        scenes=(NARROW,), actions=ACTIONS, loss=Loss(), pours=pours, prior_simulations=6, per_pour=0
+        scenes=(NARROW,), actions=ACTIONS, loss=Loss(), pours=pours, prior_simulations=6, simulations_per_pour=0
     )
     return CampaignPlan(
         "narrow-cup",
@@ -124,7 +124,7 @@ def frames(*, duration: float = 3.0, rate: float = 10.0) -> RecordedFrames:
 
 def simulation() -> tuple[PourTask, SimulatedPour]:
     """One simulated pour with frames."""
-    task = PourTask(NARROW, ACTION, SimulationParameters(particles=PARTICLES), seed=1, record_rate=10.0)
+    task = PourTask(NARROW, ACTION, SimulationParameters(particles=PARTICLES), seed=1, frame_rate=10.0)
     return task, SimulatedPour(outcome(), frames())
 
 

@@ -70,7 +70,7 @@ class FakeSimulator:
             curve_spilled=(0.0, 0.5 * spilled, spilled),
         )
         frames = None
-        if task.record_rate > 0.0:
+        if task.frame_rate > 0.0:
             frames = RecordedFrames(
                 times=np.arange(3.0),
                 positions=[u.random((task.parameters.particles, 3)).astype(np.float32) for _ in range(3)],

@@ -6,6 +6,8 @@ import socket
 from pathlib import Path
 
 from actors.emulators.ur_controller.controller_process import VirtualController
+from orchestrator.config.file_loading import load_laboratory
+from orchestrator.daemon.daemon_settings import Rig
 from tests.support.waiting import wait_for
 
 HOME = (-14.0, -91.0, -115.0, -154.0, -104.0, 0.0)
@@ -65,7 +67,7 @@ deployment:
   receiver: narrow.yaml
   actions: {angular_velocity: [20 deg/s, 60 deg/s], x_offset: [70 mm, 100 mm]}
   pours: 3
-outputs: {directory: runs, rrd: false}
+outputs: {directory: runs, recording: false}
 """
 
 
@@ -78,3 +80,10 @@ def write_rig(folder: Path, address: str) -> Path:
     path = folder / "rigged.yaml"
     path.write_text(CAMPAIGN, encoding="utf-8")
     return path
+
+
+def hardware_rig(folder: Path, address: str, model: str = "ur10") -> Rig:
+    """A rig whose arm is reached by address, as hardware is."""
+    path = write_laboratory(folder / "rig.yaml", address)
+    path.write_text(path.read_text().replace("model: ur10", f"model: {model}"))
+    return Rig("rig", path, load_laboratory(path))

@@ -21,7 +21,7 @@ from sim_engine.outcome import Loss
 from sim_engine.scene import PoseError
 from sim_engine.search_space import Space
 
-CALM: dict[str, dict[str, Any]] = {"D3": {"model": "residual", "per_pour": 0}}
+CALM: dict[str, dict[str, Any]] = {"D3": {"model": "residual", "simulations_per_pour": 0}}
 """What tests have otherwise than campaigns, unless they say it."""
 
 

@@ -41,7 +41,7 @@ calibration:
   actions: {angular_velocity: [60 deg/s, 180 deg/s], max_angle: [80 deg, 115 deg]}
   pours: {count: 3, holdout: 1}
   simulations: 6
-  initial: 3
+  initial_samples: 3
 deployment:
   strategy: D3
   receiver: narrow.yaml
@@ -49,7 +49,7 @@ deployment:
   actions: {angular_velocity: [60 deg/s, 180 deg/s], x_offset: [60 mm, 100 mm]}
   prior_simulations: 4
   pours: 2
-  per_pour: 2
+  simulations_per_pour: 2
 on_unknown: repeat
 outputs: {directory: runs, recorded_simulations: 1}
 """

@@ -19,9 +19,9 @@ import numpy as np
 from actors.interfaces import PourProgress, ProgressCallback
 from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Data, MinimumQuery, Suggestion, SuggestionQuery
+from orchestrator.journal.codec import Results, result_of
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.journal.run_record import CampaignResult
-from orchestrator.journal.stage_results import Results, result_of
 from orchestrator.requests import (
     Decision,
     Failed,
@@ -60,7 +60,7 @@ THETA = SimulationParameters(particles=500)
 
 
 def toy_plan(directory: Path, **changes: Any) -> CampaignPlan:
-    deployment = plans.deployment(scenes=(SCENE,), actions=SPACE, loss=Loss(), pours=3, per_pour=2)
+    deployment = plans.deployment(scenes=(SCENE,), actions=SPACE, loss=Loss(), pours=3, simulations_per_pour=2)
     values: dict[str, Any] = {
         "name": "toy",
         "seed": 7,
@@ -69,7 +69,7 @@ def toy_plan(directory: Path, **changes: Any) -> CampaignPlan:
         "parameters": THETA,
         "calibration": None,
         "deployment": deployment,
-        "outputs": OutputSettings(directory=str(directory), record_rate=10.0, recorded_simulations=2),
+        "outputs": OutputSettings(directory=str(directory), frame_rate=10.0, recorded_simulations=2),
         "parallel_simulations": 2,
     }
     return CampaignPlan(**(values | changes))
@@ -170,7 +170,7 @@ class ToyOptimizer:
         rng = np.random.default_rng(query.seed)
         data = getattr(query, "data", Data())
         centre = np.array(data.points[int(np.argmin(data.costs))]) if len(data) else np.full(2, 0.5)
-        points = 0.5 * centre + 0.5 * rng.random((query.count, 2))
+        points = 0.5 * centre + 0.5 * rng.random((getattr(query, "count", 1), 2))
         return Suggestion(tuple(tuple(float(u) for u in p) for p in points), seconds=random.random())
 
 

@@ -18,7 +18,7 @@ from orchestrator.daemon.access_control import Role, Tokens, token_of
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.daemon.daemon_store import AT_REST
 from orchestrator.daemon.http_api import serve_app
-from orchestrator.daemon.submission_bundle import pack
+from orchestrator.daemon.submissions import pack
 from orchestrator.daemon.supervisor import Supervisor
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
@@ -44,7 +44,7 @@ deployment:
   actions: {angular_velocity: [60 deg/s, 180 deg/s], x_offset: [60 mm, 100 mm]}
   pours: 3
 on_unknown: repeat
-outputs: {rrd: false, figures: false}
+outputs: {recording: false, figures: false}
 """
 
 

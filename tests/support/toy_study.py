@@ -71,7 +71,7 @@ class ToyLaboratory:
     def __init__(self, spec: LaboratorySettings, need_bench: bool) -> None:
         assert spec.bench is not None
         self.simulators, self.optimizer = _Simulators(), _Optimizer()
-        self.bench = _Bench(spec.bench.liquid) if need_bench else None
+        self.bench = _Bench(spec.bench.theta) if need_bench else None
 
     async def __aenter__(self) -> ToyLaboratory:
         return self

@@ -1,18 +1,27 @@
 """Commissioning checks of a UR controller for `decant doctor`: one line for each fact, with its remedy.
 
 - The checks named `…_check` compare the laboratory's file with the controller: tool, mount, payload, home, limits.
-- `judge` makes all lines from the values that `actors.arm.ur.controller_readout` has read.
+- `judge` makes all lines from the values that `actors.arm.ur.controller_readout` has read; `readiness` makes one.
 - `UrDiagnostics` is the `ArmDiagnostics` of UR arms.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from actors.arm.arm_geometry import JOINT_NAMES, Pose
 from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord, UrArmSettings
-from actors.arm.ur.controller_readout import PORTS, SCRIPTS, SLIDER, Exchange, Findings, ReadoutError, look_at
+from actors.arm.ur.controller_readout import (
+    PORTS,
+    SCRIPTS,
+    SLIDER,
+    Exchange,
+    Findings,
+    ReadoutError,
+    look_at,
+    read_status,
+)
 from actors.arm.ur.primary_interface import RobotState
 from actors.arm.ur.worker_messages import why_not_ready
 from actors.interfaces import DeviceCheck, State
@@ -211,17 +220,7 @@ def judge(
         accept: the command that accepts them.
         virtual: whether the arm is virtual and needs no acceptance.
     """
-    if not found.address:
-        return [
-            DeviceCheck(
-                "address",
-                "fail",
-                f"'{spec.address}' stands for no machine: {found.problems[0]}",
-                "write the controller's IP address into the file (teach pendant: Settings, System, Network)",
-            )
-        ]
-    checks = [DeviceCheck("address", "ok", found.address), *_ports(found)]
-    checks += [DeviceCheck("answers", "fail", text, ANSWERS) for text in found.problems]
+    checks = _connection(spec, found)
     if found.software:
         checks.append(_software(found))
     if found.dashboard is not None:
@@ -240,6 +239,41 @@ def judge(
     return checks
 
 
+def readiness(spec: UrArmSettings) -> DeviceCheck:
+    """Read whether a motion could begin now, with the remedy if it could not.
+
+    The text is that of `why_not_ready`, as in a run. The reading changes nothing and does not upload a program.
+    """
+    found = read_status(spec.address)
+    unreached = [check for check in _connection(spec, found) if check.state == "fail"]
+    if unreached or found.exchange is None:
+        return replace(unreached[0], name="motion") if unreached else DeviceCheck("motion", "warn", "not told")
+    (motion,) = _motion(found.exchange)
+    states = {check.name: check for check in _dashboard(spec, found, found.dashboard or {})}
+    if motion.state == "fail":
+        remedies = (states[name].advice for name in ("safety", "arm", "program"))
+        return replace(motion, advice=next(filter(None, remedies), "set the slider on the teach pendant"))
+    remote, model = states["remote control"], states["model"]
+    if remote.state == "fail":
+        return replace(remote, name="motion", found=f"remote control is {remote.found}")
+    return replace(model, name="motion") if model.state == "fail" else motion
+
+
+def _connection(spec: UrArmSettings, found: Findings) -> list[DeviceCheck]:
+    """Whether the controller could be reached and read."""
+    if not found.address:
+        return [
+            DeviceCheck(
+                "address",
+                "fail",
+                f"'{spec.address}' stands for no machine: {found.problems[0]}",
+                "write the controller's IP address into the file (teach pendant: Settings, System, Network)",
+            )
+        ]
+    checks = [DeviceCheck("address", "ok", found.address), *_ports(found)]
+    return checks + [DeviceCheck("answers", "fail", text, ANSWERS) for text in found.problems]
+
+
 def _ports(found: Findings) -> list[DeviceCheck]:
     reasons = set(found.ports.values())
     if None not in reasons:
@@ -254,8 +288,8 @@ def _ports(found: Findings) -> list[DeviceCheck]:
             DeviceCheck("network", "fail", f"{everything} at {found.address} ({', '.join(map(str, reasons))})", advice)
         ]
     checks = []
-    for port, name in PORTS.items():
-        reason = found.ports[port]
+    for port, reason in found.ports.items():
+        name = PORTS[port]
         advice = (
             f"on PolyScope 5.10 or later enable the service '{name}' under Settings, Security, Services; else look for "
             "a firewall between"

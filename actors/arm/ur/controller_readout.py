@@ -151,7 +151,7 @@ def read_exchange(address: str, rate: float = 125.0, seconds: float = 1.0, patie
     Args:
         address: of the controller.
         rate: requested rate of packages [Hz].
-        seconds: time for which they are counted.
+        seconds: time for which they are counted; 0 for one package, without timing.
         patience: longest wait for a response [s].
 
     Raises:
@@ -193,7 +193,7 @@ def _exchange(connection: _Rtde, rate: float, seconds: float) -> Exchange:
         raise OSError("it doesn't know protocol 2")
     trips = []
     version: tuple[int, ...] = ()
-    for _ in range(ROUND_TRIPS):
+    for _ in range(ROUND_TRIPS if seconds else 1):
         asked = time.monotonic()
         version = struct.unpack(">4I", connection.ask(rtde.GET_URCONTROL_VERSION)[:16])
         trips.append(time.monotonic() - asked)
@@ -202,14 +202,16 @@ def _exchange(connection: _Rtde, rate: float, seconds: float) -> Exchange:
     if connection.ask(rtde.START) != b"\x01":
         raise OSError("it doesn't begin to send")
     layout = struct.Struct(">B" + "".join(rtde.FORMATS[kind][0] for kind in known.values()))
-    arrivals, package, begin = [], b"", time.monotonic()
-    while time.monotonic() - begin < seconds:
+    arrivals: list[float] = []
+    package, begin = b"", time.monotonic()
+    while not arrivals or time.monotonic() - begin < seconds:
         kind, payload = connection.next()
         if kind == rtde.DATA_PACKAGE:
             arrivals.append(time.monotonic())
             package = payload
-    if len(arrivals) < 2:
+    if seconds and len(arrivals) < 2:
         raise OSError("it sends no packages")
+    duration = arrivals[-1] - arrivals[0]
     values, place = {}, 1
     numbers = layout.unpack(package)
     for name, kind_name in known.items():
@@ -223,8 +225,8 @@ def _exchange(connection: _Rtde, rate: float, seconds: float) -> Exchange:
         payload_centre=values.get("payload_cog"),
         round_trip=statistics.median(trips),
         slowest=max(trips),
-        rate=(len(arrivals) - 1) / (arrivals[-1] - arrivals[0]),
-        gap=max(b - a for a, b in itertools.pairwise(arrivals)),
+        rate=(len(arrivals) - 1) / duration if duration else 0.0,
+        gap=max((b - a for a, b in itertools.pairwise(arrivals)), default=0.0),
         wanted=rate,
         values=values,
     )
@@ -286,6 +288,36 @@ class Findings:
         return name if name.endswith("e") or self.software[0] < 5 else f"{name}e"
 
 
+def read_status(host: str) -> Findings:
+    """Read only the values that decide whether the arm can move: the dashboard's answers and one RTDE package.
+
+    It takes a fraction of a second, so it suits a repeated display. The primary port is left alone.
+
+    Args:
+        host: address or name of the controller.
+    """
+    try:
+        address = _resolved(host)
+    except OSError as error:
+        return Findings("", problems=(str(error),))
+    ports = {port: port_problem(address, port) for port in (dashboard_port.PORT, RTDE)}
+    dashboard = exchange = None
+    problems: list[str] = []
+    if ports[dashboard_port.PORT] is None:
+        with _noting(problems):
+            dashboard = ask_dashboard(address)
+    if ports[RTDE] is None:
+        with _noting(problems):
+            exchange = read_exchange(address, rate=10.0, seconds=0.0)
+    return Findings(address, ports, dashboard, None, exchange, tuple(problems))
+
+
+def _resolved(host: str) -> str:
+    address = socket.getaddrinfo(host, None, socket.AF_INET)[0][4][0]
+    assert isinstance(address, str)
+    return address
+
+
 def look_at(host: str) -> Findings:
     """Read everything from the controller.
 
@@ -293,10 +325,9 @@ def look_at(host: str) -> Findings:
         host: its address or name.
     """
     try:
-        address = socket.getaddrinfo(host, None, socket.AF_INET)[0][4][0]
+        address = _resolved(host)
     except OSError as error:
         return Findings("", problems=(str(error),))
-    assert isinstance(address, str)
     ports = {port: port_problem(address, port) for port in PORTS}
     dashboard = state = exchange = None
     problems: list[str] = []

@@ -36,8 +36,8 @@ def client_missing() -> str | None:
     if importlib.util.find_spec("rtde_receive") is not None:
         return None
     return (
-        "the arm needs the package ur-rtde, which is not installed: pip install 'decant[lab]' (it has no wheel for "
-        "Python 3.13 yet)"
+        "the arm needs the package ur-rtde, which is not installed: pip install 'decant-pouring[lab]' "
+        "(it has no wheel for Python 3.13 yet)"
     )
 
 

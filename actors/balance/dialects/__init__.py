@@ -1,3 +1,3 @@
 """Dialects of serial balances: bytes to readings and back, one dialect per file, without ports.
-`actors.balance.dialects.dialect` lists them.
+`actors.balance.dialect_registry` lists them.
 """

@@ -1,8 +1,4 @@
-"""The interface of a dialect, `Dialect` with its `LineSettings`, and the plug-in registry of balances.
-
-A dialect handles bytes and values only; this module opens no port. `BALANCES` registers dialects of serial lines and
-settings of drivers, built-in and installed.
-"""
+"""The interface of a dialect: `Dialect` and its `LineSettings`. Only bytes and values; this module opens no port."""
 
 from __future__ import annotations
 
@@ -11,11 +7,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Any
 
 from actors.balance.dialects.protocol_encoder import PlainEncoder, ProtocolEncoder
 from actors.balance.readings import Reading, Reply
-from sim_engine.settings.plugin_registry import PluginRegistry
 
 NUMBER = re.compile(r"[+-]?[0-9]{1,10}(?:\.[0-9]{1,9})?")
 """A weight in digits: no exponent, no comma, and a digit on both sides of the point."""
@@ -128,35 +122,3 @@ def text_of(line: bytes) -> str | None:
 def number_in(text: str) -> Decimal | None:
     """Return the number that makes up the whole text; None for any other text."""
     return Decimal(text) if NUMBER.fullmatch(text) else None
-
-
-def _balance(loaded: Any, name: str) -> Dialect | type[Any]:
-    found: Dialect | type[Any]
-    if isinstance(loaded, Dialect):
-        found, called = loaded, loaded.name
-    elif isinstance(loaded, type) and callable(getattr(loaded, "driver", None)) and hasattr(loaded, "model_fields"):
-        found, called = loaded, loaded.model_fields["kind"].default
-    else:
-        raise TypeError("should be an instance of a Dialect, or a class of settings with a method 'driver'")
-    if called != name:
-        raise ValueError(f"it calls itself '{called}', which should be the name that it is registered under")
-    return found
-
-
-BALANCES: PluginRegistry[Dialect | type[Any]] = PluginRegistry("decant.balances", "balance", _balance)
-"""All installed balances: instances of dialects, and subclasses of `BalanceSettings`."""
-
-
-def dialects() -> dict[str, Dialect]:
-    """Dialects by the names that files use."""
-    return {name: found for name, found in BALANCES.all.items() if isinstance(found, Dialect)}
-
-
-def kinds() -> dict[str, type[Any]]:
-    """Settings of drivers by the names that files use."""
-    return {name: found for name, found in BALANCES.all.items() if isinstance(found, type)}
-
-
-def encoders() -> dict[str, Callable[[], ProtocolEncoder]]:
-    """Protocol encoders for emulated balances, by name: one per dialect, and one per further mode of such balances."""
-    return {name: encoder for dialect in dialects().values() for name, encoder in dialect.encoders().items()}

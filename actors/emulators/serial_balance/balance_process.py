@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.balance.balance_settings import AUTO, BalanceSettings, SerialBalanceSettings
-from actors.balance.dialects.dialect import encoders
+from actors.balance.dialect_registry import encoders
 from actors.balance.scale_model import Load, ScaleSettings
 from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ChildProcess, python_module
@@ -125,7 +125,7 @@ class VirtualSerialBalance(FarProcess):
         """Start an emulated balance without a load.
 
         Args:
-            dialect: one of `actors.balance.dialects.dialect.encoders`.
+            dialect: one of `actors.balance.dialect_registry.encoders`.
             baud: speed of the line; 0: any speed, and characters take no time.
             scale: data sheet of the scale.
             time_scale: bench seconds per second of the clock; 0: bench time passes by `advance` only.

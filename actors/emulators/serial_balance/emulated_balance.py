@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from actors.balance.dialects.dialect import encoders
+from actors.balance.dialect_registry import encoders
 from actors.balance.dialects.protocol_encoder import Cancel, Follow, PendingReply, Repeat, weight_line
 from actors.balance.readings import Reading, ReadingStatus
 from actors.balance.scale_model import EmulatedScale, Load, ScaleSettings
@@ -136,7 +136,7 @@ class Emulation:
     """A balance with a dialect.
 
     Args:
-        dialect: one of `actors.balance.dialects.dialect.encoders`.
+        dialect: one of `actors.balance.dialect_registry.encoders`.
         settings: of its scale.
         time_scale: bench seconds per second of the clock; 0: bench time passes by command only.
         latency: time between query and reply [s of the clock].

@@ -62,7 +62,7 @@ class VirtualController:
             state: initial power mode, 'running', 'idle' or 'off'.
             local: start in local control.
             joints: six initial positions [rad]; a pose in the middle of its workspace by default.
-            prioritised: raise the priority of its clock; see docs/virtual-ur.md, "Control period".
+            prioritised: raise the priority of its clock; see docs/laboratory/virtual-devices.md, "Control period".
             patience: longest wait [s].
 
         Raises:
@@ -89,7 +89,7 @@ class VirtualController:
             ) from error
 
     def fault(self, name: str, *, patience: float = 5.0, **arguments: Any) -> dict[str, Any]:
-        """Inject a fault, or read the controller's internal state; see docs/virtual-ur.md for names.
+        """Inject a fault, or read the controller's internal state; see docs/laboratory/virtual-devices.md for names.
 
         Args:
             name: of the fault.

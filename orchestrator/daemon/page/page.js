@@ -2,7 +2,7 @@
 
 import { Refused, call, knownToken, listen, reach, saveReport, useToken } from "./talk.js";
 import {
-  button, cellLine, clock, draw, el, endedList, formerRuns, modeBadge, poursTable, questionCard, queueList, rigCard, stopCard,
+  button, cellLine, clock, draw, el, endedList, previousRuns, modeBadge, poursTable, questionCard, queueList, rigCard, stopCard,
 } from "./show.js";
 
 const $ = (id) => document.getElementById(id);
@@ -221,16 +221,16 @@ async function stop(rig) {
   if (!done) alarm(`${what} was not confirmed: ${PHYSICAL}.`);
 }
 
-const of = (item, verb) => call(`campaigns/${encodeURIComponent(item.id)}/${verb}`, undefined, { method: "POST" });
+const of = (item, command) => call(`campaigns/${encodeURIComponent(item.id)}/${command}`, undefined, { method: "POST" });
 const acts = {
   answer: async (question, text) => { await call(`questions/${question.id}/answer`, { answer: text }); soon(0); },
-  end: (item, verb) => doing(`${verb} ${item.name}`, () => of(item, verb)),
+  end: (item, command) => doing(`${command} ${item.name}`, () => of(item, command)),
   resume: (item) => doing(`go on with ${item.name}`, () => of(item, "resume")),
   earlier: (item, other) => doing("move", () => call(`campaigns/${encodeURIComponent(item.id)}/move`, { before: other.id })),
   hold: (hold) => doing(hold ? "hold the queue" : "let the queue go on",
     () => call(`queue/${hold ? "pause" : "resume"}`, undefined, { method: "POST" })),
   report: (id) => doing("report", () => saveReport(id)),
-  formerReport: (run) => doing(`report of ${run.run}`, () => saveReport(run.run, "runs")),
+  previousReport: (run) => doing(`report of ${run.run}`, () => saveReport(run.run, "runs")),
   note: async (run) => {
     const text = prompt(`What is to be remembered of ${run.run}?`)?.trim();
     if (!text) return;
@@ -248,13 +248,13 @@ const acts = {
   clear: (rig) => doing(rig ? `clear the stop of ${rig}` : "clear the emergency stop", () => call("emergency-stop/clear", { rig })),
 };
 
-/** Former runs that have all the words. */
+/** Previous runs that have all the words. */
 async function find() {
   const query = new URLSearchParams([["limit", 8], ...$("words").value.split(/\s+/).filter(Boolean).map((word) => ["words", word])]);
   await doing("look for runs", async () => {
     const runs = await call(`runs?${query}`, undefined, { timeout: 60000 });
-    draw(body("former"), runs, (found) => formerRuns(found, acts));
-    body("former").hidden = false;
+    draw(body("previous"), runs, (found) => previousRuns(found, acts));
+    body("previous").hidden = false;
   });
 }
 

@@ -52,7 +52,8 @@ const MOVING = ["approach", "tilt", "hold", "return"];
 
 /** One rig in the header: its state and, if there are several, a stop of its own, and its mode if they differ. */
 export function cellLine(rig, campaign, { stopped, several, mixed, up }, acts) {
-  const state = stopped ? el("strong", { class: "badge stopped" }, "STOPPED") : !campaign ? "idle" :
+  const blocked = rig.arm?.state === "fail" ? "arm can't move" : "idle";
+  const state = stopped ? el("strong", { class: "badge stopped" }, "STOPPED") : !campaign ? blocked :
     MOVING.includes(rig.checkpoint) ? "arm moves" : stateText(campaign.state);
   return el("li", { class: rig.mode },
     el("span", {}, el("b", {}, rig.name), mixed ? [" ", modeBadge(rig.mode)] : "", up ? ": " : " (last known): ", state),
@@ -79,14 +80,23 @@ export function stopCard(stop, asking, waiting, acts) {
   ] : button(`ask ${stop.rig}`, all ? "Clear the stop" : `Clear the stop of ${stop.rig}`, async () => acts.askClear(stop.rig), "plain danger"));
 }
 
+/** Whether an idle arm can move, and what to do if it can't. */
+function armStatus(arm) {
+  if (!arm) return null;
+  if (arm.state === "ok") return el("p", { class: "arm" }, `Arm: ${arm.text}.`);
+  return el("p", { class: "arm problem" }, el("b", {}, arm.state === "fail" ? `The arm can't move: ${arm.text}` : `Arm: ${arm.text}`, `, since ${clock(arm.time)}.`),
+    arm.advice ? ` ${arm.advice[0].toUpperCase()}${arm.advice.slice(1)}.` : "");
+}
+
 export function rigCard(rig, campaign, acts) {
   const idle = !campaign;
   const progress = campaign?.progress;
   return el("article", { class: `card ${rig.mode}`, "aria-label": `rig ${rig.name}` },
     el("h3", {}, rig.name, " ", modeBadge(rig.mode)),
+    armStatus(rig.arm),
     idle ? el("p", { class: "quiet" }, "Nothing runs here.") : [
       el("p", { class: "what" }, el("b", {}, campaign.name), ` ${stateText(campaign.state)}`,
-        campaign.wish !== "run" ? ` (asked to ${campaign.wish})` : ""),
+        campaign.desired_state !== "run" ? ` (asked to ${campaign.desired_state})` : ""),
       progress ? [
         el("p", {}, progress.stage ? `${progress.stage} (stage ${progress.stage_index} of ${progress.stage_count})` : "",
           progress.seconds_left ? `, about ${lasting(progress.seconds_left)} left` : ""),
@@ -189,7 +199,7 @@ export function queueList(items, paused, acts) {
     el("p", {}, paused ? el("b", {}, "The queue is held: nothing begins. ") : "", items.length ? "" : "Nothing waits. ",
       button("hold", paused ? "Let it go on" : "Hold the queue", () => acts.hold(!paused), "plain")),
     items.length ? el("ol", {}, items.map((item, index) => el("li", {}, el("span", {}, el("b", {}, item.name), " ",
-      modeBadge(item.mode), ` for ${item.rig}`, item.needs_arming ? ", waits for `decant arm`" : ""),
+      modeBadge(item.mode), ` for ${item.rig}`, item.needs_enabling ? ", waits for `decant enable`" : ""),
     index ? button(`up ${item.id}`, "Earlier", () => acts.earlier(item, items[index - 1]), "plain") : null,
     button(`drop ${item.id}`, "Take out", () => acts.end(item, "stop"), "plain danger")))) : null,
   ];
@@ -206,7 +216,7 @@ export function endedList(items, acts) {
 }
 
 /** Runs that were found, the newest first: what was poured, how well, what people said of it. */
-export function formerRuns(runs, acts) {
+export function previousRuns(runs, acts) {
   if (!runs.length) return el("p", { class: "quiet" }, "No run has all of this.");
   const best = (run) => Object.entries(run.recommended).map(([into, found]) =>
     `${into} ${found.best_loss === null ? "—" : percent(found.best_loss)}`).join(", ") || "—";
@@ -215,7 +225,7 @@ export function formerRuns(runs, acts) {
       ` of ${run.liquid.join(", ")}, best: ${best(run)}`, run.tags.map((tag) => [" ", el("b", { class: "badge" }, tag)]),
       run.notes.map((note) => el("p", { class: "quiet" }, note))),
     button(`note ${run.run}`, "Note", () => acts.note(run), "plain"),
-    button(`former ${run.run}`, "Save report", () => acts.formerReport(run), "plain"))));
+    button(`previous ${run.run}`, "Save report", () => acts.previousReport(run), "plain"))));
 }
 
 const day = (seconds) => new Date(1000 * seconds).toLocaleDateString([], { year: "numeric", month: "short", day: "numeric" });

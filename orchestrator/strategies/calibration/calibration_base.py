@@ -362,5 +362,5 @@ def check_initial(
 ) -> None:
     """Check that the random parameters fit into the budget, which `key` gives in `unit`."""
     if initial > budget:
-        at = "initial" if "initial" in settings.model_fields_set else key
+        at = "initial_samples" if "initial_samples" in settings.model_fields_set else key
         complaints.add(f"{initial} random parameters don't fit into {budget} {unit}", at)

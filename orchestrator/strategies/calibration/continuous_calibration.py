@@ -58,13 +58,15 @@ class C4Settings(CalibrationSettings):
 
     has_prior: ClassVar[bool] = True
 
+    retired: ClassVar[dict[str, str]] = {"initial": "initial_samples"}
+
     strategy: Literal["C4"] = "C4"
     """Bayesian optimisation of the mean discrepancy over the actions, one simulation per iteration."""
 
     simulations: PositiveSimulationCount | None = None
     """Single simulated pours."""
 
-    initial: PositiveSimulationCount = 8
+    initial_samples: PositiveSimulationCount = 8
     """Random parameters before the surrogate is used."""
 
     kappa: Kappa = 2.0
@@ -90,7 +92,7 @@ class C4Settings(CalibrationSettings):
             text = "key 'simulations' is missing; add for example 'simulations: 108'"
             complaints.add(text, key=True, of="simulations")
             return None
-        check_initial(self, self.initial, self.simulations, "simulations", "simulations", complaints)
+        check_initial(self, self.initial_samples, self.simulations, "simulations", "simulations", complaints)
         return None if complaints.any else self
 
     def simulations_on(self, train: int) -> int:
@@ -219,7 +221,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
                 self._questions.put(query, "conclude", self._settle_at_minimum)
             return
         if len(self._trials) == 0:
-            count = min(max(self._settings.initial, 1), remaining)
+            count = min(max(self._settings.initial_samples, 1), remaining)
             self._questions.put(SpaceFillingQuery(self._plan.parameters, count=count), "start", self._queue)
         elif self._trials.ready:
             self._questions.put(self._query(map_resolution=self._live_resolution()), "calibrate", self._queue)

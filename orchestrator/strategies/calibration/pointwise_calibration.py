@@ -154,7 +154,9 @@ def _score(trial: Trial) -> float | None:
 class C1Settings(DesignSettings):
     """C1: a uniform grid, each θ on all training pours."""
 
-    examples: ClassVar[dict[str, str]] = {"grid": "{particles: 5, cohesion: 6}", "per_axis": "10"}
+    examples: ClassVar[dict[str, str]] = {"grid": "{particles: 5, cohesion: 6}", "points_per_axis": "10"}
+
+    retired: ClassVar[dict[str, str]] = {"per_axis": "points_per_axis"}
 
     strategy: Literal["C1"] = "C1"
     """A uniform grid."""
@@ -162,7 +164,7 @@ class C1Settings(DesignSettings):
     grid: dict[Text, PositiveSimulationCount] | None = None
     """Number of values of every searched parameter: {particles: 5, cohesion: 6}."""
 
-    per_axis: PositiveSimulationCount | None = None
+    points_per_axis: PositiveSimulationCount | None = None
     """Number of values of each searched parameter, instead of 'grid'."""
 
     @property
@@ -186,18 +188,18 @@ class C1Settings(DesignSettings):
                 if name not in self.grid:
                     complaints.add(f"has no number of values for {name}, which is searched", "grid", key=True)
             grid = {name: self.grid.get(name, 0) for name in searched}
-        elif self.per_axis is not None:
-            grid = dict.fromkeys(searched, self.per_axis)
+        elif self.points_per_axis is not None:
+            grid = dict.fromkeys(searched, self.points_per_axis)
         else:
-            per_axis = 1
-            while train * (per_axis + 1) ** len(searched) <= (self.simulations or 0):
-                per_axis += 1
-            if per_axis < 2:
+            points_per_axis = 1
+            while train * (points_per_axis + 1) ** len(searched) <= (self.simulations or 0):
+                points_per_axis += 1
+            if points_per_axis < 2:
                 least = train * 2 ** len(searched)
                 text = f"allows no grid: 2 values of each searched parameter on {train} training pours take {least}"
                 complaints.add(text, "simulations")
-            grid = dict.fromkeys(searched, per_axis)
-        return None if complaints.any else self.model_copy(update={"grid": grid, "per_axis": None})
+            grid = dict.fromkeys(searched, points_per_axis)
+        return None if complaints.any else self.model_copy(update={"grid": grid, "points_per_axis": None})
 
     def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
         """Build the strategy."""
@@ -265,13 +267,15 @@ class C3Settings(DesignSettings):
 
     examples: ClassVar[dict[str, str]] = {"iterations": "59"}
 
+    retired: ClassVar[dict[str, str]] = {"initial": "initial_samples"}
+
     strategy: Literal["C3"] = "C3"
     """Bayesian optimisation, each θ on all training pours."""
 
     iterations: PositiveSimulationCount | None = None
     """Number of θ, each simulated on all training pours."""
 
-    initial: PositiveSimulationCount = 8
+    initial_samples: PositiveSimulationCount = 8
     """Random parameters before the surrogate is used."""
 
     kappa: Kappa = 2.0
@@ -288,7 +292,7 @@ class C3Settings(DesignSettings):
         if iterations is None:
             return None
         key = "simulations" if self.iterations is None else "iterations"
-        check_initial(self, self.initial, iterations, key, "θ", complaints)
+        check_initial(self, self.initial_samples, iterations, key, "θ", complaints)
         return self.model_copy(update={"iterations": iterations})
 
     def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
@@ -308,7 +312,7 @@ class BayesianCalibration(DiscrepancyOverPours[C3Settings]):
     def _next(self) -> None:
         tried = len(self._trials)
         if tried == 0:
-            count = min(max(self._settings.initial, 1), self._settings.thetas)
+            count = min(max(self._settings.initial_samples, 1), self._settings.thetas)
             self._questions.put(SpaceFillingQuery(self._plan.parameters, count=count), "start", self._queue)
         elif tried < self._settings.thetas:
             if self._trials.ready:

@@ -1,7 +1,7 @@
 """Costs of outcomes: the minimised loss, and the time that pours and simulations take.
 
 - `Costing` converts outcomes to the number that deployment minimises.
-- `Prices` compares pours and simulations by their value per second.
+- `Costs` compares pours and simulations by their value per second.
 
 The module has no clock; durations come from settings and outcomes.
 """
@@ -108,8 +108,8 @@ WITHOUT_OUTCOME = 2.0
 """CPU seconds of a simulation while no outcome has any."""
 
 
-class PricesSettings(Settings):
-    """D3 with `per_pour: free`: costs by which simulations are chosen and ended."""
+class CostSettings(Settings):
+    """D3 with `simulations_per_pour: free`: costs by which simulations are chosen and ended."""
 
     removed: ClassVar[dict[str, str]] = {
         "simulation": "was retired; remove it: outcomes say what a simulation costs before anything depends on it"
@@ -123,14 +123,14 @@ class PricesSettings(Settings):
     idle."""
 
 
-class Prices:
+class Costs:
     """Compares values in the unit of the loss per second of wall time.
 
     The duration of a pour is a setting. The duration of a simulation is estimated from the CPU seconds in outcomes.
     They are part of the journal, so that a replay yields the same estimate.
     """
 
-    def __init__(self, settings: PricesSettings, worst: float) -> None:
+    def __init__(self, settings: CostSettings, worst: float) -> None:
         self._settings, self._worst = settings, worst
         self._seen: deque[float] = deque(maxlen=MEDIAN_OF)
 

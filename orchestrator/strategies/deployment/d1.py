@@ -167,7 +167,7 @@ class OneShotPlanning(Deployment[D1Settings]):
             else:  # the only pour has been weighed
                 self._finish()
         elif len(self._trials) == 0:
-            count = min(max(self._settings.initial, 1), max(wanted - 1, 1))
+            count = min(max(self._settings.initial_samples, 1), max(wanted - 1, 1))
             self._questions.put(self._space_filling(count=count), "start", simulate)
         elif done < wanted - 1:
             if self._trials.ready:
@@ -319,7 +319,7 @@ class RobustPlanning(OneShotPlanning):
     Cups that touch under an error give this draw the worst loss. An action with which the cups touch as planned is
     never recommended.
 
-    Source: Cakmak et al., Bayesian optimization of risk measures, 2020; docs/how-it-works.md compares it with the raw
+    Source: Cakmak et al., Bayesian optimization of risk measures, 2020; docs/explanation/method.md compares it with the raw
     measures of m1 draws.
     Limitations: errors are normal and independent, and drawn once for a whole pour. Inaccuracies that the simulator has
     for every θ are not included.

@@ -25,7 +25,7 @@ from actors.optimizer.questions import (
 )
 from orchestrator.requests import Answered, Ask, Decision, Outcome, Pour, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.campaign_plan import DeploymentPlan, Premises
-from orchestrator.strategies.deployment.costing import Prices, PricesSettings
+from orchestrator.strategies.deployment.costing import Costs, CostSettings
 from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_monitoring import (
@@ -53,10 +53,16 @@ if TYPE_CHECKING:
 class D3Settings(SearchSettings):
     """D3: real pours with a simulated prior."""
 
+    retired: ClassVar[dict[str, str]] = SearchSettings.retired | {
+        "per_pour": "simulations_per_pour",
+        "prices": "costs",
+        "ignorance": "discrepancy_policy",
+    }
+
     removed: ClassVar[dict[str, str]] = {
         "trust": (
-            "was retired; remove it: 'model: adaptive' weighs the simulator by every pour ('ignorance' says what "
-            "follows), 'model: residual' always believes it"
+            "was retired; remove it: 'model: adaptive' weighs the simulator by every pour ('discrepancy_policy' says "
+            "what follows), 'model: residual' always believes it"
         ),
         "model: pooled": "was retired; write 'adaptive', or 'residual' for the paper's",
         "model: scaled": "was retired; write 'adaptive', or 'residual' for the paper's",
@@ -66,19 +72,19 @@ class D3Settings(SearchSettings):
     """Real pours with a simulated prior."""
 
     prior_simulations: SimulationCount = 37
-    """Simulations before the first pour; with 'per_pour: free' at most so many."""
+    """Simulations before the first pour; with 'simulations_per_pour: free' at most so many."""
 
-    per_pour: CountOrFree = 2
+    simulations_per_pour: CountOrFree = 2
     """Simulations told between two pours; 'free': for as long as they are worth it."""
 
-    prices: PricesSettings | None = None
-    """With 'per_pour: free': what a pour and a simulation cost."""
+    costs: CostSettings | None = None
+    """With 'simulations_per_pour: free': what a pour and a simulation cost."""
 
     model: Literal["adaptive", "residual"] = "adaptive"
     """How simulations enter the surrogate of pours; 'adaptive' averages over ways in which the simulator may be wrong,
     'residual' is the paper's, which always believes it."""
 
-    ignorance: DiscrepancyPolicySettings | None = None
+    discrepancy_policy: DiscrepancyPolicySettings | None = None
     """With 'model: adaptive': what follows when the simulator seems to say nothing of this bench."""
 
     risk_limit: RiskLimitSettings | None = None
@@ -93,7 +99,7 @@ class D3Settings(SearchSettings):
     @property
     def beside(self) -> int | None:
         """Number of simulations between two pours; None: as many as fit into the duration of a pour."""
-        return None if self.per_pour == "free" else int(self.per_pour)
+        return None if self.simulations_per_pour == "free" else int(self.simulations_per_pour)
 
     @property
     def adaptive(self) -> bool:
@@ -123,15 +129,17 @@ class D3Settings(SearchSettings):
     @property
     def spending(self) -> str:
         """The budget per receiver, as text."""
-        return f"{self.prior_simulations} simulations, then {self.pours} pours with {self.per_pour} beside each"
+        beside = self.simulations_per_pour
+        return f"{self.prior_simulations} simulations, then {self.pours} pours with {beside} beside each"
 
     def check(self, premises: Premises, complaints: Problems) -> None:
         """Check that each key belongs to the selected model and number of simulations."""
         super().check(premises, complaints)
-        if self.prices is not None and self.beside is not None:
-            text = f"decides nothing with 'per_pour: {self.per_pour}'; write 'per_pour: free', or remove it"
-            complaints.add(text, "prices", key=True)
-        for key in () if self.adaptive else ("ignorance", "risk_limit", "stop", "good_enough"):
+        if self.costs is not None and self.beside is not None:
+            given = f"'simulations_per_pour: {self.simulations_per_pour}'"
+            text = f"decides nothing with {given}; write 'simulations_per_pour: free', or remove it"
+            complaints.add(text, "costs", key=True)
+        for key in () if self.adaptive else ("discrepancy_policy", "risk_limit", "stop", "good_enough"):
             if getattr(self, key) is not None:
                 complaints.add(f"needs 'model: adaptive', not '{self.model}'", key, key=True)
 
@@ -144,10 +152,10 @@ class D3Settings(SearchSettings):
         """Rules for the consequences of pours, in units of a loss with the given largest value."""
         limit = None if self.risk_limit is None else Limit(worst * self.risk_limit.loss, self.risk_limit.probability)
         return Rules(
-            ignorance=self.ignorance or DiscrepancyPolicySettings(),
+            discrepancy_policy=self.discrepancy_policy or DiscrepancyPolicySettings(),
             limit=limit,
-            otherwise="go on" if self.risk_limit is None else self.risk_limit.otherwise,
-            gain_below=None if self.stop is None else worst * self.stop.gain_below,
+            fallback="go on" if self.risk_limit is None else self.risk_limit.fallback,
+            min_gain=None if self.stop is None else worst * self.stop.min_gain,
             good_enough=None if self.good_enough is None else worst * self.good_enough,
         )
 
@@ -164,9 +172,9 @@ class Hybrid(Deployment[D3Settings]):
     cost, f_r(a) = f_s(a) + δ(a): its posterior mean is the prior mean, its posterior covariance adds to δ's. The first
     pour is the minimiser of the prior mean; every further one minimises m(a) − κ s(a) given the weighed pours.
 
-    With `per_pour = k`, one query returns the next pour and the k most informative actions. These are simulated during
-    the pour and enter the prior: learning from real trials interleaved with planning in a model (Dyna). With `per_pour
-    = 'free'`, simulations continue as long as the pour takes.
+    With `simulations_per_pour = k`, one query returns the next pour and the k most informative actions. These are
+    simulated during the pour and enter the prior: learning from real trials interleaved with planning in a model
+    (Dyna). With `simulations_per_pour = 'free'`, simulations continue as long as the pour takes.
 
     `model` defines how simulations enter the surrogate. The above is 'residual', the paper's, which always trusts the
     simulator; 'adaptive' averages over the ways in which it may be wrong, and weighs them by every pour.
@@ -221,7 +229,7 @@ class Hybrid(Deployment[D3Settings]):
             self._simulate(suggestion, "prior")
 
         if len(self._trials) == 0:
-            count = min(max(self._settings.initial, 1), self._settings.prior_simulations)
+            count = min(max(self._settings.initial_samples, 1), self._settings.prior_simulations)
             self._questions.put(self._space_filling(count=count), "start", simulate)
         elif self._trials.ready:
             self._scalarization.weigh(exploring=True)
@@ -379,7 +387,7 @@ class FreeHybrid(Hybrid):
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         super().__init__(plan, scene, parameters, seed)
-        self._prices = Prices(self._settings.prices or PricesSettings(), self._costing.worst)
+        self._costs = Costs(self._settings.costs or CostSettings(), self._costing.worst)
         self._out: set[str] = set()
         self._awaited: int | None = None
         self._rested_at: int | None = None
@@ -394,7 +402,7 @@ class FreeHybrid(Hybrid):
         """As in D3; in addition, record the duration of a simulation."""
         super().tell(request, outcome)
         if isinstance(request, Simulate) and isinstance(outcome, Simulated):
-            self._prices.record(outcome.outcome.cpu_s)
+            self._costs.record(outcome.outcome.cpu_s)
         if isinstance(request, Pour):
             self._rested_at = None
 
@@ -437,7 +445,7 @@ class FreeHybrid(Hybrid):
     def _next_prior(self) -> None:
         settings, trials = self._settings, self._trials
         if len(trials) == 0 and settings.prior_simulations > 0:
-            count = min(max(settings.initial, trials.width), settings.prior_simulations)
+            count = min(max(settings.initial_samples, trials.width), settings.prior_simulations)
             self._put(self._space_filling(count=count), "start", lambda suggestion: self._simulate(suggestion, "prior"))
         elif len(trials) >= settings.prior_simulations:
             self._decide_to_pour("all prior simulations are asked for")
@@ -446,7 +454,7 @@ class FreeHybrid(Hybrid):
             def weighed(suggestion: Suggestion) -> None:
                 if suggestion.values and suggestion.pour_value is not None and not self._scalarization.exploring:
                     one, pour = suggestion.values[0], suggestion.pour_value
-                    if self._prices.prefers_pour(one, pour, trials.width):
+                    if self._costs.prefers_pour(one, pour, trials.width):
                         self._decide_to_pour(self._comparison(one, pour), one, pour)
                         return
                 self._simulate(suggestion, "prior")
@@ -467,7 +475,7 @@ class FreeHybrid(Hybrid):
             if suggestion.surrogate is not None:
                 self._latest_map = suggestion
             one, pour = (suggestion.values or (0.0,))[0], suggestion.pour_value or 0.0
-            exhausted = bool(suggestion.values) and self._prices.is_idle(one, self._trials.width)
+            exhausted = bool(suggestion.values) and self._costs.is_idle(one, self._trials.width)
             if exhausted and not self._scalarization.exploring:
                 self._rest(f"what is left to learn, only pours tell: {self._comparison(one, pour)}", one, pour)
             elif self._trials.lost_in_a_row >= LOST_IN_A_ROW:
@@ -549,8 +557,8 @@ class FreeHybrid(Hybrid):
     # -- results ---------------------------------------------------------------------------------------------------
 
     def _comparison(self, one: float, pour: float) -> str:
-        seconds = self._prices.simulation(self._trials.width)
-        return f"a simulation promises {one:.2g} for {seconds:.2g} s, a pour {pour:.2g} for {self._prices.pour:g} s"
+        seconds = self._costs.simulation(self._trials.width)
+        return f"a simulation promises {one:.2g} for {seconds:.2g} s, a pour {pour:.2g} for {self._costs.pour:g} s"
 
     def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
         if not suggestion.values or suggestion.pour_value is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, ClassVar, Generic, TypeVar, cast
 
 from actors.optimizer.questions import (
     Data,
@@ -38,10 +38,12 @@ from sim_engine.settings.model import PositiveSimulationCount
 class SearchSettings(DeploymentSettings):
     """Settings of D1, D2 and D3: Bayesian optimisation."""
 
+    retired: ClassVar[dict[str, str]] = {"initial": "initial_samples"}
+
     kappa: Kappa = 2.0
     """κ of the lower confidence bound."""
 
-    initial: PositiveSimulationCount = 3
+    initial_samples: PositiveSimulationCount = 3
     """Random actions before the surrogate takes over."""
 
 
@@ -334,10 +336,10 @@ class Deployment(ABC, Generic[S]):
             former_pours=len(self._prior_pours),
             refused_pours=self._refused,
             failed_pours=sum(p.status == "failed" for p in self._pours),
-            trust=self._trusted([p for p in self._pours if p.status == "weighed" and p.cost is not None]),
+            model_check=self._trusted([p for p in self._pours if p.status == "weighed" and p.cost is not None]),
             gave_up=self._gave_up,
             objectives=names,
-            front=None if front is None else tuple(front),
+            pareto_front=None if front is None else tuple(front),
             map=None if latest is None else displayed_map(latest.surrogate, self._plan.actions),
             recommended=None if self._final is None else self._recommended(self._final),
             risk=None if self._final is None else self._risk_found(self._final),

@@ -154,7 +154,7 @@ class Deployed(StageResult):
     failed_pours: int
     """Number of failed pours."""
 
-    trust: PredictionCheck | Believed
+    model_check: PredictionCheck | Believed
     """Deviation of the first pours from their predictions, or the conclusions of all pours about the simulator."""
 
     gave_up: str | None = None
@@ -169,7 +169,7 @@ class Deployed(StageResult):
     objectives: tuple[str, ...] = ()
     """Names of several objectives; empty with a plain loss."""
 
-    front: tuple[ParetoAction, ...] | None = None
+    pareto_front: tuple[ParetoAction, ...] | None = None
     """The Pareto front, if it was searched."""
 
     map: DisplayedMap | None = None

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from sim_engine.search_space import Axis, Space
 from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
 
-Otherwise = Literal["ask", "go on", "stop"]
+Fallback = Literal["ask", "go on", "stop"]
 
 GO_ON: Final = "go on"
 STOP: Final = "stop"
@@ -43,7 +43,7 @@ class DiscrepancyPolicySettings(Settings):
     limit: Annotated[float, Quantity("1", "90 %", 0.1, 1.0)] = 0.9
     """Probability that it says nothing of this bench, from which the policy follows."""
 
-    policy: Otherwise = GO_ON
+    policy: Fallback = GO_ON
     """go on: what it says counts for as little as that; stop: the deployment ends; ask: the campaign pauses with a
     question."""
 
@@ -51,13 +51,15 @@ class DiscrepancyPolicySettings(Settings):
 class RiskLimitSettings(Settings):
     """D3 with `model: adaptive`: what no pour may lose, once one has kept it."""
 
+    retired: ClassVar[dict[str, str]] = {"otherwise": "fallback"}
+
     loss: Annotated[float, Quantity("1", "10 %", 1e-3, 1.0)] = 0.1
     """As a share of what spilling the whole load would cost."""
 
     probability: Annotated[float, Quantity("1", "5 %", 1e-3, 0.5)] = 0.05
     """With which a pour may lose more."""
 
-    otherwise: Otherwise = GO_ON
+    fallback: Fallback = GO_ON
     """Where no action keeps it, which is logged before the pour. go on: the least risky one is poured; stop: the
     deployment ends; ask: the campaign pauses with a question."""
 
@@ -65,7 +67,9 @@ class RiskLimitSettings(Settings):
 class StopSettings(Settings):
     """D3 with `model: adaptive`: when no further pour is worth it."""
 
-    gain_below: Annotated[float, Quantity("1", "0.2 %", 1e-5, 1.0)] = 0.002
+    retired: ClassVar[dict[str, str]] = {"gain_below": "min_gain"}
+
+    min_gain: Annotated[float, Quantity("1", "0.2 %", 1e-5, 1.0)] = 0.002
     """Share of what spilling the whole load would cost: ends when no further pour is expected to save as much."""
 
 
@@ -156,10 +160,10 @@ class Verdict:
 class Rules:
     """Rules from the settings; losses in their own unit."""
 
-    ignorance: DiscrepancyPolicySettings
+    discrepancy_policy: DiscrepancyPolicySettings
     limit: Limit | None
-    otherwise: Otherwise
-    gain_below: float | None
+    fallback: Fallback
+    min_gain: float | None
     good_enough: float | None
 
 
@@ -231,11 +235,11 @@ class SimulatorMonitor:
             best = max(suggestion.best_mean, 0.0)
             if rules.good_enough is not None and best <= rules.good_enough:
                 return self._saved(left, f"good enough: the best action is expected to lose {self._share(best)}")
-            if rules.gain_below is not None and found.gain is not None and found.gain < rules.gain_below:
+            if rules.min_gain is not None and found.gain is not None and found.gain < rules.min_gain:
                 why = f"no further pour is worth it: one more is expected to save {self._share(found.gain)}"
                 return self._saved(left, f"{why}, the best action to lose {self._share(best)}")
-        if found.uninformative >= rules.ignorance.limit and self._followed is None and weighed:
-            return self._by(rules.ignorance.policy, self.text, "the simulator counts for as little as that")
+        if found.uninformative >= rules.discrepancy_policy.limit and self._followed is None and weighed:
+            return self._by(rules.discrepancy_policy.policy, self.text, "the simulator counts for as little as that")
         limit = rules.limit
         if limit is None or not any(cost <= limit.loss for cost in weighed) or not found.exceedances:
             return Verdict()
@@ -249,7 +253,7 @@ class SimulatorMonitor:
         if self._accepted:
             self.decisions.append(Decision(f"{why}; it is poured", {"risk": risk}, urgent=True))
             return Verdict()
-        return self._by(rules.otherwise, why, "the least risky action is poured", limit=True)
+        return self._by(rules.fallback, why, "the least risky action is poured", limit=True)
 
     def answer(self, answer: str, *, limit: bool) -> str:
         """Record the operator's answer; return the reason to end, or an empty text."""
@@ -260,7 +264,7 @@ class SimulatorMonitor:
         self.decisions.append(Decision(f"somebody decided: {answer}", urgent=True))
         return "somebody decided to stop" if answer == STOP else ""
 
-    def _by(self, policy: Otherwise, why: str, then: str, *, limit: bool = False) -> Verdict:
+    def _by(self, policy: Fallback, why: str, then: str, *, limit: bool = False) -> Verdict:
         if policy == "ask":
             meaning = f"{GO_ON}: {then}; {STOP}: this deployment ends with what is known"
             return Verdict(Ask(f"{why[0].upper()}{why[1:]}. How to go on? {meaning}.", OPTIONS), limit=limit)
@@ -290,10 +294,10 @@ class SimulatorMonitor:
             after=tuple(self._after),
             displaced=displaced,
             factor=1.0 if self._latest is None else self._latest.factor,
-            limit=self._rules.ignorance.limit,
-            policy=self._rules.ignorance.policy,
+            limit=self._rules.discrepancy_policy.limit,
+            policy=self._rules.discrepancy_policy.policy,
             followed=self._followed,
-            alarm=share >= self._rules.ignorance.limit,
+            alarm=share >= self._rules.discrepancy_policy.limit,
             text=self.text,
         )
 

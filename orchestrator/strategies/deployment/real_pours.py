@@ -61,7 +61,7 @@ class PourRow(ResultPart):
     predicted_scatter: float | None
     """Scatter of a single pour around the expected loss."""
 
-    predicted_band: tuple[float, float] | None = None
+    predicted_interval: tuple[float, float] | None = None
     """Interval that should contain nine pours in ten; None without a prediction."""
 
     loss: float | None
@@ -159,7 +159,7 @@ class PourTrial:
             predicted=None if predicted is None else predicted.mean,
             predicted_deviation=None if predicted is None else predicted.deviation,
             predicted_scatter=None if predicted is None else predicted.scatter,
-            predicted_band=None if predicted is None else predicted.of_a_pour(),
+            predicted_interval=None if predicted is None else predicted.of_a_pour(),
             loss=self.cost,
             objectives={} if self.vector is None else dict(zip(objectives, self.vector, strict=False)),
             spillage=None if weighed is None else normalised_spillage(weighed.fractions),

@@ -85,7 +85,7 @@ def test_the_robot_s_own_joint_speeds_hold_besides():
 
 
 def test_a_joint_beyond_its_range():
-    home = (*SPEC.home.angles[:5], -300 * DEG)
+    home = JointAngles.of(*SPEC.home.angles[:5], -300 * DEG)
     # the same pose of the pourer, tool turned to match, so that wrist 3 starts near the end of its range
     grip = SPEC.grip
     turned = SPEC.with_values(home=home, tool=Pose(z=0.17, rz=300 * DEG), grip=grip)

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from actors.balance.balance_settings import SerialBalanceSettings, SettlingRule
-from actors.balance.dialects.dialect import dialects
+from actors.balance.dialect_registry import dialects
+from actors.balance.scale_model import ScaleSettings
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.simulated_balance import ScaleSettings
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.serial_balance.emulated_balance import BalanceFaults
 

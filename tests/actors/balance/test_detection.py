@@ -12,7 +12,8 @@ import serial
 
 from actors.balance.balance_interface import BalanceError, LineSettingsError, UnknownDialectError
 from actors.balance.balance_settings import SerialBalanceSettings, SettlingRule, parse_format
-from actors.balance.dialects.dialect import LineSettings, dialects
+from actors.balance.dialect_registry import dialects
+from actors.balance.dialects.dialect import LineSettings
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.serial_port import port_advice
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance

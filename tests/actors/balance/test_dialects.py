@@ -8,7 +8,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from actors.balance.dialects.dialect import Dialect, dialects
+from actors.balance.dialect_registry import dialects
+from actors.balance.dialects.dialect import Dialect
 from actors.balance.dialects.kcp import KCP
 from actors.balance.dialects.kern_swt import KERN_SWT, KernSwt
 from actors.balance.dialects.mt_sics import MT_SICS

@@ -9,8 +9,8 @@ import pytest
 
 from actors.balance.balance_interface import BalanceFaultError, CommandError, NotStableError, OutOfRangeError, UnitError
 from actors.balance.balance_settings import SettlingRule
-from actors.balance.dialects.dialect import encoders
-from actors.balance.simulated_balance import Load
+from actors.balance.dialect_registry import encoders
+from actors.balance.scale_model import Load
 
 from .conftest import SOON
 

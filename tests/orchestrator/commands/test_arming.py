@@ -13,8 +13,16 @@ from typer.testing import CliRunner, Result
 from actors.emulators.ur_controller.controller_process import VirtualController
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.runs.motion_envelope import Envelope, campaign_pours, envelope, pour_count
-from orchestrator.runs.safety_approval import SafetyRecord, record_path, required_checksum, write_record
+from orchestrator.runs.motion_approval import (
+    Envelope,
+    SafetyRecord,
+    campaign_pours,
+    envelope,
+    pour_count,
+    record_path,
+    required_checksum,
+    write_record,
+)
 from orchestrator.runs.stages import stages_of
 from tests.support import hardware_laboratory
 from tests.support.loopback import free_address
@@ -58,14 +66,14 @@ def test_hardware_doesn_t_move_without_the_flag(campaign: Path, verb: str) -> No
     result = decant(verb, str(file), *action)
     assert result.exit_code == 2
     assert "is hardware" in result.stderr
-    assert "--arm" in result.stderr
+    assert "--enable-motion" in result.stderr
     assert not (campaign.parent / "runs").exists()
 
 
 @pytest.mark.realtime
 def test_the_flag_alone_doesn_t_arm_where_nobody_is_at_a_terminal(campaign: Path) -> None:
     for command in (["run", str(campaign)], ["jog", str(campaign.with_name("rig.yaml"))]):
-        result = CliRunner().invoke(app, [*command, "--arm"], input="rig\nrig\n", catch_exceptions=False)
+        result = CliRunner().invoke(app, [*command, "--enable-motion"], input="rig\nrig\n", catch_exceptions=False)
         assert result.exit_code == 2
         assert "terminal" in result.stderr
     assert not (campaign.parent / "runs").exists()
@@ -74,7 +82,7 @@ def test_the_flag_alone_doesn_t_arm_where_nobody_is_at_a_terminal(campaign: Path
 @pytest.mark.realtime
 def test_settings_that_nobody_has_accepted_can_t_be_armed(campaign: Path) -> None:
     record_path(campaign.with_name("rig.yaml")).unlink()
-    result = decant("run", str(campaign), "--arm")
+    result = decant("run", str(campaign), "--enable-motion")
     assert result.exit_code == 2
     assert "nobody has accepted" in result.stderr
     assert "decant doctor" in result.stderr
@@ -84,7 +92,7 @@ def test_settings_that_nobody_has_accepted_can_t_be_armed(campaign: Path) -> Non
 def test_the_record_that_counts_is_that_of_the_laboratory_in_use(campaign: Path) -> None:
     other = campaign.with_name("other.yaml")
     other.write_text(campaign.with_name("rig.yaml").read_text().replace("name: rig", "name: other"))
-    result = decant("run", str(campaign), "--arm", "--laboratory", str(other))
+    result = decant("run", str(campaign), "--enable-motion", "--laboratory", str(other))
     assert result.exit_code == 2
     assert "laboratory other: nobody has accepted" in result.stderr  # for rig.yaml, which the campaign names, somebody
     assert "other.yaml" in result.stderr
@@ -95,12 +103,12 @@ def test_the_record_that_counts_is_that_of_the_laboratory_in_use(campaign: Path)
 @pytest.mark.realtime
 def test_a_wrong_name_moves_nothing(campaign: Path, controller: VirtualController) -> None:
     before = joints(controller)
-    with Terminal("jog", str(campaign.with_name("rig.yaml")), "--arm", cwd=str(campaign.parent)) as terminal:
+    with Terminal("jog", str(campaign.with_name("rig.yaml")), "--enable-motion", cwd=str(campaign.parent)) as terminal:
         terminal.expect(f"HARDWARE: laboratory rig, UR10 at {controller.address}")
         terminal.expect("> ")
         terminal.type("yes")
         assert terminal.end() == 2
-    assert "not armed: 'yes' was typed" in terminal.screen
+    assert "motion is not enabled: 'yes' was typed" in terminal.screen
     assert not (campaign.parent / "runs").exists()
     assert joints(controller) == before
 
@@ -110,12 +118,12 @@ def test_what_will_move_is_shown_the_name_arms_one_run_and_its_questions_come_to
     campaign: Path, controller: VirtualController
 ) -> None:
     before = joints(controller)
-    with Terminal("run", str(campaign), "--arm", "--in-process", cwd=str(campaign.parent)) as terminal:
+    with Terminal("run", str(campaign), "--enable-motion", "--in-process", cwd=str(campaign.parent)) as terminal:
         for line in ("pours          up to 3", "box            x ", "mm/s", "deg/s, ", "clearance", "emergency stop"):
             terminal.expect(line)
         terminal.expect("> ")
         terminal.type("rig")
-        terminal.expect("armed, for this run only: rig")
+        terminal.expect("motion is enabled, for this run only: rig")
         terminal.expect("rigged-hardware-")
         terminal.expect("hardware bench")
         terminal.expect("nothing moves before that")
@@ -125,7 +133,7 @@ def test_what_will_move_is_shown_the_name_arms_one_run_and_its_questions_come_to
     assert "given up by the operator" in terminal.screen
     assert code == 3
     assert joints(controller) == before
-    assert decant("run", str(campaign), "--resume").exit_code == 2  # armed once is not armed for ever
+    assert decant("run", str(campaign), "--resume").exit_code == 2  # motion is enabled for one run only
 
 
 @pytest.mark.realtime
@@ -133,7 +141,7 @@ def test_settings_that_were_changed_since_stop_a_run_before_anybody_is_asked(
     campaign: Path, controller: VirtualController
 ) -> None:
     accept(campaign.parent, "0BADC0DE")
-    with Terminal("run", str(campaign), "--arm", "--in-process", cwd=str(campaign.parent)) as terminal:
+    with Terminal("run", str(campaign), "--enable-motion", "--in-process", cwd=str(campaign.parent)) as terminal:
         terminal.expect("> ")
         terminal.type("rig")
         code = terminal.end()
@@ -165,7 +173,7 @@ def test_envelope_covers_the_actions_of_the_campaign_and_grows_with_them(campaig
 def test_limits_of_the_laboratory_refuse_a_campaign_that_would_break_all_of_them(campaign: Path) -> None:
     laboratory = campaign.with_name("rig.yaml")
     laboratory.write_text(laboratory.read_text().replace("tilt: 135 deg", "tilt: 60 deg"))
-    result = decant("run", str(campaign), "--arm")
+    result = decant("run", str(campaign), "--enable-motion")
     assert result.exit_code == 2
     assert "60" in result.stderr
     assert "lean" in result.stderr or "tilt" in result.stderr

@@ -35,7 +35,7 @@ def invoke(command: str) -> Any:
 
 def test_the_version_is_that_of_the_package() -> None:
     result = invoke("--version")
-    assert (result.exit_code, result.stdout) == (0, f"decant {version('decant')}\n")
+    assert (result.exit_code, result.stdout) == (0, f"decant {version('decant-pouring')}\n")
 
 
 def test_shells_can_be_taught_to_complete() -> None:
@@ -59,7 +59,6 @@ def campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def begun(monkeypatch: pytest.MonkeyPatch, command: str) -> Any:
     """The plan that a command would begin with."""
-    from orchestrator.cli import campaign_commands as campaigns
     from orchestrator.cli import foreground_run as common
 
     plans = []
@@ -68,7 +67,6 @@ def begun(monkeypatch: pytest.MonkeyPatch, command: str) -> Any:
         plans.append((request.campaign, kwargs["again"]))
         raise SeenError
 
-    monkeypatch.setattr(campaigns, "run_in_front_of_people", begin)
     monkeypatch.setattr(common, "run_in_front_of_people", begin)
     result = invoke(command)
     assert isinstance(result.exception, SeenError), result.output

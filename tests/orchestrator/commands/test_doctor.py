@@ -26,7 +26,7 @@ from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.emulators.ur_controller.safety_system import SafetyConfiguration
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_laboratory
-from orchestrator.runs.safety_approval import SafetyRecordError, accepted_checksum, read_record, record_path
+from orchestrator.runs.motion_approval import SafetyRecordError, accepted_checksum, read_record, record_path
 from tests.support import hardware_laboratory
 from tests.support.loopback import free_address
 from tests.support.waiting import wait_for
@@ -256,7 +256,7 @@ def test_without_an_extra_doctor_names_package_and_extra_before_it_starts_anythi
     assert "Traceback" not in told.stderr
     said = " ".join((told.stdout + told.stderr).split())
     assert package in said
-    assert "pip install 'decant[lab]'" in said
+    assert "pip install 'decant-pouring[lab]'" in said
     looked = module in ("rtde_receive", "ray")  # neither is needed to read what arm and balance say
     assert ("started: 1" in told.stderr) is looked
     assert told.returncode == (1 if looked else 2)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
 from orchestrator.cli.command_options import Answer
-from orchestrator.runs.unknown_pours import LOST, REPEAT
+from orchestrator.runs.resume import LOST, REPEAT
 from orchestrator.strategies.deployment.model_monitoring import OPTIONS
 from tests.support.cli_inputs import ROOT, invoke, write_inputs
 
@@ -83,3 +83,17 @@ def test_a_campaign_runs_on_another_laboratory(tmp_path: Path, monkeypatch: pyte
     assert refused.exit_code == 2
     assert "ur-rtde" in refused.stderr
     assert "twin.yaml" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        ("run my.yaml --arm", "--arm: is called --enable-motion now"),
+        ("submit my.yaml --verb=plan", "--verb: is called --task now"),
+        ("arm quickstart-3f2a1c", "arm: is called enable now"),
+    ],
+)
+def test_a_retired_name_is_refused_with_the_new_one(command: str, name: str) -> None:
+    result = invoke(command)
+    assert result.exit_code == 2
+    assert name in result.stderr

@@ -13,9 +13,9 @@ from actors.arm.arm_interface import ArmPose
 from actors.arm.arm_settings import UrArmSettings
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import LaboratoryError
-from orchestrator.cli.jogging import JogError, Jogging, JogStep, parse_step, steps_home
+from orchestrator.cli.motion_control import JogError, Jogging, JogStep, parse_step, steps_home
 from orchestrator.config.file_loading import load_laboratory
-from orchestrator.runs.safety_approval import SafetyRecord, write_record
+from orchestrator.runs.motion_approval import SafetyRecord, write_record
 from tests.support import hardware_laboratory
 from tests.support.loopback import free_address
 from tests.support.terminal import Terminal
@@ -125,7 +125,7 @@ def test_arm_of_hardware_moves_by_what_was_typed_and_ctrl_c_stops_it(tmp_path: P
     with VirtualController.start(free_address(), "ur10", joints=start) as controller:
         laboratory = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", controller.address)
         write_record(laboratory, SafetyRecord(controller.fault("state")["checksum"], "2016300123", "", "", "", ""))
-        with Terminal("jog", str(laboratory), "--arm", cwd=str(tmp_path)) as terminal:
+        with Terminal("jog", str(laboratory), "--enable-motion", cwd=str(tmp_path)) as terminal:
             terminal.expect("> ")
             terminal.type("rig")
             terminal.expect("jog> ")

@@ -13,7 +13,7 @@ import pytest
 from matplotlib.text import Text
 from typer.testing import CliRunner
 
-from orchestrator.cli import solver_report as report
+from orchestrator.cli import physics_command
 from orchestrator.cli.app import app
 from orchestrator.results import figure_style as style
 from orchestrator.results.figure_style import INK
@@ -77,14 +77,14 @@ def test_the_page_keeps_other_cases_and_marks_those_that_another_solver_measured
 ) -> None:
     runner.invoke(app, ["physics", "bad", "--write", str(tmp_path)])
     runner.invoke(app, ["physics", "good", "--write", str(tmp_path)])
-    page = (tmp_path / report.PAGE_NAME).read_text(encoding="utf-8")
+    page = (tmp_path / physics_command.PAGE_NAME).read_text(encoding="utf-8")
     assert page.index("## Good") < page.index("## Bad")
     assert "1 of 2 criteria are met" in page
     assert "| height | 2,000 | 50 mm | 39.8 mm | within 2 % | **fails** |" in page
     assert (tmp_path / "images" / "validation-good.png").read_bytes()[:4] == b"\x89PNG"
     monkeypatch.setattr(sources, "solver_fingerprint", lambda: "another")
     runner.invoke(app, ["physics", "good", "--write", str(tmp_path)])
-    good, bad = (tmp_path / report.PAGE_NAME).read_text(encoding="utf-8").partition("## Bad")[::2]
+    good, bad = (tmp_path / physics_command.PAGE_NAME).read_text(encoding="utf-8").partition("## Bad")[::2]
     assert "Measured before" not in page
     assert "Measured before" not in good
     assert "Measured before" in bad
@@ -129,7 +129,7 @@ def test_many_panels_go_into_rows_and_spreads_are_bands(tmp_path: Path) -> None:
         )
         logs = tuple(panel == 0 for panel in range(panels))
         words = tuple(f"panel {panel}" for panel in range(panels))
-        path = report.draw(Figure(words, words, words, curves, log_x=logs), tmp_path / "figure.png")
+        path = physics_command.draw(Figure(words, words, words, curves, log_x=logs), tmp_path / "figure.png")
         return imread(path)
 
     three, four = picture(3), picture(4)
@@ -142,7 +142,7 @@ def test_many_panels_go_into_rows_and_spreads_are_bands(tmp_path: Path) -> None:
 def saved(figure: Figure, monkeypatch: pytest.MonkeyPatch) -> Any:
     drawn: list[Any] = []
     monkeypatch.setattr(style, "save", lambda canvas, path: drawn.append(canvas) or path)
-    report.draw(figure, Path("figure.png"))
+    physics_command.draw(figure, Path("figure.png"))
     return drawn[0]
 
 
@@ -174,9 +174,9 @@ def test_the_legend_lies_on_no_curve_and_no_number_is_tiny(panels: int, monkeypa
 
 def test_a_figure_is_drawn_again_from_what_is_kept_of_it() -> None:
     case = a_case("good", height(0.0397), figure=FIGURE)
-    record = report.case_record(case, case.run(None, suite.CaseEffort()), None, "solver")  # type: ignore[arg-type]
-    assert report.figure_of(json.loads(json.dumps(record))) == FIGURE
-    assert report.figure_of({**record, "figure": None}) is None
+    record = physics_command.case_record(case, case.run(None, suite.CaseEffort()), None, "solver")  # type: ignore[arg-type]
+    assert physics_command.figure_of(json.loads(json.dumps(record))) == FIGURE
+    assert physics_command.figure_of({**record, "figure": None}) is None
 
 
 def test_references_can_be_told_apart_and_have_their_curve_s_colour(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,6 +210,6 @@ def test_a_fault_of_the_solver_does_not_pass() -> None:
 
 
 def test_the_shipped_page_is_made_from_its_data() -> None:
-    data = json.loads((ROOT / "docs" / report.DATA_NAME).read_text(encoding="utf-8"))
-    page = (ROOT / "docs" / report.PAGE_NAME).read_text(encoding="utf-8")
-    assert page == report.page_text(data["cases"], data["theta"], data["solver"])
+    data = json.loads((ROOT / "docs" / physics_command.DATA_NAME).read_text(encoding="utf-8"))
+    page = (ROOT / "docs" / physics_command.PAGE_NAME).read_text(encoding="utf-8")
+    assert page == physics_command.page_text(data["cases"], data["theta"], data["solver"])

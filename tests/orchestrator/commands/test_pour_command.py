@@ -20,8 +20,8 @@ from actors.interfaces import UnknownPourError
 from orchestrator.cli.app import app
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
 from orchestrator.requests import Pour
+from orchestrator.runs.motion_approval import SafetyRecord, write_record
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor
-from orchestrator.runs.safety_approval import SafetyRecord, write_record
 from orchestrator.runs.stages import scenes_of
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
@@ -110,7 +110,7 @@ def test_empty_cycle_on_hardware_asks_counts_down_goes_slowly_and_leaves_a_recor
     checksum = controller.fault("state")["checksum"]
     write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
     arguments = ("pour", str(campaign), "--set", "angular_velocity=60", "--set", "x_offset=80")
-    with Terminal(*arguments, "--empty", "--slow", "0.5", "--arm", cwd=str(tmp_path)) as terminal:
+    with Terminal(*arguments, "--empty", "--slow", "0.5", "--enable-motion", cwd=str(tmp_path)) as terminal:
         terminal.expect("EMPTY pourer, at 50 %")
         terminal.expect("> ")
         terminal.type("rig")
@@ -137,7 +137,9 @@ def test_empty_cycle_that_is_not_confirmed_moves_nothing(tmp_path: Path, control
     checksum = controller.fault("state")["checksum"]
     write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
     before = controller.fault("state")["joints"]
-    with Terminal("pour", str(campaign), *ACTION, "--empty", "--slow", "0.2", "--arm", cwd=str(tmp_path)) as terminal:
+    with Terminal(
+        "pour", str(campaign), *ACTION, "--empty", "--slow", "0.2", "--enable-motion", cwd=str(tmp_path)
+    ) as terminal:
         terminal.expect("> ")
         terminal.type("rig")
         terminal.expect("> ")
@@ -207,7 +209,7 @@ def test_whole_pour_on_hardware_is_asked_for_confirmed_made_and_weighed(
     checksum = controller.fault("state")["checksum"]
     write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
     action = ("--set", "angular_velocity=60", "--set", "x_offset=80")
-    with Terminal("pour", str(campaign), *action, "--in-process", "--arm", cwd=str(tmp_path)) as terminal:
+    with Terminal("pour", str(campaign), *action, "--in-process", "--enable-motion", cwd=str(tmp_path)) as terminal:
         terminal.expect("> ")
         terminal.type("rig")
         terminal.expect("mode hardware")
@@ -230,7 +232,7 @@ def test_protective_stop_in_a_pour_is_mended_by_consent_weighed_and_left_for_a_p
     checksum = controller.fault("state")["checksum"]
     write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
     action = ("--set", "angular_velocity=30", "--set", "x_offset=80")
-    with Terminal("pour", str(campaign), *action, "--in-process", "--arm", cwd=str(tmp_path)) as terminal:
+    with Terminal("pour", str(campaign), *action, "--in-process", "--enable-motion", cwd=str(tmp_path)) as terminal:
         terminal.expect("> ")
         terminal.type("rig")
         consents = answered(terminal, lambda: controller.fault("protective_stop", after=6.5))
@@ -248,7 +250,7 @@ def test_terminal_that_is_closed_in_a_pour_leaves_the_arm_at_home_and_the_pour_u
     campaign = hardware_laboratory.write_rig(tmp_path, controller.address)
     checksum = controller.fault("state")["checksum"]
     write_record(tmp_path / "rig.yaml", SafetyRecord(checksum, "2016300123", "", "", "", ""))
-    terminal = Terminal("pour", str(campaign), *ACTION, "--in-process", "--arm", cwd=str(tmp_path))
+    terminal = Terminal("pour", str(campaign), *ACTION, "--in-process", "--enable-motion", cwd=str(tmp_path))
     try:
         for typed in ("rig", *WEIGHTS[:3]):
             terminal.expect("> ")

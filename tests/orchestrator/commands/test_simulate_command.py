@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.cli import pour_prediction as single
+from orchestrator.cli.simulate_command import told
 from sim_engine.prediction_band import spreads
 from tests.support import example_run
 from tests.support.cli_inputs import SIMULATE, invoke, process
@@ -106,8 +106,8 @@ def test_a_table_of_weighed_pours_is_predicted_and_scored(inputs: Path) -> None:
 
 def test_one_seed_has_no_spread_and_says_so() -> None:
     several = [example_run.outcome(spilled=s) for s in (0.05, 0.07)]
-    assert "received 92.0 ± 1.4 %  spilled 6.0 ± 1.4 %" in single.told(several, spreads(several))
-    alone = single.told(several[:1], spreads(several[:1]))
+    assert "received 92.0 ± 1.4 %  spilled 6.0 ± 1.4 %" in told(several, spreads(several))
+    alone = told(several[:1], spreads(several[:1]))
     assert "±" not in alone
     assert "1 seed, so no spread; --seeds 5 would tell it" in alone
 

@@ -25,7 +25,7 @@ SPOILT: dict[str, tuple[str, str, str]] = {
     "campaigns/name.yaml": (QUICKSTART, "name: quickstart", "name: 注ぐ"),
     "campaigns/two.yaml": (QUICKSTART, "name: quickstart", "name: a\n---\nname: quickstart"),
     "campaigns/tag.yaml": (QUICKSTART, "strategy: C4", "strategy: !!python/object:os.system C4"),
-    "studies/ever.yaml": (STUDY, "repetitions: 2, per_axis: 2", "repetitions: 1000000000, per_axis: 2"),
+    "studies/ever.yaml": (STUDY, "repetitions: 2, points_per_axis: 2", "repetitions: 1000000000, points_per_axis: 2"),
     "studies/twice.yaml": (STUDY, "search: [particles, cohesion]", "search: [particles, particles]"),
     "studies/levels.yaml": (STUDY, "- name: large", "- name: small"),
     "laboratories/many.yaml": (VIRTUAL, "simulators: 0", "simulators: 100000"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import trimesh
 from PIL import ExifTags, Image
 
 from orchestrator.cli.console import RefusalError
-from orchestrator.cli.vessel_measurement import Sources, vessel
+from orchestrator.cli.vessel_command import vessel
 from orchestrator.cli.vessel_tables import read_photograph
 from orchestrator.config.file_loading import load_vessel
 from sim_engine.vessel.profile import volume
@@ -26,47 +27,47 @@ def bench(name: str) -> Bench:
     return Bench(load_vessel(VESSELS / f"{name}.yaml"))
 
 
-def made(tmp_path: Path, sources: Sources) -> float:
+def made(tmp_path: Path, sources: dict[str, Any]) -> float:
     """Capacity of what is made, from its file [m³]."""
     out = tmp_path / "made.yaml"
-    vessel(out, sources, name=None, as_json=False)
+    vessel(out, **sources)
     assert out.with_suffix(".png").stat().st_size > 10_000
     return build_vessel(load_vessel(out), use_cache=False).capacity
 
 
-Door = Callable[[Bench, Path], Sources]
+Door = Callable[[Bench, Path], dict[str, Any]]
 
 
-def callipers(of: Bench, folder: Path) -> Sources:
-    return Sources(height=f"{of.height} m", diameters=of.diameters(), wall=f"{of.shape.wall} m")
+def callipers(of: Bench, folder: Path) -> dict[str, Any]:
+    return {"height": f"{of.height} m", "diameters": of.diameters(), "wall": f"{of.shape.wall} m"}
 
 
-def fill(of: Bench, folder: Path) -> Sources:
-    return Sources(height=f"{of.height} m", fill=of.fill(folder / "fill.csv"), wall="3 mm")
+def fill(of: Bench, folder: Path) -> dict[str, Any]:
+    return {"height": f"{of.height} m", "fill": of.fill(folder / "fill.csv"), "wall": "3 mm"}
 
 
-def tilt(of: Bench, folder: Path) -> Sources:
-    return Sources(height=f"{of.height} m", tilt=of.tilt(folder / "tilt.csv"), wall="3 mm")
+def tilt(of: Bench, folder: Path) -> dict[str, Any]:
+    return {"height": f"{of.height} m", "tilt": of.tilt(folder / "tilt.csv"), "wall": "3 mm"}
 
 
-def photo(of: Bench, folder: Path) -> Sources:
+def photo(of: Bench, folder: Path) -> dict[str, Any]:
     tall = of.height + of.shape.floor
     wall, floor = f"{of.shape.wall} m", f"{of.shape.floor} m"
-    return Sources(photo=of.photo(folder / "side.png"), known_height=f"{tall} m", wall=wall, floor=floor)
+    return {"photo": of.photo(folder / "side.png"), "known_height": f"{tall} m", "wall": wall, "floor": floor}
 
 
-def points(of: Bench, folder: Path) -> Sources:
-    return Sources(points=of.save_cloud(folder / "cloud.csv"), unit="mm", floor=f"{of.shape.floor} m")
+def points(of: Bench, folder: Path) -> dict[str, Any]:
+    return {"points": of.save_cloud(folder / "cloud.csv"), "unit": "mm", "floor": f"{of.shape.floor} m"}
 
 
-def depth(of: Bench, folder: Path) -> Sources:
+def depth(of: Bench, folder: Path) -> dict[str, Any]:
     wall, floor = f"{of.shape.wall} m", f"{of.shape.floor} m"
-    return Sources(depth=of.depth(folder / "depth.png"), focal=FOCAL, wall=wall, floor=floor)
+    return {"depth": of.depth(folder / "depth.png"), "focal": FOCAL, "wall": wall, "floor": floor}
 
 
-def mesh(of: Bench, folder: Path) -> Sources:
+def mesh(of: Bench, folder: Path) -> dict[str, Any]:
     of.solid().export(folder / "scan.stl")
-    return Sources(mesh=folder / "scan.stl")
+    return {"mesh": folder / "scan.stl"}
 
 
 @pytest.mark.parametrize("name", ["tumbler", pytest.param("cone", marks=pytest.mark.slow)])
@@ -104,10 +105,9 @@ AS_STORED = {
 def test_a_cup_photographed_upright_by_a_camera_on_its_side_comes_out_as_it_is(tmp_path: Path) -> None:
     of = bench("tumbler")
     sources = photo(of, tmp_path)
-    assert sources.photo is not None
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
-    Image.open(sources.photo).transpose(Image.Transpose.ROTATE_90).save(sources.photo, exif=exif)
+    Image.open(sources["photo"]).transpose(Image.Transpose.ROTATE_90).save(sources["photo"], exif=exif)
     assert made(tmp_path, sources) == pytest.approx(of.vessel.capacity, rel=0.015)
 
 
@@ -121,14 +121,13 @@ def test_a_large_photograph_with_little_room_beside_the_vessel_will_do(tmp_path:
 
     of = bench("tumbler")
     sources = photo(of, tmp_path)
-    assert sources.photo is not None
-    with Image.open(sources.photo) as whole:
+    with Image.open(sources["photo"]) as whole:
         seen = ImageChops.difference(whole, Image.new(whole.mode, whole.size, whole.getpixel((0, 0))))
         box = seen.point(lambda value: 255 * (value > 60)).getbbox()
         assert box is not None
         left, top, right, bottom = box
         close = whole.crop((left - 8, top - 8, right + 8, bottom + 8))
-        close.resize((4 * close.width, 4 * close.height)).save(sources.photo)
+        close.resize((4 * close.width, 4 * close.height)).save(sources["photo"])
     assert made(tmp_path, sources) == pytest.approx(of.vessel.capacity, rel=0.015)
 
 
@@ -141,16 +140,16 @@ def test_sources_that_are_joined_know_more_than_each_alone(tmp_path: Path, capsy
         (
             fill(of, tmp_path),
             tilt(of, tmp_path),
-            Sources(
-                height=f"{of.height} m",
-                fill=of.fill(tmp_path / "f.csv"),
-                tilt=of.tilt(tmp_path / "t.csv"),
-                diameters=of.diameters(),
-                wall="3 mm",
-            ),
+            {
+                "height": f"{of.height} m",
+                "fill": of.fill(tmp_path / "f.csv"),
+                "tilt": of.tilt(tmp_path / "t.csv"),
+                "diameters": of.diameters(),
+                "wall": "3 mm",
+            },
         )
     ):
-        vessel(tmp_path / f"{number}.yaml", sources, name=None, as_json=True)
+        vessel(tmp_path / f"{number}.yaml", **sources, as_json=True)
         told = json.loads(capsys.readouterr().out)
         deviations.append(told["capacity_deviation_mL"])
         assert abs(told["capacity_mL"] - 1e6 * of.vessel.capacity) < 3.0 * told["capacity_deviation_mL"]
@@ -169,9 +168,9 @@ def test_the_file_says_how_far_the_shape_may_be_off(tmp_path: Path, door: Door) 
 def test_a_brimful_cup_that_weighs_otherwise_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     of = bench("tumbler")
     sources = callipers(of, tmp_path)
-    vessel(tmp_path / "right.yaml", Sources(**{**vars(sources), "brimful": "321 g"}), name=None, as_json=False)
+    vessel(tmp_path / "right.yaml", **(sources | {"brimful": "321 g"}))
     assert "warning" not in capsys.readouterr().err
-    vessel(tmp_path / "wrong.yaml", Sources(**{**vars(sources), "brimful": "280 g"}), name=None, as_json=False)
+    vessel(tmp_path / "wrong.yaml", **(sources | {"brimful": "280 g"}))
     assert "brimful it held 281 mL, and the shape has 322" in capsys.readouterr().err
     assert "# Doubtful: brimful" in (tmp_path / "wrong.yaml").read_text()
 
@@ -185,8 +184,8 @@ def test_a_sheet_is_thickened_and_holes_are_closed(tmp_path: Path) -> None:
     sheet.update_faces(keep)
     sheet.export(tmp_path / "sheet.stl")
     with pytest.raises(RefusalError, match=r"a sheet without thickness.*--wall 3mm"):
-        made(tmp_path, Sources(mesh=tmp_path / "sheet.stl"))
-    capacity = made(tmp_path, Sources(mesh=tmp_path / "sheet.stl", wall="3 mm"))
+        made(tmp_path, {"mesh": tmp_path / "sheet.stl"})
+    capacity = made(tmp_path, {"mesh": tmp_path / "sheet.stl", "wall": "3 mm"})
     assert capacity == pytest.approx(of.vessel.capacity, rel=0.02)
 
 
@@ -194,30 +193,30 @@ def test_a_vessel_that_is_not_round_becomes_a_mesh(tmp_path: Path) -> None:
     of = bench("tumbler")
     oval = of.cloud(noise=1e-4) * [1.0, 0.8, 1.0]
     np.savetxt(tmp_path / "oval.csv", 1e3 * oval, delimiter=",", header="x,y,z", comments="")
-    capacity = made(tmp_path, Sources(points=tmp_path / "oval.csv", unit="mm", floor="4 mm"))
+    capacity = made(tmp_path, {"points": tmp_path / "oval.csv", "unit": "mm", "floor": "4 mm"})
     assert load_vessel(tmp_path / "made.yaml").shape.kind == "mesh"
     assert capacity == pytest.approx(0.8 * of.vessel.capacity, rel=0.04)
 
 
-def two_cups(of: Bench, folder: Path) -> Sources:
+def two_cups(of: Bench, folder: Path) -> dict[str, Any]:
     other = of.solid().apply_translation([300.0, 0.0, 0.0])
     trimesh.util.concatenate([of.solid(), other]).export(folder / "two.stl")
-    return Sources(mesh=folder / "two.stl", unit="mm")
+    return {"mesh": folder / "two.stl", "unit": "mm"}
 
 
-def tiny(of: Bench, folder: Path) -> Sources:
+def tiny(of: Bench, folder: Path) -> dict[str, Any]:
     of.solid().apply_scale(1e-6).export(folder / "tiny.stl")
-    return Sources(mesh=folder / "tiny.stl")
+    return {"mesh": folder / "tiny.stl"}
 
 
-def steep(of: Bench, folder: Path) -> Sources:
+def steep(of: Bench, folder: Path) -> dict[str, Any]:
     return replace(depth(of, folder), depth=of.depth(folder / "steep.png", down=0.7))
 
 
 def written(text: str) -> Door:
-    def door(of: Bench, folder: Path) -> Sources:
+    def door(of: Bench, folder: Path) -> dict[str, Any]:
         (folder / "fill.csv").write_text(text)
-        return Sources(height="100 mm", fill=folder / "fill.csv", wall="3 mm")
+        return {"height": "100 mm", "fill": folder / "fill.csv", "wall": "3 mm"}
 
     return door
 
@@ -227,23 +226,30 @@ def written(text: str) -> Door:
     [
         (two_cups, r"2 bodies.*a vessel is one"),
         (tiny, r"is a vessel's in no unit"),
-        (lambda of, folder: Sources(height="95 mm", wall="3 mm"), r"nothing says how wide"),
-        (lambda of, folder: Sources(diameters="5 mm: 60 mm", wall="3 mm"), r"how deep is it inside.*--height"),
-        (lambda of, folder: Sources(height="95 mm", diameters="5 mm: 60 mm"), r"how thick is the wall"),
-        (lambda of, folder: Sources(height="95", diameters="5 mm: 60 mm", wall="3 mm"), r"--height '95'.*no unit"),
-        (lambda of, folder: Sources(height="95 mm", diameters="120 mm: 60 mm", wall="3 mm"), r"not between the inner"),
-        (lambda of, folder: Sources(height="95 mm", diameters="60", wall="3 mm"), r"a height and a diameter"),
-        (lambda of, folder: Sources(photo=folder / "none.png", known_height="9 cm", wall="3 mm"), r"no such file"),
-        (lambda of, folder: Sources(photo=of.photo(folder / "p.png"), wall="3 mm"), r"one known outer length"),
+        (lambda of, folder: {"height": "95 mm", "wall": "3 mm"}, r"nothing says how wide"),
+        (lambda of, folder: {"diameters": "5 mm: 60 mm", "wall": "3 mm"}, r"how deep is it inside.*--height"),
+        (lambda of, folder: {"height": "95 mm", "diameters": "5 mm: 60 mm"}, r"how thick is the wall"),
+        (lambda of, folder: {"height": "95", "diameters": "5 mm: 60 mm", "wall": "3 mm"}, r"--height '95'.*no unit"),
         (
-            lambda of, folder: Sources(photo=of.photo(folder / "p.png", handle=True), known_height="9 cm", wall="3 mm"),
+            lambda of, folder: {"height": "95 mm", "diameters": "120 mm: 60 mm", "wall": "3 mm"},
+            r"not between the inner",
+        ),
+        (lambda of, folder: {"height": "95 mm", "diameters": "60", "wall": "3 mm"}, r"a height and a diameter"),
+        (lambda of, folder: {"photo": folder / "none.png", "known_height": "9 cm", "wall": "3 mm"}, r"no such file"),
+        (lambda of, folder: {"photo": of.photo(folder / "p.png"), "wall": "3 mm"}, r"one known outer length"),
+        (
+            lambda of, folder: {
+                "photo": of.photo(folder / "p.png", handle=True),
+                "known_height": "9 cm",
+                "wall": "3 mm",
+            },
             r"not the same on both sides",
         ),
-        (lambda of, folder: replace(depth(of, folder), focal=None), r"focal length in pixels: --focal"),
-        (lambda of, folder: replace(depth(of, folder), centre="318"), r"--centre '318': should be a column and a row"),
-        (lambda of, folder: Sources(depth=of.photo(folder / "p.png"), focal=FOCAL, wall="3 mm"), r"16 bits"),
+        (lambda of, folder: depth(of, folder) | {"focal": None}, r"focal length in pixels: --focal"),
+        (lambda of, folder: depth(of, folder) | {"centre": "318"}, r"--centre '318': should be a column and a row"),
+        (lambda of, folder: {"depth": of.photo(folder / "p.png"), "focal": FOCAL, "wall": "3 mm"}, r"16 bits"),
         (steep, r"no table is seen"),
-        (lambda of, folder: Sources(mesh=folder / "x.stl", tilt=folder / "t.csv"), r"--tilt goes with turned vessels"),
+        (lambda of, folder: {"mesh": folder / "x.stl", "tilt": folder / "t.csv"}, r"--tilt goes with turned vessels"),
         (written("level,mass\n1,2\n"), r"fill.csv:1: the column 'level_mm' is missing"),
         (written("level_mm,mass_g\n10,20\n20,x\n"), r"fill.csv:3: should be two numbers"),
         (written("level_mm,mass_g\n10,20\n200,30\n"), r"fill.csv:3: level_mm is 200; should be .* at most 100"),
@@ -263,7 +269,7 @@ def written(text: str) -> Door:
 )
 def test_what_makes_no_vessel_is_refused_and_nothing_is_written(tmp_path: Path, door: Door, said: str) -> None:
     with pytest.raises(RefusalError, match=said) as refused:
-        vessel(tmp_path / "cup.yaml", door(bench("tumbler"), tmp_path), name=None, as_json=False)
+        vessel(tmp_path / "cup.yaml", **door(bench("tumbler"), tmp_path))
     assert refused.value.code == 2
     assert not (tmp_path / "cup.yaml").exists()
     assert not (tmp_path / "cup.stl").exists()
@@ -272,11 +278,11 @@ def test_what_makes_no_vessel_is_refused_and_nothing_is_written(tmp_path: Path, 
 def test_no_file_is_written_over(tmp_path: Path) -> None:
     (tmp_path / "cup.yaml").write_text("name: cup\n")
     with pytest.raises(RefusalError, match="exists already"):
-        vessel(tmp_path / "cup.yaml", Sources(), name=None, as_json=False)
+        vessel(tmp_path / "cup.yaml")
 
 
 @pytest.mark.parametrize("name", ["12", "no"])
 def test_a_file_that_is_called_a_number_can_be_read(tmp_path: Path, name: str) -> None:
     out = tmp_path / f"{name}.yaml"
-    vessel(out, callipers(bench("tumbler"), tmp_path), name=None, as_json=False)
+    vessel(out, **callipers(bench("tumbler"), tmp_path))
     assert load_vessel(out).name == name

@@ -15,13 +15,13 @@ import pytest
 from actors.arm.arm_settings import UrArmSettings
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.cli.console import RefusalError
-from orchestrator.cli.view_command import _recording_of, _view
+from orchestrator.cli.view_command import _recording_of, view
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.journal.codec import encode_outcome, encode_request
 from orchestrator.journal.journal import JOURNAL_NAME, Header, Journal, Kind
 from orchestrator.live_view.blueprints import put_beside
-from orchestrator.live_view.repeated_pour import NoSuchPourError, find_pour, task_of
 from orchestrator.live_view.run_recording import CampaignRecording
+from orchestrator.live_view.simulation_view import NoSuchPourError, find_pour, task_of
 from orchestrator.requests import Pour, Poured
 from sim_engine.outcome import PourMeasurement
 from tests.support import example_run
@@ -88,7 +88,7 @@ def test_pour_is_simulated_again_as_the_arm_moved_with_the_load_that_was_weighed
 
     arm = load_laboratory(ROOT / "configs" / "laboratories" / "virtual.yaml").arm
     assert isinstance(arm, UrArmSettings)
-    joints = np.array(arm.home) + np.linspace(0.0, 0.4, 50)[:, None] * np.array([0, 0, 0, 0, 0, 1.0])
+    joints = np.array(arm.home.angles) + np.linspace(0.0, 0.4, 50)[:, None] * np.array([0, 0, 0, 0, 0, 1.0])
     _journal(tmp_path, {"executed": pack(ExecutedPath(np.arange(50) * 0.1, joints, True))})
     plan = replace(example_run.campaign(), laboratory=LaboratorySettings(name="virtual", arm=arm))
     (tmp_path / "theta.json").write_text('{"theta": {"particles": 700, "cohesion": 0.03}}')
@@ -108,7 +108,7 @@ def test_pour_of_an_arm_of_numbers_is_simulated_by_its_action(tmp_path: Path) ->
     task = task_of(example_run.campaign(), tmp_path, find_pour(tmp_path, 1))
     assert task.motion is None
     assert task.action == example_run.ACTION
-    assert task.record_rate > 10.0
+    assert task.frame_rate > 10.0
 
 
 def test_what_is_not_there_is_refused_with_what_is(recording: Path, tmp_path: Path) -> None:
@@ -120,4 +120,4 @@ def test_what_is_not_there_is_refused_with_what_is(recording: Path, tmp_path: Pa
     with pytest.raises(RefusalError, match="is not the folder of a run"):
         _recording_of(tmp_path / "nowhere")
     with pytest.raises(RefusalError, match="--particles and --stage go with --pour"):
-        _view([recording], pour=None, particles=500, stage=None, output=None, at=None)
+        view([recording], particles=500)

@@ -11,7 +11,7 @@ import pytest
 
 from orchestrator.cli import console as speaking
 from orchestrator.cli import console as waiting
-from orchestrator.cli import pour_prediction as single
+from orchestrator.cli import simulate_command
 from orchestrator.cli.console import WaitingIndicator
 
 
@@ -59,8 +59,8 @@ def test_simulate_says_which_seed_it_is_at_while_it_simulates(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(waiting, "EVERY", 0.1)
-    monkeypatch.setattr(single, "waiting_for", partial(waiting.waiting_for, beat=0.05))
-    assert single._simulated_pour(Slow(), [1, 2]) == [1, 2]  # type: ignore[arg-type, list-item, comparison-overlap]
+    monkeypatch.setattr(simulate_command, "waiting_for", partial(waiting.waiting_for, beat=0.05))
+    assert simulate_command._simulated_pour(Slow(), [1, 2]) == [1, 2]  # type: ignore[arg-type, list-item, comparison-overlap]
     lines = capfd.readouterr().err.splitlines()
     assert lines[0].startswith("simulating seed 1 of 2, 0 s so far; the first pour ever also compiles kernels")
     assert lines[-1].startswith("simulating seed 2 of 2, ")

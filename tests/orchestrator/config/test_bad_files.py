@@ -119,7 +119,7 @@ BAD_PARAMETERS = {
     "out of bounds": ("particles: 3", "1:12: particles: 3 is outside 200 … 50000"),
     "broken number": ("particles: 1500.5", "particles: 1500.5 should be a whole number"),
     "nothing known": ("{}", "names no parameter; known are particles, cohesion"),
-    "another unit": ("viscosity: 3 mm", "viscosity: '3 mm' is a length; should be a rate"),
+    "another unit": ("xsph_rate: 3 mm", "xsph_rate: '3 mm' is a length; should be a rate"),
 }
 
 

@@ -87,11 +87,11 @@ BAD_CAMPAIGNS = {
         "strategy: D3\n  iterations: 9",
         "deployment.iterations: belongs to D1, not to D3",
     ),
-    "prices that decide nothing": (
+    "costs that decide nothing": (
         DEPLOYED,
         "strategy: D3",
-        "strategy: D3\n  per_pour: 2\n  prices: {pour: 60 s}",
-        "deployment.prices: decides nothing with 'per_pour: 2'; write 'per_pour: free', or remove it",
+        "strategy: D3\n  simulations_per_pour: 2\n  costs: {pour: 60 s}",
+        "deployment.costs: decides nothing with 'simulations_per_pour: 2'; write 'simulations_per_pour: free'",
     ),
     "learning without pours": (
         DEPLOYED,
@@ -123,8 +123,8 @@ BAD_CAMPAIGNS = {
     "too many simulations between pours": (
         DEPLOYED,
         "pours: 15",
-        "pours: 15\n  per_pour: 1000000000",
-        "deployment.per_pour: 1000000000 is too large; at most 200,000: at ten simulations a second",
+        "pours: 15\n  simulations_per_pour: 1000000000",
+        "deployment.simulations_per_pour: 1000000000 is too large; at most 200,000: at ten simulations a second",
     ),
     "too many simulations before pours": (
         DEPLOYED,
@@ -153,14 +153,14 @@ BAD_CAMPAIGNS = {
     "neither count nor word": (
         DEPLOYED,
         "pours: 15",
-        "pours: 15\n  per_pour: four",
-        "deployment.per_pour: should be a whole number, or 'free'",
+        "pours: 15\n  simulations_per_pour: four",
+        "deployment.simulations_per_pour: should be a whole number, or 'free'",
     ),
     "negative count in place of a word": (
         DEPLOYED,
         "pours: 15",
-        "pours: 15\n  per_pour: -1",
-        "deployment.per_pour: -1 is too small; at least 0",
+        "pours: 15\n  simulations_per_pour: -1",
+        "deployment.simulations_per_pour: -1 is too small; at least 0",
     ),
     "negative seed": (CAMPAIGN, "name: test", "name: test\nseed: -1", "seed: -1 is too small; at least 0"),
     "seed beyond 63 bits": (CAMPAIGN, "name: test", f"name: test\nseed: {2**63}", f"seed: {2**63} is too large; at"),

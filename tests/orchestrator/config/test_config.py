@@ -21,7 +21,7 @@ from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.run_folder import create_run
 from orchestrator.strategies.calibration.continuous_calibration import C4Settings
 from orchestrator.strategies.campaign_plan import DeploymentSettings
-from orchestrator.strategies.deployment.costing import PricesSettings
+from orchestrator.strategies.deployment.costing import CostSettings
 from orchestrator.strategies.deployment.d1 import D1Settings
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
@@ -242,7 +242,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           object_store: 300 MB
           ray: {{address: "head.local:6379", bench_resource: left_bench}}
           bench:
-            liquid: {{particles: 3100, cohesion: 31 mN/m, viscosity: 7 Hz, friction: 0.31}}
+            liquid: {{particles: 3100, cohesion: 31 mN/m, xsph_rate: 7 Hz, friction: 0.31}}
             pose_error: {{x: 1.1 mm, y: -2 mm, z: 0.7 mm, tilt: 0.7 deg, speed_factor: 1.03}}
             pose_noise: {{x: 0.3 mm, y: 0.4 mm, tilt: 0.2 deg, speed_factor: 0.02}}
             balance: {{resolution: 0.01 g, noise: 0.2 g, drift: 0.5 g/min, settling_time: 2.5 s}}
@@ -254,19 +254,19 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           pivot: {{x: 30 mm, z: 70 mm}}
           angular_acceleration: 300 deg/s^2
           hold_time: 0.7 s
-          hold_cap: 2 s
+          max_hold_time: 2 s
           return_velocity: 45 deg/s
           y_offset: 3 mm
           height: 55 mm
         simulator:
-          parameters: {{particles: {{range: [700, 900], scale: log}}, cohesion: 0.04 N/m, viscosity: [1 1/s, 9 1/s]}}
+          parameters: {{particles: {{range: [700, 900], scale: log}}, cohesion: 0.04 N/m, xsph_rate: [1 1/s, 9 1/s]}}
         calibration:
           receiver: {vessels}/tumbler.yaml
           motion: {{x_offset: 97 mm}}
           actions: {{angular_velocity: {{range: [20 deg/s, 90 deg/s], scale: log}}, max_angle: [80 deg, 110 deg]}}
           pours: {{count: 9, holdout: 3}}
           simulations: 33
-          initial: 5
+          initial_samples: 5
           kappa: 1.5
           averaging: noise
           random_baseline: 4
@@ -278,15 +278,15 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           loss: {{name: spilled_and_retained, retained_weight: 0.5}}
           pours: 6
           prior_simulations: 11
-          per_pour: free
-          prices: {{pour: 75 s, worth: 0.01}}
+          simulations_per_pour: free
+          costs: {{pour: 75 s, worth: 0.01}}
           kappa: 3
-          initial: 4
+          initial_samples: 4
           on_failed_pour: ignore
           noise: varying
         on_unknown: repeat
         parallel_simulations: 5
-        outputs: {{directory: here, rrd: false, figures: false, record_rate: 4 1/s, recorded_simulations: 2}}
+        outputs: {{directory: here, recording: false, figures: false, frame_rate: 4 1/s, recorded_simulations: 2}}
         """)
     (tmp_path / "all.yaml").write_text(text)
     plan = load_campaign(tmp_path / "all.yaml")
@@ -299,7 +299,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     lab = plan.laboratory
     assert (lab.name, lab.simulators, lab.in_process, lab.object_store) == ("odd", 3, True, 300)
     assert lab.ray == RaySettings(address="head.local:6379", bench_resource="left_bench")
-    assert (bench.theta.particles, bench.liquid.viscosity, bench.liquid.friction) == (3100, 7.0, 0.31)
+    assert (bench.theta.particles, bench.liquid.xsph_rate, bench.liquid.friction) == (3100, 7.0, 0.31)
     assert dataclasses.astuple(bench.pose_error.error) == pytest.approx((0.0011, -0.002, 0.7 * DEG, 1.03, 0.0007))
     assert dataclasses.astuple(bench.pose_noise.deviations) == pytest.approx((0.0003, 0.0004, 0.2 * DEG, 0.02, 0.0))
     assert (bench.time_scale, bench.operator_time, bench.balance.settling_time) == pytest.approx((12.0, 60.0, 2.5))
@@ -308,7 +308,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     scene = calibration.scene
     assert (scene.liquid.name, scene.liquid.mass, scene.liquid.density) == ("oil", 0.15, pytest.approx(920.0))
     assert (scene.liquid.surface_tension, scene.liquid.dynamic_viscosity) == pytest.approx((0.032, 0.084))
-    assert (scene.pivot.kind, scene.pivot.x, scene.pivot.z, scene.hold_cap) == ("point", 0.03, 0.07, 2.0)
+    assert (scene.pivot.kind, scene.pivot.x, scene.pivot.z, scene.max_hold_time) == ("point", 0.03, 0.07, 2.0)
     assert scene.fixed == pytest.approx(
         {
             "angular_acceleration": 300 * DEG,
@@ -321,7 +321,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     )
     assert [(a.name, a.lower, a.upper, a.scale, a.integer) for a in calibration.parameters.axes] == [
         ("particles", 700.0, 900.0, "log", True),
-        ("viscosity", 1.0, 9.0, "linear", False),
+        ("xsph_rate", 1.0, 9.0, "linear", False),
     ]
     assert calibration.fixed_parameters["cohesion"] == pytest.approx(0.04)
     assert plan.parameters.particles == 900, "the default, as far as the range allows"
@@ -330,17 +330,17 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
         ("max_angle", "linear"),
     ]
     assert (calibration.pour_count, calibration.holdout, calibration.random_baseline) == (9, 3, 4)
-    assert calibration.settings == C4Settings(simulations=33, initial=5, kappa=1.5, averaging="noise")
+    assert calibration.settings == C4Settings(simulations=33, initial_samples=5, kappa=1.5, averaging="noise")
     assert [s.receiver.name for s in deployment.scenes] == ["narrow", "mug"]
     assert deployment.scenes[0].fixed["return_velocity"] == pytest.approx(30 * DEG)
     assert (deployment.loss.name, deployment.loss.retained_weight) == ("spilled_and_retained", 0.5)
     assert deployment.settings == D3Settings(
         pours=6,
         prior_simulations=11,
-        per_pour="free",
-        prices=PricesSettings(pour=75.0, worth=0.01),
+        simulations_per_pour="free",
+        costs=CostSettings(pour=75.0, worth=0.01),
         kappa=3.0,
-        initial=4,
+        initial_samples=4,
         on_failed_pour="ignore",
         noise="varying",
     )
@@ -358,9 +358,12 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
             D1Settings(pours=0, iterations=7, simulations_per_iteration=3),
         ),
         ("strategy: D2\n  pours: 9\n  mean: zero", D2Settings(pours=9, mean="zero")),
-        ("strategy: D3\n  pours: 9\n  per_pour: 0", D3Settings(pours=9, per_pour=0)),
-        ("strategy: D3\n  pours: 9", D3Settings(pours=9, per_pour=2, prior_simulations=37, model="adaptive")),
-        ("strategy: D3\n  pours: 9\n  per_pour: free", D3Settings(pours=9, per_pour="free")),
+        ("strategy: D3\n  pours: 9\n  simulations_per_pour: 0", D3Settings(pours=9, simulations_per_pour=0)),
+        (
+            "strategy: D3\n  pours: 9",
+            D3Settings(pours=9, simulations_per_pour=2, prior_simulations=37, model="adaptive"),
+        ),
+        ("strategy: D3\n  pours: 9\n  simulations_per_pour: free", D3Settings(pours=9, simulations_per_pour="free")),
         ("strategy: D3\n  pours: 9\n  model: residual", D3Settings(pours=9, model="residual")),
     ],
 )

@@ -136,7 +136,7 @@ def test_hidden_liquid_of_the_bench_is_nowhere_in_what_calibration_gets() -> Non
     plan = load_campaign(CONFIGS / "campaigns" / "quickstart.yaml")
     assert plan.laboratory.bench is not None
     assert plan.calibration is not None
-    hidden = plan.laboratory.bench.liquid
+    hidden = plan.laboratory.bench.theta
     assert plan.parameters != hidden
     assert hidden.particles > plan.calibration.parameters.axes[0].upper
     assert str(hidden.particles) not in repr(plan.calibration)

@@ -69,14 +69,14 @@ def test_command_line_values_stand_over_the_scene_and_ask_for_the_rest() -> None
 @pytest.mark.parametrize(
     "text",
     [
-        '{"theta": {"particles": 1500, "cohesion": 0.03, "viscosity": 2.5}, "train_discrepancy": 0.02, "other": null}',
-        "particles: 1500\ncohesion: 30 mN/m\nviscosity: 2.5 1/s\n",
-        "parameters: {particles: 1500, cohesion: 0.03 N/m, viscosity: 2.5}",
+        '{"theta": {"particles": 1500, "cohesion": 0.03, "xsph_rate": 2.5}, "train_discrepancy": 0.02, "other": null}',
+        "particles: 1500\ncohesion: 30 mN/m\nxsph_rate: 2.5 1/s\n",
+        "parameters: {particles: 1500, cohesion: 0.03 N/m, xsph_rate: 2.5}",
     ],
 )
 def test_parameters_as_a_program_or_a_person_writes_them(text: str, tmp_path: Path) -> None:
     (tmp_path / "theta.json").write_text(text)
     base = SimulationParameters(friction=0.2)
     loaded = load_parameters(tmp_path / "theta.json", base)
-    expected = base.model_copy(update={"particles": 1500, "cohesion": 0.03, "viscosity": 2.5})
+    expected = base.model_copy(update={"particles": 1500, "cohesion": 0.03, "xsph_rate": 2.5})
     assert loaded.model_dump() == pytest.approx(expected.model_dump())

@@ -18,7 +18,7 @@ from orchestrator.config.file_loading import load_campaign
 from orchestrator.requests import Pour, Simulate
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.stages import calibration_stages
-from orchestrator.strategies.deployment.costing import PricesSettings
+from orchestrator.strategies.deployment.costing import CostSettings
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import FreeHybrid, Hybrid
@@ -139,9 +139,9 @@ def spill(action: Action, theta: SimulationParameters, rng: np.random.Generator)
 
 DEPLOYMENTS: dict[str, tuple[type[Any], dict[str, Any]]] = {
     "D1": (OneShotPlanning, {"iterations": 8}),
-    "D2": (RealOnly, {"pours": 8, "initial": 3}),
-    "D3": (Hybrid, {"model": "adaptive", "per_pour": 2}),
-    "D3-free": (FreeHybrid, {"model": "adaptive", "per_pour": "free", "prices": PricesSettings()}),
+    "D2": (RealOnly, {"pours": 8, "initial_samples": 3}),
+    "D3": (Hybrid, {"model": "adaptive", "simulations_per_pour": 2}),
+    "D3-free": (FreeHybrid, {"model": "adaptive", "simulations_per_pour": "free", "costs": CostSettings()}),
 }
 
 
@@ -159,7 +159,9 @@ def test_every_deployment_keeps_to_them_although_the_best_lies_beyond(name: str)
 
 
 def test_calibration_weighs_and_simulates_no_others() -> None:
-    plan = calibration_plan(actions=ACTIONS, constraints=(SLOPE,), pour_count=16, holdout=2, simulations=20, initial=6)
+    plan = calibration_plan(
+        actions=ACTIONS, constraints=(SLOPE,), pour_count=16, holdout=2, simulations=20, initial_samples=6
+    )
     results: dict[str, Any] = {}
     asked: list[Action] = []
     for stage in calibration_stages(replace(plan, scene=replace(SCENE, fixed={"height": 0.05, "max_angle": 1.9}))):

@@ -54,7 +54,7 @@ def test_too_much_of_a_file_is_refused_in_time_with_the_limit(case: str, folder:
 
 
 def test_the_largest_posterior_that_calibration_writes_is_far_from_the_limit(folder: Path) -> None:
-    theta = "{particles: 1234.567890123456, cohesion: 0.01234567890123456, viscosity: 12.34567890123456}"
+    theta = "{particles: 1234.567890123456, cohesion: 0.01234567890123456, xsph_rate: 12.34567890123456}"
     rows = "".join(f"- {{theta: {theta}, weight: 0.02}}\n" for _ in range(100))
     assert len(rows) < SIZE_LIMIT / 10
     assert len(Document.read(write(folder, "theta.yaml", f"posterior:\n{rows}")).data["posterior"]) == 100

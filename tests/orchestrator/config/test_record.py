@@ -114,7 +114,7 @@ def value_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> st.SearchStrate
         most = min((m.le for m in flat if isinstance(m, annotated_types.Le)), default=40)
         return st.integers(int(least), int(most))  # type: ignore[call-overload]
     if origin is dict:
-        return st.fixed_dictionaries({name: st.integers(1, 4) for name in ("particles", "cohesion", "viscosity")})
+        return st.fixed_dictionaries({name: st.integers(1, 4) for name in ("particles", "cohesion", "xsph_rate")})
     raise AssertionError(f"settings of type {annotation} are not generated: teach this function to write one")
 
 
@@ -143,19 +143,21 @@ def sensible(section: dict[str, Any]) -> dict[str, Any]:
     kept = dict(section)
     if kept["strategy"] in ("D2", "D3"):
         kept["pours"] = max(kept.get("pours", 1), 1)
-    if kept.get("per_pour") != "free":
-        kept.pop("prices", None)
+    if kept.get("simulations_per_pour") != "free":
+        kept.pop("costs", None)
     if (risk := kept.get("risk")) is not None:
         kept["simulations_per_iteration"] = max(kept.get("simulations_per_iteration", 2), 2)
         kept["risk"] = {key: value for key, value in risk.items() if key != "level"} | {"theta": "posterior"}
-    wanted = {"C1": ("grid", "per_axis"), "C2": ("samples",), "C3": ("iterations",), "C4": ("simulations",)}
+    wanted = {"C1": ("grid", "points_per_axis"), "C2": ("samples",), "C3": ("iterations",), "C4": ("simulations",)}
     if own := wanted.get(kept["strategy"]):
         first = next((key for key in own if key in kept), own[-1])
         kept = {key: value for key, value in kept.items() if key not in (*own, "simulations")}
         kept |= {first: section.get(first, 9)}
-        kept["initial"] = min(kept.get("initial", 8), kept[first]) if "initial" in kept or own[0] != "grid" else 0
+        kept["initial_samples"] = (
+            min(kept.get("initial_samples", 8), kept[first]) if "initial_samples" in kept or own[0] != "grid" else 0
+        )
         if kept["strategy"] in ("C1", "C2"):
-            del kept["initial"]
+            del kept["initial_samples"]
     return kept
 
 
@@ -167,7 +169,7 @@ LOSSES = st.sampled_from(
         {"objectives": [{"name": "spillage", "weight": 0.3}, {"name": "retained"}], "floor": 0.7, "pareto": True},
     ]
 )
-MOTIONS = st.sampled_from([{}, {"hold_time": "0.3 s"}, {"hold_cap": "3.3 s", "pivot": {"x": "3 mm", "z": "4 mm"}}])
+MOTIONS = st.sampled_from([{}, {"hold_time": "0.3 s"}, {"max_hold_time": "3.3 s", "pivot": {"x": "3 mm", "z": "4 mm"}}])
 
 
 def quickstart() -> dict[str, Any]:

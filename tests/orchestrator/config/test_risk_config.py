@@ -102,14 +102,13 @@ def test_each_thing_that_is_wrong_is_one_error(tmp_path: Path, deployment: dict[
 
 
 def test_a_posterior_that_nobody_makes_is_refused_before_anything_starts(tmp_path: Path) -> None:
-    options = campaigns.RunOptions(in_process=True)
     path = written(tmp_path, {"risk": RISK}, outputs={"directory": str(tmp_path / "runs")})
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     del content["calibration"]
     content["simulator"] = {"parameters": {"particles": 500}}
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     with pytest.raises(RefusalError, match="this campaign has no calibration") as refused:
-        campaigns.run(path, options)
+        campaigns.run(path, in_process=True)
     assert refused.value.code == 2
     assert not (tmp_path / "runs").exists()
 

@@ -50,7 +50,7 @@ def refusal(folder: Path, text: str) -> str:
     ("keys", "simulations", "settled"),
     [
         ("strategy: C1\n  grid: {particles: 5, cohesion: 6}", 840, {"grid": {"particles": 5, "cohesion": 6}}),
-        ("strategy: C1\n  per_axis: 10", 2800, {"grid": {"particles": 10, "cohesion": 10}}),
+        ("strategy: C1\n  points_per_axis: 10", 2800, {"grid": {"particles": 10, "cohesion": 10}}),
         ("strategy: C1\n  simulations: 504", 448, {"grid": {"particles": 4, "cohesion": 4}}),
         ("strategy: C2\n  samples: 18", 504, {"samples": 18}),
         ("strategy: C2\n  simulations: 520", 504, {"samples": 18}),
@@ -76,17 +76,20 @@ def test_budgets_count_single_simulated_pours(
     ("keys", "expected"),
     [
         ("strategy: C5", "calibration.strategy: 'C5' is not known here; should be 'C1', 'C2', 'C3' or 'C4'"),
-        ("strategy: C1", "calibration: key 'per_axis' is missing; add for example 'per_axis: 10'"),
+        ("strategy: C1", "calibration: key 'points_per_axis' is missing; add for example 'points_per_axis: 10'"),
         ("strategy: C2", "calibration: key 'samples' is missing; add for example 'samples: 18'"),
         ("strategy: C4", "calibration: key 'simulations' is missing; add for example 'simulations: 108'"),
-        ("strategy: C2\n  per_axis: 4", "calibration.per_axis: belongs to C1, not to C2; remove it"),
-        ("strategy: C1\n  per_axis: 4\n  kappa: 1", "calibration.kappa: belongs to C3 and C4, not to C1; remove it"),
-        ("strategy: C1\n  per_axis: 4\n  grid: {particles: 2, cohesion: 2}", "stands beside 'grid'; keep one"),
+        ("strategy: C2\n  points_per_axis: 4", "calibration.points_per_axis: belongs to C1, not to C2; remove it"),
+        (
+            "strategy: C1\n  points_per_axis: 4\n  kappa: 1",
+            "calibration.kappa: belongs to C3 and C4, not to C1; remove it",
+        ),
+        ("strategy: C1\n  points_per_axis: 4\n  grid: {particles: 2, cohesion: 2}", "stands beside 'grid'; keep one"),
         ("strategy: C1\n  grid: {particles: 4}", "grid: has no number of values for cohesion, which is searched"),
         ("strategy: C1\n  grid: {particles: 4, cohesion: 2, friction: 2}", "grid.friction: is not searched"),
         ("strategy: C1\n  grid: {particles: 4, cohesion: none}", "grid.cohesion: should be a whole number"),
         ("strategy: C1\n  simulations: 100", "2 values of each searched parameter on 28 training pours take 112"),
-        ("strategy: C1\n  per_axis: 99999", "makes 9999800001 θ × 28 training pours"),
+        ("strategy: C1\n  points_per_axis: 99999", "makes 9999800001 θ × 28 training pours"),
         ("strategy: C3\n  simulations: 27", "not a single θ: each is simulated on all 28 training pours"),
         ("strategy: C3\n  iterations: 5", "iterations: 8 random parameters don't fit into 5 θ"),
         (
@@ -238,7 +241,8 @@ def test_confirming_pours_need_a_bench(tmp_path: Path) -> None:
 
 def test_retired_keys_and_values_are_refused_together_with_their_places(tmp_path: Path) -> None:
     text = DEPLOYED.replace("strategy: D1", "strategy: D3\n  pours: 5") + (
-        "  model: scaled\n  trust: {pours: 4, policy: widen}\n  per_pour: free\n  prices: {simulation: 2 s}\n"
+        "  model: scaled\n  trust: {pours: 4, policy: widen}\n  simulations_per_pour: free\n"
+        "  costs: {simulation: 2 s}\n"
     )
     with pytest.raises(ConfigError) as caught:
         load(tmp_path, text)
@@ -247,10 +251,33 @@ def test_retired_keys_and_values_are_refused_together_with_their_places(tmp_path
     assert [one.partition("campaign.yaml:")[2].partition(";")[0] for one in lines] == [
         f"{line}:10: deployment.model: 'scaled' was retired",
         f"{line + 1}:3: deployment.trust: was retired",
-        f"{line + 3}:12: deployment.prices.simulation: was retired",
+        f"{line + 3}:11: deployment.costs.simulation: was retired",
     ]
     assert "write 'adaptive', or 'residual'" in lines[0]
     assert "remove it: 'model: adaptive' weighs the simulator by every pour" in lines[1]
+
+
+@pytest.mark.parametrize(
+    ("old", "retired", "new"),
+    [
+        ("strategy: D1", "strategy: D3\n  pours: 5\n  per_pour: 2", "simulations_per_pour"),
+        ("strategy: D1", "strategy: D3\n  pours: 5\n  prices: {pour: 75 s}", "costs"),
+        ("strategy: D1", "strategy: D3\n  pours: 5\n  ignorance: {policy: ask}", "discrepancy_policy"),
+        ("strategy: D1", "strategy: D3\n  pours: 5\n  risk_limit: {otherwise: stop}", "fallback"),
+        ("strategy: D1", "strategy: D3\n  pours: 5\n  stop: {gain_below: 1 %}", "min_gain"),
+        ("strategy: D1", "strategy: D1\n  initial: 4", "initial_samples"),
+        ("strategy: D1", "strategy: D1\n  motion: {hold_cap: 4 s}", "max_hold_time"),
+        ("deployment:", "outputs: {rrd: false}\ndeployment:", "recording"),
+        ("deployment:", "simulator: {parameters: {viscosity: 3 1/s}}\ndeployment:", "xsph_rate"),
+        ("deployment:", "simulator: {parameters: {eddies: 0.1}}\ndeployment:", "smagorinsky_constant"),
+        ("deployment:", "simulator: {parameters: {lip_drop: 0.4}}\ndeployment:", "rim_correction"),
+        ("deployment:", "outputs: {record_rate: 4 1/s}\ndeployment:", "frame_rate"),
+    ],
+)
+def test_a_renamed_key_is_an_error_that_states_the_present_name(
+    tmp_path: Path, old: str, retired: str, new: str
+) -> None:
+    assert f"is called '{new}' now" in refusal(tmp_path, DEPLOYED.replace(old, retired))
 
 
 def test_a_retired_key_of_another_strategy_is_said_to_be_retired(tmp_path: Path) -> None:

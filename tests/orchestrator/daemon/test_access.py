@@ -27,7 +27,7 @@ from orchestrator.daemon.access_control import (
     Tokens,
     TooManyFailuresError,
 )
-from orchestrator.daemon.submission_bundle import SubmissionBundleError, unpack
+from orchestrator.daemon.submissions import SubmissionBundleError, unpack
 from tests.support.browser import on_port
 from tests.support.toy_daemon import Served, held, run, serving
 
@@ -42,7 +42,7 @@ DOING = (
     "/campaigns/x/stop",
     "/campaigns/x/abort",
     "/campaigns/x/move",
-    "/campaigns/x/arm",
+    "/campaigns/x/enable",
     "/questions/1/answer",
     "/queue/pause",
     "/queue/resume",

@@ -91,7 +91,7 @@ def test_people_are_told_of_questions_ends_failures_and_emergencies(web: WebRece
     notifier.note("CampaignRests", {"state": "unknown", "reason": "nobody knows what came of pour 3"}, "narrow-1a2b")
     begun(notifier, "other-9", "virtual")
     notifier.note("CampaignRests", {"state": "finished", "reason": ""}, "other-9")
-    notifier.note("Deed", {"what": "emergency stop", "by": "anna", "detail": "smoke"})
+    notifier.note("AuditEntry", {"what": "emergency stop", "by": "anna", "detail": "smoke"})
     notifier.close()
     told = [(m["title"], m["message"]) for m in web.messages]
     assert [title for title, _ in told] == [

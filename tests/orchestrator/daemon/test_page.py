@@ -16,6 +16,7 @@ from typing import Any
 import httpx
 import pytest
 
+from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import OperatorQuestion
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.catalogue.run_registry import VARIABLE
@@ -23,6 +24,7 @@ from orchestrator.config.file_loading import load_laboratory
 from orchestrator.daemon.access_control import Role, token_of
 from orchestrator.daemon.daemon_settings import Rig
 from tests.support.browser import OnPort, browser, on_port
+from tests.support.hardware_laboratory import hardware_rig
 from tests.support.toy_campaign import ToyOptimizer, ToySimulators
 from tests.support.toy_daemon import HeldBench, HeldLaboratory
 from tests.support.waiting import PATIENCE
@@ -203,6 +205,20 @@ def test_the_default_answer_to_clearing_a_stop_keeps_it(page: Any, tmp_path: Pat
         assert lab.do(lab.served.get("/status"))["emergency"]["by"] == "admin"
 
 
+@pytest.mark.realtime
+def test_the_card_of_an_idle_rig_says_why_its_arm_cannot_move_and_what_to_do(page: Any, tmp_path: Path) -> None:
+    with VirtualController.start("127.81.4.9", "ur10e") as controller:
+        rig = hardware_rig(tmp_path, controller.address, "ur10e")
+        with on_port(tmp_path, rigs=(rig,), arm_interval=0.1) as lab:
+            page.goto(lab.address(Role.VIEWER))
+            card = page.get_by_role("article", name="rig rig")
+            card.get_by_text("Arm: the arm is ready to move").wait_for()
+            controller.fault("protective_stop", reason="a test")
+            card.get_by_text("The arm can't move: protective stop is in force").wait_for()
+            card.get_by_text("Find the cause, then unlock it on the teach pendant").wait_for()
+            page.locator("#cells li").filter(has_text="rig: arm can't move").wait_for()
+
+
 def test_with_two_rigs_each_is_stopped_and_cleared_alone_and_all_together(page: Any, tmp_path: Path) -> None:
     laboratory = tmp_path / "numbers.yaml"
     laboratory.write_text("{name: numbers, bench: {liquid: {particles: 400}, time_scale: 0}}\n")
@@ -245,7 +261,7 @@ def test_an_arm_that_did_not_confirm_its_stop_is_not_missed(page: Any, tmp_path:
         page.get_by_text("Nothing runs here.").wait_for()
         wait_until(page, lambda: lab.served.daemon.feed.readers > 0)
         lab.loop.call_soon_threadsafe(
-            lab.served.daemon.feed.tell, "LogLine", {"level": "error", "text": text, "stage": ""}
+            lab.served.daemon.feed.publish, "LogLine", {"level": "error", "text": text, "stage": ""}
         )
         page.get_by_role("alert").get_by_text(text).wait_for()
         assert page.evaluate(LEGIBLE) == []
@@ -292,7 +308,7 @@ def test_the_queue_is_held_reordered_and_emptied(page: Any, tmp_path: Path) -> N
         page.get_by_role("button", name="Take out").first.click()
         wait_until(page, lambda: queued(lab) == [second])
         page.get_by_role("button", name="Pause", exact=True).click()
-        wait_until(page, lambda: lab.do(lab.served.get("/campaigns"))[0]["wish"] == "pause")
+        wait_until(page, lambda: lab.do(lab.served.get("/campaigns"))[0]["desired_state"] == "pause")
 
 
 def test_pours_stand_with_what_was_expected_and_what_was_spilled(page: Any, tmp_path: Path) -> None:
@@ -340,7 +356,7 @@ def test_news_that_never_pause_hide_nothing(page: Any, tmp_path: Path) -> None:
         async def chatter() -> None:
             key = await lab.served.submit()
             while lab.sockets:
-                lab.served.daemon.feed.tell("PourProgressed", {"number": 1}, key, kept=False)
+                lab.served.daemon.feed.publish("PourProgressed", {"number": 1}, key, kept=False)
                 await asyncio.sleep(0.1)
 
         asyncio.run_coroutine_threadsafe(chatter(), lab.loop)
@@ -404,10 +420,10 @@ def test_nothing_but_the_operator_scrolls_the_page(page: Any, tmp_path: Path) ->
     with on_port(tmp_path, asking(**REFILL)) as lab:
         page.goto(lab.address())
         page.get_by_text("Nothing runs here.").wait_for()
-        page.get_by_role("heading", name="Former runs").scroll_into_view_if_needed()
+        page.get_by_role("heading", name="Previous runs").scroll_into_view_if_needed()
         page.evaluate("scrollTo(0, document.documentElement.scrollHeight)")
         assert page.evaluate("scrollY") > 0
-        where = "document.querySelector('#former-head').getBoundingClientRect().top"
+        where = "document.querySelector('#previous-head').getBoundingClientRect().top"
         before = page.evaluate(where)
         asked(lab)
         page.get_by_role("button", name="1 question").wait_for()
@@ -510,7 +526,7 @@ def test_a_screen_reader_finds_its_way(page: Any, tmp_path: Path) -> None:
         page.get_by_role("button", name="Done").wait_for()
         for role in ("banner", "main"):
             assert page.get_by_role(role).count() == 1
-        for name in ("Questions", "Now", "Last pours", "Queue", "At rest", "Former runs", "Stop"):
+        for name in ("Questions", "Now", "Last pours", "Queue", "At rest", "Previous runs", "Stop"):
             assert page.get_by_role("region", name=name, exact=True).count() == 1
         assert page.get_by_role("article", name="Fill the pourer").count() == 1
         assert page.evaluate("document.documentElement.lang") == "en"
@@ -527,7 +543,7 @@ def test_former_runs_are_found_and_what_is_noted_of_them_is_found_again(
         page.goto(lab.address(Role.OPERATOR))
         page.get_by_label("Vessel, liquid, tag, any words").fill("narrow water")
         page.get_by_role("button", name="Find").click()
-        found = page.locator("#former li")
+        found = page.locator("#previous li")
         found.get_by_text(run).wait_for()
         assert page.evaluate(LEGIBLE) == []
         assert page.evaluate("document.documentElement.scrollWidth") <= 390

@@ -66,7 +66,7 @@ def test_a_step_at_the_bench_is_asked_and_the_first_answer_counts(with_person: P
             await served.post(f"/questions/{second['id']}/answer", {"answer": "done"})
             found = await served.until(key, "finished")
             assert served.laboratories[0].bench.answers == ["done", "done"]
-            assert [deed["what"] for deed in found["deeds"]].count("answer") == 2
+            assert [entry["what"] for entry in found["audit"]].count("answer") == 2
 
     run(work())
 

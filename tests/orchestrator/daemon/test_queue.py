@@ -11,14 +11,12 @@ import pytest
 from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
-from orchestrator.cli.queue_actions import submit
+from orchestrator.cli.queue_commands import submit
 from orchestrator.config.file_loading import load_campaign, load_laboratory
-from orchestrator.daemon.daemon_settings import DESK, DaemonSettings, Rig
+from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import QueueItem
-from orchestrator.daemon.rig_worker import job_of
 from orchestrator.daemon.run_readout import Pours
-from orchestrator.daemon.submission_bundle import pack
-from orchestrator.daemon.submissions import Submission, SubmissionError, prepare
+from orchestrator.daemon.submissions import Submission, SubmissionError, pack, prepare, run_request
 from orchestrator.run_service import RunRequest
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.support.small_campaign import NARROW, write_campaign
@@ -32,6 +30,7 @@ def test_submitted_campaigns_run_to_their_end_one_after_the_other(tmp_path: Path
             found = await served.until(second, "finished")
             assert found["summary"]["pours"] == 3
             assert [pour["state"] for pour in found["pours_made"]] == ["weighed"] * 3
+            assert found["pours_made"] == found["summary"]["pours_made"]
             before = await served.get(f"/campaigns/{first}")
             assert before["state"] == "finished"
             assert before["ended"] <= found["begun"]
@@ -47,9 +46,9 @@ def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
 
     def counted(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunRequest:
         read.append(item.id)
-        return job_of(settings, item, rig)
+        return run_request(settings, item, rig)
 
-    monkeypatch.setattr("orchestrator.daemon.query_routes.job_of", counted)
+    monkeypatch.setattr("orchestrator.daemon.query_routes.run_request", counted)
 
     async def work() -> None:
         async with serving(tmp_path, held) as served:
@@ -61,9 +60,9 @@ def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
             found = await served.until(key, "finished")
             assert [pour["state"] for pour in found["pours_made"]] == ["weighed"] * 3
             settings, item = served.daemon.settings, served.daemon.item(key)
-            plan = job_of(settings, item, settings.rig(item.rig)).campaign
-            afresh = Pours().of(settings.runs / str(item.run), lambda: plan)
-            assert found["pours_made"] == afresh
+            plan = run_request(settings, item, settings.rig(item.rig)).campaign
+            afresh = Pours().of(settings.runs / str(item.run), lambda: plan, live=False)
+            assert found["pours_made"] == [pour.model_dump() for pour in afresh]
 
     run(work())
     assert len(read) == 1
@@ -139,7 +138,7 @@ def test_two_campaigns_never_hold_the_same_rig_and_two_rigs_pour_at_once(tmp_pat
             await served.until(keys[0], "running")
             assert (await served.get(f"/campaigns/{keys[1]}"))["state"] == "queued"
             holders = {rig["name"]: rig["campaign"] for rig in await served.get("/rigs")}
-            assert holders == {"left": keys[0], "right": keys[2], "desk": None}
+            assert holders == {"left": keys[0], "right": keys[2], "none": None}
             assert len(served.laboratories) == 2
             for one in served.laboratories:
                 one.bench.go.set()
@@ -157,7 +156,7 @@ def test_a_campaign_for_no_rig_there_is_is_refused_with_those_there_are(tmp_path
     async def work() -> None:
         async with serving(tmp_path, HeldLaboratory) as served:
             from orchestrator.config.file_loading import load_campaign
-            from orchestrator.daemon.submission_bundle import pack
+            from orchestrator.daemon.submissions import pack
 
             text, files = pack(load_campaign(served.campaign))
             told = await served.post("/campaigns", {"text": text, "files": files, "rig": "lefft"}, status=422)
@@ -178,21 +177,23 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
     class Told:
         def post(self, path: str, body: Any) -> dict[str, Any]:
             sent.update(body)
-            return {"id": "x", "rig": "desk", "needs_arming": False}
+            return {"id": "x", "rig": "none", "needs_enabling": False}
 
-    monkeypatch.setattr("orchestrator.cli.queue_actions.talking", lambda at: contextlib.nullcontext(Told()))
+    monkeypatch.setattr(
+        "orchestrator.cli.queue_commands.connected_client", lambda url, state: contextlib.nullcontext(Told())
+    )
     arguments = ["submit", str(campaign_in(tmp_path)), "--parameters", str(theta), "--receiver", str(bowl)]
     refused = CliRunner().invoke(app, arguments)
     assert refused.exit_code == 2
-    assert "--verb plan" in refused.stderr
+    assert "--task plan" in refused.stderr
     assert not sent
-    assert CliRunner().invoke(app, [*arguments, "--verb", "plan"]).exit_code == 0
+    assert CliRunner().invoke(app, [*arguments, "--task", "plan"]).exit_code == 0
 
     async def work() -> None:
         async with serving(tmp_path) as served:
             key = (await served.post("/campaigns", sent))["id"]
             found = await served.until(key, "finished")
-            plan = job_of(served.daemon.settings, served.daemon.item(key), Rig(DESK)).campaign
+            plan = run_request(served.daemon.settings, served.daemon.item(key), Rig(NO_RIG)).campaign
             assert plan.parameters.friction == 0.21
             assert found["name"] == plan.name == "cup-plan"
             assert [scene.receiver.name for scene in plan.deployment.scenes] == ["bowl"]  # type: ignore[union-attr]
@@ -221,7 +222,7 @@ def test_a_campaign_without_the_draws_of_theta_that_it_bears_is_refused_when_it_
     text, files = pack(with_risk(tmp_path))
     for verb, said in (("run", "this campaign has no calibration"), ("plan", "needs --parameters")):
         with pytest.raises(SubmissionError, match=said):
-            prepare(settings, Submission(text=text, files=files, verb=verb), "00000a", "somebody")
+            prepare(settings, Submission(text=text, files=files, task=verb), "00000a", "somebody")
     assert not any(settings.snapshots.iterdir())
 
 
@@ -235,24 +236,20 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
     class Client:
         def post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
             sent.append(body)
-            return {"id": "risky-1", "rig": "none", "needs_arming": False}
+            return {"id": "risky-1", "rig": "none", "needs_enabling": False}
 
     @contextlib.contextmanager
-    def talking(at: Any) -> Any:
+    def connected(url: Any, state: Any) -> Any:
         yield Client()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("orchestrator.cli.queue_actions.talking", talking)
-        source = with_risk(tmp_path).source
-        at: Any = None
-        submit(
-            source, wanted="plan", rig="", priority=0, laboratory=None, seed=None, parameters=theta, at=at, as_json=True
-        )
+        patch.setattr("orchestrator.cli.queue_commands.connected_client", connected)
+        submit(with_risk(tmp_path).source, task="plan", parameters=theta, as_json=True)
     (body,) = sent
     settings = DaemonSettings(tmp_path / "state", in_process=True)
-    submission = Submission(text=body["text"], files=body["files"], verb="plan")
+    submission = Submission(text=body["text"], files=body["files"], task="plan")
     item = prepare(settings, submission, "00000a", "somebody")
-    planned = job_of(settings, item, settings.rig(item.rig)).campaign
+    planned = run_request(settings, item, settings.rig(item.rig)).campaign
     assert planned.parameters.friction == 0.2
     assert planned.deployment is not None
     assert {one.friction for one in planned.deployment.thetas} == {0.1, 0.3}
@@ -263,7 +260,7 @@ def test_warnings_of_the_check_and_a_missing_recording_are_reported_as_the_run_b
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("orchestrator.live_view.live_server.installed", lambda module: False)
-    far = CAMPAIGN.replace("[60 mm, 100 mm]", "[60 mm, 500 mm]").replace("rrd: false", "rrd: true")
+    far = CAMPAIGN.replace("[60 mm, 100 mm]", "[60 mm, 500 mm]").replace("recording: false", "recording: true")
 
     async def work() -> None:
         write_campaign(tmp_path, far)

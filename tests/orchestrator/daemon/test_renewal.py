@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 
 from actors.laboratory import WarmSimulators
-from orchestrator.daemon import restart as renewal
-from orchestrator.daemon import supervisor
-from orchestrator.daemon.restart import MOST, RENEWED, DaemonRestart, RayWatch
+from orchestrator.daemon import server_process, supervisor
+from orchestrator.daemon.server_process import MOST, RENEWED, DaemonRestart, RayWatch
 from tests.support.toy_daemon import held, run, serving
 
 
@@ -65,10 +64,10 @@ class Daemon:
         self.problems.append(str(text))
 
 
-def watched(monkeypatch: pytest.MonkeyPatch, daemon: Daemon, *, rests: bool = False) -> list[float]:
+def watched(monkeypatch: pytest.MonkeyPatch, daemon: Any, *, rests: bool = False) -> list[float]:
     """When the program was replaced, seconds after Ray was seen to be dead."""
-    monkeypatch.setattr(renewal, "COMING_TO_REST", 0.4)
-    monkeypatch.setattr(renewal, "POURING", 0.8)
+    monkeypatch.setattr(server_process, "COMING_TO_REST", 0.4)
+    monkeypatch.setattr(server_process, "POURING", 0.8)
     begun, replaced = time.monotonic(), []
 
     class Kept(DaemonRestart):
@@ -109,5 +108,5 @@ def test_people_are_told_where_ray_dies_again_and_again(monkeypatch: pytest.Monk
     assert watched(monkeypatch, daemon) == []
     assert daemon.left == []
     assert "start it again" in daemon.problems[0]
-    monkeypatch.setenv(RENEWED, " ".join(str(time.time() - renewal.WITHIN) for _ in range(MOST)))
+    monkeypatch.setenv(RENEWED, " ".join(str(time.time() - server_process.WITHIN) for _ in range(MOST)))
     assert len(watched(monkeypatch, Daemon())) == 1

@@ -47,7 +47,7 @@ def test_a_file_says_what_is_different(tmp_path: Path) -> None:
         ("prot: 3\n", "decant.yaml:1:1: prot: unknown key"),
         ("rigs: {left: lefft.yaml}\n", "did you mean 'left.yaml'?"),
         ("rigs: {left: desk.yaml}\n", "has no bench; campaigns that pour nothing need no rig"),
-        ("rigs: {desk: left.yaml}\n", "give the rig another name"),
+        ("rigs: {none: left.yaml}\n", "give the rig another name"),
         ("roots: [nowhere]\n", "is not a folder"),
         ("recordings: {age: 30}\n", "decant.yaml:1:19: recordings.age"),
     ],

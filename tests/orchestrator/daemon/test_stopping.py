@@ -25,7 +25,7 @@ def test_pausing_finishes_the_pour_and_resuming_goes_on_with_the_next_one(tmp_pa
             key = await served.submit()
             laboratory = await served.pouring()
             told = await served.post(f"/campaigns/{key}/pause")
-            assert told["wish"] == "pause"
+            assert told["desired_state"] == "pause"
             await served.until(key, "pausing", "paused")
             laboratory.bench.go.set()
             found = await served.until(key, "paused")
@@ -121,7 +121,7 @@ def test_an_emergency_stop_is_latched_until_somebody_clears_it(tmp_path: Path) -
             assert laboratory.arm_stops == 1
             assert status["emergency"]["reason"] == "glass"
             found = await served.until(key, "unknown")
-            assert found["wish"] == "abort"
+            assert found["desired_state"] == "abort"
             for path, body in (
                 (f"/campaigns/{key}/resume", None),
                 ("/campaigns", {"text": "name: x"}),

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_settings import DaemonSettings
-from orchestrator.daemon.submission_bundle import Files, pack
-from orchestrator.daemon.submissions import Submission, SubmissionError, prepare
+from orchestrator.daemon.submissions import Files, Submission, SubmissionError, pack, prepare
 from tests.support.hypothesis_examples import examples
 from tests.support.small_campaign import write_campaign
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orchestrator.results.pour_figures import _moments, place, section, simulation_png
+from orchestrator.results import figure_style as style
+from orchestrator.results.pour_figures import _moments, place, section, simulation_figure
 from sim_engine.motion import plan_motion
 from sim_engine.outcome import SimulatedPour
 from sim_engine.vessel.vessel import build_vessel
@@ -18,7 +19,7 @@ from tests.support.example_results import is_picture
 
 def test_simulated_pour_is_drawn_with_its_vessels_and_particles(tmp_path: Path) -> None:
     task, result = example_run.simulation()
-    assert is_picture(simulation_png(tmp_path / "pour.png", task, result))
+    assert is_picture(style.save(simulation_figure(task, result), tmp_path / "pour.png"))
 
 
 def test_pour_that_keeps_everything_in_the_pourer_is_drawn(tmp_path: Path) -> None:
@@ -27,7 +28,7 @@ def test_pour_that_keeps_everything_in_the_pourer_is_drawn(tmp_path: Path) -> No
     assert frames is not None
     for states in frames.states:
         states[:] = 0
-    assert is_picture(simulation_png(tmp_path / "nothing.png", task, result))
+    assert is_picture(style.save(simulation_figure(task, result), tmp_path / "nothing.png"))
 
 
 def test_snapshots_show_the_flow_from_its_beginning_to_its_end() -> None:
@@ -43,7 +44,7 @@ def test_snapshots_show_the_flow_from_its_beginning_to_its_end() -> None:
 def test_simulation_without_frames_is_refused_with_advice(tmp_path: Path) -> None:
     task, result = example_run.simulation()
     with pytest.raises(ValueError, match="record rate above 0"):
-        simulation_png(tmp_path / "pour.png", task, SimulatedPour(result.outcome))
+        simulation_figure(task, SimulatedPour(result.outcome))
 
 
 def test_section_of_a_cup_is_its_wall_cut_open() -> None:

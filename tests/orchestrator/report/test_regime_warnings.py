@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.results.console_view import summary_table
-from orchestrator.results.stage_views import receiver_names
 from orchestrator.results.summarise import summarise
 from orchestrator.results.validity_warnings import (
     best_action_warnings,
@@ -25,6 +24,7 @@ from orchestrator.results.validity_warnings import (
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.action import DEG
 from sim_engine.liquids import SimulationParameters
+from sim_engine.model_validity import NotCovered
 from sim_engine.search_space import Axis, Space
 from tests.support import example_run, small_campaign
 from tests.support.example_results import changed, shown
@@ -47,7 +47,7 @@ def deploying(actions: Space, **changes: float) -> CampaignPlan:
 
 def test_a_space_of_slow_pours_is_warned_of_and_one_of_quick_pours_is_not() -> None:
     (warnings,) = campaign_warnings(deploying(SLOW)).values()
-    assert {one.worst.kind for one in warnings} == {"dribbling", "wetting"}
+    assert {one.kind for one in warnings} == {"dribbling", "wetting"}
     assert all((one.hit, one.tried) == (5, 5) for one in warnings)
     assert campaign_warnings(deploying(QUICK)) == {}
 
@@ -55,10 +55,10 @@ def test_a_space_of_slow_pours_is_warned_of_and_one_of_quick_pours_is_not() -> N
 def test_a_warning_names_the_worst_action_and_how_many_were_tried() -> None:
     mixed = Space((Axis("angular_velocity", 40 * DEG, 90 * DEG), Axis("max_angle", 66 * DEG, 120 * DEG)))
     warnings = campaign_warnings(deploying(mixed))
-    (dribbling,) = (one for one in warnings["narrow cup"] if one.worst.kind == "dribbling")
-    assert dribbling.values["max_angle"] == pytest.approx(66 * DEG)
+    (dribbling,) = (one for one in warnings["narrow cup"] if one.kind == "dribbling")
+    assert dribbling.action_si["max_angle"] == pytest.approx(66 * DEG)
     assert (dribbling.hit, dribbling.tried) == (3, 5)  # the middle of 93° and those to 66°, not those to 120°
-    (header, *told) = lines(warnings, receiver_names(deploying(mixed)))
+    (header, *told) = lines(warnings)
     assert header.startswith("not simulated")
     assert any("into narrow, dribbling: " in line and "3 of 5 actions tried)" in line for line in told)
     assert any("max angle 66 deg" in line for line in told)
@@ -66,7 +66,7 @@ def test_a_warning_names_the_worst_action_and_how_many_were_tried() -> None:
 
 def test_a_viscous_liquid_is_told_by_its_viscosity_alone() -> None:
     (warnings,) = campaign_warnings(deploying(QUICK, dynamic_viscosity=3.0)).values()
-    assert [one.worst.kind for one in warnings] == ["viscous"]
+    assert [one.kind for one in warnings] == ["viscous"]
 
 
 def test_calibration_counts_with_the_middle_of_the_particles_that_it_searches() -> None:
@@ -78,7 +78,7 @@ def test_calibration_counts_with_the_middle_of_the_particles_that_it_searches() 
         assert plan.calibration is not None
         calibration = replace(plan.calibration, parameters=Space((axis,)))
         found = campaign_warnings(replace(plan, calibration=calibration, deployment=None))
-        return "thin_stream" in {one.worst.kind for one in found.get("calibration", ())}
+        return "thin_stream" in {one.kind for one in found.get("calibration", ())}
 
     assert thin(300, 600)
     assert not thin(20_000, 50_000)
@@ -102,14 +102,14 @@ def test_the_summary_has_them_for_people_and_for_programs(results: dict[str, Any
     plan = example_run.campaign()
     spaces = campaign_warnings(deploying(SLOW))
     deployed = {"narrow cup": results["narrow cup"]}
-    best = {"narrow cup": [one.worst for one in spaces["narrow cup"]]}
+    best = {"narrow cup": [NotCovered(one.kind, one.share, one.text) for one in spaces["narrow cup"]]}
     summary = summarise(plan, deployed, not_covered=spaces, best_not_covered=best)
     written = summary.model_dump(mode="json")
     assert [one["kind"] for one in written["not_covered"]["narrow cup"]] == ["dribbling", "wetting"]
     assert [one["kind"] for one in written["receivers"]["narrow cup"]["not_covered"]] == ["dribbling", "wetting"]
-    text = " ".join(shown(summary_table(plan, summary)).split())
-    assert "narrow, best action, dribbling: " in text
-    assert "best action, dribbling" not in shown(summary_table(plan, summarise(plan, deployed)))
+    text = " ".join(shown(summary_table(summary)).split())
+    assert "Not simulated at this action, dribbling: " in text
+    assert "at this action, dribbling" not in shown(summary_table(summarise(plan, deployed)))
 
 
 def test_numbers_are_told_with_digits_that_mean_something() -> None:

@@ -12,20 +12,23 @@ import pytest
 from matplotlib.collections import PathCollection
 from matplotlib.text import Text
 
-from orchestrator.results import spillage_figures as figures_module
-from orchestrator.results import surrogate_figures as maps_module
-from orchestrator.results.campaign_figures import draw_figures
+from orchestrator.results import figure_style as style
+from orchestrator.results import run_figures as figures_module
 from orchestrator.results.console_view import summary_table
 from orchestrator.results.figure_style import display_value, display_values, log_ticks
 from orchestrator.results.loss_units import loss_unit
-from orchestrator.results.spillage_figures import DiscrepancyGroup, PourSeries, draw_discrepancy, draw_spillage
-from orchestrator.results.stage_views import (
+from orchestrator.results.run_figures import (
+    DiscrepancyGroup,
+    PourSeries,
     calibration_picture,
     deployment_picture,
     discrepancy_groups,
-    evaluation_of,
+    draw_discrepancy,
+    draw_figures,
+    draw_spillage,
     pour_series,
 )
+from orchestrator.results.stage_views import evaluation_of
 from orchestrator.results.summarise import summarise
 from orchestrator.results.surrogate_figures import SurrogatePicture, draw_posterior, draw_surrogate, draw_trials
 from sim_engine.action import DEG, Action
@@ -56,7 +59,7 @@ def test_unfinished_run_gets_the_figures_it_can(results: dict[str, Any], tmp_pat
 def test_a_figure_that_fails_does_not_take_the_others_with_it(
     results: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    (tmp_path / "spillage.png").mkdir()
+    (tmp_path / "spillage-against-pours.png").mkdir()
     drawn = draw_figures(tmp_path, example_run.campaign(), results)
     assert "spillage against pours" not in drawn
     assert len(drawn) == 4
@@ -87,20 +90,16 @@ def in_three_axes(results: dict[str, Any]) -> tuple[Any, Any]:
     return plan, changed(result, trials=trials, found=changed(result.found, map=cut, theta=theta, posterior=None))
 
 
-def test_map_of_three_parameters_says_where_the_third_was_held_and_marks_theta(
-    results: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_map_of_three_parameters_says_where_the_third_was_held_and_marks_theta(results: dict[str, Any]) -> None:
     plan, result = in_three_axes(results)
-    drawn: list[Any] = []
-    monkeypatch.setattr(maps_module.style, "save", lambda figure, path: drawn.append(figure) or path)
     picture = calibration_picture(plan, result)
     assert picture is not None
-    draw_surrogate(tmp_path / "map.png", picture)
-    said = {text.get_text() for text in drawn[0].findobj(Text)}
+    figure = draw_surrogate(picture)
+    said = {text.get_text() for text in figure.findobj(Text)}
     assert "number of particles" in said
     assert "wall friction" in said
     assert any(text.startswith("others at θ*: cohesion 0.04 N/m") for text in said)
-    scatters = [c for c in drawn[0].axes[0].collections if isinstance(c, PathCollection)]
+    scatters = [c for c in figure.axes[0].collections if isinstance(c, PathCollection)]
     star = next(c for c in scatters if len(c.get_offsets()) == 1 and c.get_sizes()[0] > 300)
     assert star.get_offsets()[0].tolist() == pytest.approx([result.found.theta.particles, 0.2])
     dots = next(c for c in scatters if len(c.get_offsets()) == len(picture.points))
@@ -127,14 +126,16 @@ def test_expected_losses_below_zero_are_shown_as_zero_and_stored_as_they_are(
         learnt,
         recommended=changed(learnt.recommended, predicted_loss=-0.013, predicted_deviation=0.014),
         pours=[
-            changed(p, predicted=-0.005, predicted_deviation=0.008, predicted_scatter=0.006, predicted_band=None)
+            changed(p, predicted=-0.005, predicted_deviation=0.008, predicted_scatter=0.006, predicted_interval=None)
             for p in learnt.pours
         ],
         map=changed(learnt.map, mean=(np.array(learnt.map.mean) - 0.5).tolist()),
     )
     summary = summarise(plan, {"narrow cup": deployed})
-    assert summary.receivers["narrow cup"].predicted_loss == -0.013
-    assert "0.00 ± 1.40 %" in shown(summary_table(plan, summary))
+    recommended = summary.receivers["narrow cup"].recommended
+    assert recommended is not None
+    assert recommended.predicted_loss == -0.013
+    assert "0.00 ± 1.40 %" in shown(summary_table(summary))
     assert "-" not in loss_unit(Loss()).text(-0.013, 0.014)
     (told,) = set(pour_series(plan, {"narrow cup": deployed}, loss_unit(Loss()))[0].predicted)
     assert told == pytest.approx((0.0, 0.0, 0.78), abs=0.01)
@@ -150,7 +151,7 @@ def test_receivers_are_called_by_their_own_name_unless_two_share_it(results: dic
     deployed = {"narrow cup": results["narrow cup"]}
     assert draw_figures(tmp_path, plan, deployed)["loss map narrow"].name == "loss-map-narrow.png"
     assert pour_series(plan, deployed, loss_unit(Loss()))[0].receiver == "narrow (D3)"
-    text = shown(summary_table(plan, summarise(plan, deployed)))
+    text = shown(summary_table(summarise(plan, deployed)))
     assert "narrow " in text
     assert "narrow cup" not in text
     low = replace(example_run.NARROW, name="low", fixed={"height": 0.02})
@@ -178,25 +179,25 @@ def test_bars_of_the_test_discrepancy_are_the_evaluations_scores(results: dict[s
 
 def test_maps_can_be_drawn_for_any_number_of_axes(tmp_path: Path) -> None:
     for dimension in (1, 3):
-        space = Space(tuple(Axis(name, 0.0, 1.0) for name in ("cohesion", "friction", "viscosity")[:dimension]))
+        space = Space(tuple(Axis(name, 0.0, 1.0) for name in ("cohesion", "friction", "xsph_rate")[:dimension]))
         points = [space.decode([u] * dimension) for u in (0.1, 0.5, 0.9)]
         picture = SurrogatePicture("θ", "|Δ| [%]", space, points, [3.0, 1.0, 2.0], points[1])
-        assert is_picture(draw_surrogate(tmp_path / f"{dimension}.png", picture))
+        assert is_picture(style.save(draw_surrogate(picture), tmp_path / f"{dimension}.png"))
 
 
 def test_flat_surrogate_is_drawn_too(tmp_path: Path) -> None:
     flat = np.full((5, 5), 2.0)
     picture = SurrogatePicture("θ", "|Δ| [%]", example_run.THETA, [], [], mean=flat, deviation=flat)
-    assert is_picture(draw_surrogate(tmp_path / "flat.png", picture))
+    assert is_picture(style.save(draw_surrogate(picture), tmp_path / "flat.png"))
 
 
 def test_nothing_to_draw_is_said_not_drawn(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="neither a surrogate nor a single observation"):
-        draw_surrogate(tmp_path / "a.png", SurrogatePicture("θ", "|Δ| [%]", example_run.THETA, [], []))
+        draw_surrogate(SurrogatePicture("θ", "|Δ| [%]", example_run.THETA, [], []))
     with pytest.raises(ValueError, match="no pours"):
-        draw_spillage(tmp_path / "b.png", [], cost="loss [%]", title="")
+        draw_spillage([], cost="loss [%]", title="")
     with pytest.raises(ValueError, match="no set of pours"):
-        draw_discrepancy(tmp_path / "c.png", [], title="")
+        draw_discrepancy([], title="")
     assert not list(tmp_path.iterdir())
 
 
@@ -217,15 +218,15 @@ def test_clueless_first_prediction_does_not_squeeze_the_measured_pours(
 
     monkeypatch.setattr(figures_module, "_pour_panel", watching)
     series = PourSeries("cup", [10.0, 5.0, 2.0], [(50.0, 0.0, 850.0), (6.0, 4.0, 8.0), (2.0, 0.0, 4.0)])
-    assert is_picture(draw_spillage(tmp_path / "spillage.png", [series], cost="loss [%]", title=""))
+    assert is_picture(style.save(draw_spillage([series], cost="loss [%]", title=""), tmp_path / "spillage.png"))
     assert tops == [20.0]
 
 
 def test_receivers_and_predictors_that_are_missing_leave_room_not_errors(tmp_path: Path) -> None:
     failed = PourSeries("cup", [None, None], [None, None])
-    assert is_picture(draw_spillage(tmp_path / "failed.png", [failed], cost="loss [%]", title="all failed"))
+    assert is_picture(style.save(draw_spillage([failed], cost="loss [%]", title="all failed"), tmp_path / "failed.png"))
     alone = DiscrepancyGroup("another receiver", 1, 0.05)
-    assert is_picture(draw_discrepancy(tmp_path / "alone.png", [alone], title="θ* alone"))
+    assert is_picture(style.save(draw_discrepancy([alone], title="θ* alone"), tmp_path / "alone.png"))
 
 
 def test_quantities_are_shown_in_the_units_that_people_type() -> None:
@@ -246,13 +247,6 @@ def test_losses_are_shown_in_their_own_unit() -> None:
     assert "0.5 × retained" in loss_unit(Loss(retained_weight=0.5)).label
 
 
-def kept(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Figures as they are saved."""
-    drawn: list[Any] = []
-    monkeypatch.setattr(maps_module.style, "save", lambda figure, path: drawn.append(figure) or path)
-    return drawn
-
-
 def at_the_edges(**changes: Any) -> SurrogatePicture:
     """Observations and the best in the corners of the box."""
     corners = [{"particles": n, "cohesion": c} for n in (500.0, 4000.0) for c in (0.0, 0.1)]
@@ -261,57 +255,56 @@ def at_the_edges(**changes: Any) -> SurrogatePicture:
 
 
 @pytest.mark.parametrize("mapped", [True, False])
-def test_what_lies_on_an_edge_of_the_box_is_drawn_whole(mapped: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, grid = kept(monkeypatch), np.linspace(0.0, 1.0, 100).reshape(10, 10)
+def test_what_lies_on_an_edge_of_the_box_is_drawn_whole(mapped: bool) -> None:
+    grid = np.linspace(0.0, 1.0, 100).reshape(10, 10)
     numbered = at_the_edges(mean=grid, deviation=grid, numbers=[1, 2, 3, 4], best_name="best action")
-    (draw_surrogate if mapped else draw_trials)(Path("map.png"), numbered)
-    assert strays(drawn[0]) == []
+    figure = (draw_surrogate if mapped else draw_trials)(numbered)
+    assert strays(figure) == []
 
 
-def test_a_best_action_at_an_end_of_the_box_is_said_to_be_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, grid = kept(monkeypatch), np.zeros((5, 5))
-    draw_surrogate(Path("map.png"), at_the_edges(mean=grid, deviation=grid, best_name="best action"))
+def test_a_best_action_at_an_end_of_the_box_is_said_to_be_there() -> None:
+    grid = np.zeros((5, 5))
     inside = {"particles": 1000.0, "cohesion": 0.05}
-    draw_surrogate(Path("map.png"), at_the_edges(mean=grid, deviation=grid, best=inside))
+    drawn = [
+        draw_surrogate(at_the_edges(mean=grid, deviation=grid, best_name="best action")),
+        draw_surrogate(at_the_edges(mean=grid, deviation=grid, best=inside)),
+    ]
     said = [" ".join(text.get_text() for text in figure.findobj(Text)) for figure in drawn]
     assert "best action has particles at its upper end (4 000) and cohesion at its upper end (0.1 N/m)" in said[0]
     assert "end" not in said[1]
 
 
-def test_a_surrogate_that_expects_the_impossible_does_not_stretch_the_colours(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, grid = kept(monkeypatch), np.full((5, 5), 20.0)
+def test_a_surrogate_that_expects_the_impossible_does_not_stretch_the_colours() -> None:
+    grid = np.full((5, 5), 20.0)
     grid[0, 0] = 500.0
-    draw_surrogate(Path("map.png"), at_the_edges(mean=grid, deviation=grid, largest=100.0))
-    bars = [axes for axes in drawn[0].axes if axes.get_label() == "<colorbar>"]
+    figure = draw_surrogate(at_the_edges(mean=grid, deviation=grid, largest=100.0))
+    bars = [axes for axes in figure.axes if axes.get_label() == "<colorbar>"]
     assert [bar.get_ylim()[1] for bar in bars] == pytest.approx([100.0, 100.0])
 
 
-def test_simulations_stand_beside_the_pours_of_a_loss_map(
-    results: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    deployed, drawn = results["narrow cup"], kept(monkeypatch)
+def test_simulations_stand_beside_the_pours_of_a_loss_map(results: dict[str, Any]) -> None:
+    deployed = results["narrow cup"]
     picture = deployment_picture(example_run.campaign(), deployed)
     assert picture is not None
     assert len(picture.simulated) == deployed.simulations - deployed.simulations_lost
-    draw_surrogate(Path("map.png"), picture)
-    crosses = [c for c in drawn[0].axes[0].collections if c.get_label() == "simulation"]
+    figure = draw_surrogate(picture)
+    crosses = [c for c in figure.axes[0].collections if c.get_label() == "simulation"]
     assert [len(c.get_offsets()) for c in crosses] == [len(picture.simulated)]
-    assert strays(drawn[0]) == []
+    assert strays(figure) == []
 
 
-def test_predictors_that_have_nothing_to_say_get_no_bar_and_no_word(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = kept(monkeypatch)
+def test_predictors_that_have_nothing_to_say_get_no_bar_and_no_word() -> None:
     groups = [
         DiscrepancyGroup("training pours", 7, 0.06),
         DiscrepancyGroup("test pours", 3, 0.01, None, [0.02, 0.03], 0.04),
     ]
-    draw_discrepancy(Path("bars.png"), groups, title="bars")
-    said = [text.get_text() for text in drawn[0].findobj(Text)]
+    figure = draw_discrepancy(groups, title="bars")
+    said = [text.get_text() for text in figure.findobj(Text)]
     assert not [text for text in said if "n/a" in text]
-    places = [(bar.get_x(), bar.get_x() + bar.get_width()) for bar in drawn[0].axes[0].patches]
+    places = [(bar.get_x(), bar.get_x() + bar.get_width()) for bar in figure.axes[0].patches]
     assert len(places) == 4
     assert all(end <= begin for (_, end), (begin, _) in itertools.pairwise(sorted(places)))
-    assert strays(drawn[0]) == []
+    assert strays(figure) == []
 
 
 def test_ticks_of_a_logarithmic_axis_are_numbers_that_people_read() -> None:
@@ -320,18 +313,16 @@ def test_ticks_of_a_logarithmic_axis_are_numbers_that_people_read() -> None:
     assert len(log_ticks(250.0, 500.0)) >= 3
 
 
-def test_the_posterior_has_axes_with_plain_numbers_and_nothing_is_cut(
-    results: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn, result = kept(monkeypatch), results["calibration"]
+def test_the_posterior_has_axes_with_plain_numbers_and_nothing_is_cut(results: dict[str, Any]) -> None:
+    result = results["calibration"]
     theta = {**result.found.theta.model_dump(), "particles": 4000.0, "cohesion": 0.0}
-    draw_posterior(Path("posterior.png"), result.found.posterior, example_run.THETA, theta)
-    drawn[0].draw_without_rendering()
-    said = [text.get_text() for text in drawn[0].findobj(Text)]
+    figure = draw_posterior(result.found.posterior, example_run.THETA, theta)
+    figure.draw_without_rendering()
+    said = [text.get_text() for text in figure.findobj(Text)]
     assert not [text for text in said if "10^" in text]
     assert said.count("draws") == 2
-    assert strays(drawn[0]) == []
-    cloud = drawn[0].axes[2]
+    assert strays(figure) == []
+    cloud = figure.axes[2]
     (star,) = [line for line in cloud.lines if line.get_marker() == "*"]
     (place,) = cloud.transData.transform(np.column_stack(star.get_data()))
     assert cloud.bbox.padded(-5).contains(*place)

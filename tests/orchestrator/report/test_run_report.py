@@ -19,16 +19,19 @@ from actors.optimizer.optimizer_actor import Proposer
 from orchestrator.cli.app import app
 from orchestrator.cli.foreground_run import report_of_what_stands
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
 from orchestrator.journal.journal_check import JournalCheck
-from orchestrator.journal.run_record import CampaignResult, read_record
+from orchestrator.journal.run_record import CampaignResult, RecordedDecision, read_record
 from orchestrator.results import figure_style as style
+from orchestrator.results.console_view import summary_table
 from orchestrator.results.html_report import run_page
-from orchestrator.results.publishing import Published, publish, summary_of
+from orchestrator.results.publishing import Published, publish
+from orchestrator.results.run_summary import summary_json
+from orchestrator.results.summarise import summarise
 from orchestrator.run_errors import RunError
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.run_folder import create_run
 from orchestrator.strategies.campaign_plan import CampaignPlan
+from tests.support.example_results import shown
 from tests.support.small_campaign import CAMPAIGN, write_campaign
 from tests.support.toy_campaign import ToyBench, ToyLaboratory
 
@@ -100,8 +103,7 @@ def test_the_same_figure_is_the_same_file(tmp_path: Path) -> None:
     def drawn(folder: Path) -> bytes:
         figure, axes = style.new_figure(size=(3.0, 2.0))
         axes.plot([0, 1], [1, 0], "o")
-        with style.also_as(".svg", ".pdf"):
-            style.save(figure, folder / "line.png")
+        style.save(figure, folder / "line.png", (".svg", ".pdf"))
         return b"".join((folder / f"line.{kind}").read_bytes() for kind in ("png", "svg", "pdf"))
 
     assert drawn(tmp_path / "first") == drawn(tmp_path / "second")
@@ -109,9 +111,9 @@ def test_the_same_figure_is_the_same_file(tmp_path: Path) -> None:
 
 def test_it_says_what_to_do_what_to_expect_and_what_nobody_knows(made: Made) -> None:
     said, row = texts(made.page), next(iter(made.published.summary.receivers.values()))
-    assert row.best_action_si is not None
-    assert f"{row.best_action_si['x_offset'] * 1e3:.3g} mm" in said
-    assert "To pour 100 g of water from beaker into narrow, use the action below." in said
+    assert row.recommended is not None
+    assert f"{row.recommended.action_si['x_offset'] * 1e3:.3g} mm" in said
+    assert "To pour 100 g of water from beaker into narrow, use the recommended action." in said
     assert "No safe window was looked for" in said
     assert "The recommended action was not poured again" in said
     assert "The bench was VIRTUAL: no robot moved and no liquid was weighed." in said
@@ -120,8 +122,7 @@ def test_it_says_what_to_do_what_to_expect_and_what_nobody_knows(made: Made) -> 
 
 
 def test_every_pour_stands_in_a_table_with_its_grams(made: Made) -> None:
-    with JournalReader(made.result.directory / JOURNAL_NAME) as journal:
-        pours = read_record(journal).pours
+    pours = read_record(made.result.directory).pours
     assert len(pours) == 5
     said = texts(made.page)
     for pour in pours:
@@ -140,15 +141,20 @@ def test_names_and_reasons_that_are_html_stay_text(made: Made) -> None:
         for one in plan.deployment.scenes
     ]
     plan = replace(plan, deployment=replace(plan.deployment, scenes=tuple(scenes)))
-    with JournalReader(made.result.directory / JOURNAL_NAME) as journal:
-        record = read_record(journal)
-    record.pours[0].came, record.pours[0].reason = "failed", SCRIPT
+    record = read_record(made.result.directory)
+    record.pours[0].state, record.pours[0].reason = "failed", SCRIPT
     record.notes.append((0.0, SCRIPT))
-    record.decisions.append((SCRIPT, SCRIPT))
-    summary = summary_of(plan, made.result, {f"loss map {SCRIPT}": made.published.figures["discrepancy map"]})
-    damaged = JournalCheck(Path(SCRIPT), problems=(SCRIPT,))
-    versions = {"campaign": SCRIPT, "packages": {SCRIPT: SCRIPT}}
-    page = run_page(plan, summary, record, Path(SCRIPT), versions=versions, check=damaged)
+    record.decisions.append(RecordedDecision(0.0, SCRIPT, SCRIPT, {}, 0))
+    summary = summarise(
+        plan,
+        made.result.results,
+        record=record,
+        run=SCRIPT,
+        figures={f"loss map {SCRIPT}": made.published.figures["discrepancy map"]},
+        versions={"campaign": SCRIPT, "packages": {SCRIPT: SCRIPT}},
+        check=JournalCheck(Path(SCRIPT), problems=(SCRIPT,)),
+    )
+    page = run_page(summary, plan.resolved)
     assert "WARNING: the records of this run are damaged or incomplete" in page
     assert "<script" not in page
     assert page.count("&lt;script&gt;") > 10
@@ -218,7 +224,7 @@ def test_a_pour_that_nobody_knows_of_is_called_so_and_its_liquid_is_not_made_up(
     assert done.exit_code == 0, done.output
     said = texts((directory / "report.html").read_text(encoding="utf-8"))
     assert "This run is not finished. Its state is 'unknown'" in said
-    assert "Pour 2 of pours had begun, and nobody has said what came of it." in said
+    assert "Pour 2 of pours had begun, and its outcome is not known." in said
     assert "2 begun, 1 weighed, 1 of unknown outcome" in said
     assert f"--resume --run {directory.name}" in said
     assert "It is not repeated by software" in said
@@ -271,3 +277,28 @@ def test_the_library_writes_it_too(made: Made, tmp_path: Path) -> None:
 
     page = library.open_run(made.result.directory).report(tmp_path / "page.html")
     assert texts(page.read_text(encoding="utf-8")) == texts(made.page)
+
+
+def test_console_page_json_and_library_show_one_text_for_each_result(made: Made) -> None:
+    import html
+    import json
+
+    import decant as library
+
+    console = " ".join(shown(summary_table(made.published.summary), width=400).split())
+    page = " ".join(texts(made.page).split())
+    data = json.loads(json.dumps(summary_json(library.open_run(made.result.directory).summary)))
+    (receiver,) = data["receivers"].values()
+    (advice,) = data["advice"]
+    everywhere = [*filter(None, receiver["texts"].values()), *advice["sentences"], advice["window"], *advice["open"]]
+    everywhere += data["theta_sentences"]
+    assert len(everywhere) > 10
+    for text in everywhere:
+        assert text in console
+        assert html.unescape(text) in page
+    for pour in data["pours_made"]:
+        assert pour["predicted"] in page
+        assert pour["calibration"] or pour["measured"] in page
+        assert f"{pour['spilled_g']:.1f}" in page
+    assert all(use["text"] in console and use["text"] in page for use in data["occupancy"].values())
+    assert all(text in page for text in (*data["cost"].values(), *data["open_questions"], *data["asked"].values()))

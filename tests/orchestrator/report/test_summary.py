@@ -9,12 +9,12 @@ from typing import Any
 import jsonschema
 import pytest
 
-from orchestrator.journal.stage_results import decode_results
+from orchestrator.journal.codec import decode_results
 from orchestrator.results.console_view import print_summary, summary_table
 from orchestrator.results.figure_style import display_value, display_values
 from orchestrator.results.run_summary import NotSimulated, PoolUse, RunSummary, Totals, summary_schema, write_summary
 from orchestrator.results.summarise import summarise
-from orchestrator.results.wording import advice
+from orchestrator.results.wording import pool_line
 from orchestrator.strategies.deployment.model_monitoring import Belief, Believed
 from orchestrator.strategies.deployment.real_pours import PredictionCheck
 from orchestrator.strategies.single_action import PredictedPour
@@ -22,7 +22,13 @@ from sim_engine.prediction_band import SampleStatistics
 from tests.support import example_run
 from tests.support.example_results import changed, shown
 
-BUSY = PoolUse(pool_busy=0.974, pool_useful=0.41, arm_longest_wait_s=0.061, arm_mean_wait_s=0.03)
+BUSY = PoolUse(
+    pool_busy=0.974,
+    pool_useful=0.41,
+    arm_longest_wait_s=0.061,
+    arm_mean_wait_s=0.03,
+    text=pool_line(0.974, 0.41, 0.061),
+)
 
 
 def test_summary_tells_theta_discrepancies_losses_actions_and_files(results: dict[str, Any], tmp_path: Path) -> None:
@@ -43,14 +49,14 @@ def test_summary_tells_theta_discrepancies_losses_actions_and_files(results: dic
     assert summary.simulations == 60
     assert summary.discrepancy["test"]["calibrated"] == results["evaluation"].discrepancy["calibrated"]["test"]
     assert summary.discrepancy["test"]["random_theta"] == results["evaluation"].random_median["test"]
-    assert (receiver.first_loss, receiver.best_loss) == (losses[0], min(losses))
-    assert receiver.best_pour == 1 + losses.index(min(losses))
-    assert receiver.best_action == deployed.recommended.action
+    assert (receiver.first.loss, receiver.best.loss) == (losses[0], min(losses))
+    assert receiver.best.number == 1 + losses.index(min(losses))
+    assert receiver.recommended == deployed.recommended
 
-    text = shown(summary_table(plan, summary))
+    text = shown(summary_table(summary))
     assert display_value("particles", summary.theta.particles) in text
     assert "12.34" in text
-    assert f"{100 * min(losses):.2f} % (pour {receiver.best_pour})" in text
+    assert f"{100 * min(losses):.2f} % (pour {receiver.best.number})" in text
     assert display_values(deployed.recommended.action_si) in text
     assert "campaign.rrd" in text
 
@@ -69,7 +75,9 @@ def test_summary_file_has_what_was_summarised_and_the_results_read_back(
 
 def test_summary_file_is_what_its_schema_says(results: dict[str, Any], tmp_path: Path) -> None:
     plan = example_run.campaign()
-    warning = NotSimulated(kind="wetting", share=0.1, text="", action_si={"x_offset": 0.1}, hit=1, tried=5)
+    warning = NotSimulated(
+        receiver="cup", kind="wetting", share=0.1, text="", action_si={"x_offset": 0.1}, hit=1, tried=5
+    )
     summary = summarise(plan, results, totals=Totals(occupancy={"narrow cup": BUSY}))
     written = json.loads(write_summary(tmp_path, changed(summary, not_covered={"cup": (warning,)})).read_text())
     validator = jsonschema.Draft202012Validator(summary_schema())
@@ -87,13 +95,12 @@ def test_summary_warns_of_an_untrustworthy_simulator_failed_pours_and_dropped_ev
     pours = [*results["narrow cup"].pours]
     for index, why in ((1, "pour_failed: the gripper slipped"), (2, "pour_unknown: declared lost by the operator")):
         pours[index] = changed(pours[index], status="failed", reason=why)
-    poured = changed(results["narrow cup"], failed_pours=2, trust=trust, pours=tuple(pours))
+    poured = changed(results["narrow cup"], failed_pours=2, model_check=trust, pours=tuple(pours))
     plan = example_run.campaign()
-    text = shown(summary_table(plan, summarise(plan, {"narrow cup": poured}, dropped_events=12)))
+    text = shown(summary_table(summarise(plan, {"narrow cup": poured}, dropped_events=12)))
     assert "the simulator may not fit this vessel" in text
     assert (
-        "narrow: 2 pours failed: pour 2: pour_failed: the gripper slipped; "
-        "pour 3: pour_unknown: declared lost by the operator"
+        "2 pours failed: pour 2: pour_failed: the gripper slipped; pour 3: pour_unknown: declared lost by the operator"
     ) in " ".join(text.split())
     assert "lacks 12 events" in text
 
@@ -113,8 +120,8 @@ def test_what_pours_say_of_the_simulator_is_known_where_it_is_borne_out_and_open
         text="the simulator is as it is",
     )
     plan = example_run.campaign()
-    poured = changed(results["narrow cup"], trust=trust)
-    (said,) = advice(plan, summarise(plan, {"narrow cup": poured}))
+    poured = changed(results["narrow cup"], model_check=trust)
+    (said,) = summarise(plan, {"narrow cup": poured}).advice
     assert ("The simulator is as it is." in said.sentences) == known
     assert ("The simulator is as it is." in said.open) != known
 
@@ -138,10 +145,10 @@ def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(re
     )
     summary = summarise(plan, {"narrow cup": deployed, "prediction:narrow cup": foreseen})
     receiver = summary.receivers["narrow cup"]
-    assert (receiver.best_delivered_g, receiver.best_delivered_ml) == (best.delivered_g, best.delivered_ml)
+    assert receiver.best == best
     assert receiver.predicted_delivered_g == pytest.approx(900.0 * liquid.mass)
     assert receiver.predicted_delivered_ml == pytest.approx(900.0 * liquid.mass / liquid.density * 1e3)
-    text = shown(summary_table(plan, summary))
+    text = shown(summary_table(summary))
     assert f"{best.delivered_g:.1f} g, {best.delivered_ml:.1f} mL" in text
     assert f"delivered {900.0 * liquid.mass:.1f} g" in " ".join(text.split())
 
@@ -149,15 +156,15 @@ def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(re
 def test_planning_alone_shows_no_columns_about_pours_and_no_empty_table(results: dict[str, Any]) -> None:
     plan = example_run.campaign()
     planned = changed(results["narrow cup"], strategy="D1", pours=())
-    text = shown(summary_table(plan, summarise(plan, {"narrow cup": planned})))
-    assert "best expected" in text
+    text = shown(summary_table(summarise(plan, {"narrow cup": planned})))
+    assert "expected of the best action" in " ".join(text.split())
     assert display_values(planned.recommended.action_si) in text
-    for absent in ("pours", "first", "best measured", "mean |measured", "—"):
+    for absent in ("first ", "best measured", "mean |measured", "—"):
         assert absent not in text
     fruitless = changed(planned, recommended=None)
-    text = shown(summary_table(plan, summarise(plan, {"narrow cup": fruitless})))
-    assert "best expected" not in text
-    assert "narrow: nothing was learnt" in text
+    text = shown(summary_table(summarise(plan, {"narrow cup": fruitless})))
+    assert "expected of" not in text
+    assert "No action is recommended: nothing was learnt" in text
 
 
 def test_table_in_a_log_file_breaks_neither_paths_nor_rows(
@@ -167,18 +174,18 @@ def test_table_in_a_log_file_breaks_neither_paths_nor_rows(
     plan = example_run.campaign()
     recording = Path("/laboratory") / "a-folder-with-a-rather-long-name" / ("x" * 120) / "campaign.rrd"
     summary = summarise(plan, {"narrow cup": results["narrow cup"]}, recording=recording)
-    print_summary(plan, summary)
+    print_summary(summary)
     lines = capsys.readouterr().err.splitlines()
     assert any(line.endswith(str(recording)) for line in lines)
     action = display_values(results["narrow cup"].recommended.action_si)
-    assert any("narrow" in line and "D3" in line and action in line for line in lines)
+    assert any(line.endswith(f"into narrow: {action}") for line in lines)
 
 
 def test_summary_tells_how_busy_the_pool_was_and_whether_the_arm_waited(results: dict[str, Any]) -> None:
     plan = example_run.campaign()
     summary = summarise(plan, results, totals=Totals(occupancy={"deployment:narrow": BUSY}))
     assert summary.occupancy["deployment:narrow"] == BUSY
-    text = " ".join(shown(summary_table(plan, summary)).split())
+    text = " ".join(shown(summary_table(summary)).split())
     assert "narrow: pool 97 % busy while there was work (41 % of the time)" in text
     assert "the arm waited 0.061 s at most" in text
 
@@ -187,4 +194,4 @@ def test_run_that_was_stopped_at_once_has_a_summary_too() -> None:
     plan = example_run.campaign()
     summary = summarise(plan, {})
     assert (summary.theta, summary.receivers) == (None, {})
-    assert "narrow-cup" in shown(summary_table(plan, summary))
+    assert "narrow-cup" in shown(summary_table(summary))

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from actors.optimizer.questions import MinimumQuery, SuggestionQuery
-from orchestrator.cli.campaign_commands import RunOptions, run
+from orchestrator.cli.campaign_commands import run
 from orchestrator.cli.console import RefusalError
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -75,7 +75,7 @@ def calibration(folder: Path, keys: str = "") -> CampaignPlan:
 def test_c4_as_in_the_paper_takes_the_actions_influence_for_noise(folder: Path, keys: str, paper: bool) -> None:
     plan = calibration(folder, keys).calibration
     assert plan is not None
-    plan = plan.with_settings(simulations=8, initial=4)
+    plan = plan.with_settings(simulations=8, initial_samples=4)
     plan = replace(plan, scene=SCENE, actions=CALIBRATION_ACTIONS, parameters=PARAMETERS)
     results: dict[str, Any] = {}
     for stage in calibration_stages(plan)[:2]:
@@ -109,7 +109,7 @@ def test_noise_makes_no_draws_of_theta_for_a_deployment_under_risk(folder: Path)
     text = DEPLOYED.replace("strategy: D3", keys).replace("pours: 15", "pours: 1")
     path = write(folder, "campaign.yaml", text.replace("simulations: 20", "simulations: 20\n  averaging: noise"))
     with pytest.raises(RefusalError, match="draws of θ, which no surrogate makes that takes actions for noise"):
-        run(path, RunOptions(in_process=True))
+        run(path, in_process=True)
 
 
 # -- studies -----------------------------------------------------------------------------------------------------------
@@ -118,11 +118,11 @@ def test_noise_makes_no_draws_of_theta_for_a_deployment_under_risk(folder: Path)
 def study(folder: Path, **changes: Any) -> StudyPlan:
     """The quick study with the paper's methods beside ours, and as little of them as possible."""
     quick = read("quick")
-    c4 = {"repetitions": 1, "simulations": 6, "initial": 4}
-    d2, d3 = ({"repetitions": 1, "pours": 2, "initial": 1, **more} for more in ({}, {"prior_simulations": 4}))
+    c4 = {"repetitions": 1, "simulations": 6, "initial_samples": 4}
+    d2, d3 = ({"repetitions": 1, "pours": 2, "initial_samples": 1, **more} for more in ({}, {"prior_simulations": 4}))
     arms = {
         "calibration": {"C4": c4, "C4_paper": c4},
-        "deployment": {"D2": d2, "D2_paper": d2, "D3": d3, "D3_paper": {**d3, "per_pour": 0}},
+        "deployment": {"D2": d2, "D2_paper": d2, "D3": d3, "D3_paper": {**d3, "simulations_per_pour": 0}},
     }
     return load_study(written(folder, {**quick, "mismatch": quick["mismatch"][:1], **arms, **changes}))
 
@@ -136,8 +136,8 @@ def test_a_study_has_the_papers_methods_beside_ours(tmp_path: Path) -> None:
     own, papers_own = (plan.deployment(label).plan.settings for label in ("D3", "D3-paper"))
     assert isinstance(own, D3Settings)
     assert isinstance(papers_own, D3Settings)
-    assert (own.model, own.per_pour) == ("adaptive", 2)
-    assert (papers_own.model, papers_own.per_pour) == ("residual", 0)
+    assert (own.model, own.simulations_per_pour) == ("adaptive", 2)
+    assert (papers_own.model, papers_own.simulations_per_pour) == ("residual", 0)
     cells = {cell.id: cell for cell in cells_of(plan)}
     assert "calibration.small.C4-paper.01" in cells
     assert "calibration.large.C4-paper.01" not in cells, "it is compared at one level, and nobody uses its θ*"

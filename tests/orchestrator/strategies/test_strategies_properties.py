@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from actors.optimizer.questions import Data, Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
-from orchestrator.journal.stage_results import encode_result
+from orchestrator.journal.codec import encode_result
 from orchestrator.requests import Outcome, Pour, Poured, Request, Suggest
 from orchestrator.run_errors import LearningError
 from orchestrator.runs.events import Event, RequestFinished
@@ -29,7 +29,7 @@ from orchestrator.strategies.calibration.pointwise_calibration import (
 )
 from orchestrator.strategies.calibration.pour_design import DesignedPours
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.deployment.costing import PricesSettings
+from orchestrator.strategies.deployment.costing import CostSettings
 from orchestrator.strategies.deployment.d1 import OneShotPlanning, RobustPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import FreeHybrid, Hybrid
@@ -48,18 +48,24 @@ from tests.support.toy_spillage import calibration_spill, narrow_cup, weighed
 CALIBRATIONS: dict[str, tuple[Any, dict[str, Any]]] = {
     "C1": (UniformGrid, {"grid": {"particles": 2, "cohesion": 3}}),
     "C2": (StratifiedSampling, {"samples": 6}),
-    "C3": (BayesianCalibration, {"iterations": 6, "initial": 4}),
-    "C4": (ContinuousBayesianCalibration, {"simulations": 12, "initial": 6}),
+    "C3": (BayesianCalibration, {"iterations": 6, "initial_samples": 4}),
+    "C4": (ContinuousBayesianCalibration, {"simulations": 12, "initial_samples": 6}),
 }
 BOTH = Objectives((Spillage(), Retained()), pareto=True)
 RISK = plans.risk("cvar", 0.8, PoseError(x=3e-3, speed_factor=0.05))
-FREE = {"pours": 3, "prior_simulations": 12, "per_pour": "free", "prices": PricesSettings(), "model": "adaptive"}
+FREE = {
+    "pours": 3,
+    "prior_simulations": 12,
+    "simulations_per_pour": "free",
+    "costs": CostSettings(),
+    "model": "adaptive",
+}
 DEPLOYMENTS: dict[str, tuple[Any, dict[str, Any]]] = {
     "D1": (OneShotPlanning, {"iterations": 6}),
     "D1, risk": (RobustPlanning, {"iterations": 4, "simulations_per_iteration": 2, "risk": RISK}),
     "D2": (RealOnly, {"pours": 5}),
-    "D3": (Hybrid, {"pours": 3, "prior_simulations": 6, "per_pour": 2}),
-    "D3, front": (Hybrid, {"pours": 3, "prior_simulations": 6, "per_pour": 2, "objectives": BOTH}),
+    "D3": (Hybrid, {"pours": 3, "prior_simulations": 6, "simulations_per_pour": 2}),
+    "D3, front": (Hybrid, {"pours": 3, "prior_simulations": 6, "simulations_per_pour": 2, "objectives": BOTH}),
 }
 ALL = [*CALIBRATIONS, *DEPLOYMENTS]
 """Whose requests depend on outcomes alone."""
@@ -209,7 +215,7 @@ def test_an_interrupted_run_on_a_slow_laboratory_asks_for_what_an_undisturbed_on
     clock, resume = random.Random(1), False
     for outcomes in (3, 7):
         with pytest.raises(asyncio.CancelledError):
-            run("run", slow_laboratory(0.004, clock), resume=resume, watchers=[Stopper(outcomes)])
+            run("run", slow_laboratory(0.004, clock), resume=resume, subscribers=[Stopper(outcomes)])
         resume = True
         assert logical_record(tmp_path / "run") == expected[: len(logical_record(tmp_path / "run"))]
     run("run", slow_laboratory(0.004, clock), resume=True)

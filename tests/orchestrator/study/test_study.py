@@ -133,7 +133,7 @@ def test_killed_in_the_middle_it_goes_on_and_comes_to_what_an_undisturbed_one_co
 
 @pytest.mark.realtime
 def test_a_cell_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None:
-    arms, levels = {"C4": {"repetitions": 1, "simulations": 4, "initial": 4}}, read("quick")["mismatch"][:1]
+    arms, levels = {"C4": {"repetitions": 1, "simulations": 4, "initial_samples": 4}}, read("quick")["mismatch"][:1]
     deployment = {"D3": {**read("quick")["deployment"]["D3"], "pours": 1, "repetitions": 1}}
     study = replace(small(tmp_path, calibration=arms, deployment=deployment, mismatch=levels), confirm=0)
     blocked = run_folder(study.folder, "calibration.small.C4.01")
@@ -207,7 +207,7 @@ def test_a_final_pour_is_the_recommended_action_with_fresh_chance_and_its_code_i
     values = learnt.results["deployment:narrow"].recommended.action_si
     finals = [one.results["final"] for one in again]
     action = study.deployments[0].plan.scenes[0].action(values)
-    hidden = study.levels[0].bench.liquid
+    hidden = study.levels[0].bench.theta
     least = toy_study.spilled(action, hidden, 0) - 0.01
     for one in finals:
         assert one.action_si == action.values()

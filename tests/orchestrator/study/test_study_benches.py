@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.journal.stage_results import result_of
+from orchestrator.journal.codec import result_of
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
 from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.calibration.calibration_scores import Scores
@@ -36,7 +36,7 @@ def cut(folder: Path, **changes: Any) -> StudyPlan:
         "C4": {"repetitions": 1, "simulations": 12},
         "C4_active": {"repetitions": 1, "simulations": 12, "pours": 4, "design_simulations": 16},
     }
-    data["deployment"] = {"D2": {"repetitions": 1, "pours": 2, "initial": 2}}
+    data["deployment"] = {"D2": {"repetitions": 1, "pours": 2, "initial_samples": 2}}
     return load_study(written(folder, {**data, **changes, "confirm": 0}))
 
 
@@ -67,7 +67,7 @@ def test_no_bench_lets_the_cups_touch_where_calibration_and_deployment_pour() ->
     for scene, actions in spaces:
         low = {axis.name: axis.lower for axis in actions.axes}
         for level in study.levels:
-            task = PourTask(scene, scene.action(low), level.bench.liquid, 1, pose_error=level.bench.pose_error)
+            task = PourTask(scene, scene.action(low), level.bench.theta, 1, pose_error=level.bench.pose_error.error)
             try:
                 simulator.prepare(task)
             except InvalidSceneError as error:

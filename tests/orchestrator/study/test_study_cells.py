@@ -141,12 +141,12 @@ WRONG: dict[str, tuple[Any, str]] = {
     "no mismatch left": (lambda d: {**without(d, "compared"), "mismatch": []}, "mismatch: is empty"),
     "hardware": (
         lambda d: {**d, "laboratory": str(ROOT / "configs/laboratories/ur10-kern.yaml")},
-        "laboratory 'ur10-kern' is hardware. An arm moves only for one run, after '--arm'",
+        "laboratory 'ur10-kern' is hardware. An arm moves only for one run, after '--enable-motion'",
     ),
     "nothing to confirm": (lambda d: without({**d, "confirm": 1}, "deployment"), "confirm: there is no deployment"),
     "unknown level": (lambda d: {**d, "compared": "huge"}, "compared: no such level; there are small, large"),
     "level twice": (lambda d: {**d, "mismatch": [d["mismatch"][0]] * 2}, "mismatch[1]: a level 'small'"),
-    "not searched": (lambda d: {**d, "search": ["viscosity"]}, "search[0]: 'viscosity' is not searched"),
+    "not searched": (lambda d: {**d, "search": ["xsph_rate"]}, "search[0]: 'xsph_rate' is not searched"),
     "nothing left to search": (
         lambda d: {
             **without(d, "search"),
@@ -160,7 +160,10 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "no such campaign": (lambda d: {**d, "campaign": "nothing.yaml"}, "campaign: no such file"),
     "another's key": (
-        lambda d: {**d, "calibration": {**d["calibration"], "C1": {"repetitions": 1, "per_axis": 2, "samples": 3}}},
+        lambda d: {
+            **d,
+            "calibration": {**d["calibration"], "C1": {"repetitions": 1, "points_per_axis": 2, "samples": 3}},
+        },
         "calibration.C1.samples: belongs to C2, not to C1",
     ),
     "no budget": (

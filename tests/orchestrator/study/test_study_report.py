@@ -138,7 +138,7 @@ def poured(arm: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
         former_pours=0,
         refused_pours=1,
         failed_pours=0,
-        trust=PredictionCheck(z_scores=(), alarm=False),
+        model_check=PredictionCheck(z_scores=(), alarm=False),
     )
 
 
@@ -246,8 +246,8 @@ def test_a_panel_says_what_its_bench_is_like(study: StudyPlan) -> None:
     for number in ("5a", "5b", ""):
         one = next(one for one in all_drawn(study) if one.number == number)
         titles = [" ".join(axes.get_title(loc="left").split()) for axes in one.figure.axes]
-        assert titles[0] == "small mismatch cohesion 0.03, viscosity 3, friction 0, receiver -2 mm"
-        assert titles[1] == "large mismatch cohesion 0.08, viscosity 12, friction 0.2, receiver -12 mm"
+        assert titles[0] == "small mismatch cohesion 0.03, xsph rate 3, friction 0, receiver -2 mm"
+        assert titles[1] == "large mismatch cohesion 0.08, xsph rate 12, friction 0.2, receiver -12 mm"
         assert "not how hard it is to pour there" in one.caption
 
 

@@ -12,8 +12,10 @@ import pytest
 from actors.optimizer.questions import Posterior
 from orchestrator.config.file_loading import load_discrepancy, load_parameters, load_posterior
 from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.results.figure_style import save
 from orchestrator.results.publishing import theta_file
-from orchestrator.results.surrogate_figures import draw_posterior, posterior_lines
+from orchestrator.results.surrogate_figures import draw_posterior
+from orchestrator.results.wording import posterior_lines
 from orchestrator.strategies.calibration.calibration_scores import ScoredPair, Scores
 from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.posterior_summary import (
@@ -198,10 +200,8 @@ def test_theta_file_says_what_calibration_left_over_of_its_training_pours(determ
 
 
 def test_the_posterior_is_drawn(determined: Any, tmp_path: Path) -> None:
-    path = draw_posterior(
-        tmp_path / "posterior.png", determined.found.posterior, PARAMETERS, determined.found.theta.model_dump()
-    )
-    assert is_picture(path)
+    figure = draw_posterior(determined.found.posterior, PARAMETERS, determined.found.theta.model_dump())
+    assert is_picture(save(figure, tmp_path / "posterior.png"))
 
 
 def test_a_prediction_takes_turns_with_thetas_of_the_posterior(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def test_constraints_hold_under_a_prior_that_lies_beside_them() -> None:
 
 
 def calibration(**changes: Any) -> CalibrationPlan:
-    return calibration_plan(**{"fixed_parameters": {}, "simulations": 24, "initial": 24} | changes)
+    return calibration_plan(**{"fixed_parameters": {}, "simulations": 24, "initial_samples": 24} | changes)
 
 
 def speeds(**changes: Any) -> tuple[list[float], list[float]]:

@@ -215,7 +215,7 @@ def test_signed_differences_calibrate_better_than_noise_at_the_same_price():
     assert np.mean(scores["context"]) < 0.7 * np.mean(scores["noise"])
 
 
-BOX = Space((*PARAMETERS.axes, Axis("viscosity", 0.0, 1.0), Axis("friction", 0.0, 0.5)))
+BOX = Space((*PARAMETERS.axes, Axis("xsph_rate", 0.0, 1.0), Axis("friction", 0.0, 0.5)))
 
 
 def spill_by_two(action, theta, rng):
@@ -236,7 +236,7 @@ def test_of_four_parameters_the_result_maps_the_two_that_matter_with_the_others_
     result = strategy.result()
     drawn, theta = result.found.map, result.found.theta.model_dump()
     assert drawn.over == ("cohesion", "friction")
-    assert drawn.held == {"particles": theta["particles"], "viscosity": theta["viscosity"]}
+    assert drawn.held == {"particles": theta["particles"], "xsph_rate": theta["xsph_rate"]}
     mean, deviation = np.array(drawn.mean), np.array(drawn.deviation)
     assert mean.shape == deviation.shape == (30, 30)
     # the map goes through θ*: what it says there is what the result expects there, and nowhere is less expected

@@ -12,8 +12,8 @@ import pytest
 
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Suggest
+from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.stages import DEPLOYMENT, with_bench
-from orchestrator.runs.unknown_pours import OperatorNeededError
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_monitoring import (
@@ -43,7 +43,7 @@ def upside_down(action: Any, theta: Any, rng: Any) -> float:
 
 
 def adaptive(seed: int = 1, **changes: Any) -> Hybrid:
-    plan = deployment_plan(**{"model": "adaptive", "per_pour": 1, **changes})
+    plan = deployment_plan(**{"model": "adaptive", "simulations_per_pour": 1, **changes})
     strategy = plan.settings.build(plan, SCENE, THETA, seed)
     assert isinstance(strategy, Hybrid)
     return strategy
@@ -58,14 +58,14 @@ def said(strategy: Hybrid) -> list[str]:
 
 
 def believed(strategy: Hybrid) -> Believed:
-    trust = strategy.result().trust
+    trust = strategy.result().model_check
     assert isinstance(trust, Believed)
     return trust
 
 
-@pytest.mark.parametrize("per_pour", [1, "free"])
-def test_after_every_pour_it_says_how_far_the_simulator_is_to_be_trusted(per_pour: Any) -> None:
-    strategy = adaptive(pours=3, per_pour=per_pour)
+@pytest.mark.parametrize("simulations_per_pour", [1, "free"])
+def test_after_every_pour_it_says_how_far_the_simulator_is_to_be_trusted(simulations_per_pour: Any) -> None:
+    strategy = adaptive(pours=3, simulations_per_pour=simulations_per_pour)
     StrategyHarness(narrow_cup_biased, narrow_cup, beside=2).run(strategy)
     after = [text for text in said(strategy) if text.startswith("after pour")]
     assert [text.split(" the simulator ")[0] for text in after] == ["after pour 1", "after pour 2", "after pour 3"]
@@ -83,9 +83,9 @@ def test_every_pour_is_announced_with_the_band_that_its_row_has() -> None:
         decision for decision in strategy.decisions if "  predicted " in decision.text and "/2 " in decision.text
     ]
     for pour, decision in zip(strategy.result().pours, announced, strict=True):
-        assert pour.predicted_band == (decision.values["low"], decision.values["high"])
+        assert pour.predicted_interval == (decision.values["low"], decision.values["high"])
         assert "nine pours in ten lie between" in decision.text
-        assert 0.0 <= pour.predicted_band[0] < pour.predicted_band[1] <= 1.0
+        assert 0.0 <= pour.predicted_interval[0] < pour.predicted_interval[1] <= 1.0
 
 
 def test_a_result_with_what_was_said_survives_its_file() -> None:
@@ -96,7 +96,7 @@ def test_a_result_with_what_was_said_survives_its_file() -> None:
 
 
 def test_a_simulator_that_says_nothing_of_the_bench_is_found_out_and_gone_on_without() -> None:
-    strategy = adaptive(2, pours=6, ignorance=DiscrepancyPolicySettings(limit=0.7))
+    strategy = adaptive(2, pours=6, discrepancy_policy=DiscrepancyPolicySettings(limit=0.7))
     StrategyHarness(upside_down, narrow_cup).run(strategy)
     trust = believed(strategy)
     assert trust.alarm
@@ -106,7 +106,7 @@ def test_a_simulator_that_says_nothing_of_the_bench_is_found_out_and_gone_on_wit
 
 
 def test_by_its_policy_it_ends_where_the_simulator_says_nothing() -> None:
-    strategy = adaptive(pours=6, ignorance=DiscrepancyPolicySettings(limit=0.7, policy="stop"))
+    strategy = adaptive(pours=6, discrepancy_policy=DiscrepancyPolicySettings(limit=0.7, policy="stop"))
     StrategyHarness(upside_down, narrow_cup).run(strategy)
     result = strategy.result()
     assert len(losses(strategy)) < 6
@@ -117,7 +117,7 @@ def test_by_its_policy_it_ends_where_the_simulator_says_nothing() -> None:
 
 @pytest.mark.parametrize("answer", ["go on", "stop"])
 def test_by_its_policy_it_asks_a_person(answer: str) -> None:
-    strategy = adaptive(pours=6, ignorance=DiscrepancyPolicySettings(limit=0.7, policy="ask"))
+    strategy = adaptive(pours=6, discrepancy_policy=DiscrepancyPolicySettings(limit=0.7, policy="ask"))
     play = StrategyHarness(
         upside_down, narrow_cup, answer=lambda r: Answered(answer) if isinstance(r, Ask) else None
     ).run(strategy)
@@ -129,7 +129,7 @@ def test_by_its_policy_it_asks_a_person(answer: str) -> None:
 
 
 def test_it_ends_when_no_further_pour_is_worth_it_and_says_how_many_were_saved() -> None:
-    strategy = adaptive(pours=12, stop=StopSettings(gain_below=0.01))
+    strategy = adaptive(pours=12, stop=StopSettings(min_gain=0.01))
     StrategyHarness(narrow_cup).run(strategy)
     made = len(losses(strategy))
     assert made < 12
@@ -154,7 +154,7 @@ def test_good_enough_is_the_end() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_limit_is_kept_by_every_pour_after_the_first_good_one(seed: int) -> None:
-    strategy = adaptive(seed, pours=8, risk_limit=RiskLimitSettings(loss=0.15, probability=0.05, otherwise="stop"))
+    strategy = adaptive(seed, pours=8, risk_limit=RiskLimitSettings(loss=0.15, probability=0.05, fallback="stop"))
     StrategyHarness(narrow_cup_biased, narrow_cup).run(strategy)
     found = losses(strategy)
     good = next(i for i, loss in enumerate(found) if loss <= 0.15)
@@ -172,7 +172,7 @@ def test_with_a_limit_pours_are_made_for_what_they_tell_once_one_has_kept_it(lim
 
 @pytest.mark.parametrize("otherwise", ["stop", "go on"])
 def test_a_limit_that_can_not_be_kept_is_said_before_the_pour(otherwise: Any) -> None:
-    limit = RiskLimitSettings(loss=0.02, probability=0.001, otherwise=otherwise)
+    limit = RiskLimitSettings(loss=0.02, probability=0.001, fallback=otherwise)
     strategy = adaptive(pours=6, risk_limit=limit)
     StrategyHarness(narrow_cup, lambda a, t, r: 0.0).run(strategy)  # good once, and too noisy to promise it again
     told = [text for text in said(strategy) if "no action is known to keep the limit" in text]
@@ -220,7 +220,7 @@ def test_a_displacement_is_where_the_simulator_does_what_the_bench_does() -> Non
 
 
 def test_what_was_learnt_with_one_receiver_is_known_for_the_next() -> None:
-    plan = deployment_plan(model="adaptive", pours=4, per_pour=1)
+    plan = deployment_plan(model="adaptive", pours=4, simulations_per_pour=1)
     first = adaptive(pours=4)
     StrategyHarness(narrow_cup_biased, narrow_cup).run(first)
     learnt = first.result()
@@ -260,9 +260,9 @@ def asking(directory: Path, policy: Any = "ask") -> Any:
         loss=Loss(),
         pours=5,
         prior_simulations=6,
-        per_pour=1,
+        simulations_per_pour=1,
         model="adaptive",
-        ignorance=DiscrepancyPolicySettings(limit=0.1, policy=policy),
+        discrepancy_policy=DiscrepancyPolicySettings(limit=0.1, policy=policy),
     )
     return toy_plan(directory, deployment=deployment)
 
@@ -304,7 +304,7 @@ def test_a_campaign_that_asks_pauses_and_goes_on_as_answered(tmp_path: Path) -> 
         run(directory, resume=True, ask_operator=answering("lost"))
     result = run(directory, resume=True, ask_operator=answering("Go on"))
     assert result.state == "finished"
-    assert next(iter(result.results.values())).trust.followed == "go on"
+    assert next(iter(result.results.values())).model_check.followed == "go on"
     with JournalReader(directory / JOURNAL_NAME) as journal:
         assert [e.body["answer"] for e in journal.entries(kinds=[Kind.OPERATOR_ANSWERED])] == ["go on"]
     # what it asked for is what a campaign asks for that has decided so beforehand
@@ -324,7 +324,7 @@ def test_an_answer_is_replayed_exactly(tmp_path: Path) -> None:
         plan = asking(directory)
         task = asyncio.create_task(
             run_toy(directory, wrong_laboratory(), plan=plan, stages=None, resume=True,
-                    ask_operator=answering("go on"), watchers=[watch])
+                    ask_operator=answering("go on"), subscribers=[watch])
         )  # fmt: skip
         with pytest.raises(asyncio.CancelledError):
             await task
@@ -334,4 +334,4 @@ def test_an_answer_is_replayed_exactly(tmp_path: Path) -> None:
     asyncio.run(paused_after_the_answer())
     result = run(directory, resume=True)
     assert result.state == "finished"
-    assert next(iter(result.results.values())).trust.followed == "go on"
+    assert next(iter(result.results.values())).model_check.followed == "go on"

@@ -11,7 +11,7 @@ import pytest
 
 from actors.optimizer.questions import Data
 from orchestrator.config.campaign_checks import touch
-from orchestrator.journal.stage_results import encode_result
+from orchestrator.journal.codec import encode_result
 from orchestrator.requests import Failed, Outcome, Pour, Request, Simulate, Suggest
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
@@ -77,7 +77,7 @@ def out_of_reach(request: Request) -> Outcome | None:
 def test_what_only_the_arm_refuses_is_learnt_though_simulations_go_well_there() -> None:
     refused = []
     for seed in range(2):
-        strategy = make("D3", seed, pours=4, prior_simulations=10, per_pour=1)
+        strategy = make("D3", seed, pours=4, prior_simulations=10, simulations_per_pour=1)
         played = StrategyHarness(narrow_cup, answer=out_of_reach).run(strategy)
         assert len(played.real_spills) == 4
         assert not questions(played)[-1].infeasible

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import RiskQuery
-from orchestrator.journal.codec import decode_request, encode_request
-from orchestrator.journal.stage_results import decode_result, encode_result
+from orchestrator.journal.codec import decode_request, decode_result, encode_request, encode_result
 from orchestrator.requests import Failed, Simulate, Suggest
 from orchestrator.run_errors import RunError
 from orchestrator.runs.stages import with_posterior
@@ -49,7 +48,7 @@ def true_losses(values: dict[str, float], count: int = 4000) -> np.ndarray:
 
 
 def test_under_errors_the_broad_valley_is_chosen_and_without_them_the_narrow_one() -> None:
-    plain = OneShotPlanning(deployment_plan(strategy="D1", pours=0, iterations=18, initial=6), SCENE, THETA, 2)
+    plain = OneShotPlanning(deployment_plan(strategy="D1", pours=0, iterations=18, initial_samples=6), SCENE, THETA, 2)
     StrategyHarness(two_valleys).run(plain)
     assert abs(place(plain) - 0.25) < 0.06
     for risk in (plans.risk("expected", pose_error=ERRORS), plans.risk("cvar", 0.9, ERRORS)):

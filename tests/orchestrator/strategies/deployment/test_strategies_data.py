@@ -41,7 +41,7 @@ deployment:
   strategy: D2
   actions: {{angular_velocity: [15 deg/s, 120 deg/s], x_offset: [90 mm, 150 mm]}}
   pours: 5
-  initial: 4
+  initial_samples: 4
 """
 
 WITH_RUN = CAMPAIGN + "  data: {run: former}\n"

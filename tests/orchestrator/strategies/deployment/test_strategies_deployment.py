@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import Data
-from orchestrator.journal.stage_results import encode_result
+from orchestrator.journal.codec import encode_result
 from orchestrator.requests import Failed, Pour, Poured, Simulate, Suggest
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
@@ -56,7 +56,7 @@ def test_a_campaign_stays_in_its_box_keeps_its_budget_and_reports_json(name):
 def test_same_seed_same_requests_and_a_replay_repeats_them(name):
     def campaign(order="first", seed=3):
         return StrategyHarness(narrow_cup, narrow_cup_biased, order=order, slots=3).run(
-            make(name, seed, pours=3, per_pour=2)
+            make(name, seed, pours=3, simulations_per_pour=2)
         )
 
     first = campaign()
@@ -64,7 +64,7 @@ def test_same_seed_same_requests_and_a_replay_repeats_them(name):
     late = campaign("last")
     assert (late.simulations, late.pours) == (first.simulations, first.pours)
     assert campaign(seed=4).asked != first.asked
-    assert replay(make(name, 3, pours=3, per_pour=2), first) == first.asked
+    assert replay(make(name, 3, pours=3, simulations_per_pour=2), first) == first.asked
 
 
 def test_with_a_right_simulator_the_first_pours_of_d3_spill_less_than_those_of_d2():
@@ -128,7 +128,7 @@ def test_a_zero_mean_pours_worse_than_a_constant_one():
 
 
 def test_d3_asks_for_a_pour_and_the_simulations_beside_it_together():
-    strategy = make("D3", pours=4, per_pour=2)
+    strategy = make("D3", pours=4, simulations_per_pour=2)
     played = StrategyHarness(narrow_cup, slots=2).run(strategy)
     assert [r.purpose for r in played.simulations] == ["prior"] * 20 + ["refine"] * 8
     pour = next(i for i, r in enumerate(played.asked) if isinstance(r, Pour))
@@ -222,8 +222,8 @@ def test_a_simulator_that_is_wrong_raises_the_alarm_and_a_right_one_does_not():
     wrong, right = make("D3", 1, pours=5), make("D3", 1, pours=5)
     StrategyHarness(upside_down, narrow_cup).run(wrong)
     StrategyHarness(narrow_cup).run(right)
-    assert wrong.result().trust.alarm
-    assert not right.result().trust.alarm
+    assert wrong.result().model_check.alarm
+    assert not right.result().model_check.alarm
 
 
 @pytest.mark.parametrize(

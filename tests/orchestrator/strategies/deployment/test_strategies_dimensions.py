@@ -43,10 +43,10 @@ ACTIONS = (
 PARAMETERS = (
     Axis("particles", 300, 4000, "log", integer=True),
     Axis("cohesion", 0.0, 0.1),
-    Axis("viscosity", 0.5, 10.0, "log"),
+    Axis("xsph_rate", 0.5, 10.0, "log"),
     Axis("friction", 0.0, 0.5),
     Axis("wall_distance", 0.4, 1.5),
-    Axis("lip_drop", 0.0, 1.0),
+    Axis("rim_correction", 0.0, 1.0),
 )
 NAMES = ("C1", "C2", "C3", "C4", "D1", "D2", "D3")
 KINDS: dict[str, Any] = {
@@ -119,7 +119,7 @@ def make(name: str, dimension: int) -> Any:
             pours=4,
             iterations=6,
             prior_simulations=7,
-            per_pour=1,
+            simulations_per_pour=1,
             noise="varying",
             model="residual",
         )
@@ -127,7 +127,7 @@ def make(name: str, dimension: int) -> Any:
     grid = {parameter: 2 if i < 3 else 1 for i, parameter in enumerate(parameters.names)}
     budgets = {"C1": {"grid": grid}, "C2": {"samples": 6}, "C3": {"iterations": 6}, "C4": {"simulations": 12}}
     calibration: CalibrationPlan = calibration_plan(
-        strategy=name, actions=actions, parameters=parameters, fixed_parameters={}, initial=4, **budgets[name]
+        strategy=name, actions=actions, parameters=parameters, fixed_parameters={}, initial_samples=4, **budgets[name]
     )
     return KINDS[name](calibration, measured(dimension), 5)
 

@@ -1,4 +1,4 @@
-"""D3 with prices: simulations where and while they pay, an arm that waits for nobody, a journal that repeats it."""
+"""D3 with costs: simulations where and while they pay, an arm that waits for nobody, a journal that repeats it."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import Data
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.journal import Kind
+from orchestrator.journal.run_record import POOL_RESTS, Occupancy, read_record
 from orchestrator.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
-from orchestrator.results.pool_occupancy import RESTS, Occupancy, occupancies
-from orchestrator.strategies.deployment.costing import Prices, PricesSettings
+from orchestrator.strategies.deployment.costing import Costs, CostSettings
 from orchestrator.strategies.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
 from orchestrator.strategies.deployment.model_monitoring import DiscrepancyPolicySettings, subsampled
 from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
@@ -29,9 +29,9 @@ from tests.support.toy_campaign import logical_record, run_toy
 from tests.support.toy_spillage import narrow_cup, narrow_cup_biased
 
 
-def free(seed: int = 0, prices: PricesSettings | None = None, **changes: Any) -> FreeHybrid:
+def free(seed: int = 0, costs: CostSettings | None = None, **changes: Any) -> FreeHybrid:
     changes = {"pours": 3, "prior_simulations": 20, **changes}
-    plan = deployment_plan(per_pour="free", prices=prices or PricesSettings(), **changes)
+    plan = deployment_plan(simulations_per_pour="free", costs=costs or CostSettings(), **changes)
     return FreeHybrid(plan, SCENE, THETA, seed)
 
 
@@ -67,58 +67,58 @@ def played(
 
 def test_the_first_pour_comes_when_it_is_worth_more_per_second_than_a_simulation() -> None:
     def before_first(seconds: float) -> int:
-        play, _ = played(free(prices=PricesSettings(pour=seconds), pours=1))
+        play, _ = played(free(costs=CostSettings(pour=seconds), pours=1))
         return next(i for i, r in enumerate(r for r in play.asked if not isinstance(r, Suggest)) if isinstance(r, Pour))
 
     assert before_first(0.02) < 10  # a pour costs less than a simulation
     assert 20 <= before_first(86400.0) <= 24  # as many as it may make, and those that fill the slots meanwhile
-    strategy = free(prices=PricesSettings(pour=0.02), pours=1)
+    strategy = free(costs=CostSettings(pour=0.02), pours=1)
     played(strategy)
     texts = [decision.text for decision in strategy.decisions]
     assert any(text.startswith("pour now, after") and "a simulation promises" in text for text in texts)
 
 
 def test_the_pool_rests_when_simulations_promise_nothing_and_goes_on_when_something_is_new() -> None:
-    tireless = free(prices=PricesSettings(worth=0.0), pours=2, prior_simulations=10)
-    lazy = free(prices=PricesSettings(worth=1.0), pours=2, prior_simulations=10)
+    tireless = free(costs=CostSettings(worth=0.0), pours=2, prior_simulations=10)
+    lazy = free(costs=CostSettings(worth=1.0), pours=2, prior_simulations=10)
     many, few = played(tireless)[0], played(lazy)[0]
     assert len(many.simulations) > 45
     assert len(few.simulations) < 25
-    assert not any(RESTS in decision.values for decision in tireless.decisions)
-    rests = [decision for decision in lazy.decisions if RESTS in decision.values]
+    assert not any(POOL_RESTS in decision.values for decision in tireless.decisions)
+    rests = [decision for decision in lazy.decisions if POOL_RESTS in decision.values]
     assert rests
     assert "only pours tell: a simulation promises" in rests[0].text
     assert len(few.pours) == len(many.pours) == 2
 
 
 def test_the_price_of_a_simulation_is_what_outcomes_say() -> None:
-    prices = Prices(PricesSettings(pour=90.0), worst=1.0)
-    assert prices.simulation(2) == 1.0
+    costs = Costs(CostSettings(pour=90.0), worst=1.0)
+    assert costs.simulation(2) == 1.0
     for seconds in (10.0, 500.0, 12.0, 0.0):
-        prices.record(seconds)
-    assert prices.simulation(2) == 6.0  # the median; 0 is not a measurement
-    assert prices.prefers_pour(0.001, 0.1, 2)
-    assert not prices.prefers_pour(0.01, 0.1, 2)
-    assert prices.is_idle(0.005 * 6.0 / 90.0 * 0.99, 2)
-    assert not prices.is_idle(0.005 * 6.0 / 90.0 * 1.01, 2)
+        costs.record(seconds)
+    assert costs.simulation(2) == 6.0  # the median; 0 is not a measurement
+    assert costs.prefers_pour(0.001, 0.1, 2)
+    assert not costs.prefers_pour(0.01, 0.1, 2)
+    assert costs.is_idle(0.005 * 6.0 / 90.0 * 0.99, 2)
+    assert not costs.is_idle(0.005 * 6.0 / 90.0 * 1.01, 2)
 
 
 def test_a_simulator_that_fails_for_ever_is_let_alone() -> None:
     def broken(action: Any, theta: Any, rng: np.random.Generator) -> float:
         return math.nan
 
-    strategy = free(prices=PricesSettings(worth=0.0), prior_simulations=4, pours=2)
+    strategy = free(costs=CostSettings(worth=0.0), prior_simulations=4, pours=2)
     play, _ = played(strategy, broken, narrow_cup, beside=200)
     assert len(play.pours) == 2
     assert len(play.simulations) < 80
-    assert any("came to nothing" in d.text for d in strategy.decisions if RESTS in d.values)
+    assert any("came to nothing" in d.text for d in strategy.decisions if POOL_RESTS in d.values)
 
 
 def test_a_person_who_is_asked_about_the_simulator_is_answered_before_the_next_pour() -> None:
     def wrong(action: Any, theta: Any, rng: np.random.Generator) -> float:
         return 1.0 - 0.8 * narrow_cup(action, theta, rng)
 
-    strategy = free(pours=6, model="adaptive", ignorance=DiscrepancyPolicySettings(limit=0.7, policy="ask"))
+    strategy = free(pours=6, model="adaptive", discrepancy_policy=DiscrepancyPolicySettings(limit=0.7, policy="ask"))
     log = Log(strategy)
     play = StrategyHarness(
         wrong, narrow_cup, beside=10, answer=lambda r: Answered("go on") if isinstance(r, Ask) else None
@@ -126,14 +126,14 @@ def test_a_person_who_is_asked_about_the_simulator_is_answered_before_the_next_p
     play.run(log)
     assert [r.number for r in play.pours] == [1, 2, 3, 4, 5, 6]
     assert sum(isinstance(r, Ask) for r in play.asked) == 1
-    assert strategy.result().trust.followed == "go on"
+    assert strategy.result().model_check.followed == "go on"
 
 
 # -- nobody waits ----------------------------------------------------------------------------------------------------
 
 
 def test_a_slot_that_falls_free_beside_a_pour_has_its_next_simulation_at_once() -> None:
-    _, log = played(free(prices=PricesSettings(worth=0.0), pours=2), slots=3)
+    _, log = played(free(costs=CostSettings(worth=0.0), pours=2), slots=3)
     pouring, with_room, served = False, 0, 0
     for step in log.steps:
         if isinstance(step[0], Slots):
@@ -149,7 +149,7 @@ def test_a_slot_that_falls_free_beside_a_pour_has_its_next_simulation_at_once() 
 
 def test_the_next_pour_is_asked_for_with_one_quick_question() -> None:
     """No fit from scratch, no picture, no thousand points, and nothing else first."""
-    _, log = played(free(prices=PricesSettings(worth=0.0), pours=4, prior_simulations=36), narrow_cup, beside=25)
+    _, log = played(free(costs=CostSettings(worth=0.0), pours=4, prior_simulations=36), narrow_cup, beside=25)
     followed = 0
     for i, step in enumerate(log.steps[:-1]):
         if not isinstance(step[0], Pour) or step[0].number == 4:
@@ -158,12 +158,12 @@ def test_the_next_pour_is_asked_for_with_one_quick_question() -> None:
         assert isinstance(requests, list)
         question = next(r for r in requests if isinstance(r, Suggest))
         assert question.purpose == "pour"
-        problem = question.problem
-        assert problem.effort is not None
-        assert problem.effort.start
-        assert problem.effort.iterations <= 4
-        assert problem.map_resolution == 0
-        assert len(problem.simulated) <= MOST_SIMULATIONS
+        query = question.query
+        assert query.effort is not None
+        assert query.effort.start
+        assert query.effort.iterations <= 4
+        assert query.map_resolution == 0
+        assert len(query.simulated) <= MOST_SIMULATIONS
         followed += 1
     assert followed == 3
     assert log.strategy.result().map is not None
@@ -201,11 +201,11 @@ def test_told_the_same_in_the_same_order_it_asks_for_the_same(model: Any) -> Non
     assert again.result() == log.strategy.result()
 
 
-def _plan(directory: Path, prices: PricesSettings | None = None) -> Any:
+def _plan(directory: Path, costs: CostSettings | None = None) -> Any:
     plan = campaign(directory, calibration=None)
     assert plan.deployment is not None
     deployment = plan.deployment.with_settings(
-        per_pour="free", prices=prices or PricesSettings(), prior_simulations=8, model="residual"
+        simulations_per_pour="free", costs=costs or CostSettings(), prior_simulations=8, model="residual"
     )
     return replace(plan, deployment=replace(deployment, scenes=(TOY_SCENE,)))
 
@@ -216,7 +216,7 @@ def _run(directory: Path, pour: float, resume: bool = False) -> Any:
     room.bench.pauses = lambda: pour
     room.simulators.pauses = lambda: 0.005
     return asyncio.run(
-        run_toy(directory, room, plan=_plan(directory, PricesSettings(worth=0.0)), stages=None, resume=resume)
+        run_toy(directory, room, plan=_plan(directory, CostSettings(worth=0.0)), stages=None, resume=resume)
     )
 
 
@@ -235,8 +235,7 @@ def test_killed_in_the_middle_of_free_simulations_it_goes_on_from_its_journal(tm
     assert _run(tmp_path / "run", 0.2, resume=True).state == "finished"
     assert logical_record(tmp_path / "run")[: len(before)] == before
     assert set(finished_times(tmp_path / "run").values()) == {1}
-    with JournalReader(tmp_path / "run" / JOURNAL_NAME) as journal:
-        (found,) = occupancies(journal.entries(), 2).values()
+    (found,) = read_record(tmp_path / "run", slots=2).occupancies.values()
     assert found.fraction is not None
     assert 0.0 < found.fraction <= 1.0
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from orchestrator.journal.stage_results import decode_result, encode_result
+from orchestrator.journal.codec import decode_result, encode_result
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
 from orchestrator.results.console_view import summary_table
 from orchestrator.results.summarise import summarise
@@ -228,7 +228,7 @@ def test_the_front_is_reported_with_actions_that_pour_and_none_beats_another(str
     found = make(strategy, (SPILLAGE, TIME), 1, pareto=True, pours=12, iterations=16)
     played = play(found)
     result = decode_result(json.loads(json.dumps(encode_result(found.result()), allow_nan=False)))
-    front = result.front
+    front = result.pareto_front
     assert len(front) >= 3
     vectors = [(row.objectives["spillage"], row.objectives["time"]) for row in front]
     assert undominated(vectors) == list(range(len(vectors)))
@@ -251,13 +251,13 @@ def test_people_read_the_front_at_the_end_with_what_it_costs_and_how_it_is_poure
     assert summary.loss == "objectives"
     console = Console(width=200)
     with console.capture() as capture:
-        console.print(summary_table(plan, summary))
+        console.print(summary_table(summary))
     text = capture.get()
     assert "spillage + time [%]" in text
-    front = found.result().front
+    front = found.result().pareto_front
     first = front[0].objectives
-    assert f"cup, nothing beats: spillage {100 * first['spillage']:.1f} ± " in text
-    assert text.count("nothing beats") == len(front)
+    assert f"Nothing beats spillage {100 * first['spillage']:.1f} ± " in text
+    assert text.count("Nothing beats") == len(front)
     assert "deg/s, max angle" in text
     assert any("under random weights" in decision.text for decision in found.decisions)
     assert played.pours == []
@@ -291,7 +291,7 @@ def test_a_search_for_the_front_covers_more_of_it_than_as_many_drawn_actions() -
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_a_search_for_the_front_is_repeated_by_a_replay_and_whatever_finishes_first(strategy: str) -> None:
     def fresh() -> Any:
-        return make(strategy, (SPILLAGE, TIME), 4, pareto=True, pours=4, per_pour=2, iterations=8)
+        return make(strategy, (SPILLAGE, TIME), 4, pareto=True, pours=4, simulations_per_pour=2, iterations=8)
 
     first, late = play(fresh(), slots=3), play(fresh(), slots=3, order="last")
     assert (late.simulations, late.pours) == (first.simulations, first.pours)

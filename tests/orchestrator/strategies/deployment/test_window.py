@@ -13,8 +13,8 @@ import pytest
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
 from orchestrator.requests import Failed, Simulate
-from orchestrator.results.campaign_figures import draw_figures
 from orchestrator.results.loss_units import loss_unit
+from orchestrator.results.run_figures import draw_figures
 from orchestrator.results.wording import risk_line, window_line
 from orchestrator.strategies.deployment.d1 import OneShotPlanning, RobustPlanning
 from orchestrator.strategies.deployment.disturbances import RiskSettings

@@ -1,19 +1,227 @@
-"""Figures of spillage against pours, and of the discrepancy between the calibrated simulator and weighed pours."""
+"""The figures of a run: the choice of figures for its results, and those of losses and discrepancies.
+
+- `draw_figures` writes all figures into a folder; `figures_of` returns them for notebooks.
+- `draw_spillage` and `draw_discrepancy` draw losses against pours, and θ* next to its rivals.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from orchestrator.journal.codec import Results
+from orchestrator.requests import Prediction
 from orchestrator.results import figure_style as style
+from orchestrator.results.figure_style import safe_name
+from orchestrator.results.loss_units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit, largest_loss
+from orchestrator.results.stage_views import (
+    SPLITS,
+    calibrated_label,
+    calibration_of,
+    deployments_of,
+    evaluation_of,
+    receiver_name,
+    theta_of,
+)
+from orchestrator.results.surrogate_figures import (
+    SurrogatePicture,
+    draw_posterior,
+    draw_surrogate,
+    draw_trials,
+    draw_window,
+)
+from orchestrator.strategies.calibration.calibration_base import Calibrated
+from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED, Scores
+from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.deployment.deployment_result import Deployed
+from orchestrator.strategies.stage_result import DisplayedMap
 from sim_engine.prediction_band import LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_log = logging.getLogger(__name__)
+
+
+def draw_figures(
+    directory: Path, plan: CampaignPlan, results: Results, formats: tuple[str, ...] = (".svg",)
+) -> dict[str, Path]:
+    """Draw all figures that the results allow.
+
+    These are the discrepancy map and its trials, the test discrepancy, spillage against pours, loss maps, safe windows,
+    and the comparison of the first pours with simulations. With more than two searched axes, a map shows the two most
+    important ones, and the trials against every axis are a separate figure.
+
+    A figure that can't be drawn is reported and left out, so that it does not end a long run with an error.
+
+    Args:
+        directory: folder of the PNGs.
+        plan: plan of the campaign.
+        results: results of the stages.
+        formats: suffixes of additional files next to each PNG.
+
+    Returns:
+        Name of each figure → its PNG.
+    """
+    drawn: dict[str, Path] = {}
+    for name, draw in _drawings(plan, results).items():
+        try:
+            drawn[name] = style.save(draw(), directory / f"{safe_name(name.replace(' ', '-'))}.png", formats)
+        except Exception as error:
+            _log.warning("figure '%s' was not drawn: %s: %s", name, type(error).__name__, error)
+    return drawn
+
+
+def figures_of(plan: CampaignPlan, results: Results) -> dict[str, Figure]:
+    """The same figures for notebooks, not written to files. An error in a figure is raised."""
+    return {name: draw() for name, draw in _drawings(plan, results).items()}
+
+
+def _drawings(plan: CampaignPlan, results: Results) -> dict[str, Callable[[], Figure]]:
+    """The functions that draw the figures, by name."""
+    found: dict[str, Callable[[], Figure]] = {}
+    calibration, evaluation, theta = calibration_of(results), evaluation_of(results), theta_of(results)
+    if calibration is not None and (picture := calibration_picture(plan, calibration)) is not None:
+        found["discrepancy map"] = partial(draw_surrogate, picture)
+        if picture.held and picture.points:
+            found["discrepancy trials"] = partial(draw_trials, picture)
+    if theta is not None and plan.calibration is not None and theta.posterior is not None:
+        space, best = plan.calibration.parameters, theta.theta.model_dump()
+        found["posterior"] = partial(draw_posterior, theta.posterior, space, best)
+    if evaluation is not None and (groups := discrepancy_groups(evaluation)):
+        title = f"How far the simulator is from the balance: {plan.name}"
+        found["test discrepancy"] = partial(draw_discrepancy, groups, title=title)
+    if plan.deployment is None:
+        return found
+    unit = deployment_unit(plan.deployment)
+    if series := pour_series(plan, results, unit):
+        title = f"What every pour came to: {plan.name}"
+        found["spillage against pours"] = partial(draw_spillage, series, cost=unit.label, title=title)
+    for scene, result in deployments_of(results).items():
+        picture, name = deployment_picture(plan, result), receiver_name(plan, scene)
+        if picture is not None:
+            found[f"loss map {name}"] = partial(draw_surrogate, picture)
+        if result.window is not None:
+            found[f"safe window {name}"] = partial(draw_window, result, picture, unit=unit, receiver=name)
+    return found
+
+
+def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:
+    """Scores by set of pours, for `draw_discrepancy`."""
+    label = calibrated_label(evaluation)
+    if label is None:
+        return []
+    groups = []
+    for split, name in SPLITS.items():
+        own = evaluation.discrepancy[label].get(split)
+        if own is None:
+            continue
+        rivals = [scores.get(split) for other, scores in evaluation.discrepancy.items() if other.startswith("random ")]
+        groups.append(
+            DiscrepancyGroup(
+                name,
+                sum(pair.split == split and pair.theta == label for pair in evaluation.pairs),
+                own,
+                evaluation.discrepancy.get(UNCALIBRATED, {}).get(split),
+                [value for value in rivals if value is not None],
+                evaluation.mean_predictor.get(split),
+                evaluation.regression.get(split),
+                evaluation.posterior_mean.get(split),
+            )
+        )
+    return groups
+
+
+def calibration_picture(plan: CampaignPlan, result: Calibrated) -> SurrogatePicture | None:
+    """The discrepancy over θ; None if the plan calibrates nothing or no trial has a discrepancy."""
+    if plan.calibration is None:
+        return None
+    known = [(trial.theta, trial.discrepancy) for trial in result.trials if trial.discrepancy is not None]
+    shown = None if result.found is None else result.found.map
+    if not known and shown is None:
+        return None
+    return SurrogatePicture(
+        title=f"Discrepancy over θ: {', '.join(scene.receiver.name for scene in plan.calibration.scenes)}",
+        cost=DISCREPANCY.label,
+        space=plan.calibration.parameters,
+        points=[theta for theta, _ in known],
+        costs=[DISCREPANCY.factor * discrepancy for _, discrepancy in known],
+        best=None if result.found is None else result.found.theta.model_dump(),
+        largest=DISCREPANCY.factor,
+        **_surrogate(shown, DISCREPANCY),
+    )
+
+
+def deployment_picture(plan: CampaignPlan, result: Deployed) -> SurrogatePicture | None:
+    """The loss over actions with numbered pours; None before the first data."""
+    if plan.deployment is None:
+        return None
+    unit = deployment_unit(plan.deployment)
+    known = [(pour, pour.loss) for pour in result.weighed if pour.loss is not None]
+    if not known and result.map is None:
+        return None
+    return SurrogatePicture(
+        title=f"Loss over actions: {receiver_name(plan, result.scene)} ({result.strategy})",
+        cost=unit.label,
+        space=plan.deployment.actions,
+        points=[pour.action_si for pour, _ in known],
+        costs=[unit.factor * loss for _, loss in known],
+        best=None if result.recommended is None else result.recommended.action_si,
+        best_name="best action",
+        numbers=[pour.number for pour, _ in known],
+        simulated=[one.action_si for one in result.simulated],
+        largest=unit.factor * largest_loss(plan.deployment),
+        **_surrogate(result.map, unit),
+    )
+
+
+def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[PourSeries]:
+    """Pours by receiver, for `draw_spillage`; refused ones (nothing was poured) are left out."""
+    series = []
+    for scene, result in deployments_of(results).items():
+        pours = [pour for pour in result.pours if pour.status in ("weighed", "failed")]
+        if not pours:
+            continue
+        losses = [
+            unit.factor * pour.loss if pour.status == "weighed" and pour.loss is not None else None for pour in pours
+        ]
+        predictions = [
+            None
+            if pour.predicted is None
+            else _prediction_interval(
+                Prediction(
+                    pour.predicted, pour.predicted_deviation or 0.0, pour.predicted_scatter, pour.predicted_interval
+                ),
+                unit,
+            )
+            for pour in pours
+        ]
+        series.append(PourSeries(f"{receiver_name(plan, scene)} ({result.strategy})", losses, predictions))
+    return series
+
+
+def _prediction_interval(predicted: Prediction, unit: LossUnit) -> tuple[float, float, float]:
+    low, high = predicted.of_a_pour()
+    return unit.factor * at_least_nothing(predicted.mean), unit.factor * low, unit.factor * high
+
+
+def _surrogate(shown: DisplayedMap | None, unit: LossUnit) -> dict[str, Any]:
+    """The map of a figure: its axes, and the values of the other axes."""
+    if shown is None:
+        return {}
+    return {
+        "mean": unit.factor * np.maximum(np.asarray(shown.mean, float), 0.0),  # see `at_least_nothing`
+        "deviation": unit.factor * np.asarray(shown.deviation, float),
+        "over": shown.over,
+        "held": shown.held,
+    }
 
 
 TOP = 1.08
@@ -46,17 +254,13 @@ class PourSeries:
         return running
 
 
-def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title: str) -> Path:
+def draw_spillage(series: Sequence[PourSeries], *, cost: str, title: str) -> Figure:
     """Loss against pours, one panel for each receiver: measured, best so far, and prediction interval.
 
     Args:
-        path: PNG to write.
         series: one per receiver.
         cost: label of the loss with its unit.
         title: title of the whole figure.
-
-    Returns:
-        `path`.
 
     Raises:
         ValueError: no receiver, or a receiver without pours.
@@ -68,7 +272,7 @@ def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title:
     figure, axes = style.new_figure(
         rows, columns, size=(max(6.4, 4.2 * columns), 0.6 + 3.7 * rows), squeeze=False, sharey=True
     )
-    figure.suptitle(title, fontsize=12.5, color=style.INK, x=0.02, ha="left")
+    style.entitle(figure, title)
     top = 0.0
     for place, one in enumerate(series):
         panel = axes[place // columns, place % columns]
@@ -79,7 +283,7 @@ def draw_spillage(path: Path, series: Sequence[PourSeries], *, cost: str, title:
     axes[0, 0].set_ylim(0.0, TOP * top or 1.0)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    return style.save(figure, path)
+    return figure
 
 
 def _pour_title(series: PourSeries, cost: str) -> str:
@@ -175,18 +379,14 @@ class DiscrepancyGroup:
     posterior: float | None = None
 
 
-def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: str) -> Path:
+def draw_discrepancy(groups: Sequence[DiscrepancyGroup], *, title: str) -> Figure:
     """Mean |Δ| of θ* and its posterior compared with rivals.
 
     The rivals are the uncalibrated θ, random θ (median, quartiles), the mean of the training pours, and the regression.
 
     Args:
-        path: PNG to write.
         groups: sets of pours; values are fractions (0 … 1), shown in percent.
         title: title of the figure.
-
-    Returns:
-        `path`.
 
     Raises:
         ValueError: no group.
@@ -242,7 +442,7 @@ def draw_discrepancy(path: Path, groups: Sequence[DiscrepancyGroup], *, title: s
     axes.set_xticks(middles, [f"{g.name}\n{g.pours} pour{'s' * (g.pours != 1)}" for g in groups], fontsize=9.5)
     axes.tick_params(axis="x", length=0)
     figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    return style.save(figure, path)
+    return figure
 
 
 def _random(values: Sequence[float]) -> tuple[str, float | None, str, tuple[float, float] | None]:

@@ -1,27 +1,127 @@
-"""The envelope of a campaign's motions on hardware: limits of the paths of actions from all over its action spaces.
+"""Approval of motion on hardware: the accepted safety settings of a controller, and the limits of what will move.
 
-The command line and the daemon show it before a person enables the motion of one run.
+- The safety settings that an operator has accepted are kept in a small file next to the laboratory's file, for review.
+  Decant can't judge safety settings. It only detects that they differ from the accepted ones.
+- `envelope` gives the limits of the paths of actions from all over a campaign's action spaces. The command line and the
+  daemon show it before an operator enables the motion of one run.
 """
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 
 import numpy as np
 
 from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.arm_interface import PathReport
-from actors.arm.arm_settings import ArmSettings
+from actors.arm.arm_settings import ArmSettings, SafetyRecord
 from actors.interfaces import InvalidActionError
 from actors.optimizer.questions import Linear
+from orchestrator.run_errors import RunError
 from orchestrator.runs.stages import CONFIRMATION, DEPLOYMENT, StageDefinition
 from orchestrator.strategies.calibration.action_prior import actions_all_over
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.action import Action
+from sim_engine.errors import shown_path
 from sim_engine.scene import Scene
 from sim_engine.search_space import Space
+
+SUFFIX = ".safety.json"
+_CHECKSUM = re.compile(r"[0-9A-F]{8}")
+
+
+class SafetyRecordError(RunError):
+    """The record can't be read, or there is none; the text gives the reason."""
+
+    exit_code = 2
+
+
+def record_path(laboratory: Path) -> Path:
+    """Path of the record of a laboratory's file: NAME.safety.json next to NAME.yaml."""
+    return laboratory.with_name(laboratory.stem + SUFFIX)
+
+
+def read_record(laboratory: Path) -> SafetyRecord | None:
+    """The accepted safety settings of a laboratory.
+
+    Args:
+        laboratory: the laboratory's file.
+
+    Returns:
+        None if none were accepted.
+
+    Raises:
+        SafetyRecordError: the record exists but is invalid.
+    """
+    path = record_path(laboratory)
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise SafetyRecordError(
+            f"{path}: {error}. Restore it, or accept the settings anew: {_accept(laboratory)}"
+        ) from None
+    names = {field.name for field in fields(SafetyRecord)}
+    if not isinstance(data, dict) or set(data) != names or not all(isinstance(v, str) for v in data.values()):
+        raise SafetyRecordError(
+            f"{path}: should hold {', '.join(sorted(names))}, each a text. Restore it, or accept the settings anew: "
+            f"{_accept(laboratory)}"
+        )
+    record = SafetyRecord(**data)
+    if not _CHECKSUM.fullmatch(record.checksum.upper()):
+        raise SafetyRecordError(f"{path}: checksum '{record.checksum}' should be eight hexadecimal digits")
+    return record
+
+
+def write_record(laboratory: Path, record: SafetyRecord) -> Path:
+    """Store the accepted settings.
+
+    Raises:
+        OSError: the file can't be written.
+    """
+    path = record_path(laboratory)
+    path.write_text(json.dumps(asdict(record), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    return path
+
+
+def accepted_checksum(laboratory: Path) -> str | None:
+    """Accepted checksum of a laboratory; None if none was accepted.
+
+    Args:
+        laboratory: the file that describes the laboratory; the campaign's file if it contains the laboratory.
+
+    Raises:
+        SafetyRecordError: the record is invalid.
+    """
+    record = read_record(laboratory)
+    return None if record is None else record.checksum.upper()
+
+
+def required_checksum(plan: CampaignPlan) -> str:
+    """Checksum that was accepted for the hardware of a campaign's laboratory.
+
+    Raises:
+        SafetyRecordError: none was accepted, or the record can't be read.
+    """
+    laboratory = plan.laboratory_source or plan.source
+    checksum = accepted_checksum(laboratory)
+    if checksum is None:
+        raise SafetyRecordError(
+            f"laboratory {plan.laboratory.name}: nobody has accepted the controller's safety settings. Run "
+            f"'decant doctor {shown_path(laboratory)}' first; it says how"
+        )
+    return checksum
+
+
+def _accept(laboratory: Path) -> str:
+    return f"decant doctor {laboratory} --accept-safety"
+
 
 CORNERS, INTERIOR = 32, 12
 """Actions of each space whose paths are planned for the envelope, in addition to its middle."""

@@ -1,4 +1,4 @@
-"""Report of the solver's physical validation cases: a table in the terminal, figures, and the page docs/validation.md.
+"""The command `decant physics`: validates the solver in physical cases, with a table, figures and docs/evidence/validation.md.
 
 The cases themselves are in `sim_engine.validation`.
 """
@@ -11,12 +11,16 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from orchestrator.results import figure_style as style
+import typer
+
+from orchestrator.cli.command_options import Json
+from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, print_json, print_message, stdout_for_results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from rich.progress import TaskID
     from rich.table import Table
 
     from sim_engine.validation.case_result import CaseResult, Figure
@@ -44,8 +48,6 @@ AGAIN = "decant physics --full --write docs"
 REFERENCES = (("--", "o"), (":", "s"), ("-.", "^"), ((0, (6, 2)), "D"))
 """Line style, or marker for few points, of several references in a panel."""
 
-COLOURS = (style.MEASURED, style.PREDICTED, style.GOOD, style.BEST, style.FALLING, style.ESCAPED)
-
 INTRODUCTION = """# Validation
 
 <!-- written by `decant physics`; edit the cases, not this page -->
@@ -62,6 +64,92 @@ decant physics --full --write docs
 θ of all cases unless they say otherwise: {theta}.
 N is the number of particles.
 """
+
+
+def physics(
+    cases: Annotated[list[str] | None, typer.Argument(help="Names of cases; default: all.", show_default=False)] = None,
+    full: Annotated[bool, typer.Option("--full", help="Use all resolutions and seeds; takes several minutes.")] = False,
+    pours: Annotated[
+        int | None, typer.Option(min=1, help="Number of random pours in the case 'walls'.", show_default=False)
+    ] = None,
+    write: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the page validation.md, its data and figures. Cases that are not run keep their "
+            "previous results.",
+            show_default=False,
+        ),
+    ] = None,
+    list_cases: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Validate the solver against theory, experiments and other solvers; each case has a criterion.
+
+    Exit code 1 if a criterion is not met.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from orchestrator.results.console_view import PLAIN_WIDTH
+    from sim_engine.simulator import PourSimulator
+    from sim_engine.solver_fingerprint import solver_fingerprint
+    from sim_engine.validation.cases import CASES, PLAIN, CaseEffort, describe
+
+    if list_cases:
+        for case in CASES:
+            print(f"{case.name:14}{case.about}")
+        return
+    chosen = _chosen(cases or [])
+    if write is not None and not write.is_dir():
+        raise RefusalError(f"--write {write}: there is no such folder", BAD_INPUT)
+    fingerprint = solver_fingerprint()
+    records: dict[str, dict[str, Any]] = {}
+    simulator = PourSimulator()
+    try:
+        for case in chosen:
+            print_message(f"{case.name}: {case.title} …")
+            image = None
+            # a bar is shown only after the first report of progress, which short cases don't make
+            with stdout_for_results(), Progress(console=Console(stderr=True), transient=True) as bars:
+                bar = bars.add_task(case.name, total=None, visible=False)
+
+                def tell(done: int, total: int, bars: Progress = bars, bar: TaskID = bar) -> None:
+                    bars.update(bar, completed=done, total=total, visible=True)
+
+                result = case.run(simulator, CaseEffort(full, pours, tell))
+                if write is not None and result.figure is not None:
+                    image = draw(result.figure, write / IMAGES / f"validation-{case.name}.png")
+            records[case.name] = case_record(case, result, image, fingerprint)
+    finally:
+        simulator.close()
+    if write is not None:
+        together = {**kept_records(write), **records}
+        theta = describe(PLAIN)
+        order = [case.name for case in CASES]
+        page = write_page(write, together, order, fingerprint=fingerprint, theta=theta)
+        print_message(f"page: {page}")
+    rows = [(record["title"], m) for record in records.values() for m in record["measurements"]]
+    if as_json:
+        print_json({"solver": fingerprint, "full": full, "cases": records})
+    else:
+        console = Console()
+        console = console if console.is_terminal else Console(width=PLAIN_WIDTH + 40)
+        console.print(results_table(rows))
+    judged = [m for _, m in rows if m["judged"]]
+    failed = sum(not m["passed"] for m in judged)
+    if failed:
+        raise RefusalError(f"{failed} of {len(judged)} criteria are not met", FAILED)
+    print_message(f"all {len(judged)} criteria are met" if judged else "nothing was judged")
+
+
+def _chosen(names: list[str]) -> list[Case]:
+    from sim_engine.validation.cases import CASES, case
+
+    try:
+        wanted = {case(name).name for name in names}
+    except KeyError as error:
+        raise RefusalError(str(error.args[0]), BAD_INPUT) from None
+    return [one for one in CASES if not names or one.name in wanted]
 
 
 def shown(value: float | None, unit: str) -> str:
@@ -116,11 +204,13 @@ def draw(figure: Figure, path: Path) -> Path:
         figure: its curves.
         path: path of the PNG; its folder is made if needed.
     """
+    from orchestrator.results import figure_style
+
     panels = len(figure.titles)
     columns = min(panels, PANELS_ABREAST)
     rows = -(-panels // columns)
     wide, high = (6.2, 3.9) if panels == 1 else (3.4, 2.7)
-    canvas, axes = style.new_figure(rows, columns, size=(wide * columns, 0.5 + high * rows), squeeze=False)
+    canvas, axes = figure_style.new_figure(rows, columns, size=(wide * columns, 0.5 + high * rows), squeeze=False)
     styles = _curve_styles(figure)
     for number, place in enumerate(axes.flat):
         if number < panels:
@@ -135,7 +225,7 @@ def draw(figure: Figure, path: Path) -> Path:
         [handles[name] for name in names], names, loc="outside lower center", ncols=max(1, min(int(room), len(names))),
         fontsize=8.5, frameon=False,
     )  # fmt: skip
-    return style.save(canvas, path)
+    return figure_style.save(canvas, path)
 
 
 @dataclass(frozen=True)
@@ -153,20 +243,26 @@ class CaseFigureStyle:
 
 def _curve_styles(figure: Figure) -> dict[str, CaseFigureStyle]:
     """Styles by name. Measured curves differ in colour; references have their subject's colour and another style."""
+    from orchestrator.results import figure_style
+
+    shades = figure_style.MEASURED, figure_style.PREDICTED, figure_style.GOOD
+    colours = (*shades, figure_style.BEST, figure_style.FALLING, figure_style.ESCAPED)
     measured = list(dict.fromkeys(s.name for s in figure.series if s.kind == "measured"))
-    styles = {name: CaseFigureStyle(colour) for name, colour in zip(measured, COLOURS * 4, strict=False)}
+    styles = {name: CaseFigureStyle(colour) for name, colour in zip(measured, colours * 4, strict=False)}
     of_subject = {_subject(name): styles[name].colour for name in reversed(measured)}
     references = iter(REFERENCES * 4)
     for series in figure.series:
         if series.name not in styles:
             line, marker = next(references)
             few = 2 < len(series.x) < FEW
-            colour = of_subject.get(_subject(series.name), style.INK)
+            colour = of_subject.get(_subject(series.name), figure_style.INK)
             styles[series.name] = CaseFigureStyle(colour, "", marker) if few else CaseFigureStyle(colour, line)
     return styles
 
 
 def _panel(axes: Axes, figure: Figure, number: int, styles: Mapping[str, CaseFigureStyle]) -> None:
+    from orchestrator.results import figure_style
+
     for series in (s for s in figure.series if s.panel == number):
         look = styles[series.name]
         above = 3 if series.kind == "reference" else 2
@@ -177,13 +273,15 @@ def _panel(axes: Axes, figure: Figure, number: int, styles: Mapping[str, CaseFig
         if series.spread:
             low, high = ([y + side * s for y, s in zip(series.y, series.spread, strict=True)] for side in (-1, 1))
             axes.fill_between(series.x, low, high, color=look.colour, alpha=0.18, lw=0)
-    style.dress(axes, title=figure.titles[number], x=figure.x_labels[number], y=figure.y_labels[number], grid="both")
+    figure_style.dress(
+        axes, title=figure.titles[number], x=figure.x_labels[number], y=figure.y_labels[number], grid="both"
+    )
     if figure.log_x if isinstance(figure.log_x, bool) else figure.log_x[number]:
         axes.set_xscale("log")
         places = sorted({x for s in figure.series if s.panel == number and s.kind == "measured" for x in s.x})
         if len(places) > MOST_PLACES:
-            places = style.log_ticks(places[0], places[-1])
-        axes.set_xticks(places, [style.number(x) for x in places])
+            places = figure_style.log_ticks(places[0], places[-1])
+        axes.set_xticks(places, [figure_style.number(x) for x in places])
         axes.minorticks_off()
 
 

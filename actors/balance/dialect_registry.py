@@ -1,0 +1,42 @@
+"""The plug-in registry of balances, built-in and installed: dialects of serial lines, and settings of drivers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from actors.balance.dialects.dialect import Dialect
+from actors.balance.dialects.protocol_encoder import ProtocolEncoder
+from sim_engine.settings.plugin_registry import PluginRegistry
+
+
+def _balance(loaded: Any, name: str) -> Dialect | type[Any]:
+    found: Dialect | type[Any]
+    if isinstance(loaded, Dialect):
+        found, called = loaded, loaded.name
+    elif isinstance(loaded, type) and callable(getattr(loaded, "driver", None)) and hasattr(loaded, "model_fields"):
+        found, called = loaded, loaded.model_fields["kind"].default
+    else:
+        raise TypeError("should be an instance of a Dialect, or a class of settings with a method 'driver'")
+    if called != name:
+        raise ValueError(f"it calls itself '{called}', which should be the name that it is registered under")
+    return found
+
+
+BALANCES: PluginRegistry[Dialect | type[Any]] = PluginRegistry("decant.balances", "balance", _balance)
+"""All installed balances: instances of dialects, and subclasses of `BalanceSettings`."""
+
+
+def dialects() -> dict[str, Dialect]:
+    """Dialects by the names that files use."""
+    return {name: found for name, found in BALANCES.all.items() if isinstance(found, Dialect)}
+
+
+def kinds() -> dict[str, type[Any]]:
+    """Settings of drivers by the names that files use."""
+    return {name: found for name, found in BALANCES.all.items() if isinstance(found, type)}
+
+
+def encoders() -> dict[str, Callable[[], ProtocolEncoder]]:
+    """Protocol encoders for emulated balances, by name: one per dialect, and one per further mode of such balances."""
+    return {name: encoder for dialect in dialects().values() for name, encoder in dialect.encoders().items()}
