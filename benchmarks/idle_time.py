@@ -4,7 +4,7 @@ Each campaign is run by `decant run` as people run it, with and without in turn,
 have to be the same. 'Without', what is foreseen is thrown away, for this benchmark only: there is no such setting. Run
 from the project's root, on a machine that does nothing else:
 
-    python benchmarks/idle_time.py                                    # the quickstart; into docs/data/daemon.json and the page
+    python benchmarks/idle_time.py                                    # the quickstart; into docs/data/daemon.json
     python benchmarks/idle_time.py --campaigns quickstart paper --times 1
 """
 

@@ -1,4 +1,4 @@
-"""What watching costs control: `python benchmarks/live_view.py` writes docs/data/live-view-timing.json and the page's table.
+"""What watching costs control: `python benchmarks/live_view.py` writes docs/data/live-view-timing.json, and a table.
 
 A control loop of 100 Hz runs in this process and emits what a campaign emits: a pour's progress ten times a second, a
 simulation every half second, every tenth with its particles, and a surrogate every two seconds. Measured is how late

@@ -4,8 +4,8 @@
     python benchmarks/make_page.py --measure            all measurements, then the page
     python benchmarks/make_page.py --measure pour-2000 start-up
 
-Measurements are kept in docs/data/performance.json, each with its command, machine and moment; those that are not made now
-stay as they are. `docs/performance-tried.md` is written by hand and becomes a section of the page.
+Measurements are kept in docs/data/performance.json, each with its command, machine and moment. Those that are
+not made now stay as they are.
 """
 
 from __future__ import annotations

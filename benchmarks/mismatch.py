@@ -6,7 +6,7 @@
 
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
 the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are kept in FILE, so that an
-interrupted comparison goes on; `--write` makes none, and puts the rows of FILE into the table of docs/evidence/results.md.
+interrupted comparison goes on; `--write` makes none, and puts the rows of FILE into docs/evidence/results.md.
 
 Primary questions, written before any of it was run. Seeds below 1000 are for tuning, those from 1000 on for answers:
 1000 to 1019, and 2000, 3000 and 7000 to 7019 for what was changed after the answers of those before were known (5000 to

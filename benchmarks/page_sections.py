@@ -25,8 +25,8 @@ def introduction() -> str:
 
 <!-- written by benchmarks/make_page.py from docs/data/performance.json -->
 
-The cost of a simulated pour, where the time goes, and a comparison with SPlisHSPlasH, the fastest open CPU solver that we
-know of. This command measures everything again and writes the page:
+The cost of a simulated pour, where the time goes, and a comparison with SPlisHSPlasH, the fastest open CPU solver that
+we know of. This command measures everything again and writes the page:
 
 <!-- needs: checkout and minutes -->
 ```

@@ -228,9 +228,7 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=["shipped"])
     parser.add_argument("--laboratory", type=Path, default=ROOT / "configs" / "laboratories" / "twin.yaml")
     parser.add_argument("--into", type=Path, default=ROOT / "build" / "quickstart")
-    parser.add_argument(
-        "--write", action="store_true", help="write the table of what is there into docs/evidence/results.md"
-    )
+    parser.add_argument("--write", action="store_true", help="write the table into docs/evidence/results.md")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # this is a process that makes one seed
     asked = parser.parse_args()
     if asked.one is not None:

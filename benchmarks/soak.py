@@ -7,7 +7,7 @@ Every minute all processes that it has started are looked at, and everything tha
 so that it takes no more of a core than it may. Run from the project's root:
 
     python benchmarks/soak.py --minutes 60 --into soak     # writes soak/samples.jsonl and soak/campaigns.jsonl
-    python benchmarks/soak.py --draw soak                  # docs/images/daemon/soak.png, its table in docs/evidence/reliability.md
+    python benchmarks/soak.py --draw soak                  # the picture, and its table in docs/evidence/reliability.md
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The six primary questions of the study of hidden benches (docs/evidence/study-questions.md), answered by its finished cells.
+"""Answer the six questions of the study of hidden benches (docs/evidence/study-questions.md) by its finished cells.
 
     python benchmarks/study_questions.py [runs/study-benches] [--write]
 

@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/experiments/liquids.md: water, oil and glycerol leave the same cup, and where their streams may cling.
+"""Draw water, oil and glycerol that leave the same cup, and where their streams may cling.
 
 python docs/make_liquid_pictures.py
 """

@@ -1,4 +1,4 @@
-"""Pictures of the live view for `docs/laboratory/live-view.md`, by a headless browser: `python docs/make_live_pictures.py`.
+"""Pictures of the live view for `docs/laboratory/live-view.md`, by a headless browser.
 
 It runs the quickstart with `--live` in a folder of its own, looks at it while it calibrates and while it pours, and
 afterwards at its recording. Needs Playwright and a Chromium (`--chromium`), no display; some five minutes on two cores.

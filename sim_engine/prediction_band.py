@@ -13,8 +13,8 @@ The calibration residual was measured with coarse particles, and contains their 
 to their error in other scenes; the larger of the two is used. A band is the interval of r that contains a single pour
 with probability `LEVEL`.
 
-Source: derived here; measured in `docs/evidence/validation.md` (landing, convergence), and compared with unseen pours in
-`docs/evidence/results.md`.
+Source: derived here; measured in docs/evidence/validation.md (landing, convergence), and compared with unseen pours in
+docs/evidence/results.md.
 
 Limitations: the shift of one pour does not determine that of another, or the liquid that stays in the pourer.
 """

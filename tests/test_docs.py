@@ -7,20 +7,31 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import typer.main
+from ruamel.yaml import YAML
 
 from actors.runtime.child_process import child_environment
 from orchestrator.cli import foreground_run as common
 from orchestrator.cli.app import app
+from orchestrator.config.campaign_file import CampaignFile
 from orchestrator.config.file_loading import load_campaign, load_vessel
+from orchestrator.config.search_ranges import EXAMPLES
+from orchestrator.config.vessel_file import VesselFile
+from orchestrator.config.yaml.section_validation import sections_in
+from orchestrator.daemon.daemon_settings import DaemonFile
 from orchestrator.journal.journal import Kind
 from orchestrator.runs.resume import OperatorNeededError
+from orchestrator.study.study_file import StudyFile
 from sim_engine import model_validity as regimes
+from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.lip_flow import EDGE
+from sim_engine.settings.model import Settings
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "configs").rglob("*.md")])
@@ -32,6 +43,10 @@ each_page = pytest.mark.parametrize("page", PAGES, ids=IDS)
 
 def text_of(page: Path) -> str:
     return page.read_text(encoding="utf-8")
+
+
+def chapter_of(page: str, heading: str) -> str:
+    return text_of(ROOT / "docs" / page).partition(heading)[2].partition("\n## ")[0]
 
 
 def prose_of(page: Path) -> str:
@@ -104,15 +119,13 @@ def test_every_package_is_on_the_architecture_page_and_every_file_named_there_ex
     page = text_of(ROOT / "docs" / "explanation" / "architecture.md")
     for layer in ("sim_engine", "actors", "orchestrator"):
         for package in sorted(path.parent for path in (ROOT / layer).glob("*/__init__.py")):
-            assert f"`{package.relative_to(ROOT)}`" in page, f"{package} is not in docs/architecture.md"
+            assert f"`{package.relative_to(ROOT)}`" in page, f"{package} is not in docs/explanation/architecture.md"
     for name in re.findall(r"`((?:sim_engine|actors|orchestrator|decant|tests)/[\w/]+\.(?:py|js))`", page):
-        assert (ROOT / name).is_file(), f"docs/architecture.md names {name}, which does not exist"
+        assert (ROOT / name).is_file(), f"docs/explanation/architecture.md names {name}, which does not exist"
 
 
 def test_journal_kinds_are_the_journal_s() -> None:
-    chapter = (
-        text_of(ROOT / "docs" / "explanation" / "architecture.md").partition("## The journal")[2].partition("\n## ")[0]
-    )
+    chapter = chapter_of("explanation/architecture.md", "## The journal")
     rows = re.findall(r"^\| (`.+?) \|", chapter, re.MULTILINE)
     assert {word for row in rows for word in re.findall(r"`([\w.]+)`", row)} == {str(kind) for kind in Kind}
 
@@ -153,9 +166,7 @@ def test_numbers_of_the_solver_are_the_code_s() -> None:
 
 
 def test_limits_of_what_is_simulated_are_the_code_s() -> None:
-    page = (
-        text_of(ROOT / "docs" / "explanation" / "simulator.md").partition("## Model validity")[2].partition("\n## ")[0]
-    )
+    page = chapter_of("explanation/simulator.md", "## Model validity")
     for limit in (
         f"| We < {regimes.DRIBBLING_WEBER:g} at the rim |",
         f"| Bo < {regimes.WETTING_BOND:g} of the film |",
@@ -179,19 +190,40 @@ def test_quickstart_is_what_the_tutorial_says() -> None:
     assert f"{deployment.settings.simulations_before} simulations first, then at most six pours" in page
 
 
-def test_every_block_of_yaml_is_yaml_with_known_keys() -> None:
-    """Whole files are loaded; parts of files have only keys that a file of some kind has at their top."""
-    known = {
-        key
-        for model in (CampaignFile, LaboratoryFile, VesselFile, StudyFile, DaemonFile, ArmKeys, DeploymentKeys)
-        for key in model
-    }
+def keys_of(model: type[Settings]) -> set[str]:
+    """Keys of settings and of those within them."""
+    found, left = set[str](), [model]
+    seen: set[type[Settings]] = set()
+    while left:
+        one = left.pop()
+        if one not in seen:
+            seen.add(one)
+            found |= set(one.written_keys())
+            left += [inner for info in one.model_fields.values() for inner in sections_in(info.annotation)]
+    return found
+
+
+def test_blocks_of_yaml_have_only_keys_that_exist() -> None:
+    known = keys_of(CampaignFile) | keys_of(StudyFile) | keys_of(DaemonFile) | keys_of(VesselFile)
+    known |= (
+        set(EXAMPLES) | set(ACTION_DIMENSIONS) | {"constraints", "cone", "max_hold_time", "pivot", "rough", "fastest"}
+    )
     for page in PAGES:
         for kind, block in FENCE.findall(text_of(page)):
-            if kind == "yaml":
-                for part in re.split(r"^(?=liquid:)", block, flags=re.MULTILINE):
-                    found = YAML(typ="safe").load(part)
-                    assert found is None or set(found) <= known, f"{page}: {set(found) - known}"
+            for part in re.split(r"^(?=liquid:)", block, flags=re.MULTILINE) if kind == "yaml" else []:
+                found = YAML(typ="safe").load(part)
+                assert set(words_of(found)) <= known, f"{page}: {set(words_of(found)) - known}"
+
+
+def words_of(value: Any, within: str = "") -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            if within not in ("rigs", "columns"):
+                yield str(key)
+            yield from words_of(inner, str(key))
+    elif isinstance(value, list):
+        for inner in value:
+            yield from words_of(inner)
 
 
 def test_claims_name_tests_and_pages_that_exist() -> None:

@@ -1,4 +1,6 @@
-"""Names for authors of plug-ins: strategies, objectives, balances, arms and sources of vessels. See docs/extend/plug-ins.md.
+"""Names for authors of plug-ins: strategies, objectives, balances, arms and sources of vessels.
+
+How to write one: docs/extend/plug-ins.md.
 
 ::
 

@@ -1,4 +1,4 @@
-"""The command `decant physics`: validates the solver in physical cases, with a table, figures and docs/evidence/validation.md.
+"""Validation of the solver in physical cases, with a table, figures and the page docs/evidence/validation.md.
 
 The cases themselves are in `sim_engine.validation`.
 """
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from sim_engine.validation.case_result import CaseResult, Figure
     from sim_engine.validation.cases import Case
 
-PAGE_NAME, DATA_NAME, IMAGES = "validation.md", "validation.json", "images"
+PAGE_NAME, DATA_NAME, IMAGES = "evidence/validation.md", "data/validation.json", "images"
 
 SHOWN_UNITS = {"1": (1.0, ""), "m": (1e3, "mm"), "m³": (1e6, "mL")}
 """Factor and name of the display unit of an SI unit; other units are displayed unchanged."""
@@ -384,5 +384,5 @@ def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint:
             )
         parts.append("\n".join(lines) + "\n")
         if record["image"] is not None:
-            parts.append(f"![{record['title']}]({IMAGES}/{record['image']})\n")
+            parts.append(f"![{record['title']}](../{IMAGES}/{record['image']})\n")
     return "\n".join(parts)

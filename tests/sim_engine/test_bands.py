@@ -66,7 +66,7 @@ def test_what_calibration_left_over_is_found_again() -> None:
 
 
 def test_the_stated_resolution_is_what_the_nineteen_pours_show() -> None:
-    """At 1,000 particles, from docs/validation.md; the limits stand in the validation's own case."""
+    """At 1,000 particles, from docs/evidence/validation.md; the limits stand in the validation's own case."""
     found = {
         "tumbler 100 °/s, 44 mm": 0.249,
         "narrow 40 °/s, 75 mm": 0.065,

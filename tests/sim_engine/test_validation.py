@@ -290,8 +290,8 @@ NOT_MET: dict[str, str] = {
 
 
 TOO_LONG = ("walls",)
-"""Take more than ten minutes of a core: `decant physics --full` writes them into docs/validation.md, and a part of each
-is a test of its own."""
+"""Take more than ten minutes of a core: they are run for docs/evidence/validation.md, and a part of each is a test of
+its own."""
 
 
 @pytest.mark.physics
