@@ -3,7 +3,7 @@
 - `SimulatorPool`, `Bench` and `Optimizer` are the parts of a `Laboratory`. Hardware, the virtual bench and in-process
   replacements for tests implement them. All are asynchronous.
 - `Operator` answers an `OperatorQuestion` at the bench; `OperatorSettings` are its settings.
-- `Notice` is a message from a laboratory, `DeviceCheck` one line of `decant doctor`.
+- `Notice` is a message from a laboratory, `DeviceCheck` one line of `decant robot check`.
 
 None of these depends on strategies.
 """
@@ -297,7 +297,7 @@ State = Literal["ok", "warn", "fail"]
 
 @dataclass(frozen=True)
 class DeviceCheck:
-    """One line of the table of `decant doctor`.
+    """One line of the table of `decant robot check`.
 
     Attributes:
         name: of the checked item.

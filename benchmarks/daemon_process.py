@@ -1,4 +1,4 @@
-"""A `decant serve` of a benchmark's own, that ends with the benchmark, however that ends."""
+"""A `decant server start` of a benchmark's own, that ends with the benchmark, however that ends."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def serving(folder: Path, *options: str, environment: Mapping[str, str] | None =
 
     Args:
         folder: is there.
-        options: of `decant serve`, a settings file among them.
+        options: of `decant server start`, a settings file among them.
         environment: beside this process's own.
     """
     with (folder / "log").open("a") as log:
-        command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "serve", *options]
+        command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "server", "start", *options]
         process = started(
             [*command, "--state", str(folder / "state"), "--port", "0"],
             stdout=log, stderr=log, start_new_session=True, env={**os.environ, **(environment or {})},

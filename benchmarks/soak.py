@@ -1,6 +1,6 @@
 """A daemon that is kept busy for an hour or a week: does anything of it grow?
 
-`decant serve` with one simulator gets campaigns over HTTP, one after the other, on benches whose clock is scaled:
+A daemon with one simulator gets campaigns over HTTP, one after the other, on benches whose clock is scaled:
 plans, calibrations with deployments, with and without a recording, with an operator whose questions are answered over
 the API, paused and resumed, aborted while the arm tilts and resumed with its question, stopped, and some over wires.
 Every minute all processes that it has started are looked at, and everything that it keeps. It waits between campaigns

@@ -160,7 +160,7 @@ def main() -> None:
     study = read_study(asked.study)
     found = gather(study, finished_results(asked.folder, cells_of(study)))
     if not (found.finals and {"C4", "C4-active", UNCALIBRATED, RANDOM} <= found.calibrated.keys()):
-        parser.error(f"{asked.folder}: too few cells are finished; first: decant study {asked.study}")
+        parser.error(f"{asked.folder}: too few cells are finished; first: decant study run {asked.study}")
     receivers = sorted({scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes})
     text = table(found, [level.name for level in study.levels], receivers)
     print(text)

@@ -88,8 +88,8 @@ class Lab:
         self.url = self.token = ""
 
     def start(self, settings: str = "one.yaml") -> None:
-        """`decant serve`."""
-        command = [Path(sys.executable).with_name("decant"), "serve", settings, "--state", self.state]
+        """`decant server start`."""
+        command = [Path(sys.executable).with_name("decant"), "server", "start", settings, "--state", self.state]
         with (self.folder / "log").open("ab") as log:
             self.process = subprocess.Popen(
                 command, cwd=self.folder, stdout=log, stderr=log, start_new_session=True, env=child_environment()

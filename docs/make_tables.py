@@ -221,7 +221,7 @@ def parameters() -> str:
 
 
 def effects() -> str:
-    """What each parameter does to the spillage of three pours, as `decant physics sensitivity` measured it last."""
+    """What each parameter does to the spillage of three pours, as last measured by the case `sensitivity`."""
     found = {(e.parameter, e.pour): e for e in sensitivity.effects(_measured("sensitivity"))}
     rows = []
     for name, info in SimulationParameters.info().items():

@@ -47,11 +47,11 @@ within the length l ≈ 3e in which it accelerates at about Re = 75; above, the 
 For liquids as thin as water only; for others viscosity is simulated, …"""
 
 CREEPING = 2.0
-"""… up to this viscosity [Pa s], the largest that was compared with theory (`decant physics film`) …"""
+"""… up to this viscosity [Pa s], the largest that was compared with theory (`decant validate-solver film`) …"""
 
 FLOOR = 300e-6
 """… and approximately below this kinematic viscosity [m²/s], the largest that the solver itself adds in a tank 41 mm
-deep (`decant physics floor`, spacings of 4.1 to 5.9 mm, 0.05 and 0.2 m/s)."""
+deep (`decant validate-solver floor`, spacings of 4.1 to 5.9 mm, 0.05 and 0.2 m/s)."""
 
 PARTICLES_ACROSS = 2.0
 """Particles across the falling stream: with fewer, no particle has neighbours all around it, and the stream is a

@@ -32,7 +32,7 @@ JOINT_NAMES = tuple(
     f"joint {k} ({name})"
     for k, name in enumerate(("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3"), start=1)
 )
-"""Names of the joints in messages, in their order: numbered from 1, as on the axes of `decant jog`."""
+"""Names of the joints in messages, in their order: numbered from 1, as on the axes of `decant robot jog`."""
 
 Vector = tuple[float, float, float]
 Joints = tuple[float, float, float, float, float, float]

@@ -3,7 +3,7 @@
 - `ArmSettings` is the base class: frozen values that name the driver's class and the planner; `ARMS` is the registry of
   installed kinds. `UrArmSettings` is for UR arms.
 - `SafetyRecord` holds safety settings that an operator has accepted.
-- `ArmDiagnostics` holds what an arm reports to `decant doctor`.
+- `ArmDiagnostics` holds what an arm reports to `decant robot check`.
 
 Drivers and planners are named by text and imported when they are needed, because settings are also read where no arm is
 started.
@@ -185,7 +185,7 @@ class ArmSettings(Settings):
         return None
 
     def diagnostics(self) -> ArmDiagnostics:
-        """Read everything that `decant doctor` reports; nothing moves, no setting changes."""
+        """Read everything that `decant robot check` reports; nothing moves, no setting changes."""
         from actors.interfaces import LaboratoryError
 
         cls, arguments = self.driver(None)

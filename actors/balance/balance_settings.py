@@ -236,7 +236,7 @@ class BalanceSettings(Settings):
         return None
 
     def diagnostics(self, *, tare: bool) -> list[DeviceCheck]:
-        """Return the checks of `decant doctor`: identification, a stable reading, its step, and optionally a tare.
+        """Return the checks of `decant robot check`: identification, a stable reading, its step, and optionally a tare.
 
         Args:
             tare: also tare the balance.

@@ -1,7 +1,7 @@
 """A serial port that may vanish and return: it reads lines and writes bytes, and every call has a deadline.
 
 `Wire` is one open port, and `Counters` holds its statistics. `look_at_port` returns the check of a serial port for
-`decant doctor`. The meaning of the bytes belongs to the dialects.
+`decant robot check`. The meaning of the bytes belongs to the dialects.
 """
 
 from __future__ import annotations

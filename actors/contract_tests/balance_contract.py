@@ -74,7 +74,7 @@ class BalanceContract:
     # possible.
 
     def test_it_says_who_it_is(self, bench: BalanceBench) -> None:
-        """`decant doctor` shows the identification."""
+        """`decant robot check` shows the identification."""
         assert bench.driver.connect().strip()
 
     def test_it_weighs_what_is_put_on_it(self, bench: BalanceBench) -> None:

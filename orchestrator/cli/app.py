@@ -64,17 +64,23 @@ def decant(
     """Options that precede the command."""
 
 
-def _add(work: Callable[..., None], *shown: str, name: str | None = None, panel: str | None = None) -> None:
+def _group(name: str, text: str) -> typer.Typer:
+    """Add a group of commands."""
+    group = typer.Typer(name=name, cls=Commands, no_args_is_help=True, rich_markup_mode="markdown", help=text)
+    app.add_typer(group)
+    return group
+
+
+def _add(work: Callable[..., None], *shown: str, name: str | None = None, to: typer.Typer = app) -> None:
     """Add a command.
 
     Args:
         work: the function; its docstring is the help text.
         shown: examples.
         name: name of the command; None: that of the function.
-        panel: heading in the list of commands.
+        to: the group that it belongs to.
     """
-    register = app.command(name or work.__name__, cls=Command, epilog=examples(*shown), rich_help_panel=panel)
-    register(command(work))
+    to.command(name or work.__name__, cls=Command, epilog=examples(*shown))(command(work))
 
 
 _add(
@@ -94,12 +100,6 @@ _add(
     "decant plan my.yaml --parameters theta.json --receiver vase.yaml --json",
 )
 _add(
-    study_command.study,
-    "decant study configs/studies/quick.yaml",
-    "decant study configs/studies/paper.yaml --dry-run   # estimate the cost",
-    "decant study configs/studies/paper.yaml --jobs 2    # continues a stopped study",
-)
-_add(
     simulate_command.simulate,
     "decant simulate my.yaml --set angular_velocity=40 --set x_offset=90   # deg/s and mm",
     "decant simulate my.yaml --set 'angular_velocity=0.7 rad/s' --set 'x_offset=9 cm' --png pour.png",
@@ -109,16 +109,6 @@ _add(file_commands.validate, "decant validate my.yaml vase.yaml", "decant valida
 _add(file_commands.migrate, "decant migrate my.yaml rig.yaml")
 _add(file_commands.init, "decant init lab", "decant run lab/campaigns/quickstart.yaml")
 _add(file_commands.schema, "decant schema > campaign.json", "decant schema result > result.json")
-_add(
-    robot_commands.doctor,
-    "decant doctor configs/laboratories/virtual.yaml",
-    "decant doctor configs/laboratories/ur10-kern.yaml --accept-safety   # after reading them on the teach pendant",
-)
-_add(
-    robot_commands.jog,
-    "decant jog configs/laboratories/virtual.yaml         # practise without a robot",
-    "decant jog configs/laboratories/ur10-kern.yaml --enable-motion",
-)
 _add(
     pour_command.pour,
     "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --dry-run --png path.png",
@@ -137,60 +127,87 @@ _add(
     "decant view runs/first runs/second                   # side by side",
     "decant view runs/first --pour 7 --particles 5000     # simulate pour 7 again with 5000 particles",
 )
-app.add_typer(run_commands.runs)
 _add(file_commands.plugins, "decant plugins", "decant plugins --json")
-_add(
-    physics_command.physics,
-    "decant physics",
-    "decant physics outflow walls --full",
-    "decant physics --full --write docs",
-)
 
-_DAEMON = "Daemon"
-_add(
-    queue_commands.serve,
-    "decant serve",
-    "decant serve lab.yaml --port 0",
-    "decant serve --state /tmp/try --in-process",
-    panel=_DAEMON,
-)
-_add(
-    queue_commands.submit,
-    "decant submit configs/campaigns/quickstart.yaml",
-    "decant submit my.yaml --rig left --priority 5",
-    "decant submit my.yaml --task plan --parameters theta.json --receiver configs/vessels/bowl.yaml",
-    panel=_DAEMON,
-)
-_add(queue_commands.list_campaigns, "decant list", "decant list --json", name="list", panel=_DAEMON)
-_add(queue_commands.show, "decant show quickstart-3f2a1c", panel=_DAEMON)
-_add(queue_commands.logs, "decant logs -f", "decant logs quickstart-3f2a1c --json", panel=_DAEMON)
-_add(queue_commands.pause, "decant pause quickstart-3f2a1c", "decant pause   # the queue", panel=_DAEMON)
-_add(queue_commands.resume, "decant resume quickstart-3f2a1c", "decant resume   # the queue", panel=_DAEMON)
-_add(queue_commands.stop, "decant stop quickstart-3f2a1c", panel=_DAEMON)
-_add(
-    queue_commands.abort,
-    "decant abort quickstart-3f2a1c",
-    "decant abort --all",
-    "decant abort --rig left",
-    "decant abort --clear",
-    panel=_DAEMON,
-)
-_add(
-    queue_commands.answer,
-    "decant answer",
-    "decant answer 7 done",
-    "decant answer 8 weighed 3.2 0.4",
-    panel=_DAEMON,
-)
-_add(queue_commands.enable, "decant enable narrow-1b2c3d", panel=_DAEMON)
-_add(queue_commands.move, "decant move narrow-1b2c3d --first", panel=_DAEMON)
-_add(queue_commands.shutdown, "decant shutdown", panel=_DAEMON)
 _add(
     vessel_command.vessel,
     "decant vessel cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
     "decant vessel cup.yaml --photo side.png --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
     "decant vessel mug.yaml --mesh scan.stl --wall '3 mm'",
 )
+
+
+_add(
+    physics_command.validate_solver,
+    "decant validate-solver",
+    "decant validate-solver outflow walls --full",
+    "decant validate-solver --full --write docs",
+    name="validate-solver",
+)
+
+app.add_typer(run_commands.runs)
+
+_study = _group("study", "Compare strategies with repetitions, on virtual benches that differ from the simulator.")
+_add(
+    study_command.run_study,
+    "decant study run configs/studies/quick.yaml",
+    "decant study run configs/studies/paper.yaml --dry-run   # estimate the cost",
+    "decant study run configs/studies/paper.yaml --jobs 2    # continues a stopped study",
+    name="run",
+    to=_study,
+)
+_add(study_command.report_study, "decant study report configs/studies/quick.yaml", name="report", to=_study)
+
+_robot = _group("robot", "Check and move the arm of a laboratory.")
+_add(
+    robot_commands.check,
+    "decant robot check configs/laboratories/virtual.yaml",
+    "decant robot check configs/laboratories/ur10-kern.yaml --accept-safety   # after reading them on the pendant",
+    to=_robot,
+)
+_add(
+    robot_commands.jog,
+    "decant robot jog configs/laboratories/virtual.yaml         # practise without a robot",
+    "decant robot jog configs/laboratories/ur10-kern.yaml --enable-motion",
+    to=_robot,
+)
+
+_server = _group("server", "Run a laboratory as a service.")
+_add(
+    queue_commands.start,
+    "decant server start",
+    "decant server start lab.yaml --port 0",
+    "decant server start --state /tmp/try --in-process",
+    to=_server,
+)
+_add(queue_commands.shutdown, "decant server stop", name="stop", to=_server)
+
+_queue = _group("queue", "Submit campaigns to the server, follow and control them, and answer their questions.")
+_add(
+    queue_commands.submit,
+    "decant queue submit configs/campaigns/quickstart.yaml",
+    "decant queue submit my.yaml --rig left --priority 5",
+    "decant queue submit my.yaml --task plan --parameters theta.json --receiver configs/vessels/bowl.yaml",
+    to=_queue,
+)
+_add(queue_commands.list_campaigns, "decant queue list", "decant queue list --json", name="list", to=_queue)
+_add(queue_commands.show, "decant queue show quickstart-3f2a1c", to=_queue)
+_add(queue_commands.logs, "decant queue logs -f", "decant queue logs quickstart-3f2a1c --json", to=_queue)
+_add(queue_commands.pause, "decant queue pause quickstart-3f2a1c", "decant queue pause   # the queue", to=_queue)
+_add(queue_commands.resume, "decant queue resume quickstart-3f2a1c", "decant queue resume   # the queue", to=_queue)
+_add(queue_commands.stop, "decant queue stop quickstart-3f2a1c", to=_queue)
+_add(queue_commands.abort, "decant queue abort quickstart-3f2a1c", to=_queue)
+_add(
+    queue_commands.answer,
+    "decant queue answer",
+    "decant queue answer 7 done",
+    "decant queue answer 8 weighed 3.2 0.4",
+    to=_queue,
+)
+_add(queue_commands.enable, "decant queue enable narrow-1b2c3d", to=_queue)
+_add(queue_commands.move, "decant queue move narrow-1b2c3d --first", to=_queue)
+
+_add(queue_commands.estop, "decant estop", "decant estop --rig left", "decant estop --clear")
 
 
 def main() -> None:

@@ -1,13 +1,13 @@
 """Arguments and options that several commands share, and the classes of the application's commands.
 
 `command` turns a function with such parameters into a command. `Commands` and `Command` refuse names that earlier
-versions used, and give the new name (`RETIRED`).
+versions used, and give the new name (`RETIRED_COMMANDS`, `RETIRED_OPTIONS`).
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -100,17 +100,36 @@ Receiver = Annotated[
 ]
 
 
-RETIRED = {"arm": "enable", "--arm": "--enable-motion", "--verb": "--task"}
-"""Commands and options of earlier versions, with their new names."""
+RETIRED_COMMANDS = {
+    "serve": "server start",
+    "shutdown": "server stop",
+    **{
+        name: f"queue {name}"
+        for name in ("submit", "list", "show", "logs", "pause", "resume", "stop", "answer", "move")
+    },
+    "arm": "queue enable",
+    "enable": "queue enable",
+    "abort": "estop (or queue abort CAMPAIGN_ID, for one campaign)",
+    "doctor": "robot check",
+    "jog": "robot jog",
+    "physics": "validate-solver",
+}
+"""Commands of earlier versions, with their new names."""
+
+RETIRED_OPTIONS = {"--arm": "--enable-motion", "--verb": "--task"}
+"""Options of earlier versions, with their new names."""
 
 
 class Commands(TyperGroup):
-    """The group of all commands."""
+    """A group of commands."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Refuse a retired command."""
         if args and args[0] not in self.commands:
-            _refuse_retired(args[:1])
+            if ctx.parent is None and args[0] in RETIRED_COMMANDS:
+                _refuse(f"decant {args[0]}", f"decant {RETIRED_COMMANDS[args[0]]}")
+            if self.name == "study" and not args[0].startswith("-"):
+                _refuse("decant study FILE", "decant study run FILE")
         return super().parse_args(ctx, args)
 
 
@@ -121,14 +140,14 @@ class Command(TyperCommand):
         """Refuse retired options."""
         known = {name for parameter in self.params for name in parameter.opts}
         options = (arg.partition("=")[0] for arg in args[: args.index("--") if "--" in args else len(args)])
-        _refuse_retired(option for option in options if option.startswith("--") and option not in known)
+        for option in options:
+            if option in RETIRED_OPTIONS and option not in known:
+                _refuse(option, RETIRED_OPTIONS[option])
         return super().parse_args(ctx, args)
 
 
-def _refuse_retired(names: Iterable[str]) -> None:
-    for name in names:
-        if name in RETIRED:
-            fail(RefusalError(f"{name}: is called {RETIRED[name]} now", BAD_INPUT))
+def _refuse(old: str, new: str) -> None:
+    fail(RefusalError(f"{old}: is called {new} now", BAD_INPUT))
 
 
 def examples(*commands: str) -> str:

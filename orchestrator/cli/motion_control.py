@@ -2,7 +2,7 @@
 
 - Hardware moves only after the operator has read what will move and has typed the laboratory's name. The arm is
   connected, its safety settings are compared, and Ctrl-C stops it. Virtual laboratories need no approval.
-- `Jogging` is the session of `decant jog`; `parse_step` parses a line, `steps_home` computes the way home.
+- `Jogging` is the session of `decant robot jog`; `parse_step` parses a line, `steps_home` computes the way home.
 - `EmptyCycle` is the cycle of `decant pour --empty`.
 """
 
@@ -102,7 +102,7 @@ def require_flag(laboratory: LaboratorySettings, *, enabled: bool, again: str) -
     if laboratory.mode == "hardware" and not enabled:
         raise RefusalError(
             f"laboratory {laboratory.name} is hardware: an arm would move. Try it without moving first "
-            f"('decant doctor', 'decant pour --dry-run'); then enable motion for this one run: {again}",
+            f"('decant robot check', 'decant pour --dry-run'); then enable motion for this one run: {again}",
             BAD_INPUT,
         )
 
@@ -159,7 +159,7 @@ def connected(spec: LaboratorySettings, accepted: str | None) -> Iterator[tuple[
         with Refused(NotAcceptedError):
             facts = arm.connect()
         if facts.problem:
-            raise RefusalError(f"{spec.arm.title}: {facts.problem}; 'decant doctor' says what to do about it")
+            raise RefusalError(f"{spec.arm.title}: {facts.problem}; 'decant robot check' says what to do about it")
         yield arm, facts
     finally:
         arm.close()

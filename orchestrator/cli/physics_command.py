@@ -43,14 +43,14 @@ FEW = 20
 MOST_PLACES = 5
 """Maximum number of labelled points of a logarithmic axis; with more points, round numbers are labelled."""
 
-AGAIN = "decant physics --full --write docs"
+AGAIN = "decant validate-solver --full --write docs"
 
 REFERENCES = (("--", "o"), (":", "s"), ("-.", "^"), ((0, (6, 2)), "D"))
 """Line style, or marker for few points, of several references in a panel."""
 
 INTRODUCTION = """# Validation
 
-<!-- written by `decant physics`; edit the cases, not this page -->
+<!-- written by `decant validate-solver`; edit the cases, not this page -->
 
 What the solver does in cases whose outcome is known: from theory, from experiments, from other solvers. Every quantity
 is measured, not assumed, and judged by a criterion that was set beforehand; what fails is shown as failing. The page is
@@ -58,7 +58,7 @@ written by
 
 <!-- needs: checkout and minutes -->
 ```
-decant physics --full --write docs
+decant validate-solver --full --write docs
 ```
 
 θ of all cases unless they say otherwise: {theta}.
@@ -66,7 +66,7 @@ N is the number of particles.
 """
 
 
-def physics(
+def validate_solver(
     cases: Annotated[list[str] | None, typer.Argument(help="Names of cases; default: all.", show_default=False)] = None,
     full: Annotated[bool, typer.Option("--full", help="Use all resolutions and seeds; takes several minutes.")] = False,
     pours: Annotated[
@@ -372,7 +372,7 @@ def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint:
     parts = [INTRODUCTION.format(theta=theta)]
     parts.append(f"{len(judged) - failed} of {len(judged)} criteria are met.\n")
     for name, record in records.items():
-        parts.append(f"## {record['title']}\n\n{record['about']} (`decant physics {name}`)\n")
+        parts.append(f"## {record['title']}\n\n{record['about']} (`decant validate-solver {name}`)\n")
         if record["solver"] != fingerprint:
             parts.append(f"Measured before the solver's sources last changed; again: `{AGAIN} {name}`\n")
         lines = ["| quantity | N | measured | reference | criterion | |", "|---|---:|---:|---:|---|---|"]

@@ -1,4 +1,4 @@
-"""The daemon's commands: `decant serve`, and the commands that call the daemon over HTTP.
+"""The daemon's commands: `decant server start`, and the commands that call the daemon over HTTP.
 
 The HTTP client is in `orchestrator.daemon.daemon_client`.
 """
@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 
 CampaignId = Annotated[
     str,
-    typer.Argument(metavar="CAMPAIGN_ID", help="Id as shown by 'decant list', or a prefix of it.", show_default=False),
+    typer.Argument(
+        metavar="CAMPAIGN_ID", help="Id as shown by 'decant queue list', or a prefix of it.", show_default=False
+    ),
 ]
 Url = Annotated[
     str | None,
@@ -41,7 +43,7 @@ State = Annotated[
 ]
 
 
-def serve(
+def start(
     settings: Annotated[
         Path | None, typer.Argument(help="Settings file (YAML); default: a virtual laboratory.", show_default=False)
     ] = None,
@@ -79,7 +81,7 @@ def serve(
             in_process=in_process or None,
         )
         server_process.log_lines()
-        text = f"state in {chosen.state}. 'decant submit CAMPAIGN' queues one"
+        text = f"state in {chosen.state}. 'decant queue submit CAMPAIGN' queues one"
         server_process.serve(chosen, lambda url: print_message(f"serving {url}; {text}"))
     except ConfigError as error:
         raise RefusalError(str(error), BAD_INPUT) from None
@@ -152,9 +154,9 @@ def submit(
         print_json(found)
         return
     print(found["id"])
-    print_note(f"queued for {found['rig']}; follow it with: decant logs -f {found['id']}")
+    print_note(f"queued for {found['rig']}; follow it with: decant queue logs -f {found['id']}")
     if found["needs_enabling"]:
-        print_message(f"hardware: it waits until its motion is enabled: decant enable {found['id']}")
+        print_message(f"hardware: it waits until its motion is enabled: decant queue enable {found['id']}")
 
 
 def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) -> None:
@@ -177,7 +179,7 @@ def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) 
         if (arm := rig["arm"]) and arm["state"] != "ok":
             print_message(f"arm of {rig['name']}: {arm['text']}" + (f" → {arm['advice']}" if arm["advice"] else ""))
     if status["queue_paused"]:
-        print_message("the queue is paused: decant resume")
+        print_message("the queue is paused: decant queue resume")
     rows = [("CAMPAIGN", "STATE", "RIG", "SUBMITTED", "")]
     for one in campaigns:
         rows.append((one["id"], one["state"], one["rig"], _clock(one["created"]), _standing(one)))
@@ -191,7 +193,7 @@ def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) 
 def _standing(one: dict[str, Any]) -> str:
     progress = one["progress"]
     if one["needs_enabling"]:
-        return f"waits for: decant enable {one['id']}"
+        return f"waits for: decant queue enable {one['id']}"
     if progress is None:
         return str(one["reason"]).split("\n", maxsplit=1)[0][:100]
     parts = [f"{progress['stage']} ({progress['stage_index']}/{progress['stage_count']})"] if progress["stage"] else []
@@ -330,39 +332,34 @@ def _change(key: str | None, what: str, url: str | None, state: Path | None) -> 
         print(f"{found['id']}: {found['state']}, wanted: {found['desired_state']}")
 
 
-def abort(
-    key: Annotated[str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Campaign to abort; or use --all.")] = None,
-    everything: Annotated[
-        bool, typer.Option("--all", help="Emergency stop: stop every arm and give up all work until --clear.")
-    ] = False,
-    clear: Annotated[bool, typer.Option("--clear", help="Clear the emergency stop, after the cell is safe.")] = False,
-    rig: Annotated[
-        str | None, typer.Option("--rig", help="Emergency stop of this rig alone; with --clear: clear it.")
-    ] = None,
-    url: Url = None,
-    state: State = None,
-) -> None:
-    """Stop the motion at once. A tilted vessel is brought upright after the operator has agreed.
+def abort(key: CampaignId, url: Url = None, state: State = None) -> None:
+    """Stop the motion of a campaign at once. A tilted vessel is brought upright after the operator has agreed.
 
     A software stop is not a safety function: keep the robot's own emergency stop within reach.
     """
-    if sum((key is not None, everything, clear or rig is not None)) != 1:
-        raise RefusalError(
-            "name one campaign, or --all for the emergency stop, or --rig for that of one rig, or --clear to end one",
-            BAD_INPUT,
-        )
     with connected_client(url, state) as client:
-        if key is not None:
-            found = client.post(f"/campaigns/{key}/abort")
-            print(f"{found['id']}: {found['state']}, wanted: {found['desired_state']}")
-            return
+        found = client.post(f"/campaigns/{key}/abort")
+    print(f"{found['id']}: {found['state']}, wanted: {found['desired_state']}")
+
+
+def estop(
+    clear: Annotated[bool, typer.Option("--clear", help="Clear the emergency stop, after the cell is safe.")] = False,
+    rig: Annotated[str | None, typer.Option("--rig", help="This rig alone; without it all rigs.")] = None,
+    url: Url = None,
+    state: State = None,
+) -> None:
+    """Emergency stop: stop every arm of the server, and give up all work until --clear.
+
+    A software stop is not a safety function: keep the robot's own emergency stop within reach.
+    """
+    with connected_client(url, state) as client:
         client.post("/emergency-stop/clear" if clear else "/emergency-stop", {"rig": rig or ""})
     of = f" of {rig}" if rig else ""
     option = f" --rig {rig}" if rig else ""
     if clear:
         print(f"emergency stop{of} cleared: what was given up rests until it is resumed")
     else:
-        print(f"EMERGENCY STOP{of}: the work is given up; nothing begins there before 'decant abort --clear{option}'")
+        print(f"EMERGENCY STOP{of}: the work is given up; nothing begins there before 'decant estop --clear{option}'")
 
 
 def answer(
@@ -382,7 +379,7 @@ def answer(
             return
         if not text:
             raise RefusalError(
-                f"question {question}: what is the answer? 'decant answer' lists the questions", BAD_INPUT
+                f"question {question}: what is the answer? 'decant queue answer' lists the questions", BAD_INPUT
             )
         found = client.post(f"/questions/{question}/answer", {"answer": " ".join(text)})
     print(f"question {found['id']}: {found['answer']}")
@@ -398,7 +395,7 @@ def _print_question(question: dict[str, Any]) -> None:
     wanted = " | ".join(question["options"]) or {"done": "done", "yes or no": "yes | no"}.get(
         question["wants"], "a weight, such as '203.4 g'"
     )
-    print(f"  decant answer {question['id']} …   ({wanted})")
+    print(f"  decant queue answer {question['id']} …   ({wanted})")
 
 
 def enable(key: CampaignId, url: Url = None, state: State = None) -> None:

@@ -1,6 +1,6 @@
-"""The commands `decant doctor` and `decant jog`, which look at the robot of a laboratory and move it by small steps.
+"""The commands `decant robot check` and `decant robot jog`: check a laboratory, move its arm by small steps.
 
-- `doctor` checks whether a bench is ready to pour, and advises how to solve each problem. Nothing moves; the balance is
+- `check` checks whether a bench is ready to pour, and advises how to solve each problem. Nothing moves; the balance is
   tared only on request.
 - `jog` moves the arm by typed steps; the session itself is in `motion_control`.
 """
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _MARKS = {"ok": ("ok", "green"), "warn": ("warn", "yellow"), "fail": ("FAIL", "bold red")}
 
 
-def doctor(
+def check(
     laboratory: Laboratory,
     accept_safety: Annotated[
         bool,
@@ -80,7 +80,7 @@ def doctor(
         look = ready.arm.diagnostics()
         if accept_safety and not virtual:
             record = _accept(laboratory, look)
-        checks = look.checks(record, accept=f"decant doctor {laboratory} --accept-safety", virtual=virtual)
+        checks = look.checks(record, accept=f"decant robot check {laboratory} --accept-safety", virtual=virtual)
         checks += balance_diagnostics(ready.balance, tare=tare)
     checks += _packages(spec)
     checks += [DeviceCheck("plug-in", "warn", str(one), f"mend or remove {one.package}") for one in broken()]
@@ -163,7 +163,7 @@ def _accept(path: Path, look: ArmDiagnostics) -> SafetyRecord:
     if not look.checksum or not look.serial:
         raise RefusalError(
             "the controller doesn't tell its safety checksum and serial number, so nothing can be accepted; run "
-            f"'decant doctor {path}' without --accept-safety to see why",
+            f"'decant robot check {path}' without --accept-safety to see why",
             FAILED,
         )
     record = SafetyRecord(
@@ -199,7 +199,7 @@ def jog(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
     spec = read_laboratory(laboratory)
     if spec.arm is None:
         raise without_arm(laboratory, spec, "steps are typed for an arm that a driver moves")
-    require_flag(spec, enabled=enable_motion, again=f"decant jog {laboratory} --enable-motion")
+    require_flag(spec, enabled=enable_motion, again=f"decant robot jog {laboratory} --enable-motion")
     if not sys.stdin.isatty():
         raise RefusalError("jogging is typed at a terminal, step by step, with nothing piped into it", BAD_INPUT)
     with Refused(SafetyRecordError):

@@ -1,4 +1,4 @@
-"""The command `decant study`: a resumable comparison of strategies from one file, with figures, tables and a page."""
+"""The commands `decant study run` and `report`: a resumable comparison of strategies, with figures and a page."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 SHOWN_FAILURES = 5
 
 
-def study(
-    file: Annotated[Path, typer.Argument(help="Study file (YAML).", metavar="STUDY", show_default=False)],
+StudyPath = Annotated[Path, typer.Argument(help="Study file (YAML).", metavar="STUDY", show_default=False)]
+
+
+def run_study(
+    file: StudyPath,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Number of parallel processes; default: one per core.", show_default=False)
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="List the unfinished cells with an estimate of their cost; start nothing.")
-    ] = False,
-    report_only: Annotated[
-        bool, typer.Option("--report", help="Only write figures, tables and page from the existing results.")
     ] = False,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -51,17 +51,32 @@ def study(
             _print_remaining(plan, cells, as_json)
             return
         with opened(plan) as folder:
-            status = None if report_only else _run(plan, folder, jobs or os.cpu_count() or 1, file)
+            status = _run(plan, folder, jobs or os.cpu_count() or 1, file)
             page = _report(plan, folder)
     if as_json:
-        finished = len(status.finished) if status is not None else None
-        print_json({"study": plan.name, "folder": folder, "page": page, "cells": len(cells), "finished": finished})
-    if status is not None and status.failed:
+        _print_result(plan, folder, page, len(cells), len(status.finished))
+    if status.failed:
         shown = list(status.failed.items())[:SHOWN_FAILURES]
         lines = [f"{len(status.failed)} of {len(cells)} cells failed, {len(status.skipped)} need one of them:"]
         lines += [f"  {name}: {why}" for name, why in shown]
-        lines.append(f"finished cells are kept; correct that and continue with: decant study {file}")
+        lines.append(f"finished cells are kept; correct that and continue with: decant study run {file}")
         raise RefusalError("\n".join(lines))
+
+
+def report_study(file: StudyPath, as_json: Json = False, quiet: Quiet = False) -> None:
+    """Write figures, tables and the page of a study from the results that there are."""
+    from orchestrator.study.study_folder import StudyError, opened
+    from orchestrator.study.study_plan import cells_of
+
+    plan = read_study(file)
+    with Refused(StudyError), opened(plan) as folder:
+        page = _report(plan, folder)
+    if as_json:
+        _print_result(plan, folder, page, len(cells_of(plan)), None)
+
+
+def _print_result(plan: StudyPlan, folder: Path, page: Path, cells: int, finished: int | None) -> None:
+    print_json({"study": plan.name, "folder": folder, "page": page, "cells": cells, "finished": finished})
 
 
 def read_study(path: Path) -> StudyPlan:
@@ -145,7 +160,7 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> CellStatus:
 
             return run_cells(plan, folder, jobs=jobs, watch=watch)
     except KeyboardInterrupt:
-        raise RefusalError(f"interrupted; nothing is lost. Go on with: decant study {path}", INTERRUPTED) from None
+        raise RefusalError(f"interrupted; nothing is lost. Go on with: decant study run {path}", INTERRUPTED) from None
 
 
 @contextlib.contextmanager

@@ -150,7 +150,9 @@ def token_of(path: Path, role: Role) -> str | None:
 
 def _make(path: Path) -> None:
     make_state_directory(path.parent)
-    lines = ["# ROLE NAME TOKEN, one a line. Keep this file to yourself; 'decant serve' reads it when it starts.\n"]
+    lines = [
+        "# ROLE NAME TOKEN, one a line. Keep this file to yourself; 'decant server start' reads it when it starts.\n"
+    ]
     lines += [f"{role.name.lower()} {role.name.lower()} {secrets.token_urlsafe(32)}\n" for role in reversed(Role)]
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "w", encoding="utf-8") as file:

@@ -102,8 +102,8 @@ class Client:
                 "it, or itself where it signed itself, in $DECANT_CA"
             )
         return DaemonError(
-            f"no daemon answers at {self.url} ({error}); start one with 'decant serve', or say where it is: --url, "
-            "--state"
+            f"no daemon answers at {self.url} ({error}); start one with 'decant server start', or say where it is: "
+            "--url, --state"
         )
 
     def events(

@@ -178,8 +178,8 @@ class Store:
             owner = self._lock.read().strip() or "unknown"
             self._lock.close()
             raise StoreError(
-                f"{path.parent}: another daemon (process {owner}) has this state directory; 'decant shutdown' ends it, "
-                "--state names another one"
+                f"{path.parent}: another daemon (process {owner}) has this state directory; 'decant server stop' ends "
+                "it, --state names another one"
             )
         self._lock.truncate(0)
         self._lock.write(str(os.getpid()))

@@ -1,8 +1,8 @@
 """Questions to the operators of a daemon. Each is stored before it is shown, each answer before it is used.
 
-`Asking` stores a question and waits for its answer, from the page, from `decant answer` or from another machine. The
-first answer counts. `RemoteOperator` implements `Operator` for the steps at a bench; `RunQuestions` asks the questions
-of a run. A question does not outlive its run or the daemon. If it is repeated after a crash, it shows the previous
+`Asking` stores a question and waits for its answer, from the page, from `decant queue answer` or from another machine.
+The first answer counts. `RemoteOperator` implements `Operator` for the steps at a bench; `RunQuestions` asks those of
+a run. A question does not outlive its run or the daemon. If it is repeated after a crash, it shows the previous
 answer.
 """
 

@@ -256,7 +256,7 @@ class ArmStatus:
     """Whether the arm of a rig can move, as last read while no campaign used it.
 
     Attributes:
-        check: result and remedy, as in `decant doctor`.
+        check: result and remedy, as in `decant robot check`.
         time: of the first reading with this result, in seconds since 1970.
     """
 
@@ -268,7 +268,7 @@ def _readiness(arm: ArmSettings) -> DeviceCheck | None:
     try:
         return arm.readiness()
     except (LaboratoryError, OSError, ValueError) as error:
-        return DeviceCheck("motion", "fail", str(error), "see 'decant doctor'")
+        return DeviceCheck("motion", "fail", str(error), "see 'decant robot check'")
 
 
 class DaemonState(Protocol):

@@ -140,7 +140,7 @@ class CampaignOut(_Out):
 
     motion_enabled: bool
     needs_enabling: bool
-    """The campaign uses hardware and waits for `decant enable` to enable motion."""
+    """The campaign uses hardware and waits for `decant queue enable` to enable motion."""
 
     progress: ProgressOut | None
     """Progress while the campaign runs."""
@@ -202,7 +202,7 @@ class EmergencyOut(_Out):
 
 
 class ArmStatusOut(_Out):
-    """Whether an arm can move, with the text that a run or `decant doctor` would give."""
+    """Whether an arm can move, with the text that a run or `decant robot check` would give."""
 
     state: Literal["ok", "warn", "fail"]
     """'ok': it can move; 'fail': it can't; 'warn': the controller doesn't report it."""

@@ -1,4 +1,4 @@
-"""The process of `decant serve`: it listens, runs the daemon, shuts down at a safe point, and restarts if Ray dies.
+"""The daemon's process: it listens, runs the daemon, shuts down at a safe point, and restarts if Ray dies.
 
 - `serve` is the entry point; `log_lines` configures structured logs. Routes are in `http_api`, scheduling in
   `supervisor`.

@@ -114,13 +114,13 @@ def required_checksum(plan: CampaignPlan) -> str:
     if checksum is None:
         raise SafetyRecordError(
             f"laboratory {plan.laboratory.name}: nobody has accepted the controller's safety settings. Run "
-            f"'decant doctor {shown_path(laboratory)}' first; it says how"
+            f"'decant robot check {shown_path(laboratory)}' first; it says how"
         )
     return checksum
 
 
 def _accept(laboratory: Path) -> str:
-    return f"decant doctor {laboratory} --accept-safety"
+    return f"decant robot check {laboratory} --accept-safety"
 
 
 CORNERS, INTERIOR = 32, 12

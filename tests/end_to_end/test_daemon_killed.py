@@ -44,8 +44,8 @@ class Laboratory:
     def start(self) -> None:
         port = [] if "--port" in self.options or self.settings else ["--port", "0"]
         where = ["--in-process"] if self.in_process else ["--simulators", "1"]
-        self.process = self._decant("serve", *self.settings, *port, *where, *self.options, stdout=self.log)
-        self.until(lambda: (self.state / "url").exists() and self.decant("list", check=False).returncode == 0)
+        self.process = self._decant("server", "start", *self.settings, *port, *where, *self.options, stdout=self.log)
+        self.until(lambda: (self.state / "url").exists() and self.decant("queue", "list", check=False).returncode == 0)
 
     def kill(self) -> None:
         assert self.process is not None
@@ -132,7 +132,7 @@ def test_killed_during_a_pour_it_asks_what_came_of_it_writes_the_answer_down_and
     laboratory: Laboratory,
 ) -> None:
     laboratory.start()
-    key = laboratory.decant("submit", "small.yaml").stdout.strip()
+    key = laboratory.decant("queue", "submit", "small.yaml").stdout.strip()
     laboratory.until(lambda: pour_under_way(laboratory.entries()))
     laboratory.kill()
     before = laboratory.entries()
@@ -142,19 +142,19 @@ def test_killed_during_a_pour_it_asks_what_came_of_it_writes_the_answer_down_and
     }
 
     laboratory.start()
-    (question,) = laboratory.until(lambda: laboratory.told("list")["questions"])
+    (question,) = laboratory.until(lambda: laboratory.told("queue", "list")["questions"])
     assert question["campaign"] == key
     assert question["kind"] == "unknown"
     assert "had begun when the run was interrupted" in question["text"]
     assert question["options"] == ["repeat", "lost", "weighed SPILLED RETAINED [LOADED]"]
     assert "bench" in question["details"]
-    assert laboratory.told("show", key)["state"] == "waiting for operator"
+    assert laboratory.told("queue", "show", key)["state"] == "waiting for operator"
 
-    nonsense = laboratory.decant("answer", str(question["id"]), "spilt", "milk", check=False)
+    nonsense = laboratory.decant("queue", "answer", str(question["id"]), "spilt", "milk", check=False)
     assert nonsense.returncode == 2
     assert "'spilt milk' is not an answer" in nonsense.stderr
-    laboratory.decant("answer", str(question["id"]), "weighed", "3.2", "0.4")
-    laboratory.until(lambda: laboratory.told("show", key)["state"] == "finished")
+    laboratory.decant("queue", "answer", str(question["id"]), "weighed", "3.2", "0.4")
+    laboratory.until(lambda: laboratory.told("queue", "show", key)["state"] == "finished")
     assert laboratory.end() == 0
 
     entries = laboratory.entries()
@@ -171,7 +171,7 @@ def test_killed_during_a_pour_it_asks_what_came_of_it_writes_the_answer_down_and
 def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_sees_the_campaign_end(
     tmp_path: Path,
 ) -> None:
-    """`decant serve`, `decant submit`, kill -9 during a pour, `decant serve`: all the rest is done on the page."""
+    """`decant server start`, `decant queue submit`, kill -9 during a pour, and again: the rest is on the page."""
     write_campaign(tmp_path, SLOW_POURS)
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
@@ -180,7 +180,7 @@ def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_see
         page = chromium.new_page(viewport={"width": 1024, "height": 768})
         page.set_default_timeout(1e3 * PATIENCE)
         page.goto(f"http://127.0.0.1:{port}/#token={token_of(laboratory.state / 'tokens', Role.OPERATOR)}")
-        key = laboratory.decant("submit", "small.yaml").stdout.strip()
+        key = laboratory.decant("queue", "submit", "small.yaml").stdout.strip()
         laboratory.until(lambda: pour_under_way(laboratory.entries()))
         page.locator(".step").wait_for()
         laboratory.kill()
@@ -199,7 +199,7 @@ def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_see
         card.get_by_role("button", name="It was weighed").click()
         card.wait_for(state="detached")
         page.locator("#ended").get_by_text("finished").wait_for()
-        assert laboratory.told("show", key)["state"] == "finished"
+        assert laboratory.told("queue", "show", key)["state"] == "finished"
         assert laboratory.end() == 0
 
         entries = laboratory.entries()
@@ -213,12 +213,12 @@ def test_told_to_end_it_finishes_the_pour_and_goes_on_by_itself_when_it_is_start
     laboratory: Laboratory,
 ) -> None:
     laboratory.start()
-    key = laboratory.decant("submit", "small.yaml").stdout.strip()
+    key = laboratory.decant("queue", "submit", "small.yaml").stdout.strip()
     laboratory.until(lambda: pour_under_way(laboratory.entries()))
     assert laboratory.end() == 0
     assert not pour_under_way(laboratory.entries())
     laboratory.start()
-    laboratory.until(lambda: laboratory.told("show", key)["state"] == "finished")
-    assert laboratory.told("list")["questions"] == []
+    laboratory.until(lambda: laboratory.told("queue", "show", key)["state"] == "finished")
+    assert laboratory.told("queue", "list")["questions"] == []
     starts = [e.body["id"] for e in laboratory.entries() if e.kind == Kind.POUR_STARTED]
     assert len(starts) == len(set(starts)) == 5

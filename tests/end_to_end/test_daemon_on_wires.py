@@ -97,7 +97,7 @@ def test_hardware_is_armed_over_the_api_and_after_a_crash_shows_where_it_stands_
         return controller.fault("state")["joints"]
 
     home = joints()
-    key = laboratory.decant("submit", "rigged.yaml").stdout.strip()
+    key = laboratory.decant("queue", "submit", "rigged.yaml").stdout.strip()
     with client(laboratory) as people, client(laboratory, Role.VIEWER) as viewer:
         assert people.get(f"/campaigns/{key}")["needs_enabling"]
         with pytest.raises(DaemonError, match="takes operator"):

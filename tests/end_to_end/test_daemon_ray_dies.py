@@ -35,7 +35,7 @@ def test_a_campaign_goes_on_by_itself_and_the_next_one_runs(tmp_path: Path, name
         laboratory.start()
         assert laboratory.process is not None
         url = (laboratory.state / "url").read_text()
-        key = laboratory.decant("submit", "small.yaml").stdout.strip()
+        key = laboratory.decant("queue", "submit", "small.yaml").stdout.strip()
         laboratory.until(lambda: pour_under_way(laboratory.entries()))
         (former,) = of_ray(laboratory, name)
         if fault == "killed":
@@ -46,10 +46,12 @@ def test_a_campaign_goes_on_by_itself_and_the_next_one_runs(tmp_path: Path, name
         assert (laboratory.state / "url").read_text() == url
 
         end = time.monotonic() + PATIENCE
-        while laboratory.told("show", key)["state"] != "finished":  # asked about the pour, unless it could be weighed
-            for question in laboratory.told("list")["questions"]:
+        while (
+            laboratory.told("queue", "show", key)["state"] != "finished"
+        ):  # asked about the pour, unless it could be weighed
+            for question in laboratory.told("queue", "list")["questions"]:
                 assert question["kind"] == "unknown"
-                laboratory.decant("answer", str(question["id"]), "weighed", "3.2", "0.4")
+                laboratory.decant("queue", "answer", str(question["id"]), "weighed", "3.2", "0.4")
             assert time.monotonic() < end, laboratory.said()
             time.sleep(0.2)
         entries = laboratory.entries()
@@ -61,8 +63,8 @@ def test_a_campaign_goes_on_by_itself_and_the_next_one_runs(tmp_path: Path, name
         assert len(set(begun)) == 5
         assert sorted(begun) == sorted([*set(begun), *withdrawn])
 
-        second = laboratory.decant("submit", "small.yaml").stdout.strip()
-        laboratory.until(lambda: laboratory.told("show", second)["state"] == "finished")
+        second = laboratory.decant("queue", "submit", "small.yaml").stdout.strip()
+        laboratory.until(lambda: laboratory.told("queue", "show", second)["state"] == "finished")
         children = psutil.Process(laboratory.process.pid).children()
         assert not [child for child in children if child.status() == psutil.STATUS_ZOMBIE]
         assert laboratory.end() == 0

@@ -38,12 +38,12 @@ def test_it_is_served_over_tls_and_believed_by_those_only_who_know_its_certifica
         laboratory.start()
         url = (laboratory.state / "url").read_text().strip()
         assert url.startswith("https://127.0.0.1:")
-        assert laboratory.told("list")["status"]["rigs"][0]["name"] == "virtual"
-        laboratory.until(lambda: "simulators" not in laboratory.decant("list", check=False).stderr)
+        assert laboratory.told("queue", "list")["status"]["rigs"][0]["name"] == "virtual"
+        laboratory.until(lambda: "simulators" not in laboratory.decant("queue", "list", check=False).stderr)
 
         for authority, words in (("", "is not believed"), (str(others), "is not believed"), (url, "$DECANT_CA")):
             laboratory.environment = {"DECANT_CA": authority} if authority else {}
-            refused = laboratory.decant("list", check=False)
+            refused = laboratory.decant("queue", "list", check=False)
             assert refused.returncode in (1, 2)
             assert words in refused.stderr
             assert "Traceback" not in refused.stderr

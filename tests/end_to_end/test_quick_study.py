@@ -18,7 +18,15 @@ from tests.support.waiting import PATIENCE
 @pytest.mark.timeout(1800)
 def test_the_quick_study_runs_and_a_second_call_has_nothing_left_to_do(tmp_path: Path) -> None:
     path = written(tmp_path, read("quick"))
-    command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "study", str(path), "--json"]
+    command = [
+        sys.executable,
+        "-c",
+        "from orchestrator.cli.app import main; main()",
+        "study",
+        "run",
+        str(path),
+        "--json",
+    ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     answers = []
     for _ in range(2):

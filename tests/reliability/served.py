@@ -1,4 +1,4 @@
-"""The daemon: `decant serve` in a process of its own, submitted to and answered over HTTP, struck, and started again.
+"""The daemon in a process of its own, submitted to and answered over HTTP, struck, and started again.
 
 Simulators are formulas, the bench is Decant's own bench of numbers.
 """

@@ -1,4 +1,4 @@
-"""Commissioning checks of a UR controller for `decant doctor`: one line for each fact, with its remedy.
+"""Commissioning checks of a UR controller for `decant robot check`: one line for each fact, with its remedy.
 
 - The checks named `…_check` compare the laboratory's file with the controller: tool, mount, payload, home, limits.
 - `judge` makes all lines from the values that `actors.arm.ur.controller_readout` has read; `readiness` makes one.
@@ -107,7 +107,7 @@ def home_check(spec: UrArmSettings, state: RobotState) -> DeviceCheck:
         "position",
         "warn",
         f"not at home: {JOINT_NAMES[worst]} is {math.degrees(away[worst]):.1f} deg away",
-        "bring it home slowly with 'decant jog', watching it, before a pour",
+        "bring it home slowly with 'decant robot jog', watching it, before a pour",
     )
 
 

@@ -1,4 +1,4 @@
-"""Reads the state of a UR controller over plain sockets, one port at a time. Used by `decant doctor`.
+"""Reads the state of a UR controller over plain sockets, one port at a time. Used by `decant robot check`.
 
 It sends queries to the dashboard, reads the robot's state from the primary port and values over RTDE. None of these can
 move the arm or change a setting. They also work in states in which a driver cannot connect, so that the user can find

@@ -374,7 +374,7 @@ def require_accepted(accepted: str | None, found: str | None, controller: str) -
     Called once the controller is connected, before any motion is requested.
 
     Args:
-        accepted: eight hexadecimal digits, as `decant doctor --accept-safety` recorded them; None if there are none.
+        accepted: eight hexadecimal digits, as `robot check --accept-safety` recorded them; None if there are none.
         found: as the controller reports it now; None if it reports none.
         controller: its address, for messages.
 
@@ -384,7 +384,7 @@ def require_accepted(accepted: str | None, found: str | None, controller: str) -
     if accepted is None:
         raise NotAcceptedError(
             f"arm at {controller}: nobody has accepted its safety settings (checksum {found or 'unknown'}) for this "
-            "laboratory. Run 'decant doctor' on the laboratory's file first; it says how"
+            "laboratory. Run 'decant robot check' on the laboratory's file first; it says how"
         )
     if found is None:
         raise NotAcceptedError(
@@ -395,5 +395,5 @@ def require_accepted(accepted: str | None, found: str | None, controller: str) -
         raise NotAcceptedError(
             f"arm at {controller}: its safety settings have changed: checksum {found.upper()}, accepted was "
             f"{accepted.upper()}. Nothing moves. Find out on the teach pendant who changed what; when the settings are "
-            "right, accept them with 'decant doctor --accept-safety'"
+            "right, accept them with 'decant robot check --accept-safety'"
         )

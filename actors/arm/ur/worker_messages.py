@@ -55,7 +55,7 @@ STOPPED_PROGRAM, PLAYING = 1, 2
 
 
 def why_not_ready(robot_mode: int, safety_mode: int, runtime: int, slider: float) -> str:
-    """Why an arm cannot move; '' if it can. Driver, worker, `decant doctor` and its display all use this decision.
+    """Why an arm cannot move; '' if it can. Driver, worker, `decant robot check` and its display all use this decision.
 
     Reduced mode prevents motion: pours are planned within the normal limits, and would end in a protective stop.
 

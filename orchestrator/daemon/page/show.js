@@ -199,7 +199,7 @@ export function queueList(items, paused, acts) {
     el("p", {}, paused ? el("b", {}, "The queue is held: nothing begins. ") : "", items.length ? "" : "Nothing waits. ",
       button("hold", paused ? "Let it go on" : "Hold the queue", () => acts.hold(!paused), "plain")),
     items.length ? el("ol", {}, items.map((item, index) => el("li", {}, el("span", {}, el("b", {}, item.name), " ",
-      modeBadge(item.mode), ` for ${item.rig}`, item.needs_enabling ? ", waits for `decant enable`" : ""),
+      modeBadge(item.mode), ` for ${item.rig}`, item.needs_enabling ? ", waits for `decant queue enable`" : ""),
     index ? button(`up ${item.id}`, "Earlier", () => acts.earlier(item, items[index - 1]), "plain") : null,
     button(`drop ${item.id}`, "Take out", () => acts.end(item, "stop"), "plain danger")))) : null,
   ];

@@ -63,7 +63,7 @@ def joints(controller: VirtualController) -> Any:
 def test_hardware_doesn_t_move_without_the_flag(campaign: Path, verb: str) -> None:
     file = campaign if verb != "jog" else campaign.with_name("rig.yaml")
     action = ["--set", "angular_velocity=30", "--set", "x_offset=80"] if verb == "pour" else []
-    result = decant(verb, str(file), *action)
+    result = decant(*(["robot", "jog"] if verb == "jog" else [verb]), str(file), *action)
     assert result.exit_code == 2
     assert "is hardware" in result.stderr
     assert "--enable-motion" in result.stderr
@@ -72,7 +72,7 @@ def test_hardware_doesn_t_move_without_the_flag(campaign: Path, verb: str) -> No
 
 @pytest.mark.realtime
 def test_the_flag_alone_doesn_t_arm_where_nobody_is_at_a_terminal(campaign: Path) -> None:
-    for command in (["run", str(campaign)], ["jog", str(campaign.with_name("rig.yaml"))]):
+    for command in (["run", str(campaign)], ["robot", "jog", str(campaign.with_name("rig.yaml"))]):
         result = CliRunner().invoke(app, [*command, "--enable-motion"], input="rig\nrig\n", catch_exceptions=False)
         assert result.exit_code == 2
         assert "terminal" in result.stderr
@@ -85,7 +85,7 @@ def test_settings_that_nobody_has_accepted_can_t_be_armed(campaign: Path) -> Non
     result = decant("run", str(campaign), "--enable-motion")
     assert result.exit_code == 2
     assert "nobody has accepted" in result.stderr
-    assert "decant doctor" in result.stderr
+    assert "decant robot check" in result.stderr
 
 
 @pytest.mark.realtime
@@ -103,7 +103,9 @@ def test_the_record_that_counts_is_that_of_the_laboratory_in_use(campaign: Path)
 @pytest.mark.realtime
 def test_a_wrong_name_moves_nothing(campaign: Path, controller: VirtualController) -> None:
     before = joints(controller)
-    with Terminal("jog", str(campaign.with_name("rig.yaml")), "--enable-motion", cwd=str(campaign.parent)) as terminal:
+    with Terminal(
+        "robot", "jog", str(campaign.with_name("rig.yaml")), "--enable-motion", cwd=str(campaign.parent)
+    ) as terminal:
         terminal.expect(f"HARDWARE: laboratory rig, UR10 at {controller.address}")
         terminal.expect("> ")
         terminal.type("yes")

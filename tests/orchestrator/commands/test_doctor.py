@@ -1,4 +1,4 @@
-"""`decant doctor` before a bench in every wrong state: it says what is wrong and what to do, and nothing moves."""
+"""`decant robot check` before a bench in every wrong state: it says what is wrong and what to do, and nothing moves."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def laboratory(tmp_path: Path, controller: VirtualController) -> Path:
 
 
 def doctor(path: Path, *options: str) -> Result:
-    return CliRunner().invoke(app, ["doctor", str(path), *options], catch_exceptions=False)
+    return CliRunner().invoke(app, ["robot", "check", str(path), *options], catch_exceptions=False)
 
 
 def checked(path: Path, *options: str) -> dict[str, dict[str, Any]]:
@@ -91,7 +91,7 @@ def test_a_bench_that_is_ready_has_its_settings_accepted_once_and_is_told_so(
     refused = doctor(path)
     assert refused.exit_code == 1
     assert "accepted by nobody" in refused.stdout
-    assert f"decant doctor {path} --accept-safety" in refused.stdout
+    assert f"decant robot check {path} --accept-safety" in refused.stdout
     accepted = when_not_overloaded(path, "--accept-safety")
     assert accepted.exit_code == 0, accepted.output
     record = json.loads(record_path(path).read_text())
@@ -247,7 +247,7 @@ def test_without_an_extra_doctor_names_package_and_extra_before_it_starts_anythi
     """In a process that can't import the package: what is started is a controller, and it would be started 20 times."""
     (tmp_path / "without.py").write_text(WITHOUT)
     told = subprocess.run(
-        [sys.executable, tmp_path / "without.py", module, "doctor", "configs/laboratories/virtual.yaml"],
+        [sys.executable, tmp_path / "without.py", module, "robot", "check", "configs/laboratories/virtual.yaml"],
         env=dict(os.environ),
         capture_output=True,
         text=True,
@@ -355,7 +355,7 @@ def test_balance_that_is_unplugged_or_silent_is_told_with_what_to_do(
 
 def test_nothing_is_poured_with_settings_that_nobody_accepted_or_that_have_changed() -> None:
     require_accepted("22c99aa2", "22C99AA2", "robot")
-    with pytest.raises(NotAcceptedError, match="decant doctor"):
+    with pytest.raises(NotAcceptedError, match="decant robot check"):
         require_accepted(None, "22C99AA2", "robot")
     with pytest.raises(NotAcceptedError, match="have changed: checksum DEADBEEF, accepted was 22C99AA2"):
         require_accepted("22C99AA2", "DEADBEEF", "robot")

@@ -89,8 +89,11 @@ def test_a_campaign_runs_on_another_laboratory(tmp_path: Path, monkeypatch: pyte
     ("command", "name"),
     [
         ("run my.yaml --arm", "--arm: is called --enable-motion now"),
-        ("submit my.yaml --verb=plan", "--verb: is called --task now"),
-        ("arm quickstart-3f2a1c", "arm: is called enable now"),
+        ("queue submit my.yaml --verb=plan", "--verb: is called --task now"),
+        ("arm quickstart-3f2a1c", "decant arm: is called decant queue enable now"),
+        ("serve lab.yaml", "decant serve: is called decant server start now"),
+        ("abort --all", "decant abort: is called decant estop"),
+        ("study my.yaml", "decant study FILE: is called decant study run FILE now"),
     ],
 )
 def test_a_retired_name_is_refused_with_the_new_one(command: str, name: str) -> None:

@@ -125,7 +125,7 @@ def test_arm_of_hardware_moves_by_what_was_typed_and_ctrl_c_stops_it(tmp_path: P
     with VirtualController.start(free_address(), "ur10", joints=start) as controller:
         laboratory = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", controller.address)
         write_record(laboratory, SafetyRecord(controller.fault("state")["checksum"], "2016300123", "", "", "", ""))
-        with Terminal("jog", str(laboratory), "--enable-motion", cwd=str(tmp_path)) as terminal:
+        with Terminal("robot", "jog", str(laboratory), "--enable-motion", cwd=str(tmp_path)) as terminal:
             terminal.expect("> ")
             terminal.type("rig")
             terminal.expect("jog> ")

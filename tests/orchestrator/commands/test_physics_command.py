@@ -1,4 +1,4 @@
-"""`decant physics`: what a person sees of the solver's cases, and the page that it writes."""
+"""`decant validate-solver`: what a person sees of the solver's cases, and the page that it writes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def two_cases(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("two_cases")
 def test_a_criterion_that_is_not_met_is_shown_and_ends_with_code_1() -> None:
-    result = runner.invoke(app, ["physics"])
+    result = runner.invoke(app, ["validate-solver"])
     assert result.exit_code == 1
     rows = [line for line in result.stdout.splitlines() if "height" in line]
     assert ["39.7 mm" in rows[0], "pass" in rows[0]] == [True, True]
@@ -62,7 +62,7 @@ def test_a_criterion_that_is_not_met_is_shown_and_ends_with_code_1() -> None:
 
 @pytest.mark.usefixtures("two_cases")
 def test_a_case_alone_passes_and_its_json_is_valid() -> None:
-    result = runner.invoke(app, ["physics", "good", "--json"])
+    result = runner.invoke(app, ["validate-solver", "good", "--json"])
     assert result.exit_code == 0
     data = json.loads(result.stdout.splitlines()[-1])
     assert list(data["cases"]) == ["good"]
@@ -75,15 +75,15 @@ def test_a_case_alone_passes_and_its_json_is_valid() -> None:
 def test_the_page_keeps_other_cases_and_marks_those_that_another_solver_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    runner.invoke(app, ["physics", "bad", "--write", str(tmp_path)])
-    runner.invoke(app, ["physics", "good", "--write", str(tmp_path)])
+    runner.invoke(app, ["validate-solver", "bad", "--write", str(tmp_path)])
+    runner.invoke(app, ["validate-solver", "good", "--write", str(tmp_path)])
     page = (tmp_path / physics_command.PAGE_NAME).read_text(encoding="utf-8")
     assert page.index("## Good") < page.index("## Bad")
     assert "1 of 2 criteria are met" in page
     assert "| height | 2,000 | 50 mm | 39.8 mm | within 2 % | **fails** |" in page
     assert (tmp_path / "images" / "validation-good.png").read_bytes()[:4] == b"\x89PNG"
     monkeypatch.setattr(sources, "solver_fingerprint", lambda: "another")
-    runner.invoke(app, ["physics", "good", "--write", str(tmp_path)])
+    runner.invoke(app, ["validate-solver", "good", "--write", str(tmp_path)])
     good, bad = (tmp_path / physics_command.PAGE_NAME).read_text(encoding="utf-8").partition("## Bad")[::2]
     assert "Measured before" not in page
     assert "Measured before" not in good
@@ -91,16 +91,16 @@ def test_the_page_keeps_other_cases_and_marks_those_that_another_solver_measured
 
 
 def test_a_wrong_name_and_a_missing_folder_are_refused_before_anything_runs(tmp_path: Path) -> None:
-    wrong = runner.invoke(app, ["physics", "slosh"])
+    wrong = runner.invoke(app, ["validate-solver", "slosh"])
     assert wrong.exit_code == 2
     assert "no case 'slosh'; there are rest," in wrong.stderr
-    missing = runner.invoke(app, ["physics", "rest", "--write", str(tmp_path / "nowhere")])
+    missing = runner.invoke(app, ["validate-solver", "rest", "--write", str(tmp_path / "nowhere")])
     assert missing.exit_code == 2
     assert "there is no such folder" in missing.stderr
 
 
 def test_cases_are_listed_by_name() -> None:
-    result = runner.invoke(app, ["physics", "--list"])
+    result = runner.invoke(app, ["validate-solver", "--list"])
     assert result.exit_code == 0
     assert [line.split()[0] for line in result.stdout.splitlines()] == [case.name for case in suite.CASES]
 
@@ -115,7 +115,7 @@ def test_a_long_case_tells_how_far_it_is_and_a_case_without_criteria_is_judged_b
         return [reported("slope", 0.1, particles=500)], None
 
     monkeypatch.setattr(suite, "CASES", (suite.Case("long", "Long", "It takes its time.", work),))
-    result = runner.invoke(app, ["physics"])
+    result = runner.invoke(app, ["validate-solver"])
     assert (result.exit_code, result.stderr.splitlines()[-1]) == (0, "nothing was judged")
 
 

@@ -23,7 +23,7 @@ from tests.support.toy_daemon import Served, run, serving
 
 @pytest.fixture(autouse=True)
 def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The daemon's state directory is its process's, as `decant serve` has it."""
+    """The daemon's state directory is its process's, as `decant server start` has it."""
     monkeypatch.setenv(VARIABLE, "")
     use_state_directory(tmp_path / "state")
     return tmp_path / "state"

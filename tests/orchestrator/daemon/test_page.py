@@ -560,16 +560,16 @@ def test_former_runs_are_found_and_what_is_noted_of_them_is_found_again(
 
 @pytest.fixture
 def former(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The daemon's runs are in the catalogue of its own state directory, as `decant serve` has it."""
+    """The daemon's runs are in the catalogue of its own state directory, as `decant server start` has it."""
     monkeypatch.setenv(VARIABLE, str(tmp_path / "state"))
 
 
 @contextlib.contextmanager
 def a_process(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """`decant serve` as a process of its own, and the address of its page with a token."""
+    """`decant server start` as a process of its own, and the address of its page with a token."""
     settings, state = folder / "decant.yaml", folder / "state"
     settings.write_text("{listen: {port: 0}, in_process: true, keep_free: 40 MB}\n")
-    command = [sys.executable, "-c", MAIN, "serve", str(settings), "--state", str(state)]
+    command = [sys.executable, "-c", MAIN, "server", "start", str(settings), "--state", str(state)]
     with (folder / "log").open("wb") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, env=dict(os.environ), start_new_session=True)
     try:

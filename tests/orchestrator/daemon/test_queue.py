@@ -182,7 +182,7 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
     monkeypatch.setattr(
         "orchestrator.cli.queue_commands.connected_client", lambda url, state: contextlib.nullcontext(Told())
     )
-    arguments = ["submit", str(campaign_in(tmp_path)), "--parameters", str(theta), "--receiver", str(bowl)]
+    arguments = ["queue", "submit", str(campaign_in(tmp_path)), "--parameters", str(theta), "--receiver", str(bowl)]
     refused = CliRunner().invoke(app, arguments)
     assert refused.exit_code == 2
     assert "--task plan" in refused.stderr

@@ -295,7 +295,7 @@ def test_two_commands_can_not_run_one_study(tmp_path: Path) -> None:
 def test_a_dry_run_tells_by_arm_what_is_left_and_begins_nothing(tmp_path: Path) -> None:
     study = small(tmp_path, mismatch=read("quick")["mismatch"][:1])
     assert study.source is not None
-    first = CliRunner().invoke(app, ["study", str(study.source), "--dry-run"])
+    first = CliRunner().invoke(app, ["study", "run", str(study.source), "--dry-run"])
     assert first.exit_code == 0, first.output
     assert not study.folder.exists()
     cells = cells_of(study)
@@ -305,6 +305,6 @@ def test_a_dry_run_tells_by_arm_what_is_left_and_begins_nothing(tmp_path: Path) 
     assert rows["pours small"] == f"0 of {len(pours)} finished, left: 0 simulations, {each * len(pours)} pours"
     assert f"{len(cells)} cells, {len(cells)} left" in first.stdout
     run_cell(study, pours[0], study.folder, TOYS)
-    then = CliRunner().invoke(app, ["study", str(study.source), "--dry-run"]).stdout
+    then = CliRunner().invoke(app, ["study", "run", str(study.source), "--dry-run"]).stdout
     assert f"pours small {' ' * 22} 1 of {len(pours)} finished" in then
     assert f"{len(cells)} cells, {len(cells) - 1} left" in then
