@@ -2,7 +2,7 @@
 
 Toy pours after toy simulations:
 
-    python benchmarks/hybrid_models.py [--worlds right far ...] [--models simulated scaled constant] [--seeds 8]
+    python benchmarks/hybrid_models.py [--worlds right far ...] [--models residual constant] [--seeds 8]
                                        [--simulations 37] [--pours 15] [--json]
 
 A world is `spill2` of `optimiser_problems.py`, and a simulator that knows it more or less. The optimiser chooses the

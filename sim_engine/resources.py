@@ -27,11 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_engine.errors import DecantError
+from sim_engine.settings.plugin_registry import DISTRIBUTION
 
 ENVIRONMENT_VARIABLE = "DECANT_CACHE_DIR"
-
-DISTRIBUTION = "decant-pouring"
-"""Name of the installed distribution. The name `decant` belongs to another project on the package index."""
 
 
 _log = logging.getLogger(__name__)

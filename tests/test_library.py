@@ -104,7 +104,7 @@ def make_notebook() -> Any:
 
 def test_hardware_is_not_armed_from_a_program(tmp_path: Path) -> None:
     campaign = decant.load_campaign(decant.shipped("campaigns/first-pour.yaml"))
-    with pytest.raises(ValueError, match="armed from the command line alone"):
+    with pytest.raises(ValueError, match="enabled from the command line alone"):
         decant.run(campaign)
 
 

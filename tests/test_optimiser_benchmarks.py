@@ -112,10 +112,10 @@ def test_the_table_of_models_is_of_the_campaigns_that_were_made(
         return found
 
     monkeypatch.setattr(hybrid_models, "campaign", watched)
-    arguments = ("--worlds", "right", "--models", "simulated", "constant", "--seeds", "2")
+    arguments = ("--worlds", "right", "--models", "residual", "constant", "--seeds", "2")
     result = result_of(hybrid_models, monkeypatch, capsys, *arguments, "--simulations", "8", "--pours", "3")
     assert [(model, seed, count) for model, seed, count, _ in made] == [
-        (model, seed, 8) for model in ("simulated", "constant") for seed in (0, 1)
+        (model, seed, 8) for model in ("residual", "constant") for seed in (0, 1)
     ]
     for row in result["rows"]:
         for key in ("reported", "third", "mean"):

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 import operator
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -430,4 +431,9 @@ class SchemaGenerator(GenerateJsonSchema):
             form["required"] = list(required)
         for name in [name for name, mark in marks_of(model).items() if mark == SET_BY_PROGRAM]:
             form["properties"].pop(name, None)
+        for name, field in model.model_fields.items():
+            # Pydantic leaves it out for references, depending on which models were built before.
+            part = form.get("properties", {}).get(field.alias or name)
+            if field.description and part is not None:
+                part.setdefault("description", inspect.cleandoc(field.description))
         return form

@@ -18,6 +18,9 @@ from sim_engine.errors import DecantError
 
 T = TypeVar("T")
 
+DISTRIBUTION = "decant-pouring"
+"""Name of the distribution with Decant's own plug-ins. `decant` on the package index is another project."""
+
 
 class PluginError(DecantError, LookupError):
     """A name has no usable plug-in: it is unknown, or its plug-in cannot be loaded."""
@@ -136,4 +139,4 @@ def _package(entry: EntryPoint) -> str:
 
 def _decant_first(entry: EntryPoint) -> tuple[bool, str, str]:
     package = _package(entry)
-    return (not package.startswith("decant "), package, entry.name)
+    return (not package.startswith(f"{DISTRIBUTION} "), package, entry.name)

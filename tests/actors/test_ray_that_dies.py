@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 PROGRAM = """
 import asyncio, json, sys
 from actors.laboratory import open_laboratory
-from actors.optimizer.questions import ()
+from actors.optimizer.questions import Data, MinimumQuery
 from actors.laboratory_settings import LaboratorySettings
 from actors.laboratory import WarmSimulators
 from sim_engine.liquids import SimulationParameters
@@ -42,7 +42,7 @@ async def tell(asked):
     print(json.dumps(answer), flush=True)
 
 async def questions(simulators, optimizer):
-    problem = SuggestionQuery(space=Space((Axis("a", 0.0, 1.0),)), data=Data(((0.2,), (0.8,)), (1.0, 2.0)))
+    problem = MinimumQuery(space=Space((Axis("a", 0.0, 1.0),)), data=Data(((0.2,), (0.8,)), (1.0, 2.0)))
     await simulators.simulate(TASK)
     await optimizer.suggest(problem)
     print(json.dumps("ready"), flush=True)

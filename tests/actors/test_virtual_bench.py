@@ -28,7 +28,7 @@ def open_bench(fake, bench_spec):
 
     def open_it(*, ray: bool = False, make=None, simulators: int = 1, **changes):
         spec = LaboratorySettings(
-            "virtual", simulators=simulators, bench=bench_spec.with_values(**changes), in_process=not ray
+            name="virtual", simulators=simulators, bench=bench_spec.with_values(**changes), in_process=not ray
         )
         return open_laboratory(spec, need_bench=True, make=make or fake())
 
@@ -61,7 +61,7 @@ def test_measured_masses_are_those_of_the_hidden_liquid_within_the_balance(open_
 
     measured = asyncio.run(play())
     # Two readings, tare and weight: each with the noise and a rounding error.
-    deviation = np.sqrt(2 * (bench_spec.balance_noise**2 + bench_spec.balance_resolution**2 / 12))
+    deviation = np.sqrt(2 * (bench_spec.balance.noise**2 + bench_spec.balance.resolution**2 / 12))
     assert statistics.mean(m.loaded for m in measured) == pytest.approx(0.2, abs=4 * deviation / np.sqrt(40) + 1e-5)
     assert statistics.stdev([m.loaded for m in measured]) == pytest.approx(deviation, rel=0.5)
     assert statistics.mean(m.retained for m in measured) == pytest.approx(0.02, abs=4 * deviation / np.sqrt(40) + 1e-5)

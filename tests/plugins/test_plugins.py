@@ -110,7 +110,7 @@ def test_what_is_installed_is_listed_with_its_package(decant: Decant) -> None:
     listed = json.loads(decant("plugins", "--json").stdout)
     packages = {(p["group"], p["name"]): p["package"] for p in listed["plugins"]}
     assert packages["decant.balances", "spring"] == packages["decant.vessels", "cone"] == "decant-example 1.0"
-    assert packages["decant.balances", "kcp"].startswith("decant ")
+    assert packages["decant.balances", "kcp"].startswith("decant-pouring ")
     assert listed["broken"] == []
 
 
@@ -209,7 +209,8 @@ def test_a_campaign_of_things_from_outside_is_run_from_beginning_to_end(decant: 
     assert "Not installed here: decant-example 1.0 (" in reported.stderr
     page = (folder / "elsewhere.html").read_text()
     assert "Not installed here: decant-example 1.0 (" in page
-    assert page.count("<td>deployment:cone") >= 2, "a line for each pour"
+    assert "deployment:cone-1: 2 pours" in page
+    assert page.count('<tr class="bad"><th scope="row"') >= 2, "a line for each pour"
     assert "failed: cups touch" in page
     whole = decant("report", str(run), cwd=folder)
     assert "Not installed" not in whole.stderr

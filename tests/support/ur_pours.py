@@ -36,7 +36,7 @@ def settings(address: str = "", **changes: Any) -> UrArmSettings:
         limits=ArmLimits(box=Box(low=Point.of(-1.5, -1.5, -0.5), high=Point.of(1.5, 1.5, 2.0))),
         cell=RobotCell(receiver=Point.of(0.8, 0.0, 0.0), direction=0.0),
         home=JointAngles.of(*HOME),
-        address=address,
+        **({"address": address} if address else {}),
         tool=Pose(z=0.15),
         grip=Pose(rx=math.pi),  # the flange looks down, the pourer up
         payload=1.2,

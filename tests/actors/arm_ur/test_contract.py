@@ -94,4 +94,4 @@ class WaitsForTheController(UrArm):
 )
 def test_a_driver_that_does_not_do_what_it_reports_is_found(cls: type[UrArm], found_by: str, message: str) -> None:
     with contextlib.contextmanager(bench_of)(cls) as bench, pytest.raises(AssertionError, match=message):
-        getattr(ArmContract(), found_by)(bench.with_values(lost_within=3.0))
+        getattr(ArmContract(), found_by)(replace(bench, lost_within=3.0))

@@ -80,7 +80,7 @@ def test_a_restless_balance_is_given_up_with_advice_in_the_time_allowed(driver, 
 
 
 def test_an_overload_is_named_and_not_waited_out(driver, each_dialect):
-    far, balance = driver(each_dialect, settling=SettlingRule(deadline=1e6))
+    far, balance = driver(each_dialect, settling=SettlingRule(deadline=600.0))
     far.put(8.0)
     with pytest.raises(OutOfRangeError, match=r"over range.*Take something off"):
         balance.weigh()

@@ -31,7 +31,7 @@ def test_what_an_arm_read_back_is_poured_and_weighed_on_the_wire(open_stage):
     # 90 of the 100 deg that empty the pourer, and a twentieth beside the receiver
     assert measured.retained / measured.loaded == pytest.approx(1.0 / 7.0, abs=0.02)
     assert measured.spilled == pytest.approx(stage.contents.on_tray, abs=3e-4)
-    assert measured.notes["arm"]["model"] == "numbers"
+    assert measured.notes["arm"]["model"] == "simulated"
     assert stage.heard == ["tray_wiped", "pourer_empty", "pourer_full", "set_up", "start", "pourer_after"]
 
 

@@ -24,7 +24,7 @@ from tests.support import example_run
 
 DONE = OperatorQuestion("Put the full pourer into the gripper.", "done")
 WEIGHT = OperatorQuestion("Weigh the pourer on the other balance.", "weight")
-PATIENT = OperatorSettings(reminder=30.0, deadline=60.0)
+PATIENT = OperatorSettings(answers="person", reminder=30.0, deadline=60.0)
 
 
 class Keyboard:

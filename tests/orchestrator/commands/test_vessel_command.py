@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -210,7 +209,7 @@ def tiny(of: Bench, folder: Path) -> dict[str, Any]:
 
 
 def steep(of: Bench, folder: Path) -> dict[str, Any]:
-    return replace(depth(of, folder), depth=of.depth(folder / "steep.png", down=0.7))
+    return depth(of, folder) | {"depth": of.depth(folder / "steep.png", down=0.7)}
 
 
 def written(text: str) -> Door:
@@ -260,8 +259,9 @@ def written(text: str) -> Door:
         (written("level_mm,mass_g\n10,0\n40,0\n80,0\n"), r"fill.csv:2: 0 g below 10 mm make a vessel of 0 mm"),
         (written("level_mm,mass_g\n10,9e4\n40,9.1e4\n80,9.2e4\n"), r"fill.csv:2: .* should be 4 to 1000 mm"),
         (
-            lambda of, folder: replace(
-                written("tilt_deg,mass_g\n10,5\n50,60\n90,200\n")(of, folder), fill=None, tilt=folder / "fill.csv"
+            lambda of, folder: (
+                written("tilt_deg,mass_g\n10,5\n50,60\n90,200\n")(of, folder)
+                | {"fill": None, "tilt": folder / "fill.csv"}
             ),
             r"fill.csv:3: mass_g is 60 at 50, and 5 at 10 \(line 2\); a vessel that is tilted further holds less",
         ),

@@ -29,7 +29,7 @@ def refusal(folder: Path, arm: str) -> str:
 
 def test_ours_come_in_by_the_door(tmp_path):
     assert {"simulated", "ur"} <= set(ARMS.names)
-    assert ARMS.package("ur").startswith("decant ")
+    assert ARMS.package("ur").startswith("decant-pouring ")
     arm = load_laboratory(written(tmp_path, "arm: {kind: simulated}\n")).arm
     assert arm == SimulatedArmSettings(time_scale=30.0)
 
