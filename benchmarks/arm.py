@@ -148,7 +148,7 @@ def stops(arm: UrArm, controller: VirtualController, spec: UrArmSettings, speed:
 def measure(model: str, speeds: list[float], stop_speeds: list[float], count: int) -> dict[str, Any]:
     """Everything about one model."""
     with VirtualController.start(ADDRESS, model, 1.0, CYCLES[model], joints=SPEC.home.angles) as controller:
-        spec = SPEC.with_values(model=model, address=ADDRESS)  # type: ignore[arg-type]
+        spec = SPEC.with_values(model=model, address=ADDRESS)
         arm = UrArm(spec)
         try:
             arm.connect()

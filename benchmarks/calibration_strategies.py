@@ -50,6 +50,7 @@ from orchestrator.strategies.calibration.calibration_scores import Evaluation, r
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan
 from orchestrator.strategies.strategy_registry import calibrations
 from sim_engine.liquids import SimulationParameters
+from sim_engine.settings.model import Problems
 
 PAPER = ("C1=2800", "C2=504", "C3=1652", "C4=108")
 DEFAULTS, UNCALIBRATED, RANDOM = "defaults", "uncalibrated", "random"
@@ -75,9 +76,17 @@ class Complaints:
 
     any = False
 
-    def add(self, text: str, *at: str | int, key: bool = False, of: str = "") -> None:
+    def add(self, text: str, *at: str | int, key: bool = False, of: str = "", more: bool = False) -> None:
         """Something is."""
         self.any = True
+
+    def valid(self, *keys: str) -> bool:
+        """All are."""
+        return True
+
+    def within(self, *at: str | int) -> Problems:
+        """The same notes."""
+        return self
 
 
 def at_price(plan: CalibrationPlan, row: Row) -> CalibrationPlan:

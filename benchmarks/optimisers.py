@@ -34,7 +34,7 @@ from optimiser_problems import BY_NAME, PROBLEMS, Instance
 from optimiser_rivals import RIVALS, luckiest, play
 
 from actors.optimizer.feasible_region import Region
-from actors.optimizer.questions import Data, MeanName, MinimumQuery, NoiseName, SpaceFillingQuery, SuggestionQuery
+from actors.optimizer.questions import Data, MinimumQuery, PourQuery, SpaceFillingQuery, SuggestionQuery
 from actors.optimizer.suggest import propose
 from actors.runtime.child_process import child_environment
 from sim_engine.resources import cache_directory
@@ -214,16 +214,12 @@ def speed() -> list[dict[str, Any]]:
             return Data(tuple(map(tuple, points[part].tolist())), tuple(costs[part].tolist()))
 
         everything, pours, simulations = data(slice(None)), data(slice(15)), data(slice(15, None))
-        models: tuple[tuple[MeanName, NoiseName], ...] = (
-            ("constant", "constant"),
-            ("constant", "varying"),
-            ("simulated", "constant"),
-            ("scaled", "constant"),
+        queries: tuple[tuple[str, str, MinimumQuery | PourQuery], ...] = (
+            ("constant", "constant", MinimumQuery(space=space, data=everything)),
+            ("constant", "varying", MinimumQuery(space=space, data=everything, noise="varying")),
+            ("residual", "constant", PourQuery(space=space, data=pours, simulated=simulations)),
         )
-        for mean, noise in models:
-            question = MinimumQuery(space, everything, noise=noise)
-            if mean != "constant":
-                question = replace(question, data=pours, simulated=simulations, mean=mean)
+        for mean, noise, question in queries:
             fit = min(propose(replace(question, count=0)).seconds for _ in range(5))
             both = min(propose(question).seconds for _ in range(5))
             row = {"dimension": dimension, "mean": mean, "noise": noise}

@@ -73,11 +73,11 @@ class KeptPours(WorkerPool):
             rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
             self._known = {row["task"]: row["outcome"] for row in rows}
 
-    async def simulate(self, task: PourTask) -> SimulatedPour:
+    async def simulate(self, task: PourTask, user: object = None) -> SimulatedPour:
         """See `SimulatorPool.simulate`; without frames."""
         key = digest(to_json(task, PourTask))
         if key not in self._known:
-            found = await super().simulate(task)
+            found = await super().simulate(task, user)
             self._known[key] = to_json(found.outcome, PourOutcome)
             self.simulated += 1
             with self._file.open("a", encoding="utf-8") as file:

@@ -29,10 +29,10 @@ from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning, RobustPlanning
 from orchestrator.strategies.deployment.deployment_result import Recommended
-from orchestrator.strategies.deployment.disturbances import PoseNoise, RiskSettings
+from orchestrator.strategies.deployment.disturbances import RiskSettings
 from sim_engine.action import DEG, described
 from sim_engine.liquids import SimulationParameters
-from sim_engine.scene import PoseError, PourTask, Scene
+from sim_engine.scene import PoseError, PoseNoise, PourTask, Scene
 from sim_engine.simulator import InvalidSceneError, PourSimulator
 
 Floats = NDArray[np.float64]

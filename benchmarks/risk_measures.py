@@ -29,11 +29,11 @@ from orchestrator.requests import Outcome, Request, Simulate, Simulated, Slots, 
 from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning, RobustPlanning
 from orchestrator.strategies.deployment.deployment_result import Recommended
-from orchestrator.strategies.deployment.disturbances import PoseNoise, RiskSettings
+from orchestrator.strategies.deployment.disturbances import RiskSettings
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import Loss, PourOutcome
-from sim_engine.scene import PoseError, Scene
+from sim_engine.scene import PoseError, PoseNoise, Scene
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.shapes import cylinder
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Any
 
-from sim_engine.resources import DISTRIBUTION
-from sim_engine.settings.plugin_registry import PluginRegistry, UnloadablePlugin
+from sim_engine.settings.plugin_registry import DISTRIBUTION, PluginRegistry, UnloadablePlugin
 
 
 @dataclass(frozen=True)

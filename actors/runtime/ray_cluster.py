@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 from actors.interfaces import LaboratoryError, Notice
 from actors.runtime.child_process import python_module, run
-from sim_engine.resources import DISTRIBUTION
+from sim_engine.settings.plugin_registry import DISTRIBUTION
 from sim_engine.solver_fingerprint import ROOT, folder_digest
 
 if TYPE_CHECKING:

@@ -49,7 +49,7 @@ def _version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        from sim_engine.resources import DISTRIBUTION
+        from sim_engine.settings.plugin_registry import DISTRIBUTION
 
         print(f"decant {version(DISTRIBUTION)}")
         raise typer.Exit

@@ -34,7 +34,7 @@ from orchestrator.journal.journal_file import free_space
 from orchestrator.results.run_summary import PourSummary
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from sim_engine.resources import DISTRIBUTION
+from sim_engine.settings.plugin_registry import DISTRIBUTION
 
 READERS = 400
 """Largest number of concurrent event streams."""

@@ -25,7 +25,7 @@ from orchestrator.journal.journal_file import TO_BEGIN, JournalError, require_sp
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from sim_engine.resources import DISTRIBUTION
+from sim_engine.settings.plugin_registry import DISTRIBUTION
 
 RESOLVED, VERSIONS = "resolved.json", "versions.json"
 """Files with the resolved plan of a run and with the versions of the program that began it."""
