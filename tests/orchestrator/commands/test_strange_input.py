@@ -74,7 +74,7 @@ BAD: dict[str, str] = {
     "validate nan.yaml": "nan.yaml:2:38: profile.inner[1][0]: should be a finite number, got nan",
     "server start open.yaml": "open.yaml:1:16: listen.host: other machines reach this address",
     "server start port.yaml": "listen.port: 99999999999999999999 is too large; at most 65,535",
-    "server start tls.yaml": "tls.yaml:1:15: listen.tls: README.md and README.md are not a certificate and its key in PEM",
+    "server start tls.yaml": "tls.yaml:1:15: listen.tls: README.md and README.md are not a certificate",
     "server start state.yaml": "README.md is not a folder",
     "server start word.yaml": "word.yaml:1:15: notify.to[0]: is not a URL that apprise knows",
     "server start rigs.yaml": "rigs.a: duplicate key; it stands in line 1 already",
