@@ -358,10 +358,10 @@ def write_page(
     text = json.dumps(data, indent=1, ensure_ascii=False)
     # One line per curve; one line per number would be tens of thousands of lines.
     text = re.sub(r"\[\s+([-+\d.eE,\s]+?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
-    data, page = folder / DATA_NAME, folder / PAGE_NAME
-    for path in (data, page):
+    page = folder / PAGE_NAME
+    for path in (folder / DATA_NAME, page):
         path.parent.mkdir(parents=True, exist_ok=True)
-    data.write_text(text + "\n", encoding="utf-8")
+    (folder / DATA_NAME).write_text(text + "\n", encoding="utf-8")
     page.write_text(page_text(sorted_records, theta, fingerprint), encoding="utf-8")
     return page
 
