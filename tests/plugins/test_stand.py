@@ -212,6 +212,9 @@ class KeepsConsent(Stand):
         return lost
 
 
+pytestmark = pytest.mark.realtime
+"""The stand turns by the clock: a machine that stalls for a whole tilt has neither seen it nor a jump in it."""
+
 WHOLE = "test_a_whole_pour_is_made_as_planned_and_ends_consent"
 AS_REPORTED = "test_it_moves_as_it_reports_and_goes_home"
 MEASURED = "test_the_poses_it_reports_are_measured"
