@@ -177,7 +177,7 @@ _add(
     queue_commands.start,
     "decant server start",
     "decant server start lab.yaml --port 0",
-    "decant server start --state /tmp/try --in-process",
+    "decant server start --state ./trials --in-process",
     to=_server,
 )
 _add(queue_commands.shutdown, "decant server stop", name="stop", to=_server)

@@ -128,7 +128,7 @@ class Commands(TyperGroup):
         if args and args[0] not in self.commands:
             if ctx.parent is None and args[0] in RETIRED_COMMANDS:
                 _refuse(f"decant {args[0]}", f"decant {RETIRED_COMMANDS[args[0]]}")
-            if self.name == "study" and not args[0].startswith("-"):
+            if self.name == "study" and args[0].endswith((".yaml", ".yml")):
                 _refuse("decant study FILE", "decant study run FILE")
         return super().parse_args(ctx, args)
 
