@@ -94,11 +94,11 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
 def migrate(
     files: Annotated[
         list[Path],
-        typer.Argument(help="Campaign, study, vessel, laboratory or daemon files; rewritten.", show_default=False),
+        typer.Argument(help="Campaign, study, vessel, laboratory, daemon or θ files; rewritten.", show_default=False),
     ],
 ) -> None:
     """Rename what earlier versions called otherwise, in place; comments and layout stay."""
-    from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
+    from orchestrator.config.file_loading import load_campaign, load_laboratory, load_parameters, load_vessel
     from orchestrator.config.migration import migrate_file
     from orchestrator.config.yaml.file_access import resolved
     from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -109,17 +109,19 @@ def migrate(
 
         return load_study(path)
 
-    def load_daemon(path: Path) -> object:
-        from orchestrator.daemon.daemon_settings import load_settings
+    def load_other(path: Path) -> object:
+        from orchestrator.daemon.daemon_settings import DaemonFile, load_settings
 
-        return load_settings(path)
+        data = Document.read(path).data
+        of_daemon = isinstance(data, dict) and bool(data.keys() & DaemonFile.written_keys().keys())
+        return load_settings(path) if of_daemon else load_parameters(path)
 
     kinds = {"vessel": load_vessel, "laboratory": load_laboratory, "study": load_study, "campaign": load_campaign}
     left = 0
     for path in files:
         try:
             kind = kind_of(Document.read(resolved(path)).data)
-            result = migrate_file(path, load_daemon if kind is None else kinds[kind])
+            result = migrate_file(path, load_other if kind is None else kinds[kind])
         except (ConfigError, OSError) as error:
             print_message(str(error))
             left += 1

@@ -109,3 +109,13 @@ def test_the_command_reports_what_it_did_and_what_is_left(tmp_path: Path) -> Non
     left = CliRunner().invoke(app, ["migrate", str(campaign)])
     assert left.exit_code == 2
     assert "deployment.trust: was retired; remove it" in left.stderr
+
+
+def test_a_file_of_parameters_gets_the_present_names(tmp_path: Path) -> None:
+    theta = tmp_path / "theta.yaml"
+    theta.write_text("cohesion: 0.05 N/m\nviscosity: 6 1/s  # of XSPH\neddies: 0.1\n", encoding="utf-8")
+    done = CliRunner().invoke(app, ["migrate", str(theta)])
+    assert done.exit_code == 0, done.stderr
+    assert theta.read_text(encoding="utf-8") == (
+        "cohesion: 0.05 N/m\nxsph_rate: 6 1/s  # of XSPH\nsmagorinsky_constant: 0.1\n"
+    )
