@@ -260,7 +260,10 @@ async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], *, res
     for number in numbers:
         loop.add_signal_handler(number, stop)
     try:
-        return await task
+        result = await task
+        if asked:
+            print_message("the campaign had ended before: its results are written")
+        return result
     finally:
         for number in numbers:
             loop.remove_signal_handler(number)
