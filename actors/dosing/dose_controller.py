@@ -58,7 +58,7 @@ class DosingSettings(Settings):
     smallest_flow: MassFlow = 0.004
     """Lower bound of the flow at the end of a dose; it is larger where a slower stream would dribble."""
 
-    largest_fine_flow: MassFlow = 0.010
+    largest_fine_flow: MassFlow = 0.005
     """Upper bound of the flow at the end of a dose."""
 
     largest_flow: MassFlow = 0.03
@@ -205,6 +205,7 @@ class DoseController:
         self._recent: list[DoseReading] = []
         self._now, self._tilt, self._speed = 0.0, 0.0, 0.0
         self._rising = 0
+        self._tick = 0.05
         self._doubt_since: float | None = None
         self._since = 0.0
         self._stop_tilt = 0.0
@@ -252,6 +253,7 @@ class DoseController:
         else:
             self._estimator.advance(time, tilt)
         self._note_late_stream(time - self._now, tilt)
+        self._tick += 0.2 * (min(time - self._now, 0.2) - self._tick)
         self._now, self._tilt = time, tilt
         if paused and tilt > 0.0:
             self._turn_back()  # the arm has turned back by itself
@@ -394,7 +396,7 @@ class DoseController:
             self._tilt, self._speed, latency=s.latency, back=s.return_speed, acceleration=s.acceleration
         )
         middle, deviation = float(np.median(final)) + self._belief.aim, math.hypot(float(final.std()), 0.1e-3)
-        half_tick = 0.025 * self.flow
+        half_tick = 0.5 * self._tick * self.flow
         if middle + half_tick < order.amount and middle + 2.33 * deviation < order.amount + order.limit:
             return False
         self._expected = float(np.median(final))
@@ -417,7 +419,7 @@ class DoseController:
         e.advance(reading.time, self._tilt + share * (tilt - self._tilt))
         net = DoseReading(reading.time, reading.mass - self._zero, reading.stable)
         predicted = e.predicted(reading.time)
-        gate = max(5.0 * math.hypot(float(predicted.std()), e.deviation()), 1.5e-3)
+        gate = max(5.0 * math.hypot(float(predicted.std()), e.deviation()), 1.5e-3 + 0.1 * self.flow)
         if abs(net.mass - float(predicted.mean())) > gate:
             self._doubt_since = self._doubt_since if self._doubt_since is not None else reading.time
             if self.phase is not DosePhase.SETTLE:

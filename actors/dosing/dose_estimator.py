@@ -19,8 +19,9 @@ are moved instead of weighted, so that a hundred of them do not collapse on a sh
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -341,42 +342,49 @@ def identify_lag(
         return np.clip(lag + delay, *LAG_RANGE), rng.permutation(np.linspace(0.25, 1.0, count))
     risen = (masses - masses[0]) / height
     first = float(times[np.argmax(risen > 0.01)])
-    lags = np.geomspace(0.05, 2.0, 36)
-    shapes = np.array([0.25, 0.33, 0.5, 0.75, 1.0])
-    grid_lag, grid_shape = (a.ravel() for a in np.meshgrid(lags, shapes, indexing="ij"))
-    fine = 0.01 * np.arange(1200)
-    sigma = math.hypot(0.01, step / height)
-    moments = np.arange(first - 1.2, first + 0.01, 0.02)
-    log_likelihood = np.full((len(grid_lag), 3, len(moments)), -np.inf)
-    for placing, duration in enumerate((0.02, 0.15, 0.3)):
-        response = _response(grid_lag, grid_shape, np.minimum(fine / duration, 1.0))
-        for k, moment in enumerate(moments):
-            place = np.clip((times - moment) / 0.01, 0.0, len(fine) - 1.0).astype(int)
-            misfit = np.where((times < moment)[None, :], 0.0, response[:, place]) - risen
-            log_likelihood[:, placing, k] = -0.5 * np.sum((misfit / sigma) ** 2, axis=1)
-    evidence = np.exp(log_likelihood - log_likelihood.max()).sum(axis=(1, 2))
-    drawn = rng.choice(len(grid_lag), size=count, p=evidence / evidence.sum())
+    sigma = math.hypot(0.006, step / height)
+    moments = first - np.arange(0.0, 1.5, 0.02)
+    fits = []
+    for (_, response), lag in itertools.product(FILTERS.values(), _LAGS):
+        for duration in (0.02, 0.12, 0.25):
+            place = (times[None, :] - moments[:, None]) / lag
+            smooth = np.mean([response(place - part * duration / lag) for part in (0.1, 0.3, 0.5, 0.7, 0.9)], axis=0)
+            fits.append(-0.5 * np.sum(((smooth - risen) / sigma) ** 2, axis=1))
+    grid = np.array(fits).reshape(len(FILTERS), len(_LAGS), -1)
+    evidence = np.exp(grid - grid.max()).sum(axis=2)
+    drawn = rng.choice(evidence.size, size=count, p=evidence.ravel() / evidence.sum())
+    shapes = np.array([shape for shape, _ in FILTERS.values()])
     jitter = 1.0 + 0.05 * _even_normal(count, rng)
     return (
-        np.clip(grid_lag[drawn] * jitter + delay, *LAG_RANGE),
-        np.clip(grid_shape[drawn] + 0.05 * _even_normal(count, rng), *SHAPE_RANGE),
+        np.clip(_LAGS[drawn % len(_LAGS)] * jitter + delay, *LAG_RANGE),
+        np.clip(shapes[drawn // len(_LAGS)] + 0.03 * _even_normal(count, rng), *SHAPE_RANGE),
     )
 
 
-def _response(lag: Floats, shape: Floats, load: Floats) -> Floats:
-    """Readings (K, T) of filters (K,) for a load (T,) in steps of 0.01 s."""
-    dt = 0.01
-    gains = [dt / (shape * lag + dt)] + 3 * [dt / ((1.0 - shape) * lag / 3.0 + dt)]
-    states = np.zeros((4, len(lag)))
-    result = np.empty((len(lag), len(load)))
-    for k, value in enumerate(load):
-        before: Floats | float = value
-        for stage, gain in enumerate(gains):
-            states[stage] += gain * (before - states[stage])
-            before = states[stage]
-        result[:, k] = states[3]
-    return result
+def _poles(roots: Sequence[complex]) -> Callable[[Floats], Floats]:
+    """Step response over time / lag of a low-pass filter with these poles, scaled to a lag of 1."""
+    scaled = np.array(roots) * float(np.real(np.sum(-1.0 / np.array(roots))))
+    weights = [1.0 / np.prod([1.0 - root / other for other in scaled if other != root]) for root in scaled]
 
+    def response(time: Floats) -> Floats:
+        t = np.maximum(time, 0.0)
+        rest = np.sum([w * np.exp(root * t) for w, root in zip(weights, scaled, strict=True)], axis=0)
+        return np.where(time > 0.0, 1.0 - np.real(rest), 0.0)
+
+    return response
+
+
+_BUTTERWORTH = [complex(-math.sin(a), math.cos(a)) for a in (math.pi / 8, 3 * math.pi / 8, 5 * math.pi / 8, 7 * math.pi / 8)]
+_LAGS = np.geomspace(0.04, 2.0, 60)
+
+FILTERS: dict[str, tuple[float, Callable[[Floats], Floats]]] = {
+    "first order": (1.0, _poles([-1.0])),
+    "second order": (0.5, _poles([-1.0, -1.1])),
+    "four equal poles": (0.25, _poles([-1.0, -1.1, -1.2, -1.3])),
+    "Butterworth, fourth order": (0.25, _poles(_BUTTERWORTH)),
+    "moving average": (0.33, lambda time: np.clip(0.5 * time, 0.0, 1.0)),
+}
+"""Filters of balances: the nearest ρ_s, and the step response over time / lag."""
 
 _QUANTILES: dict[int, Floats] = {}
 
