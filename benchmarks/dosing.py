@@ -36,7 +36,7 @@ from sim_engine.vessel.vessel import Vessel, build_vessel
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(Path(__file__).parent))
 
-from dosing_rivals import LearntPreact, OpenLoop, Pid, Preact, Rival, RivalMemory  # noqa: E402
+from dosing_rivals import FastPid, LearntPreact, OpenLoop, Pid, Preact, Rival, RivalMemory  # noqa: E402
 
 DATA = ROOT / "docs" / "data" / "dosing.json"
 
@@ -71,10 +71,10 @@ class Group:
 
 SPOUTED = ("spouted beaker", "spouted jug")
 GROUPS = {
-    "spout, water, lag 0.1 to 0.5 s": Group(SPOUTED, (0.1, 0.5), False, 100),
-    "round rim": Group(("round beaker",), (0.1, 0.5), False, 50),
-    "oil": Group(SPOUTED, (0.1, 0.5), True, 50),
-    "lag 1 s": Group(SPOUTED, (0.9, 1.1), False, 50),
+    "spout, water, lag 0.1 to 0.5 s": Group(SPOUTED, (0.1, 0.5), False, 60),
+    "round rim": Group(("round beaker",), (0.1, 0.5), False, 25),
+    "oil": Group(SPOUTED, (0.1, 0.5), True, 25),
+    "lag 1 s": Group(SPOUTED, (0.9, 1.1), False, 25),
 }
 
 
@@ -223,13 +223,10 @@ def with_rival(rival: type[Rival]) -> Callable[[Series], list[Dose]]:
         def pour(amount: float, filled: bool) -> tuple[Any, bool]:
             series.bench.place_receiver()
             if not memory:
-                memory.append(RivalMemory(series.weighed_content() / series.density))
+                memory.append(RivalMemory(series.weighed_content() / series.density, rival.first_preact))
             elif filled:
                 memory[0].volume = series.weighed_content() / series.density
-            clean = 1.1 * series.cup.clean_flow(1.0) * series.cup.density
-            fine = min(max(clean, 0.004), 0.010)
-            if not memory[0].errors and memory[0].preact == 3e-3:
-                memory[0].preact = 0.6 * fine
+            fine = DosingSettings().largest_fine_flow
             controller = rival(series.cup, amount, memory[0], fine)
             record = series.bench.dose(controller)
             controller.learn()
@@ -245,6 +242,7 @@ CONTROLLERS: dict[str, Callable[[Series], list[Dose]]] = {
     "fixed preact": with_rival(Preact),
     "learnt preact": with_rival(LearntPreact),
     "PID": with_rival(Pid),
+    "PID, fast": with_rival(FastPid),
     "particles": with_particles,
 }
 

@@ -58,7 +58,7 @@ class DosingSettings(Settings):
     smallest_flow: MassFlow = 0.004
     """Lower bound of the flow at the end of a dose; it is larger where a slower stream would dribble."""
 
-    largest_fine_flow: MassFlow = 0.005
+    largest_fine_flow: MassFlow = 0.006
     """Upper bound of the flow at the end of a dose."""
 
     largest_flow: MassFlow = 0.03
@@ -214,9 +214,9 @@ class DoseController:
         self._top_ups = 0
         self._factor_before = float(np.median(belief.flow_factor))
         self._idle_since: float | None = None
-        self._late_volume = float(belief.volume.mean() - 3.0 * belief.volume.std())
-        self._late_onset = float(belief.onset_bias.mean() + 3.0 * belief.onset_bias.std())
-        self._late_factor = 0.6 * self._factor_before
+        self._late_volume = float(belief.volume.mean() - 2.0 * belief.volume.std())
+        self._late_onset = float(belief.onset_bias.mean() + 2.0 * belief.onset_bias.std())
+        self._late_factor = 0.7 * self._factor_before
         self._late_mass, self._late_flow = 0.0, 0.0
         self.fine_flow = settings.smallest_flow
 
@@ -457,7 +457,7 @@ class DoseController:
             self._turn_back()
         elif self._nearly_empty():
             self._turn_back(DoseEnd.SOURCE_EMPTY)
-        elif self._late_mass - net - self._late_flow > max(4e-3, 0.3 * self._late_mass) or (
+        elif self._late_mass - net - self._late_flow > max(2.5e-3, 0.3 * self._late_mass) or (
             self.phase is DosePhase.POUR and float(np.median(e.flow_factor)) < 0.3 * self._factor_before
         ):
             left = float(np.median(e.volume))

@@ -37,6 +37,9 @@ TIME_STEP = 0.025
 LAG_RANGE = (0.03, 2.5)
 """Lags that a balance can have [s]."""
 
+SURPRISE = 2.0
+"""Innovation, in standard deviations, above which lag and shape learn less from a reading."""
+
 SHAPE_RANGE = (0.22, 1.0)
 FACTOR_RANGE = (0.05, 2.0)
 
@@ -78,7 +81,7 @@ class DoseBelief:
     lag: Floats
     lag_shape: Floats
     volume: Floats
-    aim: float = 0.0
+    aim: float = 0.3e-3
     doses: int = 0
 
     @classmethod
@@ -264,13 +267,15 @@ class DoseEstimator:
         def gained(values: Floats) -> Floats:
             return float((values - values.mean()) @ centred) * shift
 
+        # a gush that the model lacks must not count as lag
+        calm = min(1.0, SURPRISE * math.sqrt(variance + deviation**2) / max(abs(innovation), 1e-9))
         log_factor, log_lag = np.log(self.flow_factor), np.log(self.lag)
         changes = [gained(v) for v in (self.onset_bias, log_factor, log_lag, self.lag_shape, self.volume, self.mass)]
         self._lags += np.stack([gained(lag) for lag in self._lags])
         self.onset_bias += changes[0]
         self.flow_factor = np.clip(np.exp(log_factor + changes[1]), *FACTOR_RANGE)
-        self.lag = np.clip(np.exp(log_lag + changes[2]), *LAG_RANGE)
-        self.lag_shape = np.clip(self.lag_shape + changes[3], *SHAPE_RANGE)
+        self.lag = np.clip(np.exp(log_lag + calm * changes[2]), *LAG_RANGE)
+        self.lag_shape = np.clip(self.lag_shape + calm * changes[3], *SHAPE_RANGE)
         self.volume = np.clip(self.volume + changes[4], 0.0, self.cup.capacity)
         self.mass += changes[5]
         self._mass_history += changes[5]
@@ -342,8 +347,10 @@ def identify_lag(
         return np.clip(lag + delay, *LAG_RANGE), rng.permutation(np.linspace(0.25, 1.0, count))
     risen = (masses - masses[0]) / height
     first = float(times[np.argmax(risen > 0.01)])
+    rise = (times > first - 0.3) & (np.cumsum(risen > 0.997) < 4)
+    times, risen = times[rise], risen[rise]
     sigma = math.hypot(0.006, step / height)
-    moments = first - np.arange(0.0, 1.5, 0.02)
+    moments = first - np.arange(0.0, 1.5, 0.03)
     fits = []
     for (_, response), lag in itertools.product(FILTERS.values(), _LAGS):
         for duration in (0.02, 0.12, 0.25):
@@ -375,7 +382,7 @@ def _poles(roots: Sequence[complex]) -> Callable[[Floats], Floats]:
 
 
 _BUTTERWORTH = [complex(-math.sin(a), math.cos(a)) for a in (math.pi / 8, 3 * math.pi / 8, 5 * math.pi / 8, 7 * math.pi / 8)]
-_LAGS = np.geomspace(0.04, 2.0, 60)
+_LAGS = np.geomspace(0.04, 2.0, 45)
 
 FILTERS: dict[str, tuple[float, Callable[[Floats], Floats]]] = {
     "first order": (1.0, _poles([-1.0])),
