@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from actors.dosing.cup_flow import CupFlow
-from actors.dosing.dose_controller import DoseController, DoseOrder, DosingSettings
+from actors.dosing.dose_controller import DoseController, DoseOrder, DosingSettings, fine_flow
 from actors.dosing.dose_estimator import DoseBelief, identify_lag
 from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
 from sim_engine.liquids import Liquid
@@ -226,7 +226,7 @@ def with_rival(rival: type[Rival]) -> Callable[[Series], list[Dose]]:
                 memory.append(RivalMemory(series.weighed_content() / series.density, rival.first_preact))
             elif filled:
                 memory[0].volume = series.weighed_content() / series.density
-            fine = DosingSettings().largest_fine_flow
+            fine = fine_flow(series.cup, 1.0, DosingSettings())
             controller = rival(series.cup, amount, memory[0], fine)
             record = series.bench.dose(controller)
             controller.learn()

@@ -58,7 +58,7 @@ class DosingSettings(Settings):
     smallest_flow: MassFlow = 0.004
     """Lower bound of the flow at the end of a dose; it is larger where a slower stream would dribble."""
 
-    largest_fine_flow: MassFlow = 0.006
+    largest_fine_flow: MassFlow = 0.008
     """Upper bound of the flow at the end of a dose."""
 
     largest_flow: MassFlow = 0.03
@@ -123,6 +123,23 @@ class DoseResult:
     estimate: tuple[float, float]
     top_ups: int
     belief: DoseBelief
+
+
+FINE_WEBER = 0.8
+"""Weber number of the film at the lip in the fine flow at the end. Below `DRIBBLING_WEBER` a part may dribble, but only
+for a second or two; a faster flow would add more to the error than it saves in spilled liquid."""
+
+
+def fine_flow(cup: CupFlow, tilt: float, settings: DosingSettings) -> float:
+    """Flow at the end of a dose: slow, but fast enough to leave the lip [kg/s].
+
+    Args:
+        cup: the source vessel.
+        tilt: at which it pours [rad].
+        settings: lower and upper bound.
+    """
+    clean = cup.clean_flow(tilt, FINE_WEBER) * cup.density
+    return min(max(clean, settings.smallest_flow), settings.largest_fine_flow)
 
 
 class DosePhase(StrEnum):
@@ -294,7 +311,7 @@ class DoseController:
         if self._rising >= 2:
             self._enter(DosePhase.POUR)
             return self._pour()
-        self.fine_flow = self._fine_flow(max(early, 0.1))
+        self.fine_flow = fine_flow(self._cup, max(early, 0.1), self._settings)
         if self._must_stop():
             self._turn_back()
             return -self._settings.return_speed
@@ -368,11 +385,6 @@ class DoseController:
         )
 
     # ---- flow
-
-    def _fine_flow(self, tilt: float) -> float:
-        s = self._settings
-        clean = 1.1 * self._cup.clean_flow(tilt) * self._cup.density
-        return min(max(clean, s.smallest_flow), s.largest_fine_flow)
 
     def _wanted_flow(self) -> float:
         """Wanted flow [kg/s]: it falls to the fine flow with the remaining amount."""
