@@ -16,9 +16,8 @@ import math
 import sys
 import tempfile
 import time
-import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -364,7 +363,9 @@ def main() -> None:
                     mean, low, high = paired(by["particles"], doses)
                     print(f"{name}: {rival} − particles: {mean:+.2f} g ({low:+.2f} … {high:+.2f})")
     if options.dump:
-        options.dump.write_text(json.dumps({g: {c: [asdict(d) for d in ds] for c, ds in by.items()} for g, by in result.items()}))
+        options.dump.write_text(
+            json.dumps({g: {c: [asdict(d) for d in ds] for c, ds in by.items()} for g, by in result.items()})
+        )
     if options.json:
         from machine import describe
 

@@ -202,7 +202,9 @@ class Preact(Rival):
         left = self.amount - self.reading - self.memory.preact
         if left <= 0.0:
             return self._turn_back()
-        wanted = min(self.fine_flow + max(left - 2.0 * self.fine_flow, 0.0) / 2.0, max(self.amount / 3.0, self.fine_flow), 0.03)
+        wanted = min(
+            self.fine_flow + max(left - 2.0 * self.fine_flow, 0.0) / 2.0, max(self.amount / 3.0, self.fine_flow), 0.03
+        )
         return self._follow(wanted, step)
 
     def learn(self) -> None:

@@ -330,7 +330,10 @@ class DoseController:
         e = self._estimator
         wanted = self._wanted_flow()
         aim = float(np.median(self._tilts_for(wanted)))
-        volume, head = float(np.median(e.volume)), float(self._cup.head_for(np.array([wanted / self._cup.density]), aim)[0])
+        volume, head = (
+            float(np.median(e.volume)),
+            float(self._cup.head_for(np.array([wanted / self._cup.density]), aim)[0]),
+        )
         feed = wanted / self._cup.density / self._cup.volume_per_tilt(volume, head)
         ahead = self._tilt + self._speed * self._settings.latency
         speed = feed + 4.0 * (aim - ahead)
@@ -441,7 +444,9 @@ class DoseController:
         before = self._recent[-2].mass - self._zero if len(self._recent) > 1 else 0.0
         base = self._late_mass if self._top_ups else 0.0
         threshold = max(SEEN, 2.5 * self._step_size)
-        self._rising = self._rising + 1 if net.mass > before + 0.5 * self._step_size and net.mass > base + threshold else 0
+        self._rising = (
+            self._rising + 1 if net.mass > before + 0.5 * self._step_size and net.mass > base + threshold else 0
+        )
         e.update(net)
 
     def _note_late_stream(self, seconds: float, tilt: float) -> None:
@@ -491,4 +496,3 @@ class DoseController:
 
     def _enter(self, phase: DosePhase) -> None:
         self.phase, self._since = phase, self._now
-

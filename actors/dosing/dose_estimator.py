@@ -381,7 +381,9 @@ def _poles(roots: Sequence[complex]) -> Callable[[Floats], Floats]:
     return response
 
 
-_BUTTERWORTH = [complex(-math.sin(a), math.cos(a)) for a in (math.pi / 8, 3 * math.pi / 8, 5 * math.pi / 8, 7 * math.pi / 8)]
+_BUTTERWORTH = [
+    complex(-math.sin(a), math.cos(a)) for a in (math.pi / 8, 3 * math.pi / 8, 5 * math.pi / 8, 7 * math.pi / 8)
+]
 _LAGS = np.geomspace(0.04, 2.0, 45)
 
 FILTERS: dict[str, tuple[float, Callable[[Floats], Floats]]] = {

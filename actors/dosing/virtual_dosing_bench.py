@@ -354,7 +354,9 @@ class VirtualDosingBench:
                 upright = time
             # ---- cup
             slosh_speed -= dt * (
-                omega**2 * slosh + 0.08 * omega * slosh_speed + 0.5 * omega**2 * cup.radius * 0.08 * (speed - before) / dt / GRAVITY
+                omega**2 * slosh
+                + 0.08 * omega * slosh_speed
+                + 0.5 * omega**2 * cup.radius * 0.08 * (speed - before) / dt / GRAVITY
             )
             slosh += dt * slosh_speed
             hold = self._dry_hold + (self._wet_hold - self._dry_hold) * self._wetness

@@ -11,11 +11,14 @@ from dataclasses import dataclass, field
 STOP_ORDER, HEARTBEAT, GO = 19, 20, 21
 """Integer inputs. An order is the number of its motion, so that an old order has no effect."""
 
+TILT_COUNTER, TILT_SPEED = 22, 18
+"""Integer and double input of a dose: a counter that changes with every command, and the wanted speed [rad/s]."""
+
 NUMBER, STATUS = 12, 13
 """Integer outputs: the number of the motion whose program runs, and its status."""
 
 CLOCK, TOOL = 12, 13
-"""Double outputs: time on the path [s]; from `TOOL` on, the six values of the controller's tool."""
+"""Double outputs: time on the path [s], in a dose the tilt [rad]; from `TOOL` on, the six values of the controller's tool."""
 
 READY, RUNNING, DONE, STOPPED = 1, 2, 3, 4
 """Statuses: ready and waiting for `GO`; moving; arrived; stopped by order."""
