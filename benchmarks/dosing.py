@@ -5,7 +5,8 @@
 
 A series is six doses of 10, 25, 50, 100, 200 g and one more of these, in a random order, from one source vessel. The
 seed draws cup, filling, balance and their errors; the bench draws the rest. The source is filled again and weighed when
-it holds too little. Development uses the seeds 0 to 99. The final seeds begin at 5000 and were fixed before tuning.
+it holds too little. Development uses the seeds 0 to 99. The final seeds begin at 6000. (A first run at
+5000 to 5059 showed one false alarm in 360 doses. The alarm was then changed on development seeds.)
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from dosing_rivals import FastPid, LearntPreact, OpenLoop, Pid, Preact, Rival, R
 DATA = ROOT / "docs" / "data" / "dosing.json"
 
 AMOUNTS = (0.010, 0.025, 0.050, 0.100, 0.200)
-FIRST_FINAL_SEED = 5000
+FIRST_FINAL_SEED = 6000
 PARTICLES = 100
 
 CUPS = {
@@ -71,9 +72,9 @@ class Group:
 SPOUTED = ("spouted beaker", "spouted jug")
 GROUPS = {
     "spout, water, lag 0.1 to 0.5 s": Group(SPOUTED, (0.1, 0.5), False, 60),
-    "round rim": Group(("round beaker",), (0.1, 0.5), False, 25),
-    "oil": Group(SPOUTED, (0.1, 0.5), True, 25),
-    "lag 1 s": Group(SPOUTED, (0.9, 1.1), False, 25),
+    "round rim": Group(("round beaker",), (0.1, 0.5), False, 20),
+    "oil": Group(SPOUTED, (0.1, 0.5), True, 20),
+    "lag 1 s": Group(SPOUTED, (0.9, 1.1), False, 20),
 }
 
 
@@ -112,7 +113,7 @@ class Dose:
     error: float
     spilled: float
     weighed_at: float
-    known: bool
+    end: str
 
 
 class Series:
@@ -164,12 +165,12 @@ class Series:
         self.bench.refill(self._refills.pop() * capacity)
         return True
 
-    def doses(self, pour: Callable[[float, bool], tuple[Any, bool]]) -> Iterator[Dose]:
-        """All doses; `pour` receives the amount and whether the source was filled, and returns record and knowledge."""
+    def doses(self, pour: Callable[[float, bool], tuple[Any, str]]) -> Iterator[Dose]:
+        """All doses; `pour` receives the amount and whether the source was filled; it returns record and end."""
         for place, amount in enumerate(self.amounts):
             filled = self.refill_for(amount)
             fill = self.bench.content / (self.bench.cup.capacity * self.density)
-            record, known = pour(amount, filled)
+            record, end = pour(amount, filled)
             yield Dose(
                 self.seed,
                 place,
@@ -182,7 +183,7 @@ class Series:
                 1e3 * (record.received - amount),
                 1e3 * record.spilled,
                 record.duration,
-                known,
+                end,
             )
 
 
@@ -192,7 +193,7 @@ def with_particles(series: Series) -> list[Dose]:
     settings = DosingSettings()
     beliefs: list[DoseBelief] = []
 
-    def pour(amount: float, filled: bool) -> tuple[Any, bool]:
+    def pour(amount: float, filled: bool) -> tuple[Any, str]:
         step = series.bench.place_receiver()
         sigma = 0.5e-3 / series.density
         if not beliefs:
@@ -208,7 +209,7 @@ def with_particles(series: Series) -> list[Dose]:
         record = series.bench.dose(controller)
         assert controller.result is not None
         beliefs[0] = controller.result.belief
-        return record, controller.result.amount is not None
+        return record, str(controller.result.end)
 
     return list(series.doses(pour))
 
@@ -219,7 +220,7 @@ def with_rival(rival: type[Rival]) -> Callable[[Series], list[Dose]]:
     def run(series: Series) -> list[Dose]:
         memory: list[RivalMemory] = []
 
-        def pour(amount: float, filled: bool) -> tuple[Any, bool]:
+        def pour(amount: float, filled: bool) -> tuple[Any, str]:
             series.bench.place_receiver()
             if not memory:
                 memory.append(RivalMemory(series.weighed_content() / series.density, rival.first_preact))
@@ -229,7 +230,7 @@ def with_rival(rival: type[Rival]) -> Callable[[Series], list[Dose]]:
             controller = rival(series.cup, amount, memory[0], fine)
             record = series.bench.dose(controller)
             controller.learn()
-            return record, controller.weighed is not None
+            return record, "reached" if controller.weighed is not None else "unknown"
 
         return list(series.doses(pour))
 
@@ -267,7 +268,7 @@ def figures(doses: Sequence[Dose]) -> dict[str, Any]:
         "time_50_p95": float(np.quantile(fifty, 0.95)) if fifty else None,
         "time_200_p95": float(np.quantile(largest, 0.95)) if largest else None,
         "time_median": float(np.median([d.weighed_at for d in doses])),
-        "unknown": sum(not d.known for d in doses),
+        "aborted": sum(d.end != "reached" for d in doses),
     }
 
 
@@ -322,7 +323,7 @@ def measure(
 
 HEAD = (
     f"{'':15} {'doses':>5} {'mean':>6} {'bias':>6} {'95 %':>6} {'worst':>6} {'>+1g':>6} {'first':>6} {'95 %':>6} "
-    f"{'spill':>6} {'95 %':>6} {'t50':>6} {'t200':>6} {'t med':>6} {'unkn':>5} {'CPU s':>6}"
+    f"{'spill':>6} {'95 %':>6} {'t50':>6} {'t200':>6} {'t med':>6} {'ended':>5} {'CPU s':>6}"
 )
 
 
@@ -331,7 +332,8 @@ def row(name: str, f: dict[str, Any]) -> str:
     keys = ("mean", "bias", "p95", "worst", "over_1g", "first_mean", "first_p95", "spill_mean", "spill_p95")
     times = ("time_50_p95", "time_200_p95", "time_median")
     values = [f"{f[k]:6.1%}" if k == "over_1g" else f"{_or_nan(f[k]):6.2f}" for k in keys]
-    return f"{name:15} {f['doses']:5d} {' '.join(values)} {' '.join(f'{_or_nan(f[k]):6.1f}' for k in times)} {f['unknown']:5d}"
+    values += [f"{_or_nan(f[k]):6.1f}" for k in times]
+    return f"{name:15} {f['doses']:5d} {' '.join(values)} {f['aborted']:5d}"
 
 
 def _or_nan(value: float | None) -> float:
@@ -339,6 +341,7 @@ def _or_nan(value: float | None) -> float:
 
 
 def main() -> None:
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # type: ignore[union-attr]
     parser.add_argument("--final", action="store_true", help="the final seeds instead of the development seeds")
     parser.add_argument("--series", type=int, default=20, help="development series")

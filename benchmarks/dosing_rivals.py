@@ -1,4 +1,4 @@
-"""Rivals of the dose controller: open loop, fixed preact, learnt preact and PID, on the same bench and with the same cup.
+"""Rivals of the dose controller: open loop, fixed and learnt preact, and PID, on the same bench with the same cup.
 
 All of them know the geometry of the cup, the weighed content of the source, and the zero of the balance. They begin
 alike: fast to the earliest plausible onset, then slowly until two readings have risen.
@@ -61,6 +61,7 @@ class Rival:
 
     @property
     def reading(self) -> float:
+        """Last reading net of the receiver [kg]."""
         return self._readings[-1].mass - self._zero if self._readings else 0.0
 
     @property
@@ -72,6 +73,7 @@ class Rival:
         return (last[-1].mass - last[0].mass) / (last[-1].time - last[0].time)
 
     def step(self, time: float, tilt: float, readings: Sequence[DoseReading]) -> TiltCommand:
+        """See `actors.dosing.virtual_dosing_bench.Doser`."""
         self._readings = (self._readings + list(readings))[-40:]
         step, self._now, self._tilt = time - self._now, time, tilt
         if time > 45.0 and self.phase in ("approach", "pour"):
@@ -189,6 +191,7 @@ class OpenLoop(Rival):
         return min(max(4.0 * (aim - self._tilt - 0.07 * self._speed), -math.radians(30.0)), math.radians(15.0))
 
     def learn(self) -> None:
+        """See `Rival.learn`."""
         if self.weighed is not None:
             self.memory.volume = max(self.memory.volume - self.weighed / self.cup.density, 0.0)
 
@@ -208,11 +211,12 @@ class Preact(Rival):
         return self._follow(wanted, step)
 
     def learn(self) -> None:
+        """See `Rival.learn`."""
         super().learn()
         if self.gain > 0.0 and self.weighed is not None:
             error = self.weighed - self.amount
             if abs(error) < 5e-3 or not self.memory.errors:
-                self.memory.errors = (self.memory.errors + [error])[-4:]
+                self.memory.errors = [*self.memory.errors, error][-4:]
                 self.memory.preact += self.gain * math.fsum(self.memory.errors) / len(self.memory.errors)
 
 

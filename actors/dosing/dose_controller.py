@@ -159,6 +159,9 @@ PARK = math.radians(18.0)
 SEEN = 0.25e-3
 """Smallest rise of the reading that counts as the stream [kg]."""
 
+LATEST_ONSET = math.radians(1.5)
+"""Tilt by which outflow can begin later than expected, even after many doses: the lip may have dried [rad]."""
+
 LONGEST_DOUBT = 1.2
 """Time with implausible readings after which the cup is turned back [s]."""
 
@@ -232,7 +235,7 @@ class DoseController:
         self._factor_before = float(np.median(belief.flow_factor))
         self._idle_since: float | None = None
         self._late_volume = float(belief.volume.mean() - 2.0 * belief.volume.std())
-        self._late_onset = float(belief.onset_bias.mean() + 2.0 * belief.onset_bias.std())
+        self._late_onset = float(belief.onset_bias.mean() + max(2.0 * belief.onset_bias.std(), LATEST_ONSET))
         self._late_factor = 0.7 * self._factor_before
         self._late_mass, self._late_flow = 0.0, 0.0
         self.fine_flow = settings.smallest_flow
@@ -275,14 +278,14 @@ class DoseController:
         if paused and tilt > 0.0:
             self._turn_back()  # the arm has turned back by itself
         self._watch()
-        speed = {
+        decide = {
             DosePhase.CHECK: self._check,
             DosePhase.APPROACH: self._approach,
             DosePhase.POUR: self._pour,
             DosePhase.RETURN: self._return,
             DosePhase.SETTLE: self._settle,
-            DosePhase.DONE: lambda: 0.0,
-        }[self.phase]()
+        }.get(self.phase)
+        speed = 0.0 if decide is None else decide()
         self._speed = speed
         return TiltCommand(speed, self.phase is DosePhase.DONE)
 
@@ -474,11 +477,17 @@ class DoseController:
             self._turn_back()
         elif self._nearly_empty():
             self._turn_back(DoseEnd.SOURCE_EMPTY)
-        elif self._late_mass - net - self._late_flow > max(2.5e-3, 0.3 * self._late_mass) or (
-            self.phase is DosePhase.POUR and float(np.median(e.flow_factor)) < 0.3 * self._factor_before
+        elif self._rate() < 0.5 * max(self._late_flow, 1e-3) and (
+            self._late_mass - net - self._late_flow > max(2.5e-3, 0.3 * self._late_mass)
+            or (self.phase is DosePhase.POUR and float(np.median(e.flow_factor)) < 0.3 * self._factor_before)
         ):
             left = float(np.median(e.volume))
             self._turn_back(DoseEnd.SOURCE_EMPTY if left < 0.08 * self._cup.capacity else DoseEnd.STREAM_MISSED)
+
+    def _rate(self) -> float:
+        """Slope of the last readings [kg/s]."""
+        first, last = self._recent[max(len(self._recent) - 7, 0)], self._recent[-1]
+        return (last.mass - first.mass) / (last.time - first.time) if last.time > first.time else math.inf
 
     def _nearly_empty(self) -> bool:
         """Whether hardly anything has flowed for a second although the cup is tilted as far as it goes."""

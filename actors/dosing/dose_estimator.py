@@ -240,7 +240,8 @@ class DoseEstimator:
     def predicted(self, time: float) -> Floats:
         """Predicted reading at a time within the last step or after it (N,) [kg]."""
         part = min(max((self.time - time) / TIME_STEP, 0.0), 1.0)
-        return (1.0 - part) * self._lags[3] + part * self._before
+        predicted: Floats = (1.0 - part) * self._lags[3] + part * self._before
+        return predicted
 
     def deviation(self) -> float:
         """Standard deviation of a reading at the current flow: display, slosh and impact [kg]."""

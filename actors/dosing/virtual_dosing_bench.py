@@ -6,12 +6,12 @@ not the model of `actors.dosing.dose_estimator`:
 | part | here |
 |---|---|
 | cup | a straight cylinder with a spout that protrudes beyond the rim, or with a round rim |
-| onset | a dry lip holds the liquid back and then gushes; a wet one holds less; it dries between doses; grip error |
-| flow | discharge that depends on the head, fluctuations, slosh that the arm excites, a film that drains late, drops |
-| dribble | below a Weber number, a part runs down the outside: half of it falls into the receiver later, half is spilled |
+| onset | a dry lip holds the liquid back and gushes; a wet one holds less and dries slowly; grip error |
+| flow | discharge that depends on the head, fluctuations, slosh, a film that drains late, drops |
+| dribble | below a Weber number a part runs down the outside: half of it falls later, half is spilled |
 | stream | falls from a height that changes, with initial speed, spread in time; its impact fluctuates |
-| balance | first order, Butterworth of fourth order, moving average, or switching lag; interval, delay, display step, noise |
-| arm | command over a register with a counter; speed and acceleration limits, servo lag; tilts back after 0.2 s without news |
+| balance | first order, Butterworth of fourth order, moving average, switching lag; delay, display, noise |
+| arm | commands at 10 or 20 Hz; limits of speed and acceleration, servo lag; back after 0.2 s without news |
 
 `DosingFault` disturbs a dose. Every dose is deterministic for a seed.
 
@@ -365,8 +365,10 @@ class VirtualDosingBench:
             outflow = 0.0
             if head > 0.0 and self.volume > 0.0:
                 ideal = self._flow_table(tilt, math.sqrt(head))
-                wide = max(cup.spout_width * math.sqrt(min(head / max(cup.spout_length, 1e-9), 1.0)) if spouted else 0.0,
-                           2.0 * math.sqrt(2.0 * cup.radius * head) if not spouted else 0.0, 1e-4)  # fmt: skip
+                wide = 2.0 * math.sqrt(2.0 * cup.radius * head)
+                if spouted:
+                    wide = cup.spout_width * math.sqrt(min(head / cup.spout_length, 1.0))
+                wide = max(wide, 1e-4)
                 outflow = (self._discharge + 0.06 * math.tanh(head / 4e-3)) * ideal
                 viscous = 0.8 * wide * GRAVITY * head**3 / (3.0 * nu)
                 outflow = outflow * viscous / (outflow**1.5 + viscous**1.5) ** (1.0 / 1.5)

@@ -170,7 +170,7 @@ def test_a_stream_beside_the_receiver_is_stopped() -> None:
     record, controller = one_dose(0.1, DosingFault("miss", 0.0))
     assert controller.result is not None
     assert controller.result.end is DoseEnd.STREAM_MISSED
-    assert record.spilled < 0.06  # the onset is known to 1.2° only, 8 g per degree
+    assert record.spilled < 0.08  # before the first dose the onset is known to 1.2° only, 8 g per degree
 
 
 def test_an_empty_source_ends_the_dose_short() -> None:

@@ -18,7 +18,8 @@ NUMBER, STATUS = 12, 13
 """Integer outputs: the number of the motion whose program runs, and its status."""
 
 CLOCK, TOOL = 12, 13
-"""Double outputs: time on the path [s], in a dose the tilt [rad]; from `TOOL` on, the six values of the controller's tool."""
+"""Double outputs: time on the path [s], in a dose the tilt [rad]; from `TOOL` on, the six values of the controller's
+tool."""
 
 READY, RUNNING, DONE, STOPPED = 1, 2, 3, 4
 """Statuses: ready and waiting for `GO`; moving; arrived; stopped by order."""
