@@ -342,7 +342,7 @@ def _or_nan(value: float | None) -> float:
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # type: ignore[union-attr]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--final", action="store_true", help="the final seeds instead of the development seeds")
     parser.add_argument("--series", type=int, default=20, help="development series")
     parser.add_argument("--first", type=int, default=0, help="first development seed")

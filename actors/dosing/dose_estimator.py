@@ -180,7 +180,8 @@ class DoseEstimator:
     @property
     def reading(self) -> Floats:
         """Predicted reading now (N,) [kg]."""
-        return self._lags[3]
+        last: Floats = self._lags[3]
+        return last
 
     def start(self, time: float, tilt: float) -> None:
         """Set the time [s] and the tilt [rad] from which `advance` continues."""
