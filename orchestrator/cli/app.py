@@ -171,6 +171,12 @@ _add(
     "decant robot jog configs/laboratories/ur10-kern.yaml --enable-motion",
     to=_robot,
 )
+_add(
+    robot_commands.home,
+    "decant robot home configs/laboratories/virtual.yaml        # practise without a robot",
+    "decant robot home configs/laboratories/ur10-kern.yaml --enable-motion",
+    to=_robot,
+)
 
 _server = _group("server", "Run a laboratory as a service.")
 _add(
