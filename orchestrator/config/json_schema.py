@@ -36,6 +36,13 @@ def study_schema() -> dict[str, Any]:
     return _schema(StudyFile, "Study")
 
 
+def daemon_schema() -> dict[str, Any]:
+    """Schema of the settings file of a daemon."""
+    from orchestrator.daemon.daemon_settings import DaemonFile
+
+    return _schema(DaemonFile, "Daemon")
+
+
 def result_schema() -> dict[str, Any]:
     """Schema of a run's `summary.json`, with every kind of result."""
     from orchestrator.results.run_summary import summary_schema
@@ -48,6 +55,7 @@ SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "vessel": vessel_schema,
     "laboratory": laboratory_schema,
     "study": study_schema,
+    "daemon": daemon_schema,
     "result": result_schema,
 }
 """Functions that create the schemas, by the names of the schema files."""
