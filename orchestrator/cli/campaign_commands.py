@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 _TOLD = {
     "prediction",
-    "prediction_band",
+    "prediction_interval",
     "at_bounds",
     "predicted_delivered_g",
     "predicted_delivered_ml",

@@ -184,9 +184,11 @@ def plugins(as_json: Json = False) -> None:
 
 
 def schema(
-    which: Annotated[str, typer.Argument(help="campaign, study, vessel, laboratory, daemon, or result.")] = "campaign",
+    which: Annotated[
+        str, typer.Argument(help="campaign, study, vessel, laboratory, daemon, result, or output.")
+    ] = "campaign",
 ) -> None:
-    """Print the JSON schema of campaign files (editors use it for completion), of other files, or of summary.json."""
+    """Print a JSON schema: of campaign or other files, for editors; of summary.json; of the output of `--json`."""
     from orchestrator.config.json_schema import SCHEMAS, schema_text
 
     if which not in SCHEMAS:

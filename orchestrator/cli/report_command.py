@@ -9,10 +9,7 @@ import typer
 
 from orchestrator.cli.command_options import Json, Quiet
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message, print_note
-from orchestrator.cli.shell_completion import files_of, local_runs
-
-RUNS = Path("runs")
-"""Folder in which names without a folder are searched."""
+from orchestrator.cli.shell_completion import RUNS, files_of, local_runs
 
 
 def report(

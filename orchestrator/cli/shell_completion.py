@@ -11,6 +11,9 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+RUNS = Path("runs")
+"""Folder in which commands search runs that are given by name."""
+
 DEPTH = 3
 """Number of folder levels that are searched for files."""
 
@@ -76,7 +79,6 @@ def catalogued_runs(incomplete: str) -> list[str]:
 
 def local_runs(incomplete: str) -> list[str]:
     """Names of the runs in the folder runs/."""
-    from orchestrator.cli.report_command import RUNS
     from orchestrator.journal.journal import JOURNAL_NAME
 
     return sorted(
@@ -117,11 +119,12 @@ def _values(column: str) -> Iterator[str]:
 
 def queued_campaigns(incomplete: str) -> list[str]:
     """Ids of the daemon's newest campaigns; none if no daemon answers."""
-    from orchestrator.cli.console import RefusalError
-    from orchestrator.cli.queue_commands import connected_client
+    from orchestrator.run_errors import RunError
 
     try:
-        with connected_client(None, None) as client:
+        from orchestrator.daemon.daemon_client import Client
+
+        with Client() as client:
             return [one["id"] for one in client.get("/campaigns", limit=50) if one["id"].startswith(incomplete)]
-    except RefusalError:
+    except (ImportError, OSError, RunError):
         return []

@@ -1,4 +1,4 @@
-"""JSON schemas of the input files, for completion and checks in editors, and of `summary.json`, for programs."""
+"""JSON schemas: of input files, for editors; of `summary.json` and the output of commands, for programs."""
 
 from __future__ import annotations
 
@@ -50,6 +50,13 @@ def result_schema() -> dict[str, Any]:
     return {"$schema": DIALECT, **summary_schema()}
 
 
+def output_schema() -> dict[str, Any]:
+    """Schema of the output of commands with `--json`; its properties are the commands."""
+    from orchestrator.cli import json_output
+
+    return {"$schema": DIALECT, **json_output.output_schema()}
+
+
 SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "campaign": campaign_schema,
     "vessel": vessel_schema,
@@ -57,6 +64,7 @@ SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "study": study_schema,
     "daemon": daemon_schema,
     "result": result_schema,
+    "output": output_schema,
 }
 """Functions that create the schemas, by the names of the schema files."""
 
