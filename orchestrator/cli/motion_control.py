@@ -397,7 +397,7 @@ class EmptyCycle:
         print_message(str(error))
         if not self._ask:
             return
-        if not _yes("Find the cause and mend it. Shall the arm bring the pourer upright, slowly, and go home?"):
+        if not _yes("Find the cause and fix it. Shall the arm bring the pourer upright, slowly, and go home?"):
             return
         with contextlib.suppress(LaboratoryError):
             self._arm.release()
@@ -423,4 +423,4 @@ class EmptyCycle:
 
 def _yes(text: str) -> bool:
     print_message(f"\n{text}")
-    return typed_line("type 'yes' to go on > ").strip().lower() == "yes"
+    return typed_line("type 'yes' to continue > ").strip().lower() == "yes"

@@ -345,7 +345,7 @@ def _change(key: str | None, what: str, url: str | None, state: Path | None) -> 
     with connected_client(url, state) as client:
         found = client.post(f"/queue/{what}" if key is None else f"/campaigns/{key}/{what}")
     if key is None:
-        print("queue paused" if found["queue_paused"] else "queue goes on")
+        print("queue paused" if found["queue_paused"] else "queue resumed")
     else:
         print(f"{found['id']}: {found['state']}, wanted: {found['desired_state']}")
 
@@ -375,9 +375,9 @@ def estop(
     of = f" of {rig}" if rig else ""
     option = f" --rig {rig}" if rig else ""
     if clear:
-        print(f"emergency stop{of} cleared: what was given up rests until it is resumed")
+        print(f"emergency stop{of} cleared: abandoned campaigns wait until they are resumed")
     else:
-        print(f"EMERGENCY STOP{of}: the work is given up; nothing begins there before 'decant estop --clear{option}'")
+        print(f"EMERGENCY STOP{of}: the work is abandoned; nothing starts there before 'decant estop --clear{option}'")
 
 
 def answer(

@@ -86,7 +86,7 @@ def check(
         checks = look.checks(record, accept=f"decant robot check {laboratory} --accept-safety", virtual=virtual)
         checks += balance_diagnostics(ready.balance, tare=tare)
     checks += _packages(spec)
-    checks += [DeviceCheck("plug-in", "warn", str(one), f"mend or remove {one.package}") for one in broken()]
+    checks += [DeviceCheck("plug-in", "warn", str(one), f"repair or remove {one.package}") for one in broken()]
     failed = [check for check in checks if check.state == "fail"]
     if as_json:
         table = [dataclasses.asdict(check) for check in checks]
@@ -94,7 +94,7 @@ def check(
     else:
         print_table(checks)
     if failed:
-        raise RefusalError(f"{len(failed)} of {len(checks)} checks fail; nothing should move before they are mended")
+        raise RefusalError(f"{len(failed)} of {len(checks)} checks fail; nothing should move before they are fixed")
     print_message("ready" if all(check.state == "ok" for check in checks) else "ready, with warnings")
 
 

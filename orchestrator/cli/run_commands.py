@@ -302,8 +302,8 @@ def compare(
     outcomes = found["outcomes"]
     keys = dict.fromkeys(key for one in outcomes for key in one)
     ended = [_compared(key, heads, [one.get(key) for one in outcomes]) for key in keys]
-    print_table(asked or [_compared("(the same settings)", heads, [""] * len(heads))], title="asked for")
-    print_table(ended, title="came to")
+    print_table(asked or [_compared("(the same settings)", heads, [""] * len(heads))], title="settings")
+    print_table(ended, title="outcomes")
 
 
 @_command("decant runs tag quickstart-20300301-1 good paper", "decant runs tag RUN --remove good")

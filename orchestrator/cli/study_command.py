@@ -164,7 +164,9 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> CellStatus:
 
             return run_cells(plan, folder, jobs=jobs, watch=watch)
     except KeyboardInterrupt:
-        raise RefusalError(f"interrupted; nothing is lost. Go on with: decant study run {path}", INTERRUPTED) from None
+        raise RefusalError(
+            f"interrupted; nothing is lost. Continue with: decant study run {path}", INTERRUPTED
+        ) from None
 
 
 @contextlib.contextmanager
