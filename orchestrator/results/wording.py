@@ -215,7 +215,7 @@ def _open(row: ReceiverSummary) -> list[str]:
     if lost := [f"pour {pour.number}: {pour.failed}" for pour in confirming if pour.failed]:
         said.append(f"Confirming pours that failed: {'; '.join(lost)}.")
     if row.risk is None and row.recommended is not None:
-        said.append("Errors of grip, placement and speed entered only as far as they happened in these pours.")
+        said.append("Errors of grip, placement and speed are included only as they occurred in these pours.")
     return said + [f"Not simulated at this action, {one.kind}: {one.text}." for one in row.not_covered]
 
 
