@@ -266,6 +266,11 @@ class SerialBalance:
         self._tared = self._reference_lost = False
         self._losses = self._strange_units = 0
 
+    @property
+    def found(self) -> Detected | None:
+        """The balance as it was detected; None before it is connected."""
+        return self._conversation.found
+
     # Measurements.
 
     def connect(self) -> str:

@@ -187,7 +187,7 @@ class RecordedBalance(FarProcess):
         """Start the replay; unsolicited bytes arrive at their times, replies after their queries.
 
         Args:
-            recording: file made by `python -m actors.balance.record_line`.
+            recording: file made by `decant balance record`.
             speed: replay speed relative to the recording.
 
         Raises:
