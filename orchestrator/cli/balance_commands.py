@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -192,8 +193,7 @@ def _settings(target: str, given: list[str] | None) -> Iterator[tuple[SerialBala
     from orchestrator.cli.robot_commands import read_laboratory
 
     if not target.endswith((".yaml", ".yml")):
-        with Refused(ValueError):
-            yield SerialBalanceSettings(port=target, **_values(given)), None
+        yield _port_settings(target, given), None
         return
     if given:
         raise RefusalError("--set belongs to a port; a laboratory file has the settings", BAD_INPUT)
@@ -214,17 +214,32 @@ def _settings(target: str, given: list[str] | None) -> Iterator[tuple[SerialBala
         emulator.close()
 
 
-def _values(given: list[str] | None) -> dict[str, Any]:
-    """Parse 'key=value' settings; values are YAML."""
-    from ruamel.yaml import YAML
+def _port_settings(port: str, given: list[str] | None) -> SerialBalanceSettings:
+    """The settings of a balance at a port, checked as those of a file are.
 
-    values = {}
+    Raises:
+        RefusalError: a setting is invalid; lists all problems.
+    """
+    from actors.balance.balance_settings import SerialBalanceSettings
+    from orchestrator.config.yaml.section_validation import PlacedProblems, validate
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.config.yaml.yaml_source import Document, Place, Report
+
+    lines = [f"port: {json.dumps(port)}"]
     for text in given or ():
         key, equals, value = text.partition("=")
         if not equals:
             raise RefusalError(f"--set {text}: should be a key and a value, as dialect=kcp", BAD_INPUT)
-        values[key.strip()] = YAML(typ="safe", pure=True).load(value)
-    return values
+        lines.append(f"{key.strip()}: {value.strip()}")
+    with Refused(ConfigError):
+        report = Report()
+        place = Place(Document.parse("\n".join(lines), Path("--set")))
+        settings = validate(SerialBalanceSettings, place, report)
+        if settings is not None:
+            settings.check_laboratory(PlacedProblems(place, report), mode="hardware")
+        report.raise_if_any()
+    assert settings is not None, "settings without problems are settings"
+    return settings
 
 
 @contextlib.contextmanager

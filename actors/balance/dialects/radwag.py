@@ -21,6 +21,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 
 from actors.balance.dialects.dialect import Dialect, number_in, text_of
 from actors.balance.dialects.protocol_encoder import (
@@ -105,7 +106,7 @@ class Radwag(Dialect):
         """See `Dialect.encode`."""
         if reading.status not in _MARKS:
             raise ValueError(f"no line of this dialect says '{reading.status}'")
-        value = reading.value or 0
+        value = Decimal(0) if reading.value is None else reading.value
         sign = "-" if value < 0 else " "
         return line_of(f"SI  {_MARKS[reading.status]} {sign}{abs(value)!s:>9} {reading.unit:<3}")
 
