@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from actors.balance.balance_check import CheckOperator
     from actors.balance.balance_settings import BalanceEmulator, SerialBalanceSettings
     from actors.balance.line_recording import Recorder
-    from actors.balance.serial_balance import SerialBalance
     from actors.interfaces import DeviceCheck
 
 CHECK_SCALE = 4.0
@@ -255,13 +254,13 @@ def _tap(to: Path | None, target: str, virtual: bool, remarks: str = "") -> Iter
         yield Recorder(file, "virtual" if virtual else "hardware", about)
 
 
-def _driver(spec: SerialBalanceSettings, tap: Recorder | None) -> SerialBalance:
-    from actors.balance.serial_balance import SerialBalance
+def _driver(spec: SerialBalanceSettings, tap: Recorder | None) -> Any:
+    """The driver of the settings; its module is not imported here."""
+    driver, arguments = spec.driver("balance")
+    return driver(*arguments, tap)
 
-    return SerialBalance(spec, "balance", tap)
 
-
-def _finish(tap: Recorder | None, to: Path | None, driver: SerialBalance) -> None:
+def _finish(tap: Recorder | None, to: Path | None, driver: Any) -> None:
     """Add to the recording what was detected and the weights as they are understood today."""
     from actors.balance.line_recording import LineRecording
 
