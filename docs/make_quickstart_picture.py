@@ -1,4 +1,4 @@
-"""Compose docs/images/quickstart.png from a quickstart run: a pour, the pours with their predictions, the expected loss.
+"""Compose docs/images/quickstart.png from a quickstart run: a pour, the pours with their predictions and the loss.
 
 decant run configs/campaigns/quickstart.yaml
 python docs/make_quickstart_picture.py runs/quickstart-…   # its recommended action is simulated with its θ
