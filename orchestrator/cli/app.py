@@ -172,6 +172,12 @@ _add(
     "decant robot jog configs/laboratories/ur10-kern.yaml --enable-motion",
     to=_robot,
 )
+_add(
+    robot_commands.home,
+    "decant robot home configs/laboratories/virtual.yaml        # practise without a robot",
+    "decant robot home configs/laboratories/ur10-kern.yaml --enable-motion",
+    to=_robot,
+)
 
 _balance = _group("balance", "Check a balance before the first pour, and record its raw traffic.")
 _add(
