@@ -90,7 +90,11 @@ def driver(virtual: Any) -> Iterator[Callable[..., tuple[VirtualSerialBalance, S
         balance.close()
 
 
-@pytest.fixture(params=list(dialects()))
+VARIANTS = ("kcp", "kern-continuous", "ohaus")
+"""Dialects whose lines are much like those of another one: the long tests run them."""
+
+
+@pytest.fixture(params=[pytest.param(name, marks=[pytest.mark.slow] * (name in VARIANTS)) for name in dialects()])
 def each_dialect(request: pytest.FixtureRequest) -> str:
     name: str = request.param
     return name

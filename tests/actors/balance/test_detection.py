@@ -40,7 +40,14 @@ def unknown(virtual: Callable[[str], VirtualSerialBalance]) -> Iterator[Callable
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("voice", [voice for voice in OF_VOICE if voice != "sbi-at-stability"])
+@pytest.mark.parametrize(
+    "voice",
+    [
+        pytest.param(voice, marks=[pytest.mark.slow] * (voice not in dialects()))
+        for voice in OF_VOICE
+        if voice != "sbi-at-stability"
+    ],
+)
 def test_the_dialect_is_found_out_and_then_used(unknown, voice):
     far, balance = unknown(voice)
     said = balance.connect()

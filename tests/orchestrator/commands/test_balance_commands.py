@@ -11,6 +11,7 @@ from typer.testing import CliRunner, Result
 from actors.balance import balance_check
 from actors.balance.dialect_registry import dialects
 from actors.balance.line_recording import LineRecording
+from orchestrator.cli import balance_commands, motion_control
 from orchestrator.cli.app import app
 
 SHIPPED = Path(__file__).parents[3] / "configs" / "laboratories"
@@ -34,6 +35,14 @@ def test_the_balance_of_a_virtual_laboratory_is_checked_and_recorded_without_a_p
     day = LineRecording.load(path)
     assert day.source == "virtual"
     assert day.weights(dialects()[day.about["dialect"]]) == day.about["weights"]
+
+
+def test_a_mass_that_is_mistyped_is_asked_for_again(monkeypatch, capsys):
+    typed = iter(["200", "200 g", ""])
+    monkeypatch.setattr(motion_control, "typed_line", lambda prompt: next(typed))
+    person = balance_commands.Person()
+    assert (person.reference(), person.reference()) == (0.2, None)
+    assert "type '200 g' if that is what is meant" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
