@@ -352,11 +352,14 @@ class MinimumQuery(ProposalQuery):
         acquisition: see `AcquisitionName`.
         mean: prior mean of the surrogate. 'constant' is fitted; 'zero' is the paper's.
         plain: 'lcb' as in the paper: κ is constant, and no point only fills space on a plateau.
+        replicates: whether a proposal may repeat an observation. Without replicates the observations describe the whole
+            cost: every third point fills space, and the others are where the surrogate is uncertain.
     """
 
     acquisition: AcquisitionName = "lcb"
     mean: MeanName = "constant"
     plain: bool = False
+    replicates: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
