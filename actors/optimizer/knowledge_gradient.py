@@ -396,7 +396,7 @@ def proposals(
     candidates = np.concatenate([candidates, known])
     pour = acquisition.minimise(score, candidates, arrays.region, rng)
     left, allowed = min(query.discrepancy.pours_left, FORESIGHT), _allowed(process, query.discrepancy, feasibility)
-    if query.discrepancy.lookahead:
+    if query.discrepancy.lookahead and len(known):
         pour = looked_ahead(process, pour, candidates, known, left, allowed, feasibility)
     simulations = instructive(process, query.count - 1, candidates, score, pour, arrays.busy, arrays.region)
     return np.concatenate([pour[None, :], simulations])

@@ -48,8 +48,12 @@ WIDTH = 0.25
 RESTS = (0.02, 0.3)
 """Smallest and largest σ, in units of the largest cost; log-uniform, like ℓ."""
 LENGTHS = (0.15, 0.6)
-FARTHER = (0.4, 3.0)
-"""Range of factors on the standard deviations of an offset, log-uniform: tails for a bench that deviates far."""
+NEAR, FARTHER = (0.03, 0.4), (0.4, 3.0)
+"""Ranges of a hypothesis' factor s on the standard deviations of its offset, and up to 1 of g and h, too; log-uniform.
+The far ones are tails for a bench that deviates far."""
+NEAR_SHARE = 0.3
+"""Fraction of the hypotheses by which the simulator is nearly right. A first pour can thus rely on it; where it is
+wrong, that pour refutes them."""
 NOISES, NOISE_GROWTH = (0.002, 0.05), 0.15
 """Smallest and largest standard deviation of one observation at zero cost, log-uniform; and its increase at the largest
 cost."""
@@ -103,7 +107,10 @@ class Hypotheses:
         rows = np.clip(np.concatenate([rows, rows[:CONTRARY]]), 1e-6, 1.0 - 1e-6)
         z = ndtri(rows[:, : 2 * dimension])
         width, gain, rest, length, far, known, noise = rows[:, 2 * dimension :].T
-        spread, contrary = _evenly(FARTHER, far), np.arange(len(rows)) >= HYPOTHESES
+        near, contrary = far < NEAR_SHARE, np.arange(len(rows)) >= HYPOTHESES
+        beyond = (far - NEAR_SHARE) / (1.0 - NEAR_SHARE)
+        spread = np.where(near, _evenly(NEAR, far / NEAR_SHARE), _evenly(FARTHER, beyond))
+        less = np.minimum(spread, 1.0)
         scales, shifts = np.ones((len(rows), dimension)), np.zeros((len(rows), dimension))
         if discrepancy.drawn:
             index = np.minimum((known / KNOWN_SHARE * len(discrepancy.drawn)).astype(int), len(discrepancy.drawn) - 1)
@@ -120,8 +127,8 @@ class Hypotheses:
         return cls(
             factors * scales,
             factors * shifts + moved,
-            WIDTH * ndtri(width),
-            GAIN * ndtri(gain),
+            less * WIDTH * ndtri(width),
+            less * GAIN * ndtri(gain),
             np.where(contrary, _evenly((CONTRARY_REST, RESTS[1]), rest), _evenly(RESTS, rest)),
             _evenly(LENGTHS, length),
             _evenly(NOISES, noise),
