@@ -199,15 +199,35 @@ def test_what_was_learnt_with_one_receiver_makes_the_first_prediction_for_the_ne
     assert error(propose(told)) < 0.9 * error(propose(fresh))
 
 
-def test_the_order_of_what_is_known_changes_no_bit():
+def test_the_order_of_the_simulations_changes_no_bit():
     question = asked(displaced, POURED, acquisition="least_loss", count=3)
-    turned = replace(
-        question,
-        data=Data(question.data.points[::-1], question.data.costs[::-1]),
-        simulated=Data(question.simulated.points[::-1], question.simulated.costs[::-1]),
-    )
+    turned = replace(question, simulated=Data(question.simulated.points[::-1], question.simulated.costs[::-1]))
     first, second = propose(question), propose(turned)
     assert replace(first, seconds=0.0) == replace(second, seconds=0.0)
+
+
+GOOD = (0.35, 0.6)
+
+
+def on_a_changed_bench(costs):
+    """The same good action again and again."""
+    return asked(cup, [], acquisition="least_loss", data=Data((GOOD,) * len(costs), tuple(costs)))
+
+
+def test_two_pours_outside_their_intervals_are_taken_for_a_change_of_the_bench():
+    before = (0.0, 0.004, 0.0, 0.002, 0.0, 0.003)
+    assert propose(on_a_changed_bench(before)).discrepancy.since_change is None
+    assert propose(on_a_changed_bench((*before, 0.9))).discrepancy.since_change is None  # it may be a mishap
+    changed = propose(on_a_changed_bench((*before, 0.9, 0.92)))
+    assert changed.discrepancy.since_change == 2
+    assert np.linalg.norm(np.array(changed.points[0]) - GOOD) > 0.08
+    back = propose(on_a_changed_bench((0.9, 0.92, *before)))
+    assert np.linalg.norm(np.array(back.points[0]) - GOOD) < 0.08
+
+
+def test_a_second_change_is_noticed_like_the_first():
+    costs = (0.0, 0.004, 0.0, 0.002, 0.9, 0.92, 0.91, 0.9, 0.0, 0.003, 0.002)
+    assert propose(on_a_changed_bench(costs)).discrepancy.since_change == 3
 
 
 def test_question_and_answer_survive_the_journal():

@@ -96,6 +96,24 @@ def test_prior_simulations_are_not_made_at_one_place() -> None:
     assert near.sum(axis=1).max() <= 3
 
 
+def test_a_bench_that_changes_is_noticed_and_said() -> None:
+    poured = 0
+
+    def changing(action: Any, theta: Any, rng: Any) -> float:
+        nonlocal poured
+        poured += 1
+        x = action.x_offset + (0.0 if poured <= 4 else 0.02)
+        return narrow_cup(replace(action, x_offset=x), theta, rng)
+
+    strategy = adaptive(1, pours=7, prior_simulations=24)
+    StrategyHarness(narrow_cup, changing).run(strategy)
+    assert any(text.startswith("since pour 5 the bench behaves differently") for text in said(strategy))
+    trust = believed(strategy)
+    assert trust.changed_since == 5
+    assert "since pour 5" in trust.text
+    assert losses(strategy)[-1] < 0.1
+
+
 def test_a_result_with_what_was_said_survives_its_file() -> None:
     strategy = adaptive(pours=2)
     StrategyHarness(narrow_cup).run(strategy)
