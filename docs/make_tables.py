@@ -374,6 +374,44 @@ def command_line() -> str:
     return "\n".join(parts)
 
 
+def json_output() -> str:
+    """The output of every command with --json, from its schema."""
+    from orchestrator.cli.json_output import output_schema
+
+    schema = output_schema()
+    kinds, parts = schema["$defs"], []
+    for command, output in schema["properties"].items():
+        parts.append(f"## `decant {command} --json`\n")
+        for reference in output.get("anyOf", [output]):
+            model = kinds[reference["$ref"].rpartition("/")[2]]
+            rows = [
+                (f"`{key}`", _json_type(part), _prose(part.get("description")))
+                for key, part in model["properties"].items()
+            ]
+            parts.append(f"{_prose(model['description'])}\n\n{_table(('key', 'value', 'meaning'), rows)}")
+    return "\n".join(parts)
+
+
+def _json_type(part: Mapping[str, Any]) -> str:
+    if "anyOf" in part:
+        return " or ".join(dict.fromkeys(map(_json_type, part["anyOf"])))
+    if "$ref" in part:
+        return f"`{part['$ref'].rpartition('/')[2]}`"
+    if "enum" in part or "const" in part:
+        return ", ".join(f"`{word}`" for word in part.get("enum", [part.get("const")]))
+    match part.get("type"):
+        case "array":
+            return f"list of: {_json_type(part['items'])}" if "items" in part else "list"
+        case "object":
+            values = part.get("additionalProperties")
+            return f"mapping to: {_json_type(values)}" if isinstance(values, dict) else "mapping"
+        case None:
+            return "any"
+        case kind:
+            names = {"string": "text", "integer": "whole number", "boolean": "`true` or `false`", "null": "`null`"}
+            return names.get(str(kind), str(kind))
+
+
 def _usage(argument: Any) -> str:
     name = str(argument.metavar or argument.name.upper())
     name = f"{name}…" if argument.nargs == -1 else name
@@ -449,6 +487,7 @@ TABLES: dict[str, Callable[[], str]] = {
         for name in ("recorded", "recorded-run", "bands", "risk", "optimizers")
     },
     "command-line": command_line,
+    "output": json_output,
     "rest": rest,
     "events": events,
     "plugin-names": plugin_names,

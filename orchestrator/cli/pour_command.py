@@ -322,7 +322,7 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
     if hardware:
         confirm(laboratory, lines)
     else:
-        print_message(f"laboratory {laboratory.name}, virtual: nothing moves but numbers\n" + "\n".join(lines))
+        print_message(f"laboratory {laboratory.name}, virtual: no hardware moves\n" + "\n".join(lines))
     try:
         directory = create_run(dataclasses.replace(plan, name=f"{plan.name}-empty"))
         with reached(laboratory) as ready:

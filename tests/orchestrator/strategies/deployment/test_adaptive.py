@@ -69,7 +69,7 @@ def test_after_every_pour_it_says_how_far_the_simulator_is_to_be_trusted(simulat
     StrategyHarness(narrow_cup_biased, narrow_cup, beside=2).run(strategy)
     after = [text for text in said(strategy) if text.startswith("after pour")]
     assert [text.split(" the simulator ")[0] for text in after] == ["after pour 1", "after pour 2", "after pour 3"]
-    assert "that it says nothing of this bench" in after[-1]
+    assert "that it does not describe this bench" in after[-1]
     trust = believed(strategy)
     assert [one.pour for one in trust.after][-3:] == [1, 2, 3]
     assert not trust.alarm
@@ -137,7 +137,7 @@ def test_by_its_policy_it_ends_where_the_simulator_says_nothing() -> None:
     result = strategy.result()
     assert len(losses(strategy)) < 6
     assert result.ended is not None
-    assert "says nothing of this bench" in result.ended
+    assert "does not describe this bench" in result.ended
     assert result.recommended is not None
 
 
