@@ -235,7 +235,7 @@ class Hybrid(Deployment[D3Settings]):
             self._scalarization.weigh(exploring=True)
             # in the paper κ is constant, and no simulation only fills space
             known, pending, plain = self._simulated(), self._trials.pending(), not self._settings.adaptive
-            query = self._query(MinimumQuery, known, everything=False, pending=pending, plain=plain)
+            query = self._query(MinimumQuery, known, everything=False, pending=pending, plain=plain, replicates=plain)
             self._questions.put(query, "prior", simulate)
 
     def _next_pour(self) -> None:

@@ -125,6 +125,9 @@ class Believed(ResultPart):
     alarm: bool
     """Whether the probability is at or above the limit."""
 
+    changed_since: int | None = None
+    """Number of the first pour since which the bench has behaved differently; None if it has not."""
+
     text: str
     """The last state as a sentence."""
 
@@ -180,6 +183,7 @@ class SimulatorMonitor:
         self._after: list[Belief] = []
         self._latest: DiscrepancyFound | None = None
         self._followed: str | None = None
+        self._changed: int | None = None
         self._accepted = False
         self.decisions: list[Decision] = []
 
@@ -189,7 +193,11 @@ class SimulatorMonitor:
         """Record the conclusions of an answer, and log those of the latest pour."""
         known = [pour for pour in pours if pour.cost is not None]
         number = known[-1].number if known else 0
-        self._latest = found
+        self._latest, since = found, found.since_change
+        before, self._changed = self._changed, known[-since].number if since and since <= len(known) else None
+        if self._changed is not None and (before is None or self._changed > before + 1):
+            text = f"since pour {self._changed} the bench behaves differently: what was poured before no longer counts"
+            self.decisions.append(Decision(text, {"changed_since": float(self._changed)}, urgent=True))
         if self._after and self._after[-1].pour == number:
             return
         self._after.append(Belief(pour=number, ignorance=found.uninformative, gain=found.gain))
@@ -205,6 +213,8 @@ class SimulatorMonitor:
         share = self._latest.uninformative
         word = next((word for limit, word in WORDS if share < limit), "is wrong here")
         text = f"the simulator {word}: probability {_percent(share)} that it does not describe this bench"
+        if self._changed is not None:
+            text += f"; since pour {self._changed} the bench behaves differently"
         if share >= WORDS[-2][0]:
             return text
         moved = [
@@ -303,6 +313,7 @@ class SimulatorMonitor:
             policy=self._rules.discrepancy_policy.policy,
             followed=self._followed,
             alarm=share >= self._rules.discrepancy_policy.limit,
+            changed_since=self._changed,
             text=self.text,
         )
 
