@@ -19,7 +19,6 @@ from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError
 from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath, PourPath
 from actors.arm.planning.kinematics import (
-    MODELS,
     cell_transforms,
     flange_transforms,
     forward,
@@ -278,7 +277,7 @@ def jog_path(spec: UrArmSettings, joints: Joints, axis: str, amount: float, spee
 
 
 def _tool_steps(spec: UrArmSettings, start: FloatArray, axis: str, amounts: FloatArray) -> FloatArray:
-    model, tool = MODELS[spec.model], cell_transforms(spec).tool
+    model, tool = spec.robot, cell_transforms(spec).tool
     rotation, position = forward(start[None], model)
     rotations, positions = np.repeat(rotation, _POINTS, axis=0), np.repeat(position, _POINTS, axis=0)
     along = np.eye(3)[AXES.index(axis) % 3]
@@ -307,7 +306,7 @@ def _turn(axis: FloatArray, angle: float) -> FloatArray:
 
 
 def _check(spec: UrArmSettings, points: FloatArray) -> None:
-    model = MODELS[spec.model]
+    model = spec.robot
     for name, positions, most in zip(JOINT_NAMES, points.T, model.joint_range, strict=True):
         if np.abs(positions).max() > most:
             raise ArmRefusedError(f"{name} would leave its range")

@@ -29,7 +29,7 @@ from actors.arm.arm_interface import (
 )
 from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import ExecutedPath, PourPath
-from actors.arm.planning.kinematics import MODELS, cell_transforms, forward
+from actors.arm.planning.kinematics import cell_transforms, forward
 from actors.arm.planning.path_checks import recheck
 from actors.arm.ur.dashboard import DashboardError, stop_program
 from actors.arm.ur.executed_motion import Stops, StopTimes, executed_path
@@ -83,7 +83,9 @@ class UrArm:
             raise ArmRefusedError("the arm has no address; give the controller's, or have a virtual one started")
         with self._at_work("connecting"):
             self.lock()
-            return self._session.open()
+            facts = self._session.open()
+            self._spec = self._spec.fitted_to(facts)
+            return facts
 
     def facts(self) -> UrFacts:
         """See `Arm.facts`."""
@@ -109,7 +111,7 @@ class UrArm:
         from scipy.spatial.transform import Rotation
 
         joints = self.joints()
-        rotation, position = forward(np.array([joints]), MODELS[self._spec.model])
+        rotation, position = forward(np.array([joints]), self._spec.robot)
         tool = cell_transforms(self._spec).tool
         x, y, z = map(float, position[0] + rotation[0] @ tool.position)
         rx, ry, rz = map(float, Rotation.from_matrix(rotation[0] @ tool.rotation).as_rotvec())
@@ -152,11 +154,13 @@ class UrArm:
     def move_to_start(self, path: PourPath) -> None:
         """See `Arm.move_to_start`."""
         with self._at_work("moving"):
+            self._check_calibration(path)
             self._go(MotionSegment.of("approach", path.approach, self._spec))
 
     def execute(self, path: PourPath) -> ExecutedPath:
         """See `Arm.execute`; the encoders are sampled `spec.rate` times per second of the clock."""
         with self._at_work("pouring"):
+            self._check_calibration(path)
             self._last_pour = path
             executed = self._go(MotionSegment.of_pour(path))
             self._tilt = float(path.tilts[-1])
@@ -266,6 +270,15 @@ class UrArm:
             raise ArmNotReleasedError("the arm is locked: an operator has to release it before it moves")
         return released
 
+    def _check_calibration(self, path: PourPath) -> None:
+        own = self._spec.robot.parameters.checksum
+        if path.calibration not in (None, own):
+            raise ArmRefusedError(
+                f"the pour was planned for a robot with {_kinematics(path.calibration)}, this one has "
+                f"{_kinematics(own)}: millimetres and a degree apart. Plan it again with the connected robot's facts "
+                "(`ArmSettings.fitted_to`)"
+            )
+
     def _go(self, segment: MotionSegment) -> ExecutedPath:
         """Execute one motion to its end."""
         stops = self._stops.count  # before consent is checked, so that a stop in between counts
@@ -332,6 +345,10 @@ class UrArm:
             self._session.kill()
             raise ArmLostError(f"{outcome.text}. {segment.last_seen(outcome.clock)}", executed)
         raise segment.stopped(outcome, executed)
+
+
+def _kinematics(checksum: str | None) -> str:
+    return f"calibration {checksum}" if checksum else "nominal lengths"
 
 
 class AcceptedArm(UrArm):

@@ -6,7 +6,9 @@ write input registers 18 … 22 and read output registers 12 … 19.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+
+from actors.arm.ur.primary_interface import RobotState
 
 STOP_ORDER, HEARTBEAT, GO = 19, 20, 21
 """Integer inputs. An order is the number of its motion, so that an old order has no effect."""
@@ -216,7 +218,4 @@ class Facts:
     remote: bool | None
     program: str
     reading: DataPackage
-    checksum: str
-    tool: tuple[float, ...]
-    ranges: tuple[tuple[float, float], ...] = field(default=())
-    speeds: tuple[float, ...] = field(default=())
+    state: RobotState
