@@ -146,8 +146,8 @@ _SINGULAR_WRIST = 1e-6
 """Below this |sin q5| joints 4 and 6 turn about the same axis, and q6 keeps its given value."""
 
 
-_SHIFTS = 12
-"""Largest number of shifts; each leaves a few percent of the error."""
+_SHIFTS = 40
+"""Largest number of shifts; each leaves a few percent of the error, and more near a singularity."""
 
 
 class Kinematics:
@@ -290,13 +290,13 @@ class Kinematics:
         target = flange
         for _ in range(_SHIFTS):
             if q is None:
-                break
+                return None
             there = self.flange(q)
             if distance(there[1], flange[1]) < 1e-9 and angle_between(there[0], flange[0]) < 1e-9:
-                break
+                return q
             target = compose(compose(flange, invert(there)), target)
             q = self._nominal_nearest(target, q)
-        return q
+        return None
 
     def _nominal_nearest(self, flange: Transform, near: Sequence[float]) -> Joints | None:
         best: Joints | None = None
