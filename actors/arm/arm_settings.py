@@ -20,6 +20,8 @@ from functools import lru_cache
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
+from pydantic import Field, Strict
+
 from actors.arm.arm_geometry import ArmLimits, Centre, JointAngles, Mount, Pose, RobotCell, Speed
 from actors.arm.ur.robot_models import MODELS, Calibration, RobotModel
 from actors.interfaces import DeviceCheck
@@ -284,6 +286,9 @@ class UrArmSettings(ArmSettings):
 
     rate: Annotated[float, Quantity("1/s", "125 Hz", 100.0, 500.0)] = 125.0
     """Rate at which the joints are read back."""
+
+    registers: Annotated[int, Strict(), Field(ge=0, le=45), NOT_IN_FINGERPRINT] = 43
+    """First of the three integer inputs of the controller that are written; 0 to 23 are reserved for a fieldbus."""
 
     cell: Annotated[RobotCell, SET_BY_PROGRAM]
     """Objects around the arm: the laboratory's section `cell`."""

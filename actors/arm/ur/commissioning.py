@@ -25,7 +25,7 @@ from actors.arm.ur.controller_readout import (
 from actors.arm.ur.primary_interface import RobotState
 from actors.arm.ur.robot_comparison import robot_checks
 from actors.arm.ur.robot_models import same_robot
-from actors.arm.ur.worker_messages import why_not_ready
+from actors.arm.ur.worker_messages import SAFETY_MODES, safety_mode, why_not_ready
 from actors.interfaces import DeviceCheck, State
 
 TOOL_TOLERANCE, TURN_TOLERANCE = 1e-3, math.radians(0.5)
@@ -344,18 +344,10 @@ def _robot_mode(mode: str) -> DeviceCheck:
     )
 
 
-def _safety_mode(mode: str) -> DeviceCheck:
-    advice = {
-        "NORMAL": "",
-        "REDUCED": "pours are planned within the normal limits: end the reduced mode, at the pendant or its input",
-        "PROTECTIVE_STOP": "find the cause, then unlock it on the teach pendant; Decant never does so by itself",
-        "RECOVERY": "the arm is outside its limits: bring it back by hand in the recovery mode of the teach pendant",
-        "SAFEGUARD_STOP": "a door, mat or light curtain holds it: close it",
-        "SYSTEM_EMERGENCY_STOP": "release the emergency stop, once you know why it was pressed",
-        "ROBOT_EMERGENCY_STOP": "release the emergency stop, once you know why it was pressed",
-    }.get(mode, "look at the teach pendant; a fault of the safety system needs a restart, or the maker's service")
-    state: State = "ok" if mode == "NORMAL" else "fail"
-    return DeviceCheck("safety", state, mode.lower().replace("_", " ") or "not told", advice)
+def _safety_mode(word: str) -> DeviceCheck:
+    mode = next((mode for mode in SAFETY_MODES.values() if mode.word == word), safety_mode(0))
+    state: State = "ok" if word == "NORMAL" else "fail"
+    return DeviceCheck("safety", state, word.lower().replace("_", " ") or "not told", mode.advice)
 
 
 def _checksum(found: Findings, record: SafetyRecord | None, accept: str, *, virtual: bool) -> DeviceCheck:

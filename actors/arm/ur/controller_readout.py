@@ -29,7 +29,7 @@ from actors.arm.ur.robot_models import model_named
 from actors.arm.ur.worker_messages import STANDSTILL
 from actors.interfaces import LaboratoryError
 
-SCRIPTS, RTDE = 30003, 30004
+SCRIPTS, RTDE = 30003, rtde.PORT
 PORTS: dict[int, str] = {
     dashboard_port.PORT: "dashboard",
     primary.PORT: "primary interface",
@@ -135,36 +135,12 @@ def read_exchange(address: str, rate: float = 125.0, seconds: float = 1.0, patie
     """
     try:
         with socket.create_connection((address, RTDE), timeout=patience) as connection:
-            return _exchange(_Rtde(connection), rate, seconds)
+            return _exchange(rtde.Requests(connection), rate, seconds)
     except (OSError, struct.error, rtde.PackageError) as error:
         raise ReadoutError(f"RTDE at {address} doesn't answer as it should: {error}") from error
 
 
-class _Rtde:
-    """Requests and responses on one connection."""
-
-    def __init__(self, connection: socket.socket) -> None:
-        self._connection = connection
-        self._packages = rtde.PackageReader()
-        self._waiting: list[tuple[int, bytes]] = []
-
-    def ask(self, kind: int, payload: bytes = b"") -> bytes:
-        self._connection.sendall(rtde.package(kind, payload))
-        while True:
-            got, answer = self.next()
-            if got == kind:
-                return answer
-
-    def next(self) -> tuple[int, bytes]:
-        while not self._waiting:
-            data = self._connection.recv(65536)
-            if not data:
-                raise OSError("it hung up")
-            self._waiting.extend(self._packages.feed(data))
-        return self._waiting.pop(0)
-
-
-def _exchange(connection: _Rtde, rate: float, seconds: float) -> Exchange:
+def _exchange(connection: rtde.Requests, rate: float, seconds: float) -> Exchange:
     if connection.ask(rtde.REQUEST_PROTOCOL_VERSION, struct.pack(">H", 2)) != b"\x01":
         raise OSError("it doesn't know protocol 2")
     trips = []
@@ -208,7 +184,7 @@ def _exchange(connection: _Rtde, rate: float, seconds: float) -> Exchange:
     )
 
 
-def _known(connection: _Rtde, names: Sequence[str], rate: float) -> dict[str, str]:
+def _known(connection: rtde.Requests, names: Sequence[str], rate: float) -> dict[str, str]:
     """The requested values that this controller has, with their types; it sends them from now on."""
     while True:
         answer = connection.ask(rtde.SETUP_OUTPUTS, struct.pack(">d", rate) + ",".join(names).encode("ascii"))

@@ -192,6 +192,12 @@ class MotionSegment:
             raise ArmRefusedError("a pour's path has a tilt for each of its times, and phases")
         return cls(checked(path.pour), path.phases, path.tilts)
 
+    def slowed(self, factor: float) -> MotionSegment:
+        """The same motion at a fraction of its speed."""
+        path = JointPath(self.path.times / factor, self.path.joints)
+        phases = tuple((name, start / factor, end / factor) for name, start, end in self.phases)
+        return MotionSegment(path, phases, self.tilts)
+
     @property
     def name(self) -> str:
         """Name of its first phase."""

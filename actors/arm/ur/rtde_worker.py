@@ -97,10 +97,10 @@ class Worker:
 
     # ---- requests
 
-    def open(self, address: str, rate: float, silence: float) -> DataPackage:
+    def open(self, address: str, rate: float, silence: float, registers: int) -> DataPackage:
         """Connect; nothing moves."""
         self._address = address
-        self._client = RtdeClient(address, rate, silence)
+        self._client = RtdeClient(address, rate, silence, registers)
         return self._client.fresh()
 
     @property

@@ -36,7 +36,7 @@ from actors.arm.ur.executed_motion import Stops, StopTimes, executed_path
 from actors.arm.ur.motion_segments import MotionSegment, jog_path, upright_way, way_home
 from actors.arm.ur.ur_session import ANSWER_TIME, Session, UrFacts
 from actors.arm.ur.urscript_writer import path_program
-from actors.arm.ur.worker_messages import DataPackage, MotionOrder, MotionOutcome, MotionSettings
+from actors.arm.ur.worker_messages import REDUCED, DataPackage, MotionOrder, MotionOutcome, MotionSettings
 from actors.interfaces import LaboratoryError
 
 RECOVERY_TIME = 90.0
@@ -44,6 +44,10 @@ RECOVERY_TIME = 90.0
 
 MOTION_MARGIN = 40.0
 """Time beyond twice its planned duration after which a motion's worker counts as blocked [s]."""
+
+IN_REDUCED_MODE = 0.25
+"""Fraction of the speed of a motion in reduced mode: 100 mm/s at most, and below the speeds that installations limit
+it to."""
 
 STOP_TIME = 1.0
 """Time for each means of stopping before the next one is tried [s]."""
@@ -155,14 +159,14 @@ class UrArm:
         """See `Arm.move_to_start`."""
         with self._at_work("moving"):
             self._check_calibration(path)
-            self._go(MotionSegment.of("approach", path.approach, self._spec))
+            self._go(MotionSegment.of("approach", path.approach, self._spec), pours=True)
 
     def execute(self, path: PourPath) -> ExecutedPath:
         """See `Arm.execute`; the encoders are sampled `spec.rate` times per second of the clock."""
         with self._at_work("pouring"):
             self._check_calibration(path)
             self._last_pour = path
-            executed = self._go(MotionSegment.of_pour(path))
+            executed = self._go(MotionSegment.of_pour(path), pours=True)
             self._tilt = float(path.tilts[-1])
             return executed
 
@@ -279,21 +283,28 @@ class UrArm:
                 "(`ArmSettings.fitted_to`)"
             )
 
-    def _go(self, segment: MotionSegment) -> ExecutedPath:
-        """Execute one motion to its end."""
+    def _go(self, segment: MotionSegment, *, pours: bool = False) -> ExecutedPath:
+        """Execute one motion to its end.
+
+        Args:
+            segment: the motion.
+            pours: it carries or pours liquid. Other motions are allowed in reduced mode, where they are slowed.
+        """
         stops = self._stops.count  # before consent is checked, so that a stop in between counts
         released, spec = self._consent(), self._spec
+        if not pours and self._session.ask("read").safety_mode == REDUCED:
+            segment = segment.slowed(IN_REDUCED_MODE)
         path = segment.path
         if segment.name != "jog":  # a jog has its own checks, since it may be the way back inside the limits
             recheck(path, spec)
         facts = self._session.facts
         if facts is None:
             raise ArmLostError("the arm is not connected; connect first")
-        settings = MotionSettings(tuple(spec.tool.as_list), spec.payload, spec.payload_centre.vector)
+        settings = MotionSettings(tuple(spec.tool.as_list), spec.payload, spec.payload_centre.vector, spec.registers)
         number = next(_numbers)
         program = path_program(path, settings, number, cb3=not facts.e_series)
         start, end = (tuple(map(float, path.joints[k])) for k in (0, -1))
-        motion = MotionOrder(program, number, start, end, path.duration, settings, stops)
+        motion = MotionOrder(program, number, start, end, path.duration, settings, stops, pours)
         self._announced, self._segment = True, segment
         self._session.forget_progress()
         self._stops.begin()

@@ -26,11 +26,11 @@ from actors.arm.ur.robot_comparison import robot_problems
 from actors.arm.ur.robot_models import Calibration
 from actors.arm.ur.worker_messages import (
     ROBOT_MODES,
-    SAFETY_MODES,
     SILENCE,
     Facts,
     MotionProgress,
     TroubleError,
+    safety_mode,
     why_not_ready,
 )
 from actors.runtime.child_process import ConnectedProcess
@@ -84,7 +84,7 @@ def facts_of(worker_facts: Facts) -> UrFacts:
         version=".".join(map(str, worker_facts.version)),
         problem=why_not_ready(r.robot_mode, r.safety_mode, r.runtime, r.slider),
         robot_mode=ROBOT_MODES.get(r.robot_mode, str(r.robot_mode)),
-        safety_mode=SAFETY_MODES.get(r.safety_mode, str(r.safety_mode)),
+        safety_mode=safety_mode(r.safety_mode).text,
         remote=worker_facts.remote,
         checksum=state.checksum,
         calibration="" if state.calibration is None else state.calibration.checksum,
@@ -238,7 +238,7 @@ class Session:
         # controller.
         silence = SILENCE if spec.time_scale == 1.0 else 8.0 * SILENCE
         try:
-            self.ask("open", spec.address, spec.rate, silence, deadline=OPEN_TIME)
+            self.ask("open", spec.address, spec.rate, silence, spec.registers, deadline=OPEN_TIME)
             facts: Facts = self.ask("facts")
             self.facts = facts_of(facts)
             problems = robot_problems(spec, facts.model, facts.version, facts.state, rests=facts.reading.stands)

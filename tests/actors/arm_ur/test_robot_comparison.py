@@ -76,7 +76,10 @@ def test_a_simulator_is_nominal() -> None:
     [
         ({"kind": 7}, r"is a UR10E of type 7 .* set up as UR10E, type 2: is this the right controller"),
         ({"lengths": (0.0, -0.7, *first_state("ur10e").lengths[2:])}, r"a link that differs by 87.3 mm from a UR10E's"),
-        ({"joint_speeds": (2.0, 2.0, 2.0, 3.2, 3.2, 3.2)}, r"limits joint 1 \(base\) to 115 deg/s; the file allows 120 deg/s"),
+        (
+            {"joint_speeds": (2.0, 2.0, 2.0, 3.2, 3.2, 3.2)},
+            r"limits joint 1 \(base\) to 115 deg/s; the file allows 120",
+        ),
         ({"joint_accelerations": (40.0, 5.0, 40.0, 40.0, 40.0, 40.0)}, r"limits a joint to 286 deg/s².*lower 'appr"),
         ({"joint_ranges": ((-0.1, 0.1),) * 6}, r"does not allow joint 1 \(base\) of 'home': correct 'home'"),
         ({"calibration": None}, r"tool [2-9].* mm and 0\.\d+ deg from where .* switch the controller off and on"),

@@ -62,7 +62,7 @@ class PrimaryServer:
                 safety_mode=mode,
                 joint_mode=253 if power.running else 255 if power.powered else 239,
                 slider=robot.mover.slider,
-                scaling=robot.mover.rate,
+                scaling=robot.mover.scaling,
                 q=robot.q,
                 target_q=robot.mover.q,
                 qd=robot.qd,
