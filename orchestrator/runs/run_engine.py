@@ -34,6 +34,7 @@ from orchestrator.runs.events import (
 )
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor, RequestExecutorError
+from orchestrator.runs.request_forecast import RequestForecast
 from orchestrator.runs.resume import (
     AskOperator,
     OperatorNeededError,
@@ -44,7 +45,6 @@ from orchestrator.runs.resume import (
     settle_unknown_pours,
 )
 from orchestrator.runs.run_folder import write_provenance
-from orchestrator.runs.speculation import RequestForecast
 from orchestrator.runs.stage_scheduler import StageScheduler
 from orchestrator.runs.stages import StageDefinition, scenes_of, stage_seed, stages_of
 from orchestrator.states import RESTING, State, check_transition

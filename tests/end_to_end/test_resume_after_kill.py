@@ -94,6 +94,7 @@ def test_a_campaign_learns_from_calibration_to_its_last_pour(undisturbed: Finish
         assert Path(figure).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_its_recording_can_be_read_and_shows_vessels_liquid_and_every_pour(undisturbed: Finished) -> None:
     rows = recording(Path(undisturbed.summary["recording"]))

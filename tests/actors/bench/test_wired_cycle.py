@@ -233,6 +233,7 @@ def test_a_pour_given_up_while_it_tilts_stops_the_arm_where_it_is(open_stage):
     assert program == "STOPPED"
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_an_error_of_the_grip_changes_what_is_poured_and_not_what_the_arm_reads(open_stage):
     async def play(tilt):

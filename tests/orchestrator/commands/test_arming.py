@@ -153,6 +153,7 @@ def test_settings_that_were_changed_since_stop_a_run_before_anybody_is_asked(
     assert "nothing moves before that" not in terminal.screen
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_envelope_covers_the_actions_of_the_campaign_and_grows_with_them(campaign: Path) -> None:
     def worst(text: str) -> Envelope:

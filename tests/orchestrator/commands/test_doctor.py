@@ -239,7 +239,14 @@ def joints_violation(angle: float) -> str | None:
 
 
 @pytest.mark.parametrize(
-    ("module", "package"), [("psutil", "psutil"), ("serial", "pyserial"), ("rtde_receive", "ur-rtde"), ("ray", "Ray")]
+    ("module", "package"),
+    [
+        ("rtde_receive", "ur-rtde"),
+        *(
+            pytest.param(*names, marks=pytest.mark.slow)
+            for names in (("psutil", "psutil"), ("serial", "pyserial"), ("ray", "Ray"))
+        ),
+    ],
 )
 def test_without_an_extra_doctor_names_package_and_extra_before_it_starts_anything(
     module: str, package: str, tmp_path: Path

@@ -12,15 +12,16 @@ import pytest
 from orchestrator.cli.foreground_run import file_trouble, given_up_pours, interruption
 from tests.support.scripted_strategy import Script, one_stage, pour, states
 from tests.support.toy_campaign import ToyBench, ToyLaboratory, run_toy, toy_plan
+from tests.support.waiting import wait_async
 
 
 def interrupted(directory: Path, times: int) -> None:
     """A toy run whose pour is under way when Ctrl-C comes."""
 
     async def play() -> None:
-        laboratory = ToyLaboratory(bench=ToyBench(lambda: 0.6))
+        laboratory = ToyLaboratory(bench=ToyBench(lambda: 0.3 if times == 1 else 60.0))
         task = asyncio.create_task(run_toy(directory, laboratory, stages=one_stage(Script(pour()))))
-        await asyncio.sleep(0.2)
+        await wait_async(lambda: laboratory.bench.received, "pour")
         for _ in range(times):
             task.cancel()
             await asyncio.sleep(0.05)

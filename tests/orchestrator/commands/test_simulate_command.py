@@ -137,6 +137,7 @@ def test_simulate_takes_units_parameters_and_another_receiver(
     assert outcome["scene"] == "beaker into tumbler"
 
 
+@pytest.mark.slow
 def test_a_cup_whose_shape_may_be_off_has_a_wider_band(inputs: Path) -> None:
     cup = "name: tumbler\nprofile: {unit: mm, inner: [[0, 0], [32, 0], [32, 100]], wall: 4 mm, floor: 4 mm"
     (inputs / "known.yaml").write_text(cup + "}\n", encoding="utf-8")

@@ -152,7 +152,7 @@ def test_good_enough_is_the_end() -> None:
     assert recommended.predicted_loss <= 0.06
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_a_limit_is_kept_by_every_pour_after_the_first_good_one(seed: int) -> None:
     strategy = adaptive(seed, pours=8, risk_limit=RiskLimitSettings(loss=0.15, probability=0.05, fallback="stop"))
     StrategyHarness(narrow_cup_biased, narrow_cup).run(strategy)
