@@ -113,7 +113,7 @@ def path_program(path: JointPath, settings: MotionSettings, number: int, *, cb3:
             "  global d_now = 0.0",
             "  global d_t = 0.0",
             f"  global d_q = {_list(points.joints[0])}",
-            *_stop_function(number),
+            *_stop_function(number, settings.registers),
             "  def d_servo(q):",
             "    d_stop()",
             f"    write_output_float_register({CLOCK}, d_now)",
@@ -145,10 +145,10 @@ def path_program(path: JointPath, settings: MotionSettings, number: int, *, cb3:
     )
 
 
-def _stop_function(number: int) -> list[str]:
+def _stop_function(number: int, registers: int) -> list[str]:
     return [
         "  def d_stop():",
-        f"    if read_input_integer_register({STOP_ORDER}) == {number}:",
+        f"    if read_input_integer_register({registers + STOP_ORDER}) == {number}:",
         f"      write_output_integer_register({STATUS}, {STOPPED})",
         f"      stopj({STOP_DECELERATION:g})",
         "      halt",
@@ -163,7 +163,7 @@ def _preparation(settings: MotionSettings, number: int) -> list[str]:
     The number is written last, so that a reader of it sees the rest.
     """
     return [
-        f'  rtde_set_watchdog("input_int_register_{HEARTBEAT}", {SLOWEST_HEARTBEAT:.1f}, "stop")',
+        f'  rtde_set_watchdog("input_int_register_{settings.registers + HEARTBEAT}", {SLOWEST_HEARTBEAT:.1f}, "stop")',
         f"  set_tcp(p{_list(settings.tool)})",
         f"  set_payload({settings.payload:.4f}, {_list(settings.centre)})",
         "  sync()",
@@ -172,7 +172,7 @@ def _preparation(settings: MotionSettings, number: int) -> list[str]:
         f"  write_output_float_register({CLOCK}, 0.0)",
         f"  write_output_integer_register({STATUS}, {READY})",
         f"  write_output_integer_register({NUMBER}, {number})",
-        f"  while read_input_integer_register({GO}) != {number}:",
+        f"  while read_input_integer_register({settings.registers + GO}) != {number}:",
         "    d_stop()",
         "    sync()",
         "  end",

@@ -163,7 +163,7 @@ def test_one_closed_port_is_named_with_what_it_is_for(tmp_path: Path) -> None:
         ("ur10e", {"local": True}, "remote control", "off", "Remote"),
         ("ur10", {"state": "off"}, "arm", "power off", "brakes"),
         ("ur10", {"state": "idle"}, "arm", "idle", "brakes"),
-        ("ur10e", {}, "model", "ur10e", "correct 'model'"),
+        ("ur10e", {}, "model", "UR10E", "correct 'model'"),
         ("ur10", {"joints": [0.0, -1.5, 1.5, -1.5, -1.5, 0.0]}, "position", "not at home", "jog"),
     ],
 )

@@ -14,6 +14,9 @@ from typing import Any
 import jsonschema
 import pytest
 
+from actors.arm.arm_settings import UrArmSettings
+from actors.emulators.ur_controller.robot import MODELS as CONTROLLED
+from actors.emulators.ur_controller.robot import calibrated
 from actors.runtime.child_process import child_environment
 from orchestrator.config.campaign_checks import check_campaign
 from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
@@ -49,6 +52,17 @@ def named(path: Path) -> str:
 @pytest.mark.parametrize("path", CAMPAIGNS, ids=named)
 def test_shipped_campaign_can_start(path: Path) -> None:
     assert check_campaign(load_campaign(path)) == []
+
+
+@pytest.mark.parametrize("name", ["ur3e-kern", "ur5e-mettler", "ur10e-sartorius"])
+def test_the_first_pours_fit_every_laboratory_of_hardware_also_with_a_calibrated_robot(name: str) -> None:
+    plan = load_campaign(CONFIGS / "campaigns" / "first-pour.yaml", CONFIGS / "laboratories" / f"{name}.yaml")
+    assert check_campaign(plan) == []
+    arm = plan.laboratory.arm
+    assert isinstance(arm, UrArmSettings)
+    own = arm.with_values(calibration=calibrated(CONTROLLED[arm.model]).calibration)
+    calibrated_plan = dataclasses.replace(plan, laboratory=plan.laboratory.with_values(arm=own))
+    assert check_campaign(calibrated_plan) == []
 
 
 @pytest.mark.parametrize("path", CAMPAIGNS, ids=named)
