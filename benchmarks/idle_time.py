@@ -29,7 +29,7 @@ ROOT = Path(__file__).parents[1]
 
 WITH = "from orchestrator.cli.app import main; main()"
 NONE = "SpeculativeExecution.predict = lambda self, request: None"
-WITHOUT = f"from orchestrator.runs.speculation import SpeculativeExecution; {NONE}; {WITH}"
+WITHOUT = f"from orchestrator.runs.request_executor import SpeculativeExecution; {NONE}; {WITH}"
 
 
 def run_once(campaign: str, program: str) -> dict[str, Any]:

@@ -33,6 +33,9 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
 MANY = (Path(__file__).parent / "actors", Path(__file__).parent / "orchestrator")
 """Folders of many short files. They come last, so that no long one is alone at the end of a run on several workers."""
 
+REALTIME = (Path(__file__).parent / "end_to_end", Path(__file__).parent / "reliability")
+"""Folders whose tests watch other processes: each is `realtime`."""
+
 PART = "DECANT_TESTS_PART"
 """Variable '2/4': of the files with tests that were chosen, each fourth one, from the second on."""
 
@@ -77,6 +80,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """
     items.sort(key=lambda item: any(item.path.is_relative_to(folder) for folder in MANY))
     for item in items:
+        if any(item.path.is_relative_to(folder) for folder in REALTIME):
+            item.add_marker("realtime")
         if item.get_closest_marker("realtime") is not None:
             item.add_marker(pytest.mark.flaky(reruns=2))
     if part := os.environ.get(PART):

@@ -50,6 +50,7 @@ def test_examples_are_short() -> None:
     assert all(len(example.strip().splitlines()) <= MOST_LINES for example in examples())
 
 
+@pytest.mark.slow
 def test_every_example_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
     """All in `make slow`; else without a calibration of its own, as a campaign has one."""
     shown = examples() if THOROUGH else [each for each in examples() if "decant.calibrate(" not in each]
@@ -149,6 +150,7 @@ decant.open_runs("misspelt")  # type: ignore[attr-defined]
 """
 
 
+@pytest.mark.slow
 def test_a_program_of_a_user_passes_a_strict_type_check_and_misspelt_names_do_not(tmp_path: Path) -> None:
     program = tmp_path / "program.py"
     program.write_text(USER, encoding="utf-8")

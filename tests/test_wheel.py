@@ -119,6 +119,7 @@ def test_the_wheel_carries_every_shipped_file_and_no_tests(wheel: Path) -> None:
     assert not [name for name in names if name.split("/")[0] in ("tests", "benchmarks", "docs")]
 
 
+@pytest.mark.slow
 def test_authors_of_plug_ins_test_them_with_what_the_wheel_carries(wheel: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")

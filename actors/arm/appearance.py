@@ -54,10 +54,10 @@ class LinkFigure:
 
     def ends(self, joints: FloatArray) -> FloatArray:
         """See `ArmFigure.ends`."""
-        from actors.arm.planning.kinematics import MODELS, cell_transforms, flange_transforms, link_points
+        from actors.arm.planning.kinematics import cell_transforms, flange_transforms, link_points
 
         cell, q = cell_transforms(self.spec), np.asarray(joints, dtype=float)
-        points = cell.base.apply(link_points(q, MODELS[self.spec.model]))
+        points = cell.base.apply(link_points(q, self.spec.robot))
         foot = np.broadcast_to(cell.base.position, (*q.shape[:-1], 1, 3))
         flange = flange_transforms(q, self.spec)
         tool = (flange @ cell.tool).position[..., None, :]

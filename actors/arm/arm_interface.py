@@ -58,6 +58,7 @@ class ArmFacts:
         model, serial, version: for messages and records; '' if the arm has none.
         checksum: of the arm's safety settings, as it reports it; '' if it has none.
         problem: why it cannot move now; '' if it can.
+        calibration: checksum of the arm's own geometry, with which its pours are planned; '' if it reports none.
     """
 
     model: str
@@ -65,6 +66,7 @@ class ArmFacts:
     version: str = ""
     checksum: str = ""
     problem: str = ""
+    calibration: str = ""
 
 
 @dataclass(frozen=True)

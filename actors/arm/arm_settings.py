@@ -15,20 +15,24 @@ import ipaddress
 import math
 import re
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
+from pydantic import Field, Strict
+
 from actors.arm.arm_geometry import ArmLimits, Centre, JointAngles, Mount, Pose, RobotCell, Speed
+from actors.arm.ur.robot_models import MODELS, Calibration, RobotModel
 from actors.interfaces import DeviceCheck
 from sim_engine.action import Action
 from sim_engine.scene import Scene
-from sim_engine.settings.model import NOT_IN_FINGERPRINT, SET_BY_PROGRAM, Example, Problems, Settings, Text
+from sim_engine.settings.model import NOT_IN_FINGERPRINT, SET_BY_PROGRAM, Choice, Example, Problems, Settings, Text
 from sim_engine.settings.plugin_registry import PluginRegistry
 from sim_engine.settings.quantity import Quantity
 
 if TYPE_CHECKING:
-    from actors.arm.arm_interface import ArmFigure, PlannedPour
+    from actors.arm.arm_interface import ArmFacts, ArmFigure, PlannedPour
     from actors.arm.planned_pour import PourPath
 
 
@@ -161,6 +165,10 @@ class ArmSettings(Settings):
         """Bench time converted to clock time [s]; 0 if nothing is waited for."""
         return seconds / self.time_scale if self.time_scale > 0.0 else 0.0
 
+    def fitted_to(self, facts: ArmFacts) -> Self:
+        """The settings with what a connected arm reports about its own geometry, for planning."""
+        return self
+
     def figure(self) -> ArmFigure | None:
         """The arm's figure for the live view. None if there is none; then only the pourer is shown."""
         return None
@@ -217,7 +225,7 @@ def _arm(loaded: object, name: str) -> type[ArmSettings]:
 ARMS: PluginRegistry[type[ArmSettings]] = PluginRegistry("decant.arms", "arm", _arm)
 """Settings classes of all installed kinds of arms."""
 
-ArmModel = Literal["ur10", "ur10e"]
+ArmModel = Annotated[str, Choice(lambda: tuple(MODELS), similar=False)]
 
 Acceleration = Annotated[float, Quantity("rad/s^2", "80 deg/s^2", 0.0, math.radians(2000.0), positive=True)]
 
@@ -249,7 +257,7 @@ class UrArmSettings(ArmSettings):
     tool: Annotated[Pose, Example("{z: 180 mm}")]
     """Tool centre point in the flange's frame, as set on the teach pendant."""
 
-    payload: Annotated[float, Quantity("kg", "1.5 kg", 0.0, 12.5)]
+    payload: Annotated[float, Quantity("kg", "1.5 kg", 0.0, 35.0)]
     """Mass of gripper and filled pourer, as set on the teach pendant."""
 
     payload_centre: Centre = Centre()
@@ -279,17 +287,30 @@ class UrArmSettings(ArmSettings):
     rate: Annotated[float, Quantity("1/s", "125 Hz", 100.0, 500.0)] = 125.0
     """Rate at which the joints are read back."""
 
+    registers: Annotated[int, Strict(), Field(ge=0, le=45), NOT_IN_FINGERPRINT] = 43
+    """First of the three integer inputs of the controller that are written; 0 to 23 are reserved for a fieldbus."""
+
     cell: Annotated[RobotCell, SET_BY_PROGRAM]
     """Objects around the arm: the laboratory's section `cell`."""
+
+    calibration: Annotated[Calibration | None, SET_BY_PROGRAM] = None
+    """Calibration of this robot, as its controller reports it; None for nominal lengths, as before it is connected."""
+
+    @property
+    def robot(self) -> RobotModel:
+        """The robot's kinematics: nominal, or calibrated."""
+        return _robot(self.model, self.calibration)
 
     def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
         """See `ArmSettings.check_laboratory`."""
         arm = problems.within("arm")
         self._check_address(arm, mode)
         if arm.valid("model", "rate"):
-            fastest = resolve_name("actors.arm.planning.kinematics:MODELS")[self.model].frequency
+            fastest = MODELS[self.model].frequency
             if self.rate > fastest:
                 arm.add(f"a {self.model} answers at most {fastest} times a second; write '{fastest} Hz'", "rate")
+        if arm.valid("model", "payload") and self.payload > (most := MODELS[self.model].payload):
+            arm.add(f"a {self.model} carries at most {most:g} kg", "payload")
         if cell is None:
             if problems.valid("cell"):
                 problems.add(
@@ -334,6 +355,10 @@ class UrArmSettings(ArmSettings):
         path: PourPath = plan_path(planning.plan_pour(scene, action), self, pourer, receiver)
         return path
 
+    def fitted_to(self, facts: ArmFacts) -> Self:
+        """See `ArmSettings.fitted_to`: the robot's calibration."""
+        return self.with_values(calibration=getattr(facts, "kinematics", None))
+
     def figure(self) -> ArmFigure:
         """See `ArmSettings.figure`."""
         figure: ArmFigure = resolve_name("actors.arm.appearance:LinkFigure")(self)
@@ -375,6 +400,11 @@ class UrArmSettings(ArmSettings):
             return None
         check: DeviceCheck = resolve_name("actors.arm.ur.commissioning:readiness")(self)
         return check
+
+
+@lru_cache(maxsize=64)
+def _robot(model: str, calibration: Calibration | None) -> RobotModel:
+    return replace(MODELS[model], calibration=calibration)
 
 
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"

@@ -63,6 +63,8 @@ class PourPath:
         tilts: (T,) of the pourer at `pour.times` [rad].
         phases: (name, start, end) of the pour's parts [s].
         report: results of the checks.
+        calibration: checksum of the robot's calibration with which it was planned; '' for nominal lengths, None for a
+            path that was not made from poses.
     """
 
     approach: JointPath
@@ -71,6 +73,7 @@ class PourPath:
     tilts: FloatArray
     phases: tuple[tuple[str, float, float], ...]
     report: PathReport
+    calibration: str | None = None
 
     @property
     def approach_time(self) -> float:
@@ -108,6 +111,7 @@ class PourPath:
                 tilt_speed=factor * r.tilt_speed,
                 duration=r.duration / factor,
             ),
+            self.calibration,
         )
 
 

@@ -41,7 +41,7 @@ class PouringBench:
     """
 
     def __init__(self, setup: Setup) -> None:
-        self._setup = setup
+        self._setup, self._arm_spec = setup, setup.spec
         self.arm, self.balance, self.ground_truth = setup.arm, setup.balance, setup.ground_truth
         self._known: dict[str, dict[str, PourMasses]] = {}
         self._one_at_a_time = asyncio.Lock()
@@ -62,6 +62,8 @@ class PouringBench:
             UnknownPourError: the pour began, but did not run as planned.
         """
         async with self._one_at_a_time:
+            with contextlib.suppress(LaboratoryError):  # the procedure reports why the arm is not ready
+                self._arm_spec = self._arm_spec.fitted_to(await self.arm.ready())
             path = await asyncio.to_thread(self._checked, scene, action)
             pour = PourProcedure(
                 self._setup, scene, action, path, seed=seed, known=self._known.get(scene.pourer.name), progress=progress
@@ -73,7 +75,7 @@ class PouringBench:
 
     def _checked(self, scene: Scene, action: Action) -> PlannedPour:
         try:
-            return self._setup.spec.plan(scene, action)
+            return self._arm_spec.plan(scene, action)
         except ValueError as error:
             raise InvalidActionError(str(error)) from error
 
@@ -195,11 +197,11 @@ async def _open_devices(
     tell: Callable[[Notice], None],
 ) -> OpenBench:
     emulators: DeviceEmulators | None = None
-    follows = False
+    true_arm: ArmSettings | None = None
     if spec.mode == "virtual":
         emulators = DeviceEmulators(opening("emulators", BenchEmulators, arm_spec, balance_spec))
         found = await emulators.found()
-        arm_spec, follows = found.arm, found.follows
+        arm_spec, true_arm = found.arm, found.true_arm
         balance_spec = found.balance or balance_spec
     arm = opening.arm(arm_spec, None if spec.mode == "virtual" else spec.accepted_checksum)
     balance = None if balance_spec.typed else opening.balance(balance_spec, spec.name)
@@ -208,8 +210,8 @@ async def _open_devices(
     ground_truth = GroundTruth(arm_spec.time_scale)
     if emulators is not None and spec.bench is not None and liquid is not None:
         hands = Hands(BenchContents(balance_spec.position), None if balance is None else emulators.put)
-        if follows and isinstance(arm_spec, UrArmSettings):
-            ground_truth = FollowedBench(spec.bench, arm_spec, emulators, hands, liquid)
+        if isinstance(true_arm, UrArmSettings):
+            ground_truth = FollowedBench(spec.bench, true_arm, emulators, hands, liquid)
         else:
             ground_truth = VirtualBench(spec.bench, arm_spec.time_scale, emulators, hands, liquid)
         if spec.operator.answers == "virtual":

@@ -366,8 +366,8 @@ def _largest_tilt(executed: Executed) -> float:
 
 
 def _arm_identity(facts: ArmFacts | None) -> dict[str, Any]:
-    """Identification of the robot for the record: model, serial number, version, checksum."""
+    """Identification of the robot for the record: model, serial number, version, checksums."""
     if facts is None:
         return {}
-    values = {name: getattr(facts, name) for name in ("model", "serial", "version", "checksum")}
+    values = {name: getattr(facts, name) for name in ("model", "serial", "version", "checksum", "calibration")}
     return {name: text for name, text in values.items() if text}

@@ -65,12 +65,13 @@ class Found:
     Attributes:
         arm: the arm's settings with the address of its emulator.
         balance: the balance's settings with the address of its emulator; None without one.
-        follows: whether `history` is available.
+        true_arm: the arm's settings with the geometry of the emulator, which a driver has to read from it; None without
+            an emulator. With one, `history` is available.
     """
 
     arm: ArmSettings
     balance: BalanceSettings | None
-    follows: bool
+    true_arm: ArmSettings | None
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,11 @@ class ArmEmulator(Protocol):
     @property
     def arm(self) -> ArmSettings:
         """The settings, with the emulator's address."""
+        ...
+
+    @property
+    def true_arm(self) -> ArmSettings:
+        """The settings with the emulator's own geometry, which a driver has to read from it."""
         ...
 
     def install(self) -> None:
@@ -142,8 +148,10 @@ class BenchEmulators:
 
     def found(self) -> Found:
         """Return the addresses of the emulators."""
-        arm = self._spec if self._arm is None else self._arm.arm
-        return Found(arm, self._weighs if self._balance is None else self._balance.balance, self._arm is not None)
+        balance = self._weighs if self._balance is None else self._balance.balance
+        return (
+            Found(self._spec, balance, None) if self._arm is None else Found(self._arm.arm, balance, self._arm.true_arm)
+        )
 
     def install(self) -> None:
         """See `ArmEmulator.install`."""
@@ -375,7 +383,7 @@ class FollowedBench(VirtualBench):
 
     Args:
         spec, emulators, hands, simulators: as for `VirtualBench`.
-        arm: the cell as configured; it may differ from the ground truth.
+        arm: the cell as configured, which may differ from the ground truth, with the true geometry of the arm.
     """
 
     def __init__(

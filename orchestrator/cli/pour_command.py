@@ -84,7 +84,7 @@ def pour(
     require_flag(bench, enabled=enable_motion, again=f"{again} … --enable-motion")
     if empty:
         assert chosen.path is not None
-        pour_empty(chosen.plan, chosen.action, chosen.path.slowed(slow), slow=slow, as_json=as_json)
+        pour_empty(chosen, chosen.path.slowed(slow), slow=slow, as_json=as_json)
         return
     _pour(chosen, in_process=in_process, again=f"Another pour: {again} …", as_json=as_json)
 
@@ -292,13 +292,12 @@ def told(weighed: WeighedPour) -> str:
     return f"{masses}, delivered {weighed.delivered_g:.1f} g ({weighed.delivered_ml:.1f} mL); {r}"
 
 
-def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: float, as_json: bool) -> None:
+def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float, as_json: bool) -> None:
     """Approach, tilt, return, retreat.
 
     Args:
-        plan: campaign.
-        action: that the path was planned for.
-        path: slowed already.
+        chosen: campaign, scene and action.
+        path: slowed already; planned again if the arm reports a geometry of its own.
         slow: by what.
         as_json: print the record.
 
@@ -311,7 +310,7 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
     from orchestrator.runs.motion_approval import SafetyRecordError, report_lines, required_checksum
     from orchestrator.runs.run_folder import create_run
 
-    laboratory = plan.laboratory
+    plan, action, laboratory = chosen.plan, chosen.action, chosen.plan.laboratory
     assert laboratory.arm is not None
     hardware = laboratory.mode == "hardware"
     if hardware and not sys.stdin.isatty():
@@ -322,7 +321,7 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
     if hardware:
         confirm(laboratory, lines)
     else:
-        print_message(f"laboratory {laboratory.name}, virtual: nothing moves but numbers\n" + "\n".join(lines))
+        print_message(f"laboratory {laboratory.name}, virtual: no hardware moves\n" + "\n".join(lines))
     try:
         directory = create_run(dataclasses.replace(plan, name=f"{plan.name}-empty"))
         with reached(laboratory) as ready:
@@ -330,6 +329,9 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
             # this command announces each movement itself, by counting down before it lets the arm move
             driver = ready.with_values(arm=ready.arm.with_values(warning_time=0.0))
             with connected(driver, checksum) as (arm, facts):
+                fitted = ready.arm.fitted_to(facts)
+                if fitted != ready.arm:
+                    path = fitted.plan(chosen.scene, action).slowed(slow)
                 cycle = EmptyCycle(arm, path, ready.arm.on_clock(laboratory.arm.warning_time), ask=hardware)
                 executed = cycle.run()
     except LaboratoryError as error:
@@ -340,7 +342,7 @@ def pour_empty(plan: CampaignPlan, action: Action, path: PlannedPour, *, slow: f
         "mode": laboratory.mode,
         "laboratory": laboratory.name,
         "date": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-        "robot": {"model": facts.model, "serial": facts.serial, "version": facts.version, "checksum": facts.checksum},
+        "robot": {name: getattr(facts, name) for name in ("model", "serial", "version", "checksum", "calibration")},
         "action": action.values(),
         "slow": slow,
         "planned": dataclasses.asdict(path.report),

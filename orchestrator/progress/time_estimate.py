@@ -264,7 +264,7 @@ def _work(plan: CampaignPlan, name: str) -> WorkEstimate:
         if name == CALIBRATION:
             return WorkEstimate(calibration.simulations, particles=particles_of(plan))
         if name == EVALUATION:
-            # Random θ and the uncalibrated one need no θ*: see `orchestrator.runs.speculation`.
+            # Random θ and the uncalibrated one need no θ*: see `orchestrator.runs.request_forecast`.
             rivals = _weighed(calibration) + calibration.random_baseline * _unseen(calibration)
             return WorkEstimate(_scored(calibration), ahead=rivals if calibration.pour_count else 0)
     if deployment is not None and name.startswith((DEPLOYMENT, CONFIRMATION)):

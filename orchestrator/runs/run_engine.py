@@ -34,6 +34,7 @@ from orchestrator.runs.events import (
 )
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor, RequestExecutorError
+from orchestrator.runs.request_forecast import RequestForecast
 from orchestrator.runs.resume import (
     AskOperator,
     OperatorNeededError,
@@ -44,7 +45,6 @@ from orchestrator.runs.resume import (
     settle_unknown_pours,
 )
 from orchestrator.runs.run_folder import write_provenance
-from orchestrator.runs.speculation import RequestForecast
 from orchestrator.runs.stage_scheduler import StageScheduler
 from orchestrator.runs.stages import StageDefinition, scenes_of, stage_seed, stages_of
 from orchestrator.states import RESTING, State, check_transition
@@ -334,7 +334,7 @@ class _Run:
 
     def _come_to_rest(self, state: State, reason: str) -> None:
         if self._unknown_pours:
-            state, reason = State.UNKNOWN, f"{reason}, while a pour was under way: nobody knows what came of it"
+            state, reason = State.UNKNOWN, f"{reason}, while a pour was under way: its outcome is unknown"
         try:
             self._enter(state, reason)
         except JournalError as problem:  # the next process finds the run interrupted

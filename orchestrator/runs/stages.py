@@ -64,7 +64,7 @@ class StageDefinition:
         build: makes the strategy from the earlier stages' results and the stage's seed.
         order: order in which outcomes are delivered.
         pours: whether it needs a bench.
-        stand_in: placeholder for its result in speculative execution (`orchestrator.runs.speculation`).
+        stand_in: placeholder for its result in speculative execution (`orchestrator.runs.request_forecast`).
     """
 
     name: str

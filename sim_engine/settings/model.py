@@ -171,14 +171,22 @@ class Choice:
 
     Attributes:
         words: returns them.
+        similar: whether an error may suggest a similar word. If not, it lists all words: 'ur6' is no misspelt 'ur5'.
     """
 
     words: Callable[[], Sequence[str]]
+    similar: bool = True
 
     def _validate(self, value: Any) -> str:
         words = self.words()
         if value not in words:
             expected = " or ".join([", ".join(map(repr, words[:-1])), repr(words[-1])])
+            if not self.similar:
+                raise PydanticCustomError(
+                    "not_supported",
+                    "{value} is not supported; supported are {words}",
+                    {"value": repr(value), "words": ", ".join(words)},
+                )
             raise PydanticKnownError("literal_error", {"expected": expected})
         return str(value)
 

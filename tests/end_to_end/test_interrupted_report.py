@@ -6,6 +6,8 @@ import json
 import signal
 from pathlib import Path
 
+import pytest
+
 from orchestrator.journal.journal import Entry, Kind
 from orchestrator.states import State
 from tests.support.command_process import Workplace
@@ -14,6 +16,7 @@ from tests.support.small_campaign import CAMPAIGN, write_campaign
 SHORT = CAMPAIGN[: CAMPAIGN.index("deployment:")] + "outputs: {directory: runs, recording: false}\n"
 
 
+@pytest.mark.slow
 def test_a_run_interrupted_before_its_report_is_published_by_decant_report(tmp_path: Path) -> None:
     write_campaign(tmp_path, SHORT)
     place = Workplace(tmp_path)

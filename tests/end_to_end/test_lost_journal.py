@@ -129,11 +129,13 @@ def without_ledger(run: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "problem"),
     [
-        (without_journal, "journal.sqlite is missing, but the folder has resolved.json"),
-        (truncated, "journal.sqlite is empty, but the folder has resolved.json"),
+        pytest.param(
+            without_journal, "journal.sqlite is missing, but the folder has resolved.json", marks=pytest.mark.slow
+        ),
+        pytest.param(truncated, "journal.sqlite is empty, but the folder has resolved.json", marks=pytest.mark.slow),
         (with_another_weight, "(pour.finished) was changed after it was written"),
-        (without_its_last_entries, "entries were lost"),
-        (without_ledger, "pours.jsonl, the ledger of pours, is missing"),
+        pytest.param(without_its_last_entries, "entries were lost", marks=pytest.mark.slow),
+        pytest.param(without_ledger, "pours.jsonl, the ledger of pours, is missing", marks=pytest.mark.slow),
     ],
 )
 def test_a_run_with_a_damaged_journal_is_refused_with_the_pours_that_were_made(
@@ -166,7 +168,7 @@ def test_a_run_with_a_damaged_journal_is_refused_with_the_pours_that_were_made(
         find_run(plan)  # without a name it is found by its journal, or by its ledger
 
 
-@pytest.mark.parametrize("lost", ["deleted", "damaged"])
+@pytest.mark.parametrize("lost", ["deleted", pytest.param("damaged", marks=pytest.mark.slow)])
 def test_a_lost_write_ahead_log_repeats_no_pour(place: Workplace, lost: str) -> None:
     run = place.run_directory()
     before = pours_begun(run)

@@ -11,7 +11,7 @@ import pytest
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Failed, Outcome, Pour, Simulate
 from orchestrator.runs.events import Event, RequestFinished, StageClosed
-from orchestrator.runs.speculation import SpeculativeExecution
+from orchestrator.runs.request_executor import SpeculativeExecution
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
 from sim_engine.scene import PourTask
 from tests.orchestrator.test_stages import Optimizer, campaign

@@ -66,6 +66,7 @@ def test_viewer_who_joins_late_sees_all_that_happened(tmp_path: Path) -> None:
     assert Contents(monitor.path).rows("/learning/narrow_cup/loss/measured") == 3
 
 
+@pytest.mark.slow
 def test_who_comes_late_gets_the_newest_first_in_the_arrangement_that_is_shown_now(tmp_path: Path) -> None:
     plan = example_run.campaign()
     with LiveView() as live:

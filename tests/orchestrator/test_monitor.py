@@ -256,6 +256,7 @@ def test_recording_brings_its_blueprint_and_passes_the_viewers_own_check(tmp_pat
     assert checked.returncode == 0, checked.stderr
 
 
+@pytest.mark.slow
 def test_resumed_run_keeps_the_recording_made_before_the_interruption(tmp_path: Path) -> None:
     plan = example_run.campaign()
     first = RerunMonitor(tmp_path / "campaign.rrd", plan)

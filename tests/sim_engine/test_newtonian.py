@@ -45,6 +45,7 @@ def test_the_packing_adds_little_to_a_viscosity_however_slow_the_shear(simulator
     assert value < 6e-4  # it was 11e-4 before the packing's stress was taken out of the velocities
 
 
+@pytest.mark.slow
 def test_a_film_on_an_incline_is_slow_at_the_wall_and_as_fast_as_nusselt_s_in_the_mean(
     simulator: PourSimulator,
 ) -> None:

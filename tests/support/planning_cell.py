@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from actors.arm.arm_geometry import ArmLimits, Box, JointAngles, Point, Pose, RobotCell
 from actors.arm.arm_settings import UrArmSettings
+from actors.arm.planning.kinematics import flange_poses, inverse, posture
 from actors.arm.planning.trajectory import follow
+from actors.arm.ur.robot_models import MODELS
 from orchestrator.config.file_loading import load_vessel
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid
@@ -77,6 +79,25 @@ def waiting_at(x: float, y: float, z: float) -> UrArmSettings:
     pose = np.array([[x, y, z, 1.0, 0.0, 0.0, 0.0]])
     q = follow(pose, np.array(SPEC.home.angles), SPEC)[0]
     return SPEC.with_values(home=JointAngles.of(q[0], q[1], q[2], q[3], q[4], q[5]))
+
+
+def cell_of(model: str, **changes: Any) -> UrArmSettings:
+    """A cell of the size of a model's reach, with a home in the same posture as in `SPEC`."""
+    robot = MODELS[model]
+    small = model in ("ur3", "ur3e")
+    x = 0.38 if small else round(0.7 * (abs(robot.a2) + abs(robot.a3)), 3)
+    spec = SPEC.with_values(
+        model=model,
+        limits=LIMITS.with_values(box=Box(low=Point.of(0.05, -0.9, -0.3), high=Point.of(1.6, 0.9, 1.2))),
+        cell=SPEC.cell.with_values(receiver=Point.of(x, 0.0, 0.12 if small else 0.06)),
+        tool=Pose(z=0.09 if small else 0.17),
+    )
+    waiting = np.array(
+        [[-0.16, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0] if small else [-0.296, -0.003, 0.303, 1.0, 0.0, 0.0, 0.0]]
+    )
+    flange = flange_poses(waiting, spec)
+    home = inverse(flange.rotation, flange.position, robot)[0, posture(np.array(SPEC.home.angles), SPEC.robot)]
+    return spec.with_values(home=JointAngles.of(*map(float, home)), **changes)
 
 
 def turned(rotations: FloatArray, others: FloatArray) -> FloatArray:

@@ -89,6 +89,7 @@ class ToyBench:
 
     pauses: Callable[[], float] = lambda: 0.0
     mode: str = "virtual"
+    received: list[int] = field(default_factory=list)
     poured: list[int] = field(default_factory=list)
     aborted: list[int] = field(default_factory=list)
     fails: Callable[[int], Exception | None] = lambda seed: None
@@ -96,6 +97,7 @@ class ToyBench:
     async def pour(
         self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
     ) -> PourMeasurement:
+        self.received.append(seed)
         if progress is not None:
             progress(PourProgress("tilt", 0.5))
         try:

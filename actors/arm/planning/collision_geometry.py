@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from actors.arm.planning.kinematics import cell_transforms
 from actors.arm.planning.trajectory import SampledPath
+from actors.arm.ur.robot_models import SAME_ANGLE, SAME_PLACE
 from sim_engine.collision import clearance, thinned, way_of
 from sim_engine.vessel.distance_grid import MARGIN
 from sim_engine.vessel.vessel import Vessel
@@ -106,7 +107,15 @@ def nearest_to_receiver(sampled: SampledPath, until: float, pourer: Vessel, rece
     indices = np.concatenate([coarse, fine])
     away = np.concatenate([away, clearance(pourer, receiver, poses[fine])])
     best = int(np.argmin(away))
-    return Nearest(float(away[best]), int(indices[best]))
+    return Nearest(float(away[best]) - _pourer_error(sampled, pourer), int(indices[best]))
+
+
+def _pourer_error(sampled: SampledPath, pourer: Vessel) -> float:
+    """Largest distance of a calibrated robot's pourer from where it is planned [m], by the driver's own check."""
+    if sampled.model.calibration is None:
+        return 0.0
+    lever = float(np.linalg.norm(cell_transforms(sampled.spec).pourer.apply(hull(pourer)), axis=-1).max())
+    return SAME_PLACE + SAME_ANGLE * lever
 
 
 def nearest_links(sampled: SampledPath, receiver: Vessel) -> tuple[Nearest, Nearest]:
@@ -115,7 +124,8 @@ def nearest_links(sampled: SampledPath, receiver: Vessel) -> tuple[Nearest, Near
     world = cell_transforms(sampled.spec).world.inverse
     table, cup = [], []
     along = np.linspace(0.0, 1.0, 13)[:, None]
-    for name, first, second, radius in LINKS:
+    for name, first, second, drawn in LINKS:
+        radius = drawn + sampled.link_error
         a, b = points[:, first, None], points[:, second, None]
         line = a + (b - a) * along
         above = line[..., 2].min(axis=1) - radius - sampled.spec.cell.table

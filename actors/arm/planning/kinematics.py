@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from actors.arm.arm_geometry import Pose
 from actors.arm.arm_settings import UrArmSettings
-from actors.arm.ur.robot_models import MODELS, RobotModel
+from actors.arm.ur.robot_models import MODELS, Calibration, RobotModel
 from sim_engine.collision import rotations
 from sim_engine.scene import SampledMotion
 
-__all__ = ["MODELS", "RobotModel", "beyond_reach", "forward", "inverse", "link_points", "posture", "singularities"]
+__all__ = ["MODELS", "beyond_reach", "forward", "inverse", "link_points", "posture", "refined", "singularities"]
 
 FloatArray = NDArray[np.float64]
 
@@ -48,6 +48,8 @@ def forward(q: FloatArray, m: RobotModel) -> tuple[FloatArray, FloatArray]:
     Returns:
         Rotation matrices (..., 3, 3) and positions (..., 3) [m], base frame.
     """
+    if m.calibration is not None:
+        return _chain(q, m.calibration)[2:]
     s1, c1, s5, c5, s6, c6 = (f(q[..., k]) for k in (0, 4, 5) for f in (np.sin, np.cos))
     q23 = q[..., 1] + q[..., 2]
     s, c = np.sin(q23 + q[..., 3]), np.cos(q23 + q[..., 3])
@@ -64,8 +66,66 @@ def forward(q: FloatArray, m: RobotModel) -> tuple[FloatArray, FloatArray]:
     return rotation, position
 
 
+def _chain(q: FloatArray, own: Calibration) -> tuple[list[FloatArray], list[FloatArray], FloatArray, FloatArray]:
+    """Directions of the joints' axes and a point on each, rotation and position of the flange of a calibrated robot."""
+    rotation = np.broadcast_to(np.eye(3), (*q.shape[:-1], 3, 3))
+    position = np.zeros((*q.shape[:-1], 3))
+    axes, points = [], []
+    for k in range(6):
+        s, c = np.sin(q[..., k] + own.theta[k]), np.cos(q[..., k] + own.theta[k])
+        sa, ca = np.sin(own.alpha[k]), np.cos(own.alpha[k])
+        zero = np.zeros_like(s)
+        columns = [(c, s, zero), (-s * ca, c * ca, zero + sa), (s * sa, -c * sa, zero + ca)]
+        turned = np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
+        axes.append(rotation[..., 2])
+        points.append(position)
+        step = np.stack([own.a[k] * c, own.a[k] * s, zero + own.d[k]], axis=-1)
+        position = position + (rotation @ step[..., None])[..., 0]
+        rotation = rotation @ turned
+    return axes, points, rotation, position
+
+
+NEWTON_STEPS = 6
+"""Most steps from the closed form's joints to those of a calibrated robot; two or three are usual."""
+
+
+def refined(q: FloatArray, rotation: FloatArray, position: FloatArray, m: RobotModel) -> FloatArray:
+    """Joints of a calibrated robot, by Newton steps from those of the closed form; the same joints if it is nominal.
+
+    Args:
+        q: joints that nearly reach the poses, shape (T, 6) [rad]; NaN if there are none.
+        rotation, position: of the flange, shapes (T, 3, 3) and (T, 3) [m].
+        m: the robot.
+
+    Returns:
+        Shape (T, 6) [rad]; NaN where there are none, as beyond the reach.
+    """
+    if m.calibration is None:
+        return q
+    q, known = q.copy(), np.isfinite(q).all(axis=-1)
+    for step in range(NEWTON_STEPS + 1):
+        axes, points, there, place = _chain(q[known], m.calibration)
+        apart = rotation[known] @ np.swapaxes(there, -1, -2)
+        turn = 0.5 * np.stack([apart[:, 2, 1] - apart[:, 1, 2], apart[:, 0, 2] - apart[:, 2, 0],
+                               apart[:, 1, 0] - apart[:, 0, 1]], axis=-1)  # fmt: skip
+        error = np.concatenate([position[known] - place, turn], axis=-1)
+        if step == NEWTON_STEPS or not np.any(np.abs(error) > 1e-11):
+            break
+        columns = [
+            np.concatenate([np.cross(axis, place - point), axis], axis=-1)
+            for axis, point in zip(axes, points, strict=True)
+        ]
+        jacobian = np.stack(columns, axis=-1)
+        transposed = np.swapaxes(jacobian, -1, -2)
+        # slightly damped, so that a singular pose is no error here: its joints do not converge, and are NaN below
+        change = np.linalg.solve(transposed @ jacobian + 1e-14 * np.eye(6), transposed @ error[..., None])
+        q[known] += change[..., 0]
+    q[known] = np.where(np.abs(error).max(axis=-1, keepdims=True) < 1e-8, q[known], np.nan)
+    return q
+
+
 def inverse(rotation: FloatArray, position: FloatArray, m: RobotModel) -> FloatArray:
-    """All postures that reach a pose of the flange.
+    """All postures that reach a pose of the flange; see `refined` for calibrated robots.
 
     Args:
         rotation: of the flange, shape (T, 3, 3).
@@ -85,7 +145,8 @@ def inverse(rotation: FloatArray, position: FloatArray, m: RobotModel) -> FloatA
             q2 = np.arctan2(v, u) - np.arctan2(m.a3 * np.sin(q3), m.a2 + m.a3 * np.cos(q3))
             q = np.stack([q1, q2, q3, q234 - q2 - q3, q5, q6], axis=-1)
             q = np.where(np.isfinite(q).all(axis=-1, keepdims=True), q, np.nan)
-            out[:, 2 * number + elbow] = q - 2.0 * np.pi * np.round(q / (2.0 * np.pi))
+            q = q - 2.0 * np.pi * np.round(q / (2.0 * np.pi))
+            out[:, 2 * number + elbow] = refined(q, rotation, position, m)
     return out
 
 
@@ -115,8 +176,8 @@ def _wrists(rotation: FloatArray, position: FloatArray, m: RobotModel) -> Iterat
 
 def posture(q: FloatArray, m: RobotModel) -> int:
     """Number of the posture of joints (6,), as `inverse` counts."""
-    rotation, position = forward(q[None], m)
-    solutions = inverse(rotation, position, m)[0]
+    rotation, position = forward(q[None], m.nominal)
+    solutions = inverse(rotation, position, m.nominal)[0]
     apart = np.abs(np.angle(np.exp(1j * (solutions - q)))).max(axis=-1)
     return int(np.nanargmin(apart))
 
@@ -164,7 +225,7 @@ def link_points(q: FloatArray, m: RobotModel) -> FloatArray:
     w1 = elbow + m.a3 * (np.cos(q23)[..., None] * radial + np.sin(q23)[..., None] * up)
     w2 = w1 + m.d4 * across
     w3 = w2 + m.d5 * (s[..., None] * radial - c[..., None] * up)
-    _, flange = forward(q, m)
+    _, flange = forward(q, m.nominal)
     outside, inside = m.d4 * across, 0.25 * m.d4 * across
     return np.stack(
         [shoulder, shoulder + outside, elbow + outside, elbow + inside, w1 + inside, w2, w3, flange], axis=-2
@@ -306,7 +367,7 @@ def pourer_transforms(joints: FloatArray, spec: UrArmSettings) -> Transforms:
 
 def flange_transforms(joints: FloatArray, spec: UrArmSettings) -> Transforms:
     """Poses of the flange in the room's frame for joints (T, 6) [rad]."""
-    return cell_transforms(spec).base @ Transforms(*forward(joints, MODELS[spec.model]))
+    return cell_transforms(spec).base @ Transforms(*forward(joints, spec.robot))
 
 
 def quaternions(rotation: FloatArray) -> FloatArray:

@@ -19,7 +19,6 @@ from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.collision_geometry import Nearest, hull, nearest_links, nearest_to_receiver
 from actors.arm.planning.kinematics import (
-    MODELS,
     beyond_reach,
     cell_transforms,
     flange_poses,
@@ -88,7 +87,7 @@ def _receiver(spec: UrArmSettings) -> list[str]:
             problems.append(f"cell.receiver: ({x:.3f}, {y:.3f}, {z:.3f}) m lies beyond plane {number} of limits.planes")
     if z < spec.cell.table - 1e-6:
         problems.append(f"cell.receiver: stands at {z:.3f} m, below cell.table at {spec.cell.table:.3f} m")
-    model = MODELS[spec.model]
+    model = spec.robot
     beside = np.array([[-0.1, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0]])
     flange = flange_poses(beside, spec)
     if not np.isfinite(inverse(flange.rotation, flange.position, model)).any():
@@ -106,7 +105,7 @@ def _receiver(spec: UrArmSettings) -> list[str]:
 
 
 def _home(spec: UrArmSettings) -> list[str]:
-    model, q = MODELS[spec.model], np.array([spec.home.angles])
+    model, q = spec.robot, np.array([spec.home.angles])
     problems = []
     for name, angle, most in zip(JOINT_NAMES, spec.home.angles, model.joint_range, strict=True):
         if abs(angle) > most:

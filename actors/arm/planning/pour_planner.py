@@ -129,6 +129,7 @@ def plan_path(motion: PourMotion, spec: UrArmSettings, pourer: Vessel, receiver:
             pourer,
             _deviation(motion, made),
         ),
+        calibration=spec.robot.parameters.checksum,
     )
 
 

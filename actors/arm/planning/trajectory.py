@@ -20,20 +20,21 @@ from numpy.typing import NDArray
 from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.kinematics import (
-    MODELS,
-    RobotModel,
     Transforms,
     between,
     cell_transforms,
     flange_poses,
     flange_transforms,
+    forward,
     inverse,
     link_points,
     posture,
     pourer_transforms,
     quaternions,
+    refined,
     singularities,
 )
+from actors.arm.ur.robot_models import SAME_PLACE, RobotModel
 from sim_engine.motion import Phase, PourMotion, Segment, turn
 
 FloatArray = NDArray[np.float64]
@@ -191,7 +192,16 @@ class SampledPath:
     @property
     def model(self) -> RobotModel:
         """The robot."""
-        return MODELS[self.spec.model]
+        return self.spec.robot
+
+    @cached_property
+    def link_error(self) -> float:
+        """Largest distance of a link from where `links` has it [m]: drawn with nominal lengths, it differs from a
+        calibrated robot by no more than the flange does."""
+        if self.model.calibration is None:
+            return 0.0
+        nominal, own = (forward(self.joints, model)[1] for model in (self.model.nominal, self.model))
+        return SAME_PLACE + float(np.linalg.norm(nominal - own, axis=-1).max())
 
     @cached_property
     def flange(self) -> Transforms:
@@ -324,9 +334,11 @@ def follow(poses: FloatArray, near: FloatArray, spec: UrArmSettings) -> FloatArr
     Raises:
         OutOfReachError: some poses cannot be reached.
     """
-    model = MODELS[spec.model]
+    model = spec.robot
     flange = flange_poses(poses, spec)
-    joints = inverse(flange.rotation, flange.position, model)[:, posture(np.array(spec.home.angles), model)]
+    number = posture(np.array(spec.home.angles), model)
+    joints = inverse(flange.rotation, flange.position, model.nominal)[:, number]
+    joints = refined(joints, flange.rotation, flange.position, model)
     if np.isnan(joints).any():
         raise OutOfReachError(poses)
     return np.unwrap(np.concatenate([near[None], joints]), axis=0)[1:]

@@ -23,7 +23,9 @@ from actors.arm.ur.controller_readout import (
     read_status,
 )
 from actors.arm.ur.primary_interface import RobotState
-from actors.arm.ur.worker_messages import why_not_ready
+from actors.arm.ur.robot_comparison import robot_checks
+from actors.arm.ur.robot_models import same_robot
+from actors.arm.ur.worker_messages import SAFETY_MODES, safety_mode, why_not_ready
 from actors.interfaces import DeviceCheck, State
 
 TOOL_TOLERANCE, TURN_TOLERANCE = 1e-3, math.radians(0.5)
@@ -111,37 +113,6 @@ def home_check(spec: UrArmSettings, state: RobotState) -> DeviceCheck:
     )
 
 
-def limit_checks(spec: UrArmSettings, state: RobotState) -> list[DeviceCheck]:
-    """Check that the file's limits are within the controller's."""
-    checks = []
-    if state.joint_speeds:
-        slowest = min(state.joint_speeds)
-        if spec.limits.joint_speed > slowest + 1e-6:
-            checks.append(
-                DeviceCheck(
-                    "joint speed",
-                    "warn",
-                    f"the file allows {math.degrees(spec.limits.joint_speed):.0f} deg/s, the controller "
-                    f"{math.degrees(slowest):.0f} deg/s for its slowest joint",
-                    "a fast pour may end in a protective stop; lower 'joint_speed' in the file",
-                )
-            )
-        else:
-            checks.append(DeviceCheck("joint speed", "ok", "the file's limit is within the controller's"))
-    out = [
-        i
-        for i, (q, (low, high)) in enumerate(zip(spec.home.angles, state.joint_ranges, strict=False))
-        if not low <= q <= high
-    ]
-    if out:
-        checks.append(
-            DeviceCheck(
-                "home", "fail", f"{JOINT_NAMES[out[0]]} of 'home' is outside the controller's range", "correct 'home'"
-            )
-        )
-    return checks
-
-
 def distance(a: Pose, b: Pose) -> float:
     """Distance between two frames' origins [m]."""
     return math.dist((a.x, a.y, a.z), (b.x, b.y, b.z))
@@ -225,13 +196,16 @@ def judge(
         checks.append(_software(found))
     if found.dashboard is not None:
         checks += _dashboard(spec, found, found.dashboard)
+    name = (found.dashboard or {}).get("get robot model", "")
+    if found.state is not None and found.software and name:
+        rests = found.exchange is not None and found.exchange.rests
+        checks += robot_checks(spec, name, found.software, found.state, rests=rests)
     if found.state is not None:
         checks += [
             _checksum(found, record, accept, virtual=virtual),
             tool_check(spec, found.state),
             home_check(spec, found.state),
         ]
-        checks += limit_checks(spec, found.state)
     if found.state is not None and found.exchange is not None:
         checks.append(mount_check(spec, found.state, found.exchange))
     if found.exchange is not None:
@@ -253,10 +227,13 @@ def readiness(spec: UrArmSettings) -> DeviceCheck:
     if motion.state == "fail":
         remedies = (states[name].advice for name in ("safety", "arm", "program"))
         return replace(motion, advice=next(filter(None, remedies), "set the slider on the teach pendant"))
-    remote, model = states["remote control"], states["model"]
+    remote = states["remote control"]
     if remote.state == "fail":
         return replace(remote, name="motion", found=f"remote control is {remote.found}")
-    return replace(model, name="motion") if model.state == "fail" else motion
+    if not same_robot(found.model, spec.model):
+        text = f"the controller says {found.model or 'nothing'}, the file {spec.model}"
+        return DeviceCheck("motion", "fail", text, "correct 'model' or 'address' in the file")
+    return motion
 
 
 def _connection(spec: UrArmSettings, found: Findings) -> list[DeviceCheck]:
@@ -325,16 +302,7 @@ def _software(found: Findings) -> DeviceCheck:
 
 
 def _dashboard(spec: UrArmSettings, found: Findings, responses: dict[str, str]) -> list[DeviceCheck]:
-    checks = [
-        DeviceCheck("model", "ok", f"{found.model.upper()}, serial number {found.serial}")
-        if found.model == spec.model
-        else DeviceCheck(
-            "model",
-            "fail",
-            f"the controller says {found.model or responses.get('get robot model', 'nothing')}, the file {spec.model}",
-            "is this the right controller? Lengths and limits differ between models: correct 'model' or 'address'",
-        )
-    ]
+    checks = []
     remote = responses.get("is in remote control", "").lower()
     if found.software and found.software[0] < 5:
         checks.append(DeviceCheck("remote control", "ok", "a CB3 controller always takes programs"))
@@ -376,18 +344,10 @@ def _robot_mode(mode: str) -> DeviceCheck:
     )
 
 
-def _safety_mode(mode: str) -> DeviceCheck:
-    advice = {
-        "NORMAL": "",
-        "REDUCED": "pours are planned within the normal limits: end the reduced mode, at the pendant or its input",
-        "PROTECTIVE_STOP": "find the cause, then unlock it on the teach pendant; Decant never does so by itself",
-        "RECOVERY": "the arm is outside its limits: bring it back by hand in the recovery mode of the teach pendant",
-        "SAFEGUARD_STOP": "a door, mat or light curtain holds it: close it",
-        "SYSTEM_EMERGENCY_STOP": "release the emergency stop, once you know why it was pressed",
-        "ROBOT_EMERGENCY_STOP": "release the emergency stop, once you know why it was pressed",
-    }.get(mode, "look at the teach pendant; a fault of the safety system needs a restart, or the maker's service")
-    state: State = "ok" if mode == "NORMAL" else "fail"
-    return DeviceCheck("safety", state, mode.lower().replace("_", " ") or "not told", advice)
+def _safety_mode(word: str) -> DeviceCheck:
+    mode = next((mode for mode in SAFETY_MODES.values() if mode.word == word), safety_mode(0))
+    state: State = "ok" if word == "NORMAL" else "fail"
+    return DeviceCheck("safety", state, word.lower().replace("_", " ") or "not told", mode.advice)
 
 
 def _checksum(found: Findings, record: SafetyRecord | None, accept: str, *, virtual: bool) -> DeviceCheck:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import re
 import socket
 import statistics
@@ -24,9 +25,11 @@ from actors.arm.ur import primary_interface as primary
 from actors.arm.ur import rtde
 from actors.arm.ur.dashboard import Dashboard, DashboardError
 from actors.arm.ur.primary_interface import RobotState
+from actors.arm.ur.robot_models import model_named
+from actors.arm.ur.worker_messages import STANDSTILL
 from actors.interfaces import LaboratoryError
 
-SCRIPTS, RTDE = 30003, 30004
+SCRIPTS, RTDE = 30003, rtde.PORT
 PORTS: dict[int, str] = {
     dashboard_port.PORT: "dashboard",
     primary.PORT: "primary interface",
@@ -86,6 +89,11 @@ class Exchange:
         """Acceleration that the tool measures, in its own frame [m/s²]: upwards at rest; None if it is not reported."""
         return self.values.get("actual_tool_accelerometer")
 
+    @property
+    def rests(self) -> bool:
+        """Whether no joint moves."""
+        return max(map(abs, self.values.get("actual_qd", (math.inf,)))) < STANDSTILL
+
 
 def port_problem(address: str, port: int, patience: float = 2.0) -> str | None:
     """Why a port cannot be reached; None if it is open."""
@@ -113,38 +121,6 @@ def ask_dashboard(address: str, questions: Sequence[str] = QUESTIONS, patience: 
         raise ReadoutError(str(error)) from error
 
 
-def read_state(address: str, patience: float = 3.0) -> RobotState:
-    """The robot's state, once all its parts have arrived.
-
-    Args:
-        address: of the controller.
-        patience: longest wait [s]; at most half of it is spent on the checksum and the limits, which may be missing.
-
-    Raises:
-        ReadoutError: no state arrived, or it cannot be read.
-    """
-    begin, rest, parts = time.monotonic(), b"", dict[int, bytes]()
-    needed, welcome = {primary.JOINTS, primary.CARTESIAN}, {primary.SAFETY, primary.CONFIGURATION}
-    try:
-        with socket.create_connection((address, primary.PORT), timeout=patience) as connection:
-            while not (needed | welcome) <= parts.keys():
-                spent = time.monotonic() - begin
-                if spent > patience or (needed <= parts.keys() and spent > patience / 2.0):
-                    break
-                data = connection.recv(65536)
-                if not data:
-                    break
-                packages, rest = primary.split(rest + data)
-                for kind, body in packages:
-                    if kind == primary.STATE:
-                        parts |= dict(primary.split(body)[0])
-    except (OSError, primary.PrimaryError) as error:
-        raise ReadoutError(f"the primary port at {address} can't be read: {error}") from error
-    if not needed <= parts.keys():
-        raise ReadoutError(f"the primary port at {address} sent no robot state within {patience:g} s")
-    return primary.robot_state(parts)
-
-
 def read_exchange(address: str, rate: float = 125.0, seconds: float = 1.0, patience: float = 3.0) -> Exchange:
     """Values over RTDE, round-trip times, and the regularity of packages.
 
@@ -159,36 +135,12 @@ def read_exchange(address: str, rate: float = 125.0, seconds: float = 1.0, patie
     """
     try:
         with socket.create_connection((address, RTDE), timeout=patience) as connection:
-            return _exchange(_Rtde(connection), rate, seconds)
+            return _exchange(rtde.Requests(connection), rate, seconds)
     except (OSError, struct.error, rtde.PackageError) as error:
         raise ReadoutError(f"RTDE at {address} doesn't answer as it should: {error}") from error
 
 
-class _Rtde:
-    """Requests and responses on one connection."""
-
-    def __init__(self, connection: socket.socket) -> None:
-        self._connection = connection
-        self._packages = rtde.PackageReader()
-        self._waiting: list[tuple[int, bytes]] = []
-
-    def ask(self, kind: int, payload: bytes = b"") -> bytes:
-        self._connection.sendall(rtde.package(kind, payload))
-        while True:
-            got, answer = self.next()
-            if got == kind:
-                return answer
-
-    def next(self) -> tuple[int, bytes]:
-        while not self._waiting:
-            data = self._connection.recv(65536)
-            if not data:
-                raise OSError("it hung up")
-            self._waiting.extend(self._packages.feed(data))
-        return self._waiting.pop(0)
-
-
-def _exchange(connection: _Rtde, rate: float, seconds: float) -> Exchange:
+def _exchange(connection: rtde.Requests, rate: float, seconds: float) -> Exchange:
     if connection.ask(rtde.REQUEST_PROTOCOL_VERSION, struct.pack(">H", 2)) != b"\x01":
         raise OSError("it doesn't know protocol 2")
     trips = []
@@ -197,7 +149,7 @@ def _exchange(connection: _Rtde, rate: float, seconds: float) -> Exchange:
         asked = time.monotonic()
         version = struct.unpack(">4I", connection.ask(rtde.GET_URCONTROL_VERSION)[:16])
         trips.append(time.monotonic() - asked)
-    names = ("timestamp", "payload", "payload_cog", "actual_tool_accelerometer", *STATUS)
+    names = ("timestamp", "payload", "payload_cog", "actual_tool_accelerometer", "actual_qd", *STATUS)
     known = _known(connection, names, rate)
     if connection.ask(rtde.START) != b"\x01":
         raise OSError("it doesn't begin to send")
@@ -232,7 +184,7 @@ def _exchange(connection: _Rtde, rate: float, seconds: float) -> Exchange:
     )
 
 
-def _known(connection: _Rtde, names: Sequence[str], rate: float) -> dict[str, str]:
+def _known(connection: rtde.Requests, names: Sequence[str], rate: float) -> dict[str, str]:
     """The requested values that this controller has, with their types; it sends them from now on."""
     while True:
         answer = connection.ask(rtde.SETUP_OUTPUTS, struct.pack(">d", rate) + ",".join(names).encode("ascii"))
@@ -282,10 +234,8 @@ class Findings:
     @property
     def model(self) -> str:
         """Name of the model in laboratory files; '' if unknown."""
-        name = (self.dashboard or {}).get("get robot model", "").lower()
-        if not name or not self.software:
-            return ""
-        return name if name.endswith("e") or self.software[0] < 5 else f"{name}e"
+        name = (self.dashboard or {}).get("get robot model", "")
+        return model_named(name, self.software) if name and self.software else ""
 
 
 def read_status(host: str) -> Findings:
@@ -336,7 +286,7 @@ def look_at(host: str) -> Findings:
             dashboard = ask_dashboard(address)
     if ports[primary.PORT] is None:
         with _noting(problems):
-            state = read_state(address)
+            state = primary.read_state(address)
     if ports[RTDE] is None:
         with _noting(problems):
             exchange = read_exchange(address)
@@ -350,5 +300,5 @@ def look_at(host: str) -> Findings:
 def _noting(problems: list[str]) -> Iterator[None]:
     try:
         yield
-    except ReadoutError as error:
+    except (ReadoutError, primary.PrimaryError) as error:
         problems.append(str(error))

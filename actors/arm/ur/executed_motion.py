@@ -13,7 +13,7 @@ import numpy as np
 
 from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath
-from actors.arm.planning.kinematics import MODELS, cell_transforms, forward, pourer_motion
+from actors.arm.planning.kinematics import cell_transforms, forward, pourer_motion
 from actors.arm.ur.worker_messages import MotionOutcome, Sample
 
 LONGEST_LAG = 0.3
@@ -70,7 +70,7 @@ def _tracking(times: FloatArray, joints: FloatArray, path: JointPath, spec: UrAr
     lag = best_lag(times, joints, path)
     planned = path.at(times - lag)
     angles = np.abs(joints - planned).max(axis=1)
-    model, tool = MODELS[spec.model], cell_transforms(spec).tool.position
+    model, tool = spec.robot, cell_transforms(spec).tool.position
     points = []
     for q in (joints, planned):
         rotation, position = forward(q, model)

@@ -17,12 +17,11 @@ from actors.arm.ur.primary_interface import Primary, PrimaryError
 from actors.arm.ur.rtde_client import AT_REST, RtdeClient
 from actors.arm.ur.worker_messages import (
     DONE,
-    NORMAL,
+    FULL_SPEED,
     PLAYING,
     READY,
     ROBOT_MODES,
     RUNNING_MODE,
-    SAFETY_MODES,
     SLOWEST_HEARTBEAT,
     STOPPED,
     STOPPED_PROGRAM,
@@ -32,6 +31,8 @@ from actors.arm.ur.worker_messages import (
     MotionProgress,
     Sample,
     TroubleError,
+    may_move,
+    safety_mode,
     why_not_ready,
 )
 
@@ -53,9 +54,6 @@ OVERTIME = 10.0
 BEAT_INTERVAL, TELL_INTERVAL, LOOK_INTERVAL = 0.02, 0.05, 0.002
 OWNER_SILENCE = 3.0
 """Time without a sign of life after which the driver counts as dead [s of the clock]."""
-
-_KINDS = {3: "protective stop", 5: "safeguard", 6: "emergency stop", 7: "emergency stop"}
-"""Kinds of stops by safety mode; "safety" for all others."""
 
 
 class MotionMonitor:
@@ -102,7 +100,10 @@ class MotionMonitor:
             TroubleError: refused before anything moved.
         """
         reading = self._client.fresh()
-        self._refuse_if(why_not_ready(reading.robot_mode, reading.safety_mode, reading.runtime, reading.slider))
+        pours = self._motion.pours
+        self._refuse_if(
+            why_not_ready(reading.robot_mode, reading.safety_mode, reading.runtime, reading.slider, pours=pours)
+        )
         self._refuse_if(_elsewhere(reading.joints, self._motion.start))
         self._refuse_if(_not_remote(self._address))
         self._joints = reading.joints
@@ -158,14 +159,13 @@ class MotionMonitor:
                 tool_is_set = _near(reading.tool, settings.tool, SAME_TOOL)
                 payload_is_set = _near(payload, (settings.payload, *settings.centre), SAME_PAYLOAD)
                 if tool_is_set and payload_is_set:
-                    why = _elsewhere(reading.joints, motion.start)
-                    return why
+                    return _elsewhere(reading.joints, motion.start) or (_slowed(reading) if motion.pours else "")
                 if time.monotonic() > end - 0.5 * UPLOAD_TIME:
                     return (
                         f"tool and payload were set to {_show((*settings.tool, settings.payload, *settings.centre))}; "
                         f"the controller has {_show((*reading.tool, *payload))}"
                     )
-            if reading.safety_mode != NORMAL or reading.robot_mode != RUNNING_MODE:
+            if self._is_stopped(reading):
                 return "the robot is not ready any more"
             if primary.broken or time.monotonic() > end:
                 return "the program did not start on the controller"
@@ -180,7 +180,7 @@ class MotionMonitor:
             if reading.status == STOPPED and reading.number == motion.number:
                 self._answered = time.monotonic()
                 return self._broken_off("operator", "stopped by the operator")
-            if reading.safety_mode != NORMAL or reading.robot_mode != RUNNING_MODE:
+            if self._is_stopped(reading):
                 return self._stopped_by_safety(reading)
             if reading.status == DONE and reading.number == motion.number:
                 arrived = arrived or time.monotonic()
@@ -204,15 +204,19 @@ class MotionMonitor:
     def _stopped_by_safety(self, reading: DataPackage) -> MotionOutcome:
         # After a safeguard stop the program would resume when the safeguard is reset, after a protective stop at
         # 'play'.
-        kind = _KINDS.get(reading.safety_mode, "safety")
-        text = SAFETY_MODES.get(reading.safety_mode, "") if reading.safety_mode != NORMAL else ""
-        text = text or f"the robot is {ROBOT_MODES.get(reading.robot_mode, 'not running')}"
-        return self._broken_off(kind, text)
+        mode = safety_mode(reading.safety_mode)
+        if may_move(reading.safety_mode, pours=self._motion.pours):
+            return self._broken_off("safety", f"the robot is {ROBOT_MODES.get(reading.robot_mode, 'not running')}")
+        return self._broken_off(mode.kind or "safety", mode.text)
+
+    def _is_stopped(self, reading: DataPackage) -> bool:
+        allowed = may_move(reading.safety_mode, pours=self._motion.pours)
+        return not allowed or reading.robot_mode != RUNNING_MODE
 
     def _stopped_by_program(self, primary: Primary) -> MotionOutcome:
         time.sleep(0.05)  # the safety mode may be reported a little later
         reading = self._look()
-        if reading.safety_mode != NORMAL or reading.robot_mode != RUNNING_MODE:
+        if self._is_stopped(reading):
             return self._stopped_by_safety(reading)
         if self._ordered.is_set():
             return self._broken_off("operator", "stopped by the operator")
@@ -269,7 +273,7 @@ class MotionMonitor:
         reading = self._client.look(1.0 if self._went else AT_REST)
         self._joints = reading.joints
         if self._went:
-            self._slider = min(self._slider, reading.slider)
+            self._slider = min(self._slider, reading.speed)
             if reading.number == self._motion.number:
                 self._clock = reading.clock
             if not self._samples or reading.time > self._samples[-1][0]:
@@ -308,6 +312,17 @@ def _elsewhere(joints: tuple[float, ...], wanted: tuple[float, ...]) -> str:
     return f"{JOINT_NAMES[worst]} is {errors[worst] * 57.29578:.1f}° away from where it should be; stand there first"
 
 
+def _slowed(reading: DataPackage) -> str:
+    """Why the program, which runs and waits, would be slower than planned; '' if it would not."""
+    if reading.speed >= FULL_SPEED:
+        return ""
+    return (
+        f"the controller runs programs at {100.0 * reading.speed:.0f} % of their speed (slider "
+        f"{100.0 * reading.slider:.0f} %, its own slowing {100.0 * reading.scaling:.0f} %); a pour needs 100 %. Decant "
+        "does not raise the slider, since a person lowered it"
+    )
+
+
 def _not_remote(address: str) -> str:
     try:
         with Dashboard(address) as dashboard:
@@ -324,7 +339,6 @@ UNLOCK_DELAY = 5.5
 POWER_TIME = 60.0
 """Longest wait for power and brakes [s of controller time]."""
 
-_PROTECTIVE, _SAFEGUARD, _EMERGENCIES, _FAULTS = 3, 5, (6, 7), (8, 9)
 _IDLE = 5
 
 
@@ -344,24 +358,26 @@ def recover(client: RtdeClient, address: str, scale: float) -> str:
     """
     done = []
     try:
-        mode = client.fresh().safety_mode
-        if mode in _EMERGENCIES:
+        mode = safety_mode(client.fresh().safety_mode)
+        if mode.kind == "emergency stop":
             raise TroubleError("refused", "the emergency stop is still pressed; release its button first")
-        if mode == _SAFEGUARD:
+        if mode.kind == "safeguard":
             raise TroubleError("refused", "the safeguard stop is still in force; leave the guarded area, then reset it")
-        if mode in _FAULTS:
-            raise TroubleError(
-                "refused", "the safety system reports a fault; restart it at the pendant, after its cause was found"
-            )
+        if mode.kind == "safety":
+            raise TroubleError("refused", f"{mode.text} is in force: {mode.advice}")
         with Dashboard(address) as dashboard:
             # A paused program would resume, and the next uploaded program would be discarded.
             dashboard.demand("stop", "Stopped")
             dashboard.ask("close popup")
             dashboard.ask("close safety popup")
-            if mode == _PROTECTIVE:
+            if mode.kind == "protective stop":
                 _unlock(dashboard, scale)
                 done.append("protective stop unlocked")
-                _until(lambda: client.fresh().safety_mode == NORMAL, POWER_TIME / scale, "the safety mode stays")
+                _until(
+                    lambda: may_move(client.fresh().safety_mode, pours=False),
+                    POWER_TIME / scale,
+                    "the safety mode stays",
+                )
             if client.fresh().robot_mode < _IDLE:
                 dashboard.demand("power on", "Powering on")
                 done.append("switched on")

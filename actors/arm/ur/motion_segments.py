@@ -19,7 +19,6 @@ from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError
 from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath, PourPath
 from actors.arm.planning.kinematics import (
-    MODELS,
     cell_transforms,
     flange_transforms,
     forward,
@@ -193,6 +192,12 @@ class MotionSegment:
             raise ArmRefusedError("a pour's path has a tilt for each of its times, and phases")
         return cls(checked(path.pour), path.phases, path.tilts)
 
+    def slowed(self, factor: float) -> MotionSegment:
+        """The same motion at a fraction of its speed."""
+        path = JointPath(self.path.times / factor, self.path.joints)
+        phases = tuple((name, start / factor, end / factor) for name, start, end in self.phases)
+        return MotionSegment(path, phases, self.tilts)
+
     @property
     def name(self) -> str:
         """Name of its first phase."""
@@ -278,7 +283,7 @@ def jog_path(spec: UrArmSettings, joints: Joints, axis: str, amount: float, spee
 
 
 def _tool_steps(spec: UrArmSettings, start: FloatArray, axis: str, amounts: FloatArray) -> FloatArray:
-    model, tool = MODELS[spec.model], cell_transforms(spec).tool
+    model, tool = spec.robot, cell_transforms(spec).tool
     rotation, position = forward(start[None], model)
     rotations, positions = np.repeat(rotation, _POINTS, axis=0), np.repeat(position, _POINTS, axis=0)
     along = np.eye(3)[AXES.index(axis) % 3]
@@ -307,7 +312,7 @@ def _turn(axis: FloatArray, angle: float) -> FloatArray:
 
 
 def _check(spec: UrArmSettings, points: FloatArray) -> None:
-    model = MODELS[spec.model]
+    model = spec.robot
     for name, positions, most in zip(JOINT_NAMES, points.T, model.joint_range, strict=True):
         if np.abs(positions).max() > most:
             raise ArmRefusedError(f"{name} would leave its range")

@@ -13,9 +13,12 @@ import socket
 import struct
 import threading
 import time
+import zlib
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+
+from actors.arm.ur.robot_models import Calibration
 
 PORT = 30001
 PATIENCE = 2.0
@@ -23,11 +26,12 @@ PATIENCE = 2.0
 
 _LONGEST = 1_000_000
 STATE, _MESSAGE = 16, 20
-JOINTS, CARTESIAN, CONFIGURATION, SAFETY = 1, 4, 6, 10
+JOINTS, CARTESIAN, KINEMATICS, CONFIGURATION, SAFETY = 1, 4, 5, 6, 10
 """Parts of a robot state."""
 _ERROR, _KEY, _EXCEPTION = 6, 7, 10
 _HEAD = struct.Struct(">iB")
 _JOINT = struct.Struct(">3d4fB")
+_CONFIGURATION, _KINEMATICS = struct.Struct(">53d4i"), struct.Struct(">6I24d")
 
 
 class PrimaryError(Exception):
@@ -62,7 +66,10 @@ class RobotState:
         tool: TCP in the flange's frame, likewise.
         checksum: of the safety configuration, eight hexadecimal digits.
         joint_ranges: lowest and highest position of each joint [rad].
-        joint_speeds: largest speed of each joint [rad/s].
+        joint_speeds, joint_accelerations: largest ones of each joint [rad/s], [rad/s²].
+        kind: type of robot, see `RobotModel.kind`; None if it is not reported.
+        lengths: nominal Denavit–Hartenberg lengths: six along x, six along z [m].
+        calibration: of this robot; None if it is nominal, as a simulator's is, or not reported.
     """
 
     joints: tuple[float, ...] = ()
@@ -71,13 +78,18 @@ class RobotState:
     checksum: str = ""
     joint_ranges: tuple[tuple[float, float], ...] = ()
     joint_speeds: tuple[float, ...] = ()
+    joint_accelerations: tuple[float, ...] = ()
+    kind: int | None = None
+    lengths: tuple[float, ...] = ()
+    calibration: Calibration | None = None
 
 
 def robot_state(parts: Mapping[int, bytes]) -> RobotState:
     """Read the parts of a robot state, by type."""
     joints, cartesian = parts.get(JOINTS, b""), parts.get(CARTESIAN, b"")
     safety, limits = parts.get(SAFETY, b""), parts.get(CONFIGURATION, b"")
-    numbers = struct.unpack_from(">24d", limits) if len(limits) >= 24 * 8 else ()
+    known = len(limits) >= _CONFIGURATION.size
+    numbers = _CONFIGURATION.unpack_from(limits) if known else ()
     places = struct.unpack_from(">12d", cartesian) if len(cartesian) >= 12 * 8 else ()
     return RobotState(
         joints=tuple(_JOINT.unpack_from(joints, _JOINT.size * i)[0] for i in range(len(joints) // _JOINT.size)),
@@ -86,7 +98,52 @@ def robot_state(parts: Mapping[int, bytes]) -> RobotState:
         checksum=f"{int.from_bytes(safety[:4], 'big'):08X}" if len(safety) >= 4 else "",
         joint_ranges=tuple(zip(numbers[0:12:2], numbers[1:12:2], strict=True)),
         joint_speeds=tuple(numbers[12:24:2]),
+        joint_accelerations=tuple(numbers[13:24:2]),
+        kind=numbers[55] if known else None,
+        lengths=tuple(numbers[29:41]),
+        calibration=_calibration(parts.get(KINEMATICS, b"")),
     )
+
+
+def _calibration(data: bytes) -> Calibration | None:
+    """Source: the manufacturer's client library. Simulators send checksums of all ones."""
+    if len(data) < _KINEMATICS.size or data[:24] == b"\xff" * 24:
+        return None
+    values = _KINEMATICS.unpack_from(data)[6:]
+    theta, a, d, alpha = (values[6 * k : 6 * k + 6] for k in range(4))
+    return Calibration(theta, a, d, alpha, f"{zlib.crc32(data[: _KINEMATICS.size]):08X}")
+
+
+def read_state(address: str, patience: float = 3.0) -> RobotState:
+    """The robot's state, once all its parts have arrived.
+
+    Args:
+        address: of the controller.
+        patience: longest wait [s]; at most half of it is spent on parts that may be missing.
+
+    Raises:
+        PrimaryError: no state arrived, or it cannot be read.
+    """
+    begin, rest, parts = time.monotonic(), b"", dict[int, bytes]()
+    needed, welcome = {JOINTS, CARTESIAN}, {SAFETY, CONFIGURATION, KINEMATICS}
+    try:
+        with socket.create_connection((address, PORT), timeout=patience) as connection:
+            while not (needed | welcome) <= parts.keys():
+                spent = time.monotonic() - begin
+                if spent > patience or (needed <= parts.keys() and spent > patience / 2.0):
+                    break
+                data = connection.recv(65536)
+                if not data:
+                    break
+                packages, rest = split(rest + data)
+                for kind, body in packages:
+                    if kind == STATE:
+                        parts |= dict(split(body)[0])
+    except (OSError, PrimaryError) as error:
+        raise PrimaryError(f"the primary port at {address} can't be read: {error}") from error
+    if not needed <= parts.keys():
+        raise PrimaryError(f"the primary port at {address} sent no robot state within {patience:g} s")
+    return robot_state(parts)
 
 
 class Primary:
@@ -96,7 +153,6 @@ class Primary:
         address: of the controller.
 
     Attributes:
-        state: the first complete one, with the tool.
         complaints: its latest messages about programs.
         broken: it reported that a program cannot be read, or cannot continue.
 
@@ -105,20 +161,15 @@ class Primary:
     """
 
     def __init__(self, address: str) -> None:
-        self.state = RobotState()
         self.complaints: deque[str] = deque(maxlen=8)
         self.broken = False
         self._rest = b""
-        parts: dict[int, bytes] = {}
         try:
             self._socket = socket.create_connection((address, PORT), timeout=PATIENCE)
             end = time.monotonic() + PATIENCE
-            while self.state.tool == ():
+            while not self._take(self._socket.recv(65536)):
                 if time.monotonic() > end:
                     raise PrimaryError(f"{address}:{PORT} sends no robot state")
-                for body in self._take(self._socket.recv(65536)):
-                    parts |= dict(split(body)[0])
-                self.state = robot_state(parts)
             self._socket.settimeout(None)
         except OSError as error:
             raise PrimaryError(f"{address}:{PORT}: {error}") from error
@@ -146,15 +197,15 @@ class Primary:
             while data := self._socket.recv(65536):
                 self._take(data)
 
-    def _take(self, data: bytes) -> list[bytes]:
-        """Store the contents of messages; returns robot states."""
+    def _take(self, data: bytes) -> bool:
+        """Store the contents of messages; returns whether a robot state was among them."""
         if not data:
             raise PrimaryError("hung up")
         packages, self._rest = split(self._rest + data)
         for kind, body in packages:
             if kind == _MESSAGE:
                 self._message(body)
-        return [body for kind, body in packages if kind == STATE]
+        return any(kind == STATE for kind, _ in packages)
 
     def _message(self, body: bytes) -> None:
         if len(body) < 10:

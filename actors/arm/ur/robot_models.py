@@ -1,16 +1,56 @@
-"""The two robots: lengths, masses and limits. Plain values.
+"""The supported robots: lengths, masses and limits, and the calibration of a single robot. Plain values.
 
-Source of the Denavit–Hartenberg parameters, masses and centres of mass: the manufacturer's public page "DH Parameters
-for calculations of kinematics and dynamics". Nominal: a real robot is calibrated and differs by tenths of a millimetre.
+Sources:
+
+- lengths and joint speeds: `default_kinematics.yaml` and `joint_limits.yaml` of the manufacturer's ROS 2 description;
+- masses and centres: `physical_parameters.yaml` there, which cites the manufacturer's page "DH Parameters for
+  calculations of kinematics and dynamics". The values of the UR30 and the UR8 Long are those of a public fork of it;
+- payloads: product pages, second-hand. A UR10e takes 10 kg or 12.5 kg; its label says which;
+- robot types: the manufacturer's client library.
+
+No value was compared with a robot. A UR5 of the CB3 generation exists in three series of different lengths. The names
+on the dashboard, and the types of UR7e and UR12e, are unverified: both should report those of UR5e and UR10e.
+
+Lengths are nominal. A factory-calibrated robot differs from them by 2–8 mm and 0.4–1.4° (`Calibration`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from math import radians
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import pi, radians
 
 Vector = tuple[float, float, float]
 Joints = tuple[float, float, float, float, float, float]
+
+TWISTS: Joints = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
+"""Denavit–Hartenberg twists of every model [rad]."""
+
+SAME_PLACE, SAME_ANGLE = 0.5e-3, radians(0.1)
+"""Largest distance and angle between the tool's pose by own kinematics and by the controller's [m], [rad]."""
+
+CB3_FREQUENCY, FREQUENCY = 125, 500
+"""Control cycles per second of the older generation and of all later ones [Hz]."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Denavit–Hartenberg parameters of one robot, as measured in the factory.
+
+    The axes of joints 2 to 4 are nearly parallel, so that `d[1]` and `d[2]` may be hundreds of metres and `theta[1]`
+    and `theta[2]` any angle. Only the product of all transformations has a meaning, not a single parameter.
+
+    Attributes:
+        theta, a, d, alpha: of the six joints [rad], [m], [m], [rad].
+        checksum: eight hexadecimal digits; '' for a nominal robot, such as a simulator.
+    """
+
+    theta: Joints
+    a: Joints
+    d: Joints
+    alpha: Joints
+    checksum: str
 
 
 @dataclass(frozen=True)
@@ -23,8 +63,11 @@ class RobotModel:
         masses: of the links [kg].
         centres: of the links' masses, in their own frames [m].
         joint_speed: largest speed of each joint [rad/s].
-        joint_range: largest rotation of each joint in either direction [rad].
+        payload: largest payload [kg].
+        kind: type of robot in configuration data.
         frequency: control cycles per second [Hz].
+        joint_range: largest rotation of each joint in either direction [rad].
+        calibration: of a single robot; None for nominal lengths.
     """
 
     name: str
@@ -36,50 +79,239 @@ class RobotModel:
     d6: float
     masses: tuple[float, ...]
     centres: tuple[Vector, ...]
-    frequency: int
-    joint_speed: Joints = field(default=tuple(radians(v) for v in (120.0, 120.0, 180.0, 180.0, 180.0, 180.0)))  # type: ignore[assignment]
+    joint_speed: Joints
+    payload: float
+    kind: int
+    frequency: int = FREQUENCY
     joint_range: Joints = field(default=tuple(radians(363.0) for _ in range(6)))  # type: ignore[assignment]
+    calibration: Calibration | None = None
+
+    @property
+    def cb3(self) -> bool:
+        """Whether the robot is of the older generation."""
+        return self.frequency == CB3_FREQUENCY
+
+    @property
+    def a(self) -> Joints:
+        """Nominal lengths along x of the six joints [m]."""
+        return (0.0, self.a2, self.a3, 0.0, 0.0, 0.0)
+
+    @property
+    def d(self) -> Joints:
+        """Nominal lengths along z of the six joints [m]."""
+        return (self.d1, 0.0, 0.0, self.d4, self.d5, self.d6)
+
+    @property
+    def parameters(self) -> Calibration:
+        """All Denavit–Hartenberg parameters: calibrated, or nominal."""
+        return self.calibration or Calibration((0.0,) * 6, self.a, self.d, TWISTS, "")
+
+    @cached_property
+    def nominal(self) -> RobotModel:
+        """The model without calibration."""
+        return self if self.calibration is None else replace(self, calibration=None)
 
 
-UR10 = RobotModel(
-    name="UR10",
-    d1=0.1273,
-    a2=-0.612,
-    a3=-0.5723,
-    d4=0.163941,
-    d5=0.1157,
-    d6=0.0922,
-    masses=(7.1, 12.7, 4.27, 2.0, 2.0, 0.365),
-    centres=(
-        (0.021, 0.0, 0.027),
-        (0.38, 0.0, 0.158),
-        (0.24, 0.0, 0.068),
-        (0.0, 0.007, 0.018),
-        (0.0, 0.007, 0.018),
-        (0.0, 0.0, -0.026),
-    ),
-    frequency=125,
+def _speeds(*degrees: float) -> Joints:
+    a, b, c, d, e, f = (radians(v) for v in degrees)
+    return a, b, c, d, e, f
+
+
+_SMALL = _speeds(180, 180, 180, 360, 360, 360)
+_MIDDLE = _speeds(180, 180, 180, 180, 180, 180)
+_LARGE = _speeds(120, 120, 180, 180, 180, 180)
+_FAST = _speeds(180, 180, 240, 300, 300, 300)
+_HEAVY = _speeds(120, 120, 150, 210, 210, 210)
+
+
+def _centres(shoulder: Vector, upper: Vector, forearm: Vector, y: float, z: float, end: float) -> tuple[Vector, ...]:
+    """Centres of robots whose wrists 1 and 2 mirror each other: at ±y and z; wrist 3 at `end` along its axis."""
+    return shoulder, upper, forearm, (0.0, y, z), (0.0, -y, z), (0.0, 0.0, end)
+
+
+_CENTRES_3 = _centres((0.0, -0.02, 0.0), (0.13, 0.0, 0.1157), (0.05, 0.0, 0.0238), 0.0, 0.01, -0.02)
+_CENTRES_5 = _centres(
+    (0.0, -0.02561, 0.00193), (0.2125, 0.0, 0.11336), (0.15, 0.0, 0.0265), -0.0018, 0.01634, -0.001159
+)
+_CENTRES_10 = (
+    (0.021, 0.0, 0.027),
+    (0.38, 0.0, 0.158),
+    (0.24, 0.0, 0.068),
+    (0.0, 0.007, 0.018),
+    (0.0, 0.007, 0.018),
+    (0.0, 0.0, -0.026),
 )
 
-UR10E = RobotModel(
-    name="UR10",
-    d1=0.1807,
-    a2=-0.6127,
-    a3=-0.57155,
-    d4=0.17415,
-    d5=0.11985,
-    d6=0.11655,
-    masses=(7.369, 13.051, 3.989, 2.1, 1.98, 0.615),
-    centres=(
-        (0.021, 0.0, 0.027),
-        (0.38, 0.0, 0.158),
-        (0.24, 0.0, 0.068),
-        (0.0, 0.007, 0.018),
-        (0.0, 0.007, 0.018),
-        (0.0, 0.0, -0.026),
-    ),
-    frequency=500,
+_CENTRES_16 = (
+    *((0.0, -0.016, 0.03), (0.302, 0.0, 0.16), (0.194, 0.0, 0.065)),
+    *((0.0, -0.009, 0.011), (0.0, 0.018, 0.012), (0.0, 0.0, -0.044)),
+)
+_CENTRES_20 = (
+    *((0.0, -0.061, 0.0062), (0.5226, 0.0, 0.2098), (0.3234, 0.0, 0.0604)),
+    *((0.0, -0.0026, 0.0393), (0.0, 0.0024, 0.0379), (0.0, 0.0, -0.0293)),
+)
+_CENTRES_30 = (
+    *((-0.0001, -0.06, 0.0069), (0.3894, 0.0, 0.2103), (0.2257, 0.0, 0.0629)),
+    *((0.0, -0.0048, 0.0353), (0.0, 0.0046, 0.0341), (0.0, 0.0, -0.0293)),
 )
 
-MODELS = {"ur10": UR10, "ur10e": UR10E}
+
+def _centres_15(upper: Vector, forearm: Vector) -> tuple[Vector, ...]:
+    wrists = (0.000025, -0.019695, 0.016413), (0.000025, 0.01996, 0.015886), (-0.000018, -0.000112, -0.053397)
+    return (0.000024, -0.033309, 0.025304), upper, forearm, *wrists
+
+
+def _robot(
+    name: str,
+    millimetres: tuple[float, ...],
+    masses: tuple[float, ...],
+    centres: tuple[Vector, ...],
+    speeds: Joints,
+    payload: float,
+    kind: int,
+    frequency: int = FREQUENCY,
+) -> RobotModel:
+    d1, a2, a3, d4, d5, d6 = (round(length / 1000.0, 9) for length in millimetres)
+    return RobotModel(name, d1, a2, a3, d4, d5, d6, masses, centres, speeds, payload, kind, frequency)
+
+
+_UR5E = _robot(
+    "UR5",
+    (162.5, -425, -392.2, 133.3, 99.7, 99.6),
+    (3.761, 8.058, 2.846, 1.37, 1.3, 0.365),
+    _CENTRES_5,
+    _MIDDLE,
+    5.0,
+    1,
+)
+_UR10E = _robot(
+    "UR10",
+    (180.7, -612.7, -571.55, 174.15, 119.85, 116.55),
+    (7.369, 13.051, 3.989, 2.1, 1.98, 0.615),
+    _CENTRES_10,
+    _LARGE,
+    12.5,
+    2,
+)
+
+MODELS = {
+    "ur3": _robot(
+        "UR3",
+        (151.9, -243.65, -213.25, 112.35, 85.35, 81.9),
+        (2.0, 3.42, 1.26, 0.8, 0.8, 0.35),
+        _CENTRES_3,
+        _SMALL,
+        3.0,
+        3,
+        CB3_FREQUENCY,
+    ),
+    "ur5": _robot(
+        "UR5",
+        (89.159, -425, -392.25, 109.15, 94.65, 82.3),
+        (3.7, 8.393, 2.33, 1.219, 1.219, 0.1879),
+        _CENTRES_5,
+        _MIDDLE,
+        5.0,
+        1,
+        CB3_FREQUENCY,
+    ),
+    "ur10": _robot(
+        "UR10",
+        (127.3, -612, -572.3, 163.941, 115.7, 92.2),
+        (7.1, 12.7, 4.27, 2.0, 2.0, 0.365),
+        _CENTRES_10,
+        _LARGE,
+        10.0,
+        2,
+        CB3_FREQUENCY,
+    ),
+    "ur3e": _robot(
+        "UR3",
+        (151.85, -243.55, -213.2, 131.05, 85.35, 92.1),
+        (1.98, 3.4445, 1.437, 0.871, 0.805, 0.261),
+        _CENTRES_3,
+        _SMALL,
+        3.0,
+        3,
+    ),
+    "ur5e": _UR5E,
+    "ur7e": replace(_UR5E, payload=7.5),
+    "ur10e": _UR10E,
+    "ur12e": _UR10E,
+    "ur16e": _robot(
+        "UR16",
+        (180.7, -478.4, -360, 174.15, 119.85, 116.55),
+        (7.369, 10.45, 4.321, 2.18, 2.033, 0.907),
+        _CENTRES_16,
+        _LARGE,
+        16.0,
+        4,
+    ),
+    "ur8long": _robot(
+        "UR8L",
+        (218.6, -898.9, -714.9, 182.4, 136.1, 143.4),
+        (9.9883, 17.0738, 7.6393, 2.089, 2.0869, 1.0666),
+        _centres_15((0.565429, -0.000074, 0.19542), (0.416102, 0.000058, 0.065663)),
+        _FAST,
+        10.0,
+        6,
+    ),
+    "ur15": _robot(
+        "UR15",
+        (218.6, -647.5, -516.4, 182.4, 136.1, 143.4),
+        (9.9883, 14.9255, 6.1015, 2.089, 2.0869, 1.0666),
+        _centres_15((0.419009, -0.000083, 0.192787), (0.305471, 0.000019, 0.070552)),
+        _FAST,
+        17.5,
+        9,
+    ),
+    "ur18": _robot(
+        "UR18",
+        (218.6, -475, -338.9, 182.4, 136.1, 143.4),
+        (9.9883, 14.2009, 5.52, 2.089, 2.0869, 1.0666),
+        _centres_15((0.308664, -0.000088, 0.190204), (0.199652, 0.000021, 0.073101)),
+        _FAST,
+        18.0,
+        5,
+    ),
+    "ur20": _robot(
+        "UR20",
+        (236.3, -862, -728.7, 201, 159.3, 154.3),
+        (16.343, 29.632, 7.879, 3.054, 3.126, 0.926),
+        _CENTRES_20,
+        _HEAVY,
+        25.0,
+        7,
+    ),
+    "ur30": _robot(
+        "UR30",
+        (236.3, -637, -503.7, 201, 159.3, 154.3),
+        (16.343, 28.542, 7.156, 3.054, 3.126, 0.926),
+        _CENTRES_30,
+        _HEAVY,
+        35.0,
+        8,
+    ),
+}
 """Models by their names in configuration files."""
+
+
+def model_named(name: str, software: Sequence[int]) -> str:
+    """The name in configuration files of the model that a controller reports; its own name if it is not supported.
+
+    Args:
+        name: as the dashboard reports it; controllers leave out the 'e' of the e-Series.
+        software: version of the controller's software.
+    """
+    plain = name.strip().lower().replace(" ", "")
+    plain = "ur8long" if plain == "ur8l" else plain
+    cb3 = bool(software) and software[0] < 5
+    return next((key for key in (f"{plain}e", plain) if key in MODELS and MODELS[key].cb3 == cb3), plain)
+
+
+def same_robot(a: str, b: str) -> bool:
+    """Whether two models cannot be told apart by their controllers, such as UR5e and UR7e."""
+    if a not in MODELS or b not in MODELS:
+        return a == b
+    first, second = MODELS[a], MODELS[b]
+    return (first.kind, first.a, first.d, first.cb3) == (second.kind, second.a, second.d, second.cb3)

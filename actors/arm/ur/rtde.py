@@ -7,6 +7,7 @@ Source: the manufacturer's RTDE guide, and recordings of real clients.
 
 from __future__ import annotations
 
+import socket
 import struct
 from collections.abc import Iterator
 
@@ -18,6 +19,8 @@ SETUP_OUTPUTS = ord("O")
 SETUP_INPUTS = ord("I")
 START = ord("S")
 PAUSE = ord("P")
+
+PORT = 30004
 
 HEADER = struct.Struct(">HB")
 
@@ -68,6 +71,32 @@ class PackageReader:
             payload = bytes(rest[HEADER.size : size])
             del rest[:size]
             yield kind, payload
+
+
+class Requests:
+    """Requests and responses on one connection; `OSError` if it is lost."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._packages = PackageReader()
+        self._waiting: list[tuple[int, bytes]] = []
+
+    def ask(self, kind: int, payload: bytes = b"") -> bytes:
+        """Send a request. Returns the response of the same type."""
+        self._connection.sendall(package(kind, payload))
+        while True:
+            got, answer = self.next()
+            if got == kind:
+                return answer
+
+    def next(self) -> tuple[int, bytes]:
+        """Type and payload of the next package."""
+        while not self._waiting:
+            data = self._connection.recv(65536)
+            if not data:
+                raise OSError("it hung up")
+            self._waiting.extend(self._packages.feed(data))
+        return self._waiting.pop(0)
 
 
 def names(payload: bytes) -> list[str]:

@@ -1,8 +1,10 @@
 """A small interface to the RTDE client library, for the worker process only. A client is discarded, never reconnected.
 
-It uses only the parts of the library that read values and write input registers. The library's control interface
-uploads its own program when it is created, reconnects by itself, uploads again, and then ends the running program and
-sometimes its process. This is not acceptable in a cell where nothing may run without consent.
+It uses only the part of the library that reads values. `InputWriter` writes the three input registers: the library's
+own writer claims all outputs, the speed slider and registers of a fieldbus, so that no PLC, gripper or ROS driver could
+be connected at the same time. The library's control interface uploads its own program when it is created, reconnects by
+itself, uploads again, and then ends the running program and sometimes its process. This is not acceptable in a cell
+where nothing may run without consent.
 
 `client_missing` reports whether the library is installed.
 """
@@ -13,11 +15,13 @@ import contextlib
 import faulthandler
 import importlib.util
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
 from typing import Any
 
+from actors.arm.ur import rtde
 from actors.arm.ur.worker_messages import (
     CLOCK,
     GO,
@@ -41,7 +45,7 @@ def client_missing() -> str | None:
     )
 
 
-PORTS = {30004: "RTDE", 29999: "dashboard", 30001: "primary interface"}
+PORTS = {rtde.PORT: "RTDE", 29999: "dashboard", 30001: "primary interface"}
 PROBE_TIME = 2.0
 CONSTRUCTION_TIME = 5.0
 """Time after which a blocked constructor ends the process [s], because it holds the interpreter lock."""
@@ -59,7 +63,7 @@ _SAME_READINGS = 10
 
 _VARIABLES = [
     *("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state", "robot_status_bits"),
-    *("target_speed_fraction", "payload", "payload_cog", "safety_status_bits"),
+    *("target_speed_fraction", "speed_scaling", "payload", "payload_cog", "safety_status_bits"),
     *(f"output_int_register_{n}" for n in (NUMBER, STATUS)),
     *(f"output_double_register_{n}" for n in (CLOCK, *range(TOOL, TOOL + 6))),
 ]
@@ -72,31 +76,32 @@ class RtdeClient:
         address: of the controller.
         rate: of reading [Hz of the clock].
         silence: longest time without new data [s of the clock].
+        registers: first of the three integer inputs that are written.
 
     Raises:
-        TroubleError: the controller cannot be reached, or the library is missing.
+        TroubleError: the controller cannot be reached, another client writes these inputs, or the library is missing.
     """
 
-    def __init__(self, address: str, rate: float, silence: float) -> None:
+    def __init__(self, address: str, rate: float, silence: float, registers: int) -> None:
         for port, name in PORTS.items():
             _probe(address, port, name)
         if (missing := client_missing()) is not None:
             raise TroubleError("refused", missing)
-        from rtde_io import RTDEIOInterface  # type: ignore[import-not-found]
         from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
 
         for attempt in range(1, ATTEMPTS + 1):
             try:
                 with _bounded(CONSTRUCTION_TIME):
                     self._receive: Any = RTDEReceiveInterface(address, rate, _VARIABLES)
-                    self._io: Any = RTDEIOInterface(address)
+                self._inputs = InputWriter(address, registers)
                 break
-            except (RuntimeError, ValueError) as error:
+            except (RuntimeError, ValueError, TroubleError) as error:
                 if attempt == ATTEMPTS:
+                    if isinstance(error, TroubleError):
+                        raise
                     raise TroubleError("lost", f"{address}: {error}") from None
                 time.sleep(BETWEEN_ATTEMPTS)
         self._silence = silence
-        self._writing = threading.Lock()
         self._last: DataPackage | None = None
         self._same_readings = 0
 
@@ -133,6 +138,7 @@ class RtdeClient:
                 safety_mode=r.getSafetyMode(),
                 runtime=r.getRuntimeState(),
                 slider=r.getTargetSpeedFraction(),
+                scaling=r.getSpeedScaling(),
                 payload=r.getPayload(),
                 centre=tuple(r.getPayloadCog()),
                 number=r.getOutputIntRegister(NUMBER),
@@ -163,23 +169,72 @@ class RtdeClient:
 
     def beat(self, count: int) -> None:
         """Write the heartbeat, so that the program continues."""
-        self._write(HEARTBEAT, count & 0xFFFF)
+        self._inputs.write(HEARTBEAT, count & 0xFFFF)
 
     def go(self, number: int) -> None:
         """Write the order to start."""
-        self._write(GO, number)
+        self._inputs.write(GO, number)
 
     def order_stop(self, number: int) -> None:
         """Write the order to stop."""
-        self._write(STOP_ORDER, number)
+        self._inputs.write(STOP_ORDER, number)
 
-    def _write(self, register: int, value: int) -> None:
+
+class InputWriter:
+    """Writes three integer inputs over a connection of its own, and claims no other variable.
+
+    Args:
+        address: of the controller.
+        first: number of the first input; the others follow.
+
+    Raises:
+        TroubleError: the controller does not answer, or another client writes one of the inputs.
+    """
+
+    def __init__(self, address: str, first: int) -> None:
+        self._writing = threading.Lock()
+        self._recipes: dict[int, int] = {}
+        try:
+            self._socket = socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME)
+            requests = rtde.Requests(self._socket)
+            if requests.ask(rtde.REQUEST_PROTOCOL_VERSION, b"\0\2") != b"\1":
+                raise TroubleError("lost", f"{address}: its RTDE does not know protocol 2")
+            for register in (STOP_ORDER, HEARTBEAT, GO):
+                name = f"input_int_register_{first + register}"
+                answer = requests.ask(rtde.SETUP_INPUTS, name.encode("ascii"))
+                self._recipes[register] = answer[0]
+                self._check(address, name, rtde.names(answer[1:]))
+            self._socket.setblocking(False)  # a write never waits: some bytes always fit into the buffer
+        except (OSError, rtde.PackageError, IndexError) as error:
+            raise TroubleError("lost", f"{address}: its RTDE does not answer as it should: {error}") from None
+
+    def _check(self, address: str, name: str, kinds: list[str]) -> None:
+        if kinds == ["INT32"]:
+            return
+        self._socket.close()
+        if kinds == ["IN_USE"]:
+            raise TroubleError(
+                "refused",
+                f"{address}: another client writes {name}, such as a PLC, a gripper's URCap, a ROS driver or another "
+                "Decant; end it, or choose other inputs with the arm's key 'registers'",
+            )
+        raise TroubleError(
+            "refused",
+            f"{address}: {name} is {' '.join(kinds) or 'unknown'}; inputs from 24 on need software 3.9 or 5.3, for an "
+            "older one choose 'registers' below 21",
+        )
+
+    def write(self, register: int, value: int) -> None:
+        """Write one of the inputs. A lost connection is noticed by reading, and by the program's watchdog."""
         # If another thread is blocked here, the stop must still be attempted by other means.
         if not self._writing.acquire(timeout=0.2):
             return
         try:
-            with contextlib.suppress(RuntimeError):  # a lost connection is noticed by reading
-                self._io.setInputIntRegister(register, value)
+            with contextlib.suppress(OSError):
+                self._socket.sendall(
+                    rtde.package(rtde.DATA_PACKAGE, struct.pack(">Bi", self._recipes[register], value))
+                )
+                self._socket.recv(4096)  # messages of the controller, which nothing reads; usually there are none
         finally:
             self._writing.release()
 

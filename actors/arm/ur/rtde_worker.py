@@ -18,7 +18,7 @@ from typing import Any
 
 from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
 from actors.arm.ur.motion_execution import MotionMonitor, recover
-from actors.arm.ur.primary_interface import Primary, PrimaryError
+from actors.arm.ur.primary_interface import PrimaryError, read_state
 from actors.arm.ur.rtde_client import RtdeClient
 from actors.arm.ur.worker_messages import (
     STOPPED_PROGRAM,
@@ -97,10 +97,10 @@ class Worker:
 
     # ---- requests
 
-    def open(self, address: str, rate: float, silence: float) -> DataPackage:
+    def open(self, address: str, rate: float, silence: float, registers: int) -> DataPackage:
         """Connect; nothing moves."""
         self._address = address
-        self._client = RtdeClient(address, rate, silence)
+        self._client = RtdeClient(address, rate, silence, registers)
         return self._client.fresh()
 
     @property
@@ -120,14 +120,10 @@ class Worker:
                 serial = dashboard.ask("get serial number")
                 program = dashboard.ask("programState")
                 remote = None if version[0] < 5 else dashboard.ask("is in remote control").lower() == "true"
-            primary = Primary(self._address)
-            primary.close()
+            state = read_state(self._address)
         except (DashboardError, PrimaryError) as error:
             raise TroubleError("lost", str(error)) from None
-        return Facts(
-            *(model, serial, version, remote, program, reading),
-            *(primary.state.checksum, primary.state.tool, primary.state.joint_ranges, primary.state.joint_speeds),
-        )
+        return Facts(model, serial, version, remote, program, reading, state)
 
     def read(self) -> DataPackage:
         """A fresh package."""

@@ -29,14 +29,14 @@ from actors.arm.arm_interface import (
 )
 from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import ExecutedPath, PourPath
-from actors.arm.planning.kinematics import MODELS, cell_transforms, forward
+from actors.arm.planning.kinematics import cell_transforms, forward
 from actors.arm.planning.path_checks import recheck
 from actors.arm.ur.dashboard import DashboardError, stop_program
 from actors.arm.ur.executed_motion import Stops, StopTimes, executed_path
 from actors.arm.ur.motion_segments import MotionSegment, jog_path, upright_way, way_home
 from actors.arm.ur.ur_session import ANSWER_TIME, Session, UrFacts
 from actors.arm.ur.urscript_writer import path_program
-from actors.arm.ur.worker_messages import DataPackage, MotionOrder, MotionOutcome, MotionSettings
+from actors.arm.ur.worker_messages import REDUCED, DataPackage, MotionOrder, MotionOutcome, MotionSettings
 from actors.interfaces import LaboratoryError
 
 RECOVERY_TIME = 90.0
@@ -44,6 +44,10 @@ RECOVERY_TIME = 90.0
 
 MOTION_MARGIN = 40.0
 """Time beyond twice its planned duration after which a motion's worker counts as blocked [s]."""
+
+IN_REDUCED_MODE = 0.25
+"""Fraction of the speed of a motion in reduced mode: 100 mm/s at most, and below the speeds that installations limit
+it to."""
 
 STOP_TIME = 1.0
 """Time for each means of stopping before the next one is tried [s]."""
@@ -83,7 +87,9 @@ class UrArm:
             raise ArmRefusedError("the arm has no address; give the controller's, or have a virtual one started")
         with self._at_work("connecting"):
             self.lock()
-            return self._session.open()
+            facts = self._session.open()
+            self._spec = self._spec.fitted_to(facts)
+            return facts
 
     def facts(self) -> UrFacts:
         """See `Arm.facts`."""
@@ -109,7 +115,7 @@ class UrArm:
         from scipy.spatial.transform import Rotation
 
         joints = self.joints()
-        rotation, position = forward(np.array([joints]), MODELS[self._spec.model])
+        rotation, position = forward(np.array([joints]), self._spec.robot)
         tool = cell_transforms(self._spec).tool
         x, y, z = map(float, position[0] + rotation[0] @ tool.position)
         rx, ry, rz = map(float, Rotation.from_matrix(rotation[0] @ tool.rotation).as_rotvec())
@@ -152,13 +158,15 @@ class UrArm:
     def move_to_start(self, path: PourPath) -> None:
         """See `Arm.move_to_start`."""
         with self._at_work("moving"):
-            self._go(MotionSegment.of("approach", path.approach, self._spec))
+            self._check_calibration(path)
+            self._go(MotionSegment.of("approach", path.approach, self._spec), pours=True)
 
     def execute(self, path: PourPath) -> ExecutedPath:
         """See `Arm.execute`; the encoders are sampled `spec.rate` times per second of the clock."""
         with self._at_work("pouring"):
+            self._check_calibration(path)
             self._last_pour = path
-            executed = self._go(MotionSegment.of_pour(path))
+            executed = self._go(MotionSegment.of_pour(path), pours=True)
             self._tilt = float(path.tilts[-1])
             return executed
 
@@ -266,21 +274,37 @@ class UrArm:
             raise ArmNotReleasedError("the arm is locked: an operator has to release it before it moves")
         return released
 
-    def _go(self, segment: MotionSegment) -> ExecutedPath:
-        """Execute one motion to its end."""
+    def _check_calibration(self, path: PourPath) -> None:
+        own = self._spec.robot.parameters.checksum
+        if path.calibration not in (None, own):
+            raise ArmRefusedError(
+                f"the pour was planned for a robot with {_kinematics(path.calibration)}, this one has "
+                f"{_kinematics(own)}: millimetres and a degree apart. Plan it again with the connected robot's facts "
+                "(`ArmSettings.fitted_to`)"
+            )
+
+    def _go(self, segment: MotionSegment, *, pours: bool = False) -> ExecutedPath:
+        """Execute one motion to its end.
+
+        Args:
+            segment: the motion.
+            pours: it carries or pours liquid. Other motions are allowed in reduced mode, where they are slowed.
+        """
         stops = self._stops.count  # before consent is checked, so that a stop in between counts
         released, spec = self._consent(), self._spec
+        if not pours and self._session.ask("read").safety_mode == REDUCED:
+            segment = segment.slowed(IN_REDUCED_MODE)
         path = segment.path
         if segment.name != "jog":  # a jog has its own checks, since it may be the way back inside the limits
             recheck(path, spec)
         facts = self._session.facts
         if facts is None:
             raise ArmLostError("the arm is not connected; connect first")
-        settings = MotionSettings(tuple(spec.tool.as_list), spec.payload, spec.payload_centre.vector)
+        settings = MotionSettings(tuple(spec.tool.as_list), spec.payload, spec.payload_centre.vector, spec.registers)
         number = next(_numbers)
         program = path_program(path, settings, number, cb3=not facts.e_series)
         start, end = (tuple(map(float, path.joints[k])) for k in (0, -1))
-        motion = MotionOrder(program, number, start, end, path.duration, settings, stops)
+        motion = MotionOrder(program, number, start, end, path.duration, settings, stops, pours)
         self._announced, self._segment = True, segment
         self._session.forget_progress()
         self._stops.begin()
@@ -332,6 +356,10 @@ class UrArm:
             self._session.kill()
             raise ArmLostError(f"{outcome.text}. {segment.last_seen(outcome.clock)}", executed)
         raise segment.stopped(outcome, executed)
+
+
+def _kinematics(checksum: str | None) -> str:
+    return f"calibration {checksum}" if checksum else "nominal lengths"
 
 
 class AcceptedArm(UrArm):

@@ -22,13 +22,15 @@ from typing import Any
 from actors.arm.arm_geometry import Joints, Pose, Vector
 from actors.arm.arm_interface import ArmError, ArmFacts, ArmLostError, ArmRefusedError
 from actors.arm.arm_settings import UrArmSettings
+from actors.arm.ur.robot_comparison import robot_problems
+from actors.arm.ur.robot_models import Calibration
 from actors.arm.ur.worker_messages import (
     ROBOT_MODES,
-    SAFETY_MODES,
     SILENCE,
     Facts,
     MotionProgress,
     TroubleError,
+    safety_mode,
     why_not_ready,
 )
 from actors.runtime.child_process import ConnectedProcess
@@ -49,6 +51,7 @@ class UrFacts(ArmFacts):
         program: state and name of the controller's program.
         joint_ranges: lowest and highest of each joint [rad], as configured; empty if they are not reported.
         joint_speeds: likewise [rad/s].
+        kinematics: calibration of the robot; None if it is nominal, as a simulator's is.
     """
 
     robot_mode: str = ""
@@ -62,6 +65,7 @@ class UrFacts(ArmFacts):
     program: str = ""
     joint_ranges: tuple[tuple[float, float], ...] = ()
     joint_speeds: tuple[float, ...] = ()
+    kinematics: Calibration | None = None
 
     @property
     def e_series(self) -> bool:
@@ -71,7 +75,7 @@ class UrFacts(ArmFacts):
 
 def facts_of(worker_facts: Facts) -> UrFacts:
     """Convert the worker's facts."""
-    r = worker_facts.reading
+    r, state = worker_facts.reading, worker_facts.state
     a, b, c, d, e, f = r.joints
     x, y, z = r.centre
     return UrFacts(
@@ -80,17 +84,19 @@ def facts_of(worker_facts: Facts) -> UrFacts:
         version=".".join(map(str, worker_facts.version)),
         problem=why_not_ready(r.robot_mode, r.safety_mode, r.runtime, r.slider),
         robot_mode=ROBOT_MODES.get(r.robot_mode, str(r.robot_mode)),
-        safety_mode=SAFETY_MODES.get(r.safety_mode, str(r.safety_mode)),
+        safety_mode=safety_mode(r.safety_mode).text,
         remote=worker_facts.remote,
-        checksum=worker_facts.checksum,
-        tool=Pose.of(*worker_facts.tool),
+        checksum=state.checksum,
+        calibration="" if state.calibration is None else state.calibration.checksum,
+        kinematics=state.calibration,
+        tool=Pose.of(*state.tool),
         payload=r.payload,
         payload_centre=(x, y, z),
         joints=(a, b, c, d, e, f),
         slider=r.slider,
         program=worker_facts.program,
-        joint_ranges=worker_facts.ranges,
-        joint_speeds=worker_facts.speeds,
+        joint_ranges=state.joint_ranges,
+        joint_speeds=state.joint_speeds,
     )
 
 
@@ -232,9 +238,12 @@ class Session:
         # controller.
         silence = SILENCE if spec.time_scale == 1.0 else 8.0 * SILENCE
         try:
-            self.ask("open", spec.address, spec.rate, silence, deadline=OPEN_TIME)
-            self.facts = self.find_out()
-            self._check_model(self.facts)
+            self.ask("open", spec.address, spec.rate, silence, spec.registers, deadline=OPEN_TIME)
+            facts: Facts = self.ask("facts")
+            self.facts = facts_of(facts)
+            problems = robot_problems(spec, facts.model, facts.version, facts.state, rests=facts.reading.stands)
+            if problems:
+                raise ArmRefusedError(f"the robot at {spec.address} {'; '.join(problems)}")
         except ArmError:
             self.discard()
             raise
@@ -284,11 +293,3 @@ class Session:
         """End the worker and forget the robot."""
         self.kill()
         self._worker, self.facts = None, None
-
-    def _check_model(self, facts: UrFacts) -> None:
-        model = facts.model.lower().removesuffix("e") + ("e" if facts.e_series else "")
-        if model != self._spec.model:
-            raise ArmRefusedError(
-                f"the robot at {self._spec.address} is a {model.upper()} (software {facts.version}); "
-                f"the arm is set up as {self._spec.model.upper()}"
-            )

@@ -123,7 +123,7 @@ def path_program(path: JointPath, settings: MotionSettings, number: int, *, cb3:
             "  global d_now = 0.0",
             "  global d_t = 0.0",
             f"  global d_q = {_list(points.joints[0])}",
-            *_stop_function(number),
+            *_stop_function(number, settings.registers),
             "  def d_servo(q):",
             "    d_stop()",
             f"    write_output_float_register({CLOCK}, d_now)",
@@ -198,7 +198,7 @@ def tilt_program(
             "  global d_tilt = 0.0",
             "  global d_speed = 0.0",
             f"  global d_silence = {NEWS_TIMEOUT - FIRST_NEWS_TIMEOUT}",
-            *_stop_function(number),
+            *_stop_function(number, settings.registers),
             "  def d_clip(x, low, high):",
             "    if x < low:",
             "      return low",
@@ -212,16 +212,16 @@ def tilt_program(
             "  end",
             *_preparation(settings, number, heartbeat=False),
             f"  movej({_list(points.joints[0])}, a={_ALIGNING_ACCELERATION}, v={_ALIGNING_SPEED})",
-            f"  local d_counter = read_input_integer_register({TILT_COUNTER})",
+            f"  local d_counter = read_input_float_register({settings.registers + TILT_COUNTER})",
             f"  while d_tilt > 0.0 or d_silence < {NEWS_TIMEOUT}:",
-            f"    local d_news = read_input_integer_register({TILT_COUNTER})",
+            f"    local d_news = read_input_float_register({settings.registers + TILT_COUNTER})",
             "    if d_news != d_counter:",
             "      d_counter = d_news",
             "      d_silence = 0.0",
             "    else:",
             "      d_silence = d_silence + d_step",
             "    end",
-            f"    local d_wanted = read_input_float_register({TILT_SPEED})",
+            f"    local d_wanted = read_input_float_register({settings.registers + TILT_SPEED})",
             f"    if d_silence >= {NEWS_TIMEOUT}:",
             f"      d_wanted = -{limits.speed:.6f}",
             "    elif d_silence < 0.0:",
@@ -274,10 +274,10 @@ def _search(points: JointPath, first: int, last: int, indent: str) -> list[str]:
     ]
 
 
-def _stop_function(number: int) -> list[str]:
+def _stop_function(number: int, registers: int) -> list[str]:
     return [
         "  def d_stop():",
-        f"    if read_input_integer_register({STOP_ORDER}) == {number}:",
+        f"    if read_input_integer_register({registers + STOP_ORDER}) == {number}:",
         f"      write_output_integer_register({STATUS}, {STOPPED})",
         f"      stopj({STOP_DECELERATION:g})",
         "      halt",
@@ -291,9 +291,9 @@ def _preparation(settings: MotionSettings, number: int, *, heartbeat: bool = Tru
 
     The number is written last, so that a reader of it sees the rest.
     """
-    watchdog = f'  rtde_set_watchdog("input_int_register_{HEARTBEAT}", {SLOWEST_HEARTBEAT:.1f}, "stop")'
+    watched = f"input_int_register_{settings.registers + HEARTBEAT}"
     return [
-        *([watchdog] if heartbeat else []),
+        *([f'  rtde_set_watchdog("{watched}", {SLOWEST_HEARTBEAT:.1f}, "stop")'] if heartbeat else []),
         f"  set_tcp(p{_list(settings.tool)})",
         f"  set_payload({settings.payload:.4f}, {_list(settings.centre)})",
         "  sync()",
@@ -302,7 +302,7 @@ def _preparation(settings: MotionSettings, number: int, *, heartbeat: bool = Tru
         f"  write_output_float_register({CLOCK}, 0.0)",
         f"  write_output_integer_register({STATUS}, {READY})",
         f"  write_output_integer_register({NUMBER}, {number})",
-        f"  while read_input_integer_register({GO}) != {number}:",
+        f"  while read_input_integer_register({settings.registers + GO}) != {number}:",
         "    d_stop()",
         "    sync()",
         "  end",

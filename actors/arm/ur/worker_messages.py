@@ -1,18 +1,22 @@
 """Messages and registers shared by the driver, the worker and the controller's program.
 
 These are plain values, and the module has no slow imports, so that the worker starts quickly. The client library can
-write input registers 18 … 22 and read output registers 12 … 19.
+read output registers 12 … 19. Input registers are written by `InputWriter`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-STOP_ORDER, HEARTBEAT, GO = 19, 20, 21
-"""Integer inputs. An order is the number of its motion, so that an old order has no effect."""
+from actors.arm.ur.primary_interface import RobotState
 
-TILT_COUNTER, TILT_SPEED = 22, 18
-"""Integer and double input of a dose: a counter that changes with every command, and the wanted speed [rad/s]."""
+STOP_ORDER, HEARTBEAT, GO = 0, 1, 2
+"""Integer inputs, counted from the arm's setting `registers`. An order is the number of its motion, so that an old
+order has no effect."""
+
+TILT_SPEED, TILT_COUNTER = 0, 1
+"""Double inputs of a dose, counted from the same setting: the wanted speed [rad/s], and a number that changes with every
+command."""
 
 NUMBER, STATUS = 12, 13
 """Integer outputs: the number of the motion whose program runs, and its status."""
@@ -43,39 +47,101 @@ ROBOT_MODES = {
     7: "running",
     8: "updating firmware",
 }
+
+
+@dataclass(frozen=True)
+class SafetyMode:
+    """A mode of the safety system.
+
+    Attributes:
+        word: on the dashboard.
+        text: for messages.
+        kind: of the stop, see `actors.arm.arm_interface.ArmStoppedError`; '' if the arm may move.
+        advice: the remedy.
+    """
+
+    word: str
+    text: str
+    kind: str
+    advice: str
+
+
+_CLOSE_GUARD = "a door, mat or light curtain holds it: close it"
+_RELEASE = "release the emergency stop, once you know why it was pressed"
+_INSPECT = "find the cause, then unlock it on the teach pendant; Decant never does so by itself"
+_RECOVER = "the arm is outside its limits: bring it back by hand in the recovery mode of the teach pendant"
+_ENABLE = "hold the enabling device in its middle position, or switch it off on the teach pendant"
+_RESTART = "look at the teach pendant; a fault of the safety system needs a restart, or the maker's service"
+
 SAFETY_MODES = {
-    1: "normal",
-    2: "reduced mode",
-    3: "protective stop",
-    4: "recovery mode",
-    5: "safeguard stop",
-    6: "emergency stop (system)",
-    7: "emergency stop (robot)",
-    8: "safety violation",
-    9: "fault of the safety system",
-}
+    number: SafetyMode(*row)
+    for number, *row in (
+        (1, "NORMAL", "normal", "", ""),
+        (2, "REDUCED", "reduced mode", "", "pours need the normal limits: end it, at the pendant or its input"),
+        (3, "PROTECTIVE_STOP", "protective stop", "protective stop", _INSPECT),
+        (4, "RECOVERY", "recovery mode", "safety", _RECOVER),
+        (5, "SAFEGUARD_STOP", "safeguard stop", "safeguard", _CLOSE_GUARD),
+        (6, "SYSTEM_EMERGENCY_STOP", "emergency stop (system)", "emergency stop", _RELEASE),
+        (7, "ROBOT_EMERGENCY_STOP", "emergency stop (robot)", "emergency stop", _RELEASE),
+        (8, "VIOLATION", "safety violation", "safety", _RESTART),
+        (9, "FAULT", "fault of the safety system", "safety", _RESTART),
+        (10, "VALIDATE_JOINT_ID", "validation of a joint", "safety", "confirm the joint on the teach pendant"),
+        (11, "UNDEFINED_SAFETY_MODE", "undefined safety mode", "safety", _RESTART),
+        (12, "AUTOMATIC_MODE_SAFEGUARD_STOP", "safeguard stop (automatic mode)", "safeguard", _CLOSE_GUARD),
+        (13, "SYSTEM_THREE_POSITION_ENABLING_STOP", "stop by an enabling device", "safeguard", _ENABLE),
+        (14, "TP_THREE_POSITION_ENABLING_STOP", "stop by the pendant's enabling device", "safeguard", _ENABLE),
+        (15, "IMMI_EMERGENCY_STOP", "emergency stop (injection moulding machine)", "emergency stop", _RELEASE),
+        (16, "IMMI_SAFEGUARD_STOP", "safeguard stop (injection moulding machine)", "safeguard", _CLOSE_GUARD),
+        (17, "PROFISAFE_WAITING_FOR_PARAMETERS", "wait for PROFIsafe", "safety", "start the PROFIsafe controller"),
+        (18, "PROFISAFE_AUTOMATIC_MODE_SAFEGUARD_STOP", "safeguard stop (PROFIsafe, automatic mode)", "safeguard",
+         _CLOSE_GUARD),
+        (19, "PROFISAFE_SAFEGUARD_STOP", "safeguard stop (PROFIsafe)", "safeguard", _CLOSE_GUARD),
+        (20, "PROFISAFE_EMERGENCY_STOP", "emergency stop (PROFIsafe)", "emergency stop", _RELEASE),
+        (22, "SAFETY_API_SAFEGUARD_STOP", "safeguard stop (safety API)", "safeguard", _CLOSE_GUARD),
+    )
+}  # fmt: skip
+"""RTDE's safety modes. Words above 9 are those of the manufacturer's client library; no public document names 21."""
+
+
+def safety_mode(number: int) -> SafetyMode:
+    """A safety mode by its number; an unknown one is a stop that a person has to look at."""
+    return SAFETY_MODES.get(number, SafetyMode("", f"safety mode {number}", "safety", _RESTART))
+
+
 RUNNING_MODE, NORMAL, REDUCED = 7, 1, 2
 STOPPED_PROGRAM, PLAYING = 1, 2
 
 
-def why_not_ready(robot_mode: int, safety_mode: int, runtime: int, slider: float) -> str:
+FULL_SPEED, LEAST_SPEED = 0.99, 0.01
+"""Smallest fractions of the programmed speed while liquid moves, and for any motion."""
+
+
+def why_not_ready(robot_mode: int, safety: int, runtime: int, slider: float, *, pours: bool = True) -> str:
     """Why an arm cannot move; '' if it can. Driver, worker, `decant robot check` and its display all use this decision.
 
-    Reduced mode prevents motion: pours are planned within the normal limits, and would end in a protective stop.
+    Reduced mode prevents pours: they are planned within the normal limits, and would end in a protective stop. Slow
+    motions back to home are allowed.
 
     Args:
-        robot_mode, safety_mode, runtime: RTDE's numbers (`robot_mode`, `safety_mode`, `runtime_state`).
+        robot_mode, safety, runtime: RTDE's numbers (`robot_mode`, `safety_mode`, `runtime_state`).
         slider: `target_speed_fraction`, 0 … 1.
+        pours: whether the motion carries or pours liquid.
     """
-    if safety_mode != NORMAL:
-        return f"{SAFETY_MODES.get(safety_mode, f'safety mode {safety_mode}')} is in force"
+    if not may_move(safety, pours=pours):
+        return f"{safety_mode(safety).text} is in force"
     if robot_mode != RUNNING_MODE:
         return f"the robot is {ROBOT_MODES.get(robot_mode, f'in mode {robot_mode}')}, not running"
     if runtime != STOPPED_PROGRAM:
         return "a program runs on the controller, or is paused; stop it at the pendant"
-    if slider < 0.999:
-        return f"the speed slider is at {100.0 * slider:.0f} %; a pour needs 100 %"
+    if slider < (FULL_SPEED if pours else LEAST_SPEED):
+        needed = "a pour needs 100 %" if pours else "nothing would move"
+        return f"the speed slider is at {100.0 * slider:.0f} %; {needed}"
     return ""
+
+
+def may_move(safety: int, *, pours: bool) -> bool:
+    """Whether a safety mode allows a motion: reduced mode only without liquid."""
+    return safety == NORMAL or (safety == REDUCED and not pours)
 
 
 class TroubleError(Exception):
@@ -98,11 +164,13 @@ class MotionSettings:
     Attributes:
         tool: TCP in the flange's frame [m], [rad].
         payload: [kg]; `centre` [m].
+        registers: first of the three integer inputs that are written, and of the two double inputs of a dose.
     """
 
     tool: tuple[float, ...]
     payload: float
     centre: tuple[float, ...]
+    registers: int
 
 
 @dataclass(frozen=True)
@@ -116,6 +184,7 @@ class MotionOrder:
         duration: of its path [s of controller time].
         settings: read back before the start.
         stops: number of stops when the motion was requested; if there is another one, it does not start.
+        pours: it carries or pours liquid, so it needs the normal limits and the full speed.
     """
 
     program: str
@@ -125,6 +194,7 @@ class MotionOrder:
     duration: float
     settings: MotionSettings
     stops: int
+    pours: bool
 
 
 @dataclass(frozen=True)
@@ -135,7 +205,8 @@ class DataPackage:
         time: of the controller [s]; `seen` [s of `time.monotonic`].
         joints, speeds: measured [rad], [rad/s].
         robot_mode, safety_mode, runtime: as numbers.
-        slider: 0 … 1.
+        slider: position of the speed slider, 0 … 1.
+        scaling: the controller's own slowing, 0 … 1.
         payload: [kg]; `centre` [m].
         number, status, clock, tool: of the program, see the registers.
     """
@@ -148,12 +219,18 @@ class DataPackage:
     safety_mode: int
     runtime: int
     slider: float
+    scaling: float
     payload: float
     centre: tuple[float, ...]
     number: int
     status: int
     clock: float
     tool: tuple[float, ...]
+
+    @property
+    def speed(self) -> float:
+        """Fraction of the programmed speed at which the arm really moves."""
+        return self.slider * self.scaling
 
     @property
     def stands(self) -> bool:
@@ -196,7 +273,7 @@ class MotionOutcome:
         standing: when it was first seen at rest [s of `time.monotonic`].
         answered: when the program was first seen to accept a stop order [s of `time.monotonic`].
         moved: it had been ordered to start.
-        slider: lowest position seen.
+        slider: lowest fraction of the programmed speed that was seen.
     """
 
     kind: str
@@ -220,7 +297,4 @@ class Facts:
     remote: bool | None
     program: str
     reading: DataPackage
-    checksum: str
-    tool: tuple[float, ...]
-    ranges: tuple[tuple[float, float], ...] = field(default=())
-    speeds: tuple[float, ...] = field(default=())
+    state: RobotState

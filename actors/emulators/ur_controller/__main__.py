@@ -11,7 +11,7 @@ from math import radians
 from actors.emulators.ur_controller.control_clock import Host, until_orphaned
 from actors.emulators.ur_controller.controller import Controller
 from actors.emulators.ur_controller.fault_injection import FaultServer
-from actors.emulators.ur_controller.robot import HOME, MODELS, RobotMode
+from actors.emulators.ur_controller.robot import HOME, MODELS, RobotMode, calibrated
 from actors.emulators.ur_controller.safety_system import SafetyConfiguration
 
 _STATES = {"running": RobotMode.RUNNING, "idle": RobotMode.IDLE, "off": RobotMode.POWER_OFF}
@@ -22,6 +22,7 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m actors.emulators.ur_controller", description=__doc__)
     parser.add_argument("--address", default="127.0.0.2", help="loopback address of all ports (default %(default)s)")
     parser.add_argument("--model", choices=sorted(MODELS), default="ur10e")
+    parser.add_argument("--calibrated", action="store_true", help="a robot that differs from nominal by millimetres")
     parser.add_argument("--time-scale", type=float, default=1.0, help="controller seconds per wall second")
     parser.add_argument("--frequency", type=float, help="control cycles per controller second; the model's by default")
     parser.add_argument("--state", choices=sorted(_STATES), default="running", help="power, to begin with")
@@ -57,8 +58,9 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
 
 async def serve(chosen: argparse.Namespace) -> None:
     """Open all ports, print one line of JSON when ready, and run until the end."""
+    model = MODELS[chosen.model]
     controller = Controller(
-        MODELS[chosen.model],
+        calibrated(model) if chosen.calibrated else model,
         frequency=chosen.frequency,
         time_scale=chosen.time_scale,
         mode=_STATES[chosen.state],

@@ -13,6 +13,7 @@ from typing import Any
 from actors.arm.arm_settings import UrArmSettings
 from actors.bench.virtual_bench import History
 from actors.emulators.ur_controller.controller_process import VirtualController, VirtualControllerError
+from actors.emulators.ur_controller.robot import MODELS, calibrated
 from actors.interfaces import LaboratoryError
 
 PORTS = (29999, 30001, 30002, 30003, 30004, 30011, 30012)
@@ -42,6 +43,11 @@ class UrEmulator:
     def arm(self) -> UrArmSettings:
         """See `ArmEmulator.arm`."""
         return self._spec.with_values(address=self._controller.address)
+
+    @property
+    def true_arm(self) -> UrArmSettings:
+        """See `ArmEmulator.true_arm`; its robot is calibrated, as a real one is."""
+        return self.arm.with_values(calibration=calibrated(MODELS[self._spec.model]).calibration)
 
     def install(self) -> None:
         """See `ArmEmulator.install`; sets gravity, TCP and payload, which a real controller has in its installation."""
@@ -88,8 +94,9 @@ def _start_controller(arm: UrArmSettings) -> VirtualController:
         if not _is_free(address):
             continue
         try:
+            frequency = FREQUENCY if arm.time_scale > 1.0 else None
             return VirtualController.start(
-                address, arm.model, arm.time_scale, FREQUENCY if arm.time_scale > 1.0 else None, joints=arm.home.angles
+                address, arm.model, arm.time_scale, frequency, calibrated=True, joints=arm.home.angles
             )
         except VirtualControllerError as error:
             reason = str(error)

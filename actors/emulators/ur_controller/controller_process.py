@@ -48,6 +48,7 @@ class VirtualController:
         *,
         state: str = "running",
         local: bool = False,
+        calibrated: bool = False,
         joints: Sequence[float] | None = None,
         prioritised: bool = True,
         patience: float = START_TIME,
@@ -56,11 +57,12 @@ class VirtualController:
 
         Args:
             address: any loopback address; each controller needs one of its own.
-            model: 'ur10' or 'ur10e'.
+            model: a name in `actors.arm.ur.robot_models.MODELS`.
             time_scale: controller seconds per wall second.
             frequency: control cycles per controller second [Hz]; the model's by default.
             state: initial power mode, 'running', 'idle' or 'off'.
             local: start in local control.
+            calibrated: the robot differs from nominal lengths, as a real one does.
             joints: six initial positions [rad]; a pose in the middle of its workspace by default.
             prioritised: raise the priority of its clock; see docs/laboratory/virtual-devices.md, "Control period".
             patience: longest wait [s].
@@ -72,6 +74,7 @@ class VirtualController:
         command += ["--time-scale", repr(float(time_scale)), "--state", state, "--parent", str(os.getpid())]
         command += [] if frequency is None else ["--frequency", repr(float(frequency))]
         command += ["--local"] if local else []
+        command += ["--calibrated"] if calibrated else []
         command += [] if prioritised else ["--normal-priority"]
         command += [] if joints is None else ["--joints=" + ",".join(repr(degrees(q)) for q in joints)]
         process = ChildProcess(command)

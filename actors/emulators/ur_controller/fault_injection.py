@@ -47,6 +47,7 @@ class ControllerFaults:
             "noise": self.noise,
             "lag": self.lag,
             "slider": self.slider,
+            "slowing": self.slowing,
             "remote": self.remote,
             "checksum": self.checksum,
             "limits": self.limits,
@@ -240,6 +241,17 @@ class ControllerFaults:
             self._controller.robot.mover.slider = value
 
         self._when(move, **when)
+
+    def slowing(self, fraction: float, **when: Any) -> None:
+        """Slow programs down whatever the slider says, as a controller does near its limits."""
+        value = _finite(fraction)
+        if not 0.0 < value <= 1.0:
+            raise ValueError("a slowed program runs at 0 to 1 of its speed")
+
+        def slow() -> None:
+            self._controller.robot.mover.slowing = value
+
+        self._when(slow, **when)
 
     def remote(self, active: bool, **when: Any) -> None:
         """Switch remote control on or off."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from math import acos, asin, atan2, cos, hypot, pi, sin, sqrt
 
-from actors.arm.ur.robot_models import Joints, RobotModel
+from actors.arm.ur.robot_models import Calibration, Joints, RobotModel
 
 Vector = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
@@ -146,8 +146,15 @@ _SINGULAR_WRIST = 1e-6
 """Below this |sin q5| joints 4 and 6 turn about the same axis, and q6 keeps its given value."""
 
 
+_SHIFTS = 40
+"""Largest number of shifts; each leaves a few percent of the error, and more near a singularity."""
+
+
 class Kinematics:
     """Kinematics of one robot model. Poses are those of the flange; the caller composes a tool.
+
+    A calibrated robot follows its calibration: `flange`, `velocity` and `nearest`. The others use nominal lengths,
+    since single frames of a calibrated robot may be hundreds of metres away.
 
     Args:
         model: lengths and joint ranges.
@@ -158,6 +165,8 @@ class Kinematics:
 
     def flange(self, q: Sequence[float]) -> Transform:
         """Transform of the flange in the base's frame [m]."""
+        if self.model.calibration is not None:
+            return _frames(q, self.model.calibration)[-1]
         m = self.model
         q1, q2, q3, q4, q5, q6 = q
         s1, c1, s5, c5, s6, c6 = sin(q1), cos(q1), sin(q5), cos(q5), sin(q6), cos(q6)
@@ -206,21 +215,17 @@ class Kinematics:
 
     def links(self, q: Sequence[float]) -> list[Transform]:
         """Denavit–Hartenberg frames of the six links, each at its link's distal end, base frame."""
-        m = self.model
-        lengths = ((0.0, m.d1, 0.5), (m.a2, 0.0, 0.0), (m.a3, 0.0, 0.0), (0.0, m.d4, 0.5), (0.0, m.d5, -0.5))
-        frame: Transform = (IDENTITY, (0.0, 0.0, 0.0))
-        frames = []
-        for angle, (a, d, twist) in zip(q, (*lengths, (0.0, m.d6, 0.0)), strict=True):
-            turned = multiply(rotation_matrix((0.0, 0.0, angle)), rotation_matrix((pi * twist, 0.0, 0.0)))
-            frame = compose(frame, (turned, (a * cos(angle), a * sin(angle), d)))
-            frames.append(frame)
-        return frames
+        return _frames(q, self.model.nominal.parameters)
 
     def velocity(
         self, q: Sequence[float], qd: Sequence[float], point: Vector
     ) -> tuple[float, float, float, float, float, float]:
         """Velocity of a point fixed to the flange [m/s] and the flange's angular velocity [rad/s], base frame."""
-        axes, origins = self.axes(q)
+        if self.model.calibration is None:
+            axes, origins = self.axes(q)
+        else:
+            before = [(IDENTITY, (0.0, 0.0, 0.0)), *_frames(q, self.model.calibration)[:5]]
+            axes, origins = [(r[2], r[5], r[8]) for r, _ in before], [origin for _, origin in before]
         vx = vy = vz = wx = wy = wz = 0.0
         px, py, pz = point
         for (ax, ay, az), (ox, oy, oz), rate in zip(axes, origins, qd, strict=True):
@@ -273,10 +278,27 @@ class Kinematics:
     def nearest(self, flange: Transform, near: Sequence[float]) -> Joints | None:
         """Return the solution nearest to `near` within the joint ranges; None if there is none.
 
+        For a calibrated robot the target of the closed form is shifted until its solution leads to `flange`.
+
         Args:
             flange: target transform.
             near: joint positions [rad]; solutions may lie beyond ±π to stay near them.
         """
+        q = self._nominal_nearest(flange, near)
+        if self.model.calibration is None:
+            return q
+        target = flange
+        for _ in range(_SHIFTS):
+            if q is None:
+                return None
+            there = self.flange(q)
+            if distance(there[1], flange[1]) < 1e-9 and angle_between(there[0], flange[0]) < 1e-9:
+                return q
+            target = compose(compose(flange, invert(there)), target)
+            q = self._nominal_nearest(target, q)
+        return None
+
+    def _nominal_nearest(self, flange: Transform, near: Sequence[float]) -> Joints | None:
         best: Joints | None = None
         least = float("inf")
         limits = self.model.joint_range
@@ -295,6 +317,18 @@ class Kinematics:
                 least = total
                 best = (turned[0], turned[1], turned[2], turned[3], turned[4], turned[5])
         return best
+
+
+def _frames(q: Sequence[float], own: Calibration) -> list[Transform]:
+    """Denavit–Hartenberg frames of the six links, base frame."""
+    frame: Transform = (IDENTITY, (0.0, 0.0, 0.0))
+    frames = []
+    for joint, theta, a, d, twist in zip(q, own.theta, own.a, own.d, own.alpha, strict=True):
+        angle = joint + theta
+        turned = multiply(rotation_matrix((0.0, 0.0, angle)), rotation_matrix((twist, 0.0, 0.0)))
+        frame = compose(frame, (turned, (a * cos(angle), a * sin(angle), d)))
+        frames.append(frame)
+    return frames
 
 
 def _turn(angle: float) -> float:

@@ -151,7 +151,7 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         "safety_mode": ("INT32", lambda: safety.mode),
         "safety_status": ("INT32", lambda: safety.mode),
         "actual_tool_accelerometer": ("VECTOR3D", slow.accelerometer),
-        "speed_scaling": ("DOUBLE", lambda: mover.rate),
+        "speed_scaling": ("DOUBLE", lambda: mover.scaling),
         "target_speed_fraction": ("DOUBLE", lambda: mover.slider),
         "actual_momentum": ("DOUBLE", lambda: 0.0),
         "actual_main_voltage": ("DOUBLE", lambda: 48.0),

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from actors.arm.planning.kinematics import MODELS, beyond_reach, forward, inverse, link_points, posture, singularities
+from actors.emulators.ur_controller.robot import MODELS as CONTROLLED
+from actors.emulators.ur_controller.robot import calibrated
 from actors.emulators.ur_controller.robot_kinematics import Kinematics
 from tests.support.hypothesis_examples import examples
 from tests.support.planning_cell import SPEC, turned
@@ -40,6 +42,25 @@ def test_all_postures_that_the_controller_finds_are_found(name, q):
     for solution in theirs:
         apart = np.abs(np.exp(1j * reached) - np.exp(1j * np.array(solution))).max(axis=1)
         assert apart.min() < 1e-5
+
+
+@pytest.mark.parametrize("name", MODELS)
+@given(q=joints)
+@settings(max_examples=examples(50), deadline=None)
+def test_a_calibrated_robot_is_where_its_controller_has_it_and_is_led_back_there(name, q):
+    model = calibrated(CONTROLLED[name])
+    rotation, position = forward(q[None], model)
+    theirs, at = Kinematics(model).flange(q)
+    np.testing.assert_allclose(rotation[0].ravel(), theirs, atol=1e-12)
+    np.testing.assert_allclose(position[0], at, atol=1e-11)
+    assume(singularities(q, MODELS[name]).min() > 0.15)  # closer by, two solutions may be within the calibration
+    found = inverse(rotation, position, model)[0]
+    reached = found[np.isfinite(found).all(axis=1)]
+    assert np.abs(np.exp(1j * reached) - np.exp(1j * q)).max(axis=1).min() < 1e-7
+    back, there = forward(reached, model)
+    assert turned(back, rotation).max() < 1e-6
+    assert np.abs(there - position).max() < 1e-7
+    assert Kinematics(model).nearest((theirs, at), q) == pytest.approx(q, abs=1e-6)
 
 
 @given(q=joints)

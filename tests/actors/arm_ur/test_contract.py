@@ -17,17 +17,19 @@ from actors.arm.planning.pour_planner import plan_path
 from actors.arm.ur.ur_driver import UrArm
 from actors.contract_tests.arm_contract import ArmBench, ArmContract
 from actors.emulators.ur_controller import VirtualController
+from actors.emulators.ur_controller.robot import MODELS, calibrated
 from sim_engine.action import DEG
 from tests.support.loopback import free_address
+from tests.support.planning_cell import cell_of
 
-from .test_planned import ACTION, SPEC, motion, vessels
+from .test_planned import ACTION, motion, vessels
 
 
-def bench_of(cls: type[UrArm]) -> Iterator[ArmBench]:
-    """An arm and its controller, whose true joints are the witness."""
-    path = plan_path(motion(ACTION.with_values(angular_velocity=25 * DEG)), SPEC, *vessels())
+def bench_of(cls: type[UrArm], model: str = "ur10e") -> Iterator[ArmBench]:
+    """An arm and its controller, whose true joints are the witness. The robot is calibrated, as a real one is."""
+    true = cell_of(model, warning_time=0.0, time_scale=5.0, calibration=calibrated(MODELS[model]).calibration)
     with VirtualController.start(
-        free_address(), SPEC.model, SPEC.time_scale, 125.0, joints=SPEC.home.angles
+        free_address(), true.model, true.time_scale, 125.0, calibrated=True, joints=true.home.angles
     ) as controller:
 
         def true_poses(since: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -35,18 +37,20 @@ def bench_of(cls: type[UrArm]) -> Iterator[ArmBench]:
             times, joints = np.array(kept["times"]), np.array(kept["joints"]).reshape(-1, 6)
             if len(times) < 2:
                 return np.zeros(0), np.zeros((0, 7))
-            return times, pourer_motion(joints, times, SPEC).poses
+            return times, pourer_motion(joints, times, true).poses
 
-        arm = cls(SPEC.with_values(address=controller.address))
+        arm = cls(true.with_values(address=controller.address, calibration=None))
+        spec = true.fitted_to(arm.connect())
+        path = plan_path(motion(ACTION.with_values(angular_velocity=25 * DEG)), spec, *vessels())
         yield ArmBench(
             arm,
             path,
-            SPEC.time_scale,
+            spec.time_scale,
             jog=("z", 0.005, 0.05),
             trip=lambda: controller.fault("protective_stop"),
             true_poses=true_poses,
-            tool_speed=SPEC.limits.tool_speed,
-            tilt_speed=SPEC.limits.tilt_speed,
+            tool_speed=true.limits.tool_speed,
+            tilt_speed=true.limits.tilt_speed,
             disturb=lambda: controller.fault("lag", seconds=0.8),
             cut=lambda: controller.fault("refuse"),
             restore=lambda: controller.fault("clear"),
@@ -55,10 +59,14 @@ def bench_of(cls: type[UrArm]) -> Iterator[ArmBench]:
         arm.close()
 
 
+QUICK = ("ur3e", "ur10", "ur20")
+"""Models of different sizes and both generations; the others are slow only because they are many."""
+
+
 class TestUrArm(ArmContract):
-    @pytest.fixture
-    def bench(self) -> Iterator[ArmBench]:
-        yield from bench_of(UrArm)
+    @pytest.fixture(params=[name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in MODELS])
+    def bench(self, request: pytest.FixtureRequest) -> Iterator[ArmBench]:
+        yield from bench_of(UrArm, request.param)
 
 
 class ReportsThePlan(UrArm):
@@ -66,7 +74,7 @@ class ReportsThePlan(UrArm):
 
     def execute(self, path: PourPath) -> ExecutedPath:
         done = super().execute(path)
-        planned = pourer_motion(path.pour.at(done.times), done.times, SPEC).poses
+        planned = pourer_motion(path.pour.at(done.times), done.times, self._spec).poses
         return replace(done, poses=planned)
 
 

@@ -22,7 +22,7 @@ from actors.arm.ur.worker_messages import MotionSettings
 from tests.support.hypothesis_examples import examples
 from tests.support.ur_pours import HOME, START, pour_path, settings, smooth
 
-NO_TOOL = MotionSettings((0.0,) * 6, 0.0, (0.0,) * 3)
+NO_TOOL = MotionSettings((0.0,) * 6, 0.0, (0.0,) * 3, 43)
 POUR = pour_path()
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from actors.arm.arm_interface import ArmNotReleasedError, ArmRefusedError, ArmStoppedError
+from actors.arm.ur.worker_messages import may_move, safety_mode
 from tests.support.ur_pours import HOME, START, pour_path
 
 from .conftest import Call, Rig
@@ -232,3 +233,41 @@ def test_an_arm_that_was_moved_off_its_way_is_not_moved_blindly(rig: Rig) -> Non
     with pytest.raises(ArmRefusedError, match="does not stand on the way home"):
         rig.arm.retreat(rig.path)
     assert rig.moved(began) == 0.0
+
+
+@pytest.mark.realtime
+def test_a_controller_that_slows_programs_by_itself_pours_nothing(resting: Rig) -> None:
+    resting.fault("slowing", fraction=0.5)
+    resting.arm.release()
+    try:
+        with pytest.raises(ArmRefusedError, match=r"at 50 % of their speed \(slider 100 %, its own slowing 50 %\)"):
+            resting.arm.move_to_start(resting.path)
+    finally:
+        resting.fault("slowing", fraction=1.0)
+
+
+@pytest.mark.realtime
+def test_reduced_mode_pours_nothing_and_lets_a_stopped_arm_go_home_slowly(rig: Rig) -> None:
+    rig.to_start()
+    rig.fault("reduced", active=True)
+    rig.arm.release()
+    with pytest.raises(ArmRefusedError, match="reduced mode is in force"):
+        rig.arm.execute(rig.path)
+    rig.arm.release()
+    began = rig.now
+    rig.arm.retreat(rig.path)
+    rig.await_rest()
+    times, joints = rig.history(began)
+    assert joints[-1] == pytest.approx(HOME, abs=1e-3)
+    fastest = np.abs(np.diff(joints, axis=0) / np.diff(times)[:, None]).max()
+    planned = np.abs(np.diff(rig.path.retreat.joints, axis=0) / np.diff(rig.path.retreat.times)[:, None]).max()
+    assert fastest < 0.3 * planned
+
+
+@pytest.mark.parametrize("number", range(1, 23))
+def test_every_safety_mode_has_a_name_a_class_and_advice(number: int) -> None:
+    mode = safety_mode(number)
+    assert mode.text
+    assert (mode.kind == "") == may_move(number, pours=False)
+    assert (mode.advice == "") == (number == 1)
+    assert may_move(number, pours=True) == (number == 1)

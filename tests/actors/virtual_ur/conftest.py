@@ -15,7 +15,7 @@ import pytest
 
 from actors.emulators.ur_controller import VirtualController
 from actors.emulators.ur_controller.controller import Controller, RuntimeState
-from actors.emulators.ur_controller.robot import UR10E
+from actors.emulators.ur_controller.robot import MODELS
 from actors.emulators.ur_controller.servers.primary_messages import ControllerMessage
 from actors.runtime.child_process import child_environment
 from tests.support.loopback import free_address
@@ -27,7 +27,7 @@ class Bench:
     """A controller without sockets or clock: time passes when a test says so."""
 
     def __init__(self, **options: Any) -> None:
-        self.controller = Controller(options.pop("model", UR10E), **options)
+        self.controller = Controller(options.pop("model", MODELS["ur10e"]), **options)
         self.messages: list[ControllerMessage] = []
         self.controller.listeners.append(self.messages.append)
         self.times: list[float] = []

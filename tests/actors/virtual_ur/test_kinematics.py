@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from actors.arm.ur.robot_models import RobotModel
-from actors.emulators.ur_controller.robot import HOME, MODELS, UR10E, Robot
+from actors.emulators.ur_controller.robot import HOME, MODELS, Robot
 from actors.emulators.ur_controller.robot_kinematics import (
     IDENTITY,
     Kinematics,
@@ -61,8 +61,8 @@ def test_the_flange_is_where_the_table_of_lengths_puts_it(model: RobotModel, q: 
 
 def test_a_stretched_arm_is_as_long_as_its_links() -> None:
     # All joints at zero: both links along −x, the wrist beside them, the tool pointing along −y.
-    _, point = Kinematics(UR10E).flange((0.0,) * 6)
-    m = UR10E
+    _, point = Kinematics(MODELS["ur10e"]).flange((0.0,) * 6)
+    m = MODELS["ur10e"]
     assert point == pytest.approx((m.a2 + m.a3, -m.d4 - m.d6, m.d1 - m.d5))
 
 
@@ -80,14 +80,14 @@ def test_every_solution_puts_the_flange_where_it_was_wanted(model: RobotModel, q
 
 
 def test_shoulder_wrist_and_elbow_give_eight_solutions() -> None:
-    kinematics = Kinematics(UR10E)
+    kinematics = Kinematics(MODELS["ur10e"])
     solutions = list(kinematics.inverse(kinematics.flange((0.3, -1.2, 1.4, -1.7, -1.1, 0.4))))
     assert len({tuple(round(x, 6) for x in s) for s in solutions}) == 8
 
 
 @given(q=joints)
 def test_the_nearest_solution_is_the_one_it_came_from(q: tuple[float, ...]) -> None:
-    kinematics = Kinematics(UR10E)
+    kinematics = Kinematics(MODELS["ur10e"])
     found = kinematics.nearest(kinematics.flange(q), q)
     assert found is not None
     # Where the arm is stretched or folded two solutions fall together, and rounding decides: the pose still is right.
@@ -98,13 +98,13 @@ def test_the_nearest_solution_is_the_one_it_came_from(q: tuple[float, ...]) -> N
 
 
 def test_solutions_stay_near_joints_beyond_half_a_turn() -> None:
-    kinematics = Kinematics(UR10E)
+    kinematics = Kinematics(MODELS["ur10e"])
     q = (3.5, -1.2, 1.4, -1.7, -1.1, -6.0)
     assert kinematics.nearest(kinematics.flange(q), q) == pytest.approx(q)
 
 
 def test_with_a_straight_wrist_the_last_joint_stays_as_it_was() -> None:
-    kinematics = Kinematics(UR10E)
+    kinematics = Kinematics(MODELS["ur10e"])
     q = (0.3, -1.2, 1.4, -1.7, 0.0, 0.9)
     assert kinematics.nearest(kinematics.flange(q), q) == pytest.approx(q, abs=1e-6)
 
@@ -112,12 +112,12 @@ def test_with_a_straight_wrist_the_last_joint_stays_as_it_was() -> None:
 @pytest.mark.parametrize("point", [(2.0, 0.0, 0.5), (0.05, 0.0, 0.5), (0.0, 0.0, 0.0)])
 def test_out_of_reach_there_is_no_solution(point: tuple[float, float, float]) -> None:
     down = rotation_matrix((math.pi, 0.0, 0.0))
-    assert Kinematics(UR10E).nearest((down, point), HOME) is None
+    assert Kinematics(MODELS["ur10e"]).nearest((down, point), HOME) is None
 
 
 @given(q=joints, rates=joints)
 def test_velocity_is_how_fast_the_flange_moves(q: tuple[float, ...], rates: tuple[float, ...]) -> None:
-    kinematics, h = Kinematics(UR10E), 1e-6
+    kinematics, h = Kinematics(MODELS["ur10e"]), 1e-6
     before = kinematics.flange([a - h * b for a, b in zip(q, rates, strict=True)])
     after = kinematics.flange([a + h * b for a, b in zip(q, rates, strict=True)])
     moved = [(b - a) / (2 * h) for a, b in zip(before[1], after[1], strict=True)]
@@ -128,7 +128,7 @@ def test_velocity_is_how_fast_the_flange_moves(q: tuple[float, ...], rates: tupl
 
 @given(q=joints)
 def test_the_last_link_s_frame_is_the_flange(q: tuple[float, ...]) -> None:
-    kinematics = Kinematics(UR10E)
+    kinematics = Kinematics(MODELS["ur10e"])
     last, flange = kinematics.links(q)[5], kinematics.flange(q)
     assert distance(last[1], flange[1]) < 1e-9
     assert angle_between(last[0], flange[0]) < 1e-6
@@ -136,14 +136,14 @@ def test_the_last_link_s_frame_is_the_flange(q: tuple[float, ...]) -> None:
 
 @given(q=joints)
 def test_holding_torques_are_what_raising_the_arm_by_a_joint_costs(q: tuple[float, ...]) -> None:
-    robot = Robot(UR10E, q, SafetyConfiguration.of(UR10E))
+    robot = Robot(MODELS["ur10e"], q, SafetyConfiguration.of(MODELS["ur10e"]))
     robot.payload, robot.cog = 2.0, (0.01, 0.02, 0.1)
 
     def energy(joints: list[float]) -> float:
         frames = robot.kinematics.links(joints)
-        heights = [compose(f, (IDENTITY, c))[1][2] for f, c in zip(frames, UR10E.centres, strict=True)]
+        heights = [compose(f, (IDENTITY, c))[1][2] for f, c in zip(frames, MODELS["ur10e"].centres, strict=True)]
         load = compose(frames[5], (IDENTITY, robot.cog))[1][2]
-        return 9.82 * (sum(m * h for m, h in zip(UR10E.masses, heights, strict=True)) + robot.payload * load)
+        return 9.82 * (sum(m * h for m, h in zip(MODELS["ur10e"].masses, heights, strict=True)) + robot.payload * load)
 
     torques, h = robot.holding_torques, 1e-5
     for i in range(6):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from actors.emulators.ur_controller.controller import RuntimeState
-from actors.emulators.ur_controller.robot import BOOT_TIME, BRAKE_TIME, HOME, POWER_ON_TIME, UR10, RobotMode
+from actors.emulators.ur_controller.robot import BOOT_TIME, BRAKE_TIME, HOME, MODELS, POWER_ON_TIME, RobotMode
 from actors.emulators.ur_controller.rtde_fields import write
 from actors.emulators.ur_controller.safety_system import SafetyMode
 from actors.emulators.ur_controller.servers.dashboard_server import DashboardServer
@@ -287,7 +287,7 @@ def test_a_fault_that_makes_no_sense_is_refused_with_a_word_why(bench: Bench, re
 
 
 def test_a_cb3_controller_knows_no_remote_control(bench: Bench) -> None:
-    old = Bench(model=UR10, remote=False)
+    old = Bench(model=MODELS["ur10"], remote=False)
     assert not old.controller.local
     assert old.controller.frequency == 125
     bench.controller.set_remote(False)

@@ -26,7 +26,7 @@ from actors.emulators.ur_controller.safety_system import SafetyMode
 from .conftest import Bench
 
 TILTS = np.radians(np.arange(0.0, 101.0, 2.0))
-NUMBER = 7
+NUMBER, REGISTERS = 7, 43
 LIMITS = TiltLimits(math.radians(115.0), math.radians(600.0))
 
 
@@ -37,9 +37,9 @@ class Dose(Bench):
         super().__init__()
         joints = np.tile(np.array(HOME), (len(TILTS), 1))
         joints[:, 5] += TILTS + 0.05 * np.sin(TILTS)
-        settings = MotionSettings((0.0,) * 6, 1.0, (0.0, 0.0, 0.1))
+        settings = MotionSettings((0.0,) * 6, 1.0, (0.0, 0.0, 0.1), REGISTERS)
         self.controller.upload(tilt_program(TILTS, joints, LIMITS, settings, NUMBER, cb3=False))
-        self.controller.registers.input_int[GO] = NUMBER
+        self.controller.registers.input_int[REGISTERS + GO] = NUMBER
         self.tick(0.1)
 
     @property
@@ -54,8 +54,8 @@ class Dose(Bench):
     def drive(self, speed: float, seconds: float) -> None:
         """Write a speed [deg/s] 20 times a second."""
         for _ in range(round(seconds / 0.05)):
-            self.controller.registers.input_double[TILT_SPEED] = math.radians(speed)
-            self.controller.registers.input_int[TILT_COUNTER] += 1
+            self.controller.registers.input_double[REGISTERS + TILT_SPEED] = math.radians(speed)
+            self.controller.registers.input_double[REGISTERS + TILT_COUNTER] += 1
             self.tick(0.05)
 
 
@@ -106,7 +106,7 @@ def test_range_and_speed_are_limited_whatever_is_written() -> None:
 def test_an_order_to_stop_stops_it_where_it_is() -> None:
     dose = Dose()
     dose.drive(40.0, 1.0)
-    dose.controller.registers.input_int[STOP_ORDER] = NUMBER
+    dose.controller.registers.input_int[REGISTERS + STOP_ORDER] = NUMBER
     dose.tick(0.3)
     held = dose.joints[-1][5]
     dose.tick(0.5)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from actors.arm.ur import rtde
 from actors.emulators.ur_controller.controller import Controller
-from actors.emulators.ur_controller.robot import UR10, UR10E
+from actors.emulators.ur_controller.robot import MODELS
 from actors.emulators.ur_controller.servers import primary_messages as primary
 from actors.emulators.ur_controller.servers.connections import MOST_UNSENT, Connection, Connections, ScriptConnection
 from actors.emulators.ur_controller.servers.dashboard_server import DashboardConnection, DashboardServer
@@ -86,7 +86,7 @@ class Rtde(Wire):
 
 @pytest.fixture
 def server() -> RtdeServer:
-    controller = Controller(UR10E)
+    controller = Controller(MODELS["ur10e"])
     return RtdeServer(controller, Connections(controller))
 
 
@@ -225,7 +225,7 @@ def kinds_of(controller: Controller, names: list[str]) -> list[str]:
     return [answers[i % 2][i // 2] for i in range(len(names))]
 
 
-@pytest.mark.parametrize("model", [UR10, UR10E], ids=["CB3", "e-Series"])
+@pytest.mark.parametrize("model", [MODELS["ur10"], MODELS["ur10e"]], ids=["CB3", "e-Series"])
 @pytest.mark.parametrize("table", [RECORD_RECIPE, DOCUMENTED, SINCE_E_SERIES], ids=["record", "both", "e-Series"])
 def test_outputs_that_the_manufacturer_documents_have_their_types(model: Any, table: dict[str, str]) -> None:
     wanted = {name: kind for kind, names in table.items() for name in names.split()}
@@ -234,7 +234,7 @@ def test_outputs_that_the_manufacturer_documents_have_their_types(model: Any, ta
     assert dict(zip(wanted, kinds_of(Controller(model), list(wanted)), strict=True)) == wanted
 
 
-@pytest.mark.parametrize("model", [UR10, UR10E], ids=["CB3", "e-Series"])
+@pytest.mark.parametrize("model", [MODELS["ur10"], MODELS["ur10e"]], ids=["CB3", "e-Series"])
 def test_registers_have_their_types_and_later_outputs_are_not_found(model: Any) -> None:
     registers = {
         f"{side}_{kind}_register_{i}": type_
@@ -254,7 +254,7 @@ def test_registers_have_their_types_and_later_outputs_are_not_found(model: Any) 
 
 
 def test_outputs_follow_what_the_arm_does() -> None:
-    controller = Controller(UR10E)
+    controller = Controller(MODELS["ur10e"])
     fields = RtdeServer(controller, Connections(controller)).fields
     still = (fields["script_control_line"].read(), fields["joint_position_deviation_ratio"].read())
     assert still == (0, 0.0)
@@ -380,7 +380,7 @@ anything = st.lists(st.one_of(known, st.binary(max_size=40)), max_size=12)
 @settings(max_examples=examples(80), deadline=None)
 @given(pieces=anything)
 def test_no_bytes_whatever_disturb_a_controller(kind: str, pieces: list[bytes]) -> None:
-    controller = Controller(UR10E)
+    controller = Controller(MODELS["ur10e"])
     wire = Wire(KINDS[kind](controller))
     for piece in pieces:
         wire.say(piece)
@@ -398,7 +398,9 @@ _values = st.sampled_from(
         *("x", "y", "a", "t"),
     )
 )
-_commands = st.sampled_from(["f", "a", "t", "run t", *sorted(name for name, _ in Controller(UR10E).known_commands)])
+_commands = st.sampled_from(
+    ["f", "a", "t", "run t", *sorted(name for name, _ in Controller(MODELS["ur10e"]).known_commands)]
+)
 
 
 def _larger(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
@@ -458,7 +460,7 @@ def reported(wire: Wire) -> list[str]:
 @settings(max_examples=examples(600), deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(texts=st.lists(_programs, min_size=1, max_size=3))
 def test_no_program_whatever_ends_the_controller_or_keeps_the_next_from_running(texts: list[str]) -> None:
-    controller = Controller(UR10E, frequency=125)
+    controller = Controller(MODELS["ur10e"], frequency=125)
     connections = Connections(controller)
     port = PrimaryServer(controller, connections)
     for text in texts:
@@ -495,7 +497,7 @@ def test_no_program_whatever_ends_the_controller_or_keeps_the_next_from_running(
     ],
 )
 def test_a_program_that_can_not_be_run_is_reported_on_the_port_it_came_by(text: str, says: str) -> None:
-    controller = Controller(UR10E)
+    controller = Controller(MODELS["ur10e"])
     wire = Wire(_primary(controller))
     wire.take()
     wire.say(text.encode())
@@ -511,7 +513,7 @@ def test_a_defect_of_the_translator_is_reported_and_the_controller_goes_on(
     def broken(*_: object) -> None:
         raise KeyError("a defect")
 
-    server = Wire(_primary(controller := Controller(UR10E)))
+    server = Wire(_primary(controller := Controller(MODELS["ur10e"])))
     server.take()
     with monkeypatch.context() as patch:
         patch.setattr("actors.emulators.ur_controller.controller.translate", broken)
@@ -523,14 +525,14 @@ def test_a_defect_of_the_translator_is_reported_and_the_controller_goes_on(
 
 
 def test_a_line_without_an_end_is_not_kept_for_ever() -> None:
-    wire = Wire(_dashboard(Controller(UR10E)))
+    wire = Wire(_dashboard(Controller(MODELS["ur10e"])))
     for _ in range(20):
         wire.say(b"x" * 1000)
     assert wire.cut
 
 
 def test_the_primary_port_says_its_version_and_then_its_state() -> None:
-    controller = Controller(UR10E)
+    controller = Controller(MODELS["ur10e"])
     wire = Wire(_primary(controller))
     packages = primary.split(wire.take())
     assert [kind for kind, _ in packages] == [primary.ROBOT_MESSAGE, primary.ROBOT_STATE]
@@ -560,7 +562,7 @@ def test_the_primary_port_says_its_version_and_then_its_state() -> None:
 
 
 def test_the_safety_checksum_can_be_read_where_a_real_controller_gives_it() -> None:
-    controller = Controller(UR10E)
+    controller = Controller(MODELS["ur10e"])
 
     def told() -> str | None:
         return primary.safety_checksum(dict(primary.split(Wire(_primary(controller)).take()))[primary.ROBOT_STATE])
@@ -571,7 +573,7 @@ def test_the_safety_checksum_can_be_read_where_a_real_controller_gives_it() -> N
 
 
 def test_primary_clients_are_told_what_programs_say_and_why_they_end() -> None:
-    controller = Controller(UR10E)
+    controller = Controller(MODELS["ur10e"])
     connections = Connections(controller)
     server = PrimaryServer(controller, connections)
     first = Wire(PrimaryConnection(server, messages=True, writable=True))
@@ -589,7 +591,7 @@ def test_primary_clients_are_told_what_programs_say_and_why_they_end() -> None:
 
 
 def test_a_connection_made_in_local_control_may_only_read_even_after_the_switch_to_remote() -> None:
-    controller = Controller(UR10E, remote=False)
+    controller = Controller(MODELS["ur10e"], remote=False)
     connections = Connections(controller)
     dashboard = DashboardServer(controller)
     old, script = Wire(DashboardConnection(connections, dashboard)), Wire(ScriptConnection(connections))
@@ -614,7 +616,7 @@ def test_a_connection_made_in_local_control_may_only_read_even_after_the_switch_
 
 
 def test_programs_are_read_by_the_primary_port_too() -> None:
-    controller = Controller(UR10)
+    controller = Controller(MODELS["ur10"])
     wire = Wire(_primary(controller))
     wire.say(b"set_standard_digital_out(2, True)\n")
     controller.tick()

@@ -163,7 +163,7 @@ def test_one_closed_port_is_named_with_what_it_is_for(tmp_path: Path) -> None:
         ("ur10e", {"local": True}, "remote control", "off", "Remote"),
         ("ur10", {"state": "off"}, "arm", "power off", "brakes"),
         ("ur10", {"state": "idle"}, "arm", "idle", "brakes"),
-        ("ur10e", {}, "model", "ur10e", "correct 'model'"),
+        ("ur10e", {}, "model", "UR10E", "correct 'model'"),
         ("ur10", {"joints": [0.0, -1.5, 1.5, -1.5, -1.5, 0.0]}, "position", "not at home", "jog"),
     ],
 )
@@ -239,7 +239,14 @@ def joints_violation(angle: float) -> str | None:
 
 
 @pytest.mark.parametrize(
-    ("module", "package"), [("psutil", "psutil"), ("serial", "pyserial"), ("rtde_receive", "ur-rtde"), ("ray", "Ray")]
+    ("module", "package"),
+    [
+        ("rtde_receive", "ur-rtde"),
+        *(
+            pytest.param(*names, marks=pytest.mark.slow)
+            for names in (("psutil", "psutil"), ("serial", "pyserial"), ("ray", "Ray"))
+        ),
+    ],
 )
 def test_without_an_extra_doctor_names_package_and_extra_before_it_starts_anything(
     module: str, package: str, tmp_path: Path

@@ -12,15 +12,16 @@ import pytest
 from orchestrator.cli.foreground_run import file_trouble, given_up_pours, interruption
 from tests.support.scripted_strategy import Script, one_stage, pour, states
 from tests.support.toy_campaign import ToyBench, ToyLaboratory, run_toy, toy_plan
+from tests.support.waiting import wait_async
 
 
 def interrupted(directory: Path, times: int) -> None:
     """A toy run whose pour is under way when Ctrl-C comes."""
 
     async def play() -> None:
-        laboratory = ToyLaboratory(bench=ToyBench(lambda: 0.6))
+        laboratory = ToyLaboratory(bench=ToyBench(lambda: 0.3 if times == 1 else 60.0))
         task = asyncio.create_task(run_toy(directory, laboratory, stages=one_stage(Script(pour()))))
-        await asyncio.sleep(0.2)
+        await wait_async(lambda: laboratory.bench.received, "pour")
         for _ in range(times):
             task.cancel()
             await asyncio.sleep(0.05)
@@ -34,7 +35,7 @@ def test_after_ctrl_c_once_nothing_is_lost(tmp_path: Path) -> None:
     interrupted(tmp_path / "run", 1)
     assert states(tmp_path / "run")[-1] == "paused"
     said = interruption(tmp_path / "run", toy_plan(tmp_path), "decant run toy.yaml --resume")
-    assert said == "; nothing is lost. Go on with: decant run toy.yaml --resume"
+    assert said == "; nothing is lost. Continue with: decant run toy.yaml --resume"
 
 
 def test_after_ctrl_c_twice_it_is_said_what_may_be_lost_and_what_to_do(tmp_path: Path) -> None:
@@ -44,14 +45,14 @@ def test_after_ctrl_c_twice_it_is_said_what_may_be_lost_and_what_to_do(tmp_path:
     assert given_up_pours(tmp_path / "run") == ["pour 1 of stage only"]
     real = replace(plan, laboratory=plan.laboratory.with_values(mode="hardware"))
     for each, advice in (
-        (real, "lost unless you weigh it now.*Resuming asks what came of it: 'weighed SPILLED RETAINED'"),
-        (plan, "Resuming asks what came of it: on a virtual bench 'repeat'"),
+        (real, "lost unless you weigh it now.*Resuming asks for its outcome: 'weighed SPILLED RETAINED'"),
+        (plan, "Resuming asks for its outcome: on a virtual bench 'repeat'"),
         (replace(plan, on_unknown="repeat"), "Resuming pours it again with the same chance"),
     ):
         said = interruption(tmp_path / "run", each, "decant run toy.yaml --resume")
         assert "nothing is lost" not in said
-        assert said.startswith(" while pour 1 of stage only was under way: it was given up")
-        assert said.endswith("Go on with: decant run toy.yaml --resume")
+        assert said.startswith(" while pour 1 of stage only was under way: it was abandoned")
+        assert said.endswith("Continue with: decant run toy.yaml --resume")
         with pytest.raises(ValueError, match=advice):
             raise ValueError(said)
 

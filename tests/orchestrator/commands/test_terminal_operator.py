@@ -21,6 +21,7 @@ from orchestrator.cli.terminal_operator import TerminalOperator
 from orchestrator.progress.console_progress import ProgressDisplay
 from orchestrator.runs.events import LogLine
 from tests.support import example_run
+from tests.support.waiting import PATIENCE, wait_async
 
 DONE = OperatorQuestion("Put the full pourer into the gripper.", "done")
 WEIGHT = OperatorQuestion("Weigh the pourer on the other balance.", "weight")
@@ -37,11 +38,9 @@ class Keyboard:
     def type(self, text: str) -> None:
         os.write(self.keys, text.encode())
 
-    async def shows(self, text: str) -> None:
-        """Wait until the screen shows it."""
-        async with asyncio.timeout(10.0):
-            while text not in self.screen.getvalue():
-                await asyncio.sleep(0.01)
+    async def shows(self, text: str, times: int = 1) -> None:
+        """Wait until the screen shows it, so many times."""
+        await wait_async(lambda: self.screen.getvalue().count(text) >= times, f"{text!r} on the screen")
 
     def operator(self, spec: OperatorSettings = PATIENT) -> TerminalOperator:
         return TerminalOperator(spec, stdin=self.terminal, out=self.screen)
@@ -58,7 +57,7 @@ def keyboard() -> Iterator[Keyboard]:
 
 def played(scene: Callable[[], Awaitable[None]]) -> None:
     async def within() -> None:
-        async with asyncio.timeout(30.0):
+        async with asyncio.timeout(PATIENCE):
             await scene()
 
     asyncio.run(within())
@@ -117,9 +116,9 @@ def test_a_weight_needs_its_unit_and_is_echoed(keyboard: Keyboard) -> None:
 def test_yes_and_no_are_told_apart_from_anything_else(keyboard: Keyboard) -> None:
     async def scene() -> None:
         operator = keyboard.operator()
-        for typed, answer in (("maybe\nn\n", "no"), ("YES\n", "yes")):
+        for prompts, typed, answer in ((1, "maybe\nn\n", "no"), (3, "YES\n", "yes")):
             asking = asyncio.create_task(operator.ask(OperatorQuestion("Does it still show this weight?", "yes or no")))
-            await asyncio.sleep(0.1)
+            await keyboard.shows("> ", prompts)
             keyboard.type(typed)
             assert await asking == answer
 
@@ -131,7 +130,7 @@ def test_giving_up_ends_the_pour_with_the_question_that_it_was_given_up_at(keybo
         asking = asyncio.create_task(keyboard.operator().ask(DONE))
         await keyboard.shows("> ")
         keyboard.type("Give  up\n")
-        with pytest.raises(LaboratoryError, match="given up by the operator at: Put the full pourer"):
+        with pytest.raises(LaboratoryError, match="abandoned by the operator at: Put the full pourer"):
             await asking
 
     played(scene)
@@ -139,7 +138,7 @@ def test_giving_up_ends_the_pour_with_the_question_that_it_was_given_up_at(keybo
 
 def test_nobody_answers_reminders_then_the_question_is_given_up(keyboard: Keyboard) -> None:
     async def scene() -> None:
-        with pytest.raises(LaboratoryError, match="nobody answered within 1 s"):
+        with pytest.raises(LaboratoryError, match="no answer within 1 s"):
             await keyboard.operator(OperatorSettings(reminder=0.3, deadline=1.0)).ask(DONE)
 
     played(scene)
@@ -178,8 +177,9 @@ def test_ctrl_d_once_is_a_slip_and_a_closed_terminal_ends_the_question(keyboard:
         await keyboard.shows("still open")
         keyboard.type("done\n")
         assert await asking == "done"
+        prompts = keyboard.screen.getvalue().count("> ")
         asking = asyncio.create_task(operator.ask(DONE))
-        await asyncio.sleep(0.1)
+        await keyboard.shows("> ", prompts + 1)
         os.close(keyboard.keys)
         with pytest.raises(LaboratoryError, match="terminal was closed"):
             await asking
@@ -196,7 +196,7 @@ def test_the_program_goes_on_while_nobody_types_and_a_question_can_be_cancelled(
         with pytest.raises(asyncio.CancelledError):
             await asking
         asking = asyncio.create_task(operator.ask(DONE))  # the terminal was let go of
-        await asyncio.sleep(0.1)
+        await keyboard.shows("> ", 2)
         keyboard.type("d\n")
         assert await asking == "done"
 

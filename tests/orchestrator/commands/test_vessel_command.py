@@ -70,7 +70,10 @@ def mesh(of: Bench, folder: Path) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", ["tumbler", pytest.param("cone", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("door", [callipers, fill, tilt, photo, points, depth, mesh])
+@pytest.mark.parametrize(
+    "door",
+    [callipers, fill, tilt, photo, *(pytest.param(each, marks=pytest.mark.slow) for each in (points, depth, mesh))],
+)
 def test_a_cup_comes_out_as_it_is_through_every_door(tmp_path: Path, name: str, door: Door) -> None:
     of, within = bench(name), 0.03 if door is depth else 0.015  # a pixel of the camera is 1.4 mm on the cup
     assert made(tmp_path, door(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=within)

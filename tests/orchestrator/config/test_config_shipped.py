@@ -7,16 +7,22 @@ import itertools
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import pytest
 
+from actors.arm.arm_settings import UrArmSettings
+from actors.emulators.ur_controller.robot import MODELS as CONTROLLED
+from actors.emulators.ur_controller.robot import calibrated
 from actors.runtime.child_process import child_environment
 from orchestrator.config.campaign_checks import check_campaign
 from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
 from orchestrator.config.json_schema import (
     campaign_schema,
+    daemon_schema,
     laboratory_schema,
     result_schema,
     schema_text,
@@ -36,7 +42,7 @@ SCHEMAS = {
     "laboratories": laboratory_schema,
     "studies": study_schema,
 }
-SHIPPED = [path for kind in SCHEMAS for path in sorted((CONFIGS / kind).glob("*.yaml"))]
+SHIPPED = [CONFIGS / "daemon.yaml", *(path for kind in SCHEMAS for path in sorted((CONFIGS / kind).glob("*.yaml")))]
 
 
 def named(path: Path) -> str:
@@ -46,6 +52,17 @@ def named(path: Path) -> str:
 @pytest.mark.parametrize("path", CAMPAIGNS, ids=named)
 def test_shipped_campaign_can_start(path: Path) -> None:
     assert check_campaign(load_campaign(path)) == []
+
+
+@pytest.mark.parametrize("name", ["ur3e-kern", "ur5e-mettler", "ur10e-sartorius"])
+def test_the_first_pours_fit_every_laboratory_of_hardware_also_with_a_calibrated_robot(name: str) -> None:
+    plan = load_campaign(CONFIGS / "campaigns" / "first-pour.yaml", CONFIGS / "laboratories" / f"{name}.yaml")
+    assert check_campaign(plan) == []
+    arm = plan.laboratory.arm
+    assert isinstance(arm, UrArmSettings)
+    own = arm.with_values(calibration=calibrated(CONTROLLED[arm.model]).calibration)
+    calibrated_plan = dataclasses.replace(plan, laboratory=plan.laboratory.with_values(arm=own))
+    assert check_campaign(calibrated_plan) == []
 
 
 @pytest.mark.parametrize("path", CAMPAIGNS, ids=named)
@@ -71,8 +88,9 @@ def test_committed_schema_is_current(kind: str) -> None:
     assert (CONFIGS / "schema" / f"{name}.json").read_text(encoding="utf-8") == schema_text(SCHEMAS[kind]())
 
 
-def test_committed_schema_of_results_is_current() -> None:
-    assert (CONFIGS / "schema" / "result.json").read_text(encoding="utf-8") == schema_text(result_schema())
+@pytest.mark.parametrize(("name", "schema"), [("result", result_schema), ("daemon", daemon_schema)])
+def test_committed_schema_of_other_files_is_current(name: str, schema: Callable[[], dict[str, Any]]) -> None:
+    assert (CONFIGS / "schema" / f"{name}.json").read_text(encoding="utf-8") == schema_text(schema())
 
 
 def test_schema_refuses_what_an_editor_should_underline() -> None:

@@ -185,7 +185,9 @@ def test_the_emergency_stop_is_one_press_and_is_latched_until_it_is_cleared(page
         assert lab.do(lab.served.get("/status"))["emergency"] is None
 
 
-@pytest.mark.parametrize("act", ["Enter", "Escape", "second press"])
+@pytest.mark.parametrize(
+    "act", ["Enter", *(pytest.param(act, marks=pytest.mark.slow) for act in ("Escape", "second press"))]
+)
 def test_the_default_answer_to_clearing_a_stop_keeps_it(page: Any, tmp_path: Path, act: str) -> None:
     with on_port(tmp_path) as lab:
         page.goto(lab.address())
@@ -378,8 +380,8 @@ def test_a_lost_connection_is_told_with_what_to_do(page: Any, tmp_path: Path) ->
         assert page.get_by_role("button", name="EMERGENCY STOP").is_enabled()
 
 
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGSTOP])
-@pytest.mark.parametrize("size", ["small phone", "desk"])
+@pytest.mark.parametrize("end", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("size", [pytest.param("small phone", marks=pytest.mark.slow), "desk"])
 def test_without_a_daemon_the_stop_is_disabled_and_the_physical_one_is_named(
     page: Any, tmp_path: Path, size: str, end: signal.Signals
 ) -> None:

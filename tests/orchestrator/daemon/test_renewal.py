@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from actors.laboratory import WarmSimulators
 from orchestrator.daemon import server_process, supervisor
 from orchestrator.daemon.server_process import MOST, RENEWED, DaemonRestart, RayWatch
 from tests.support.toy_daemon import held, run, serving
+from tests.support.waiting import wait_async, wait_for
 
 
 def test_a_pour_is_finished_before_and_its_campaign_goes_on_after(
@@ -64,7 +66,11 @@ class Daemon:
         self.problems.append(str(text))
 
 
-def watched(monkeypatch: pytest.MonkeyPatch, daemon: Any, *, rests: bool = False) -> list[float]:
+def watch_threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "watch over Ray"]
+
+
+def watched(monkeypatch: pytest.MonkeyPatch, daemon: Any, *, hangs: bool = True) -> list[float]:
     """When the program was replaced, seconds after Ray was seen to be dead."""
     monkeypatch.setattr(server_process, "COMING_TO_REST", 0.4)
     monkeypatch.setattr(server_process, "POURING", 0.8)
@@ -76,10 +82,11 @@ def watched(monkeypatch: pytest.MonkeyPatch, daemon: Any, *, rests: bool = False
 
     async def work() -> None:
         watch = RayWatch(daemon, Kept(), lambda: False)
-        await asyncio.sleep(0.05)
-        if rests:
-            watch.close()
-        time.sleep(1.5)  # as a loop that hangs in a call to a dead Ray
+        if hangs:
+            wait_for(lambda: replaced, "new beginning")  # blocks the loop, as a call to a dead Ray does
+            return
+        watch.close()
+        await wait_async(lambda: not watch_threads())
         await asyncio.sleep(0)
 
     with contextlib.suppress(TimeoutError):
@@ -92,7 +99,7 @@ def test_a_loop_that_hangs_keeps_nobody_from_beginning_anew(monkeypatch: pytest.
     assert len(watched(monkeypatch, daemon)) == 1
     assert daemon.left == ["raylet"]
     assert not daemon.problems
-    assert watched(monkeypatch, Daemon(), rests=True) == []
+    assert watched(monkeypatch, Daemon(), hangs=False) == []
 
 
 def test_a_pour_gets_more_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,7 +112,7 @@ def test_a_pour_gets_more_time(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_people_are_told_where_ray_dies_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
     daemon = Daemon()
     monkeypatch.setenv(RENEWED, " ".join(str(time.time()) for _ in range(MOST)))
-    assert watched(monkeypatch, daemon) == []
+    assert watched(monkeypatch, daemon, hangs=False) == []
     assert daemon.left == []
     assert "start it again" in daemon.problems[0]
     monkeypatch.setenv(RENEWED, " ".join(str(time.time() - server_process.WITHIN) for _ in range(MOST)))

@@ -48,6 +48,7 @@ class Mover:
     Attributes:
         q, qd, qdd: targets [rad], [rad/s], [rad/s²].
         slider: requested speed fraction of paths, 0 … 1.
+        slowing: the controller's own speed fraction, as near a limit.
         rate: effective speed fraction.
         joint_speed, joint_range: limits; a safety configuration may narrow the model's.
     """
@@ -55,7 +56,7 @@ class Mover:
     def __init__(self, model: RobotModel, q: Joints) -> None:
         zero: Joints = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self.q, self.qd, self.qdd = q, zero, zero
-        self.slider = 1.0
+        self.slider = self.slowing = 1.0
         self.rate = 1.0
         self.joint_speed = model.joint_speed
         self.joint_range: tuple[tuple[float, float], ...] = tuple((-r, r) for r in model.joint_range)
@@ -65,6 +66,17 @@ class Mover:
         self._frozen = False
 
     # ---- state
+
+    @property
+    def _wanted_rate(self) -> float:
+        return self.slider * self.slowing
+
+    @property
+    def scaling(self) -> float:
+        """Effective speed as a fraction of the slider's, as RTDE reports it."""
+        if not isinstance(self._action, Path) or self.slider == 0.0:
+            return self.slowing
+        return min(1.0, self.rate / self.slider)
 
     @property
     def moving(self) -> bool:
@@ -120,7 +132,7 @@ class Mover:
             prelude = self._braking() if any(abs(v) > STILL for v in self.qd) else None
         path = Path(line, speed, acceleration, self.joint_speed, duration=duration, radius=radius, prelude=prelude)
         if not any(abs(v) > STILL for v in self.qd):
-            self.rate = self.slider
+            self.rate = self._wanted_rate
         self._action = path
         return path
 
@@ -221,11 +233,9 @@ class Mover:
         if self._frozen:
             fastest = max(abs(v) for v in self.qd)
             self.rate = 0.0 if fastest <= SAFETY_STOP * dt else self.rate * (1.0 - SAFETY_STOP * dt / fastest)
-        elif self.rate != self.slider:
+        elif self.rate != (wanted := self._wanted_rate):
             step = RAMP * dt
-            self.rate = (
-                max(self.slider, self.rate - step) if self.rate > self.slider else min(self.slider, self.rate + step)
-            )
+            self.rate = max(wanted, self.rate - step) if self.rate > wanted else min(wanted, self.rate + step)
 
     def _check(self, q: Joints, dt: float) -> None:
         for i in range(6):

@@ -11,8 +11,11 @@ sent as zeros. The first four bytes of the safety data are the checksum, accordi
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+from actors.arm.ur.robot_models import Calibration
 
 ROBOT_STATE = 16
 ROBOT_MESSAGE = 20
@@ -21,6 +24,9 @@ MODE_DATA, JOINT_DATA, TOOL_DATA, MASTERBOARD_DATA, CARTESIAN_INFO = 0, 1, 2, 3,
 KINEMATICS_INFO, CONFIGURATION_DATA, ADDITIONAL_INFO, SAFETY_DATA = 5, 6, 8, 10
 
 TEXT, POPUP, SAFETY_MODE, ERROR_CODE, VERSION, KEY, RUNTIME_EXCEPTION = 0, 2, 5, 6, 3, 7, 10
+
+ACCELERATION = 40.0
+"""Largest acceleration of every joint [rad/s²]. The manufacturer publishes none; this one is plausible."""
 
 _SIZE = struct.Struct(">iB")
 
@@ -133,10 +139,12 @@ def safety_checksum(state: bytes) -> str | None:
     return f"{int.from_bytes(data[:4], 'big'):08X}" if len(data) >= 4 else None
 
 
-def kinematics_info(a: Sequence[float], d: Sequence[float], alpha: Sequence[float]) -> bytes:
-    """Encode the Denavit–Hartenberg parameters without calibration."""
-    zeros = (0.0,) * 6
-    return package(KINEMATICS_INFO, bytes(24), struct.pack(">24dI", *zeros, *a, *d, *alpha, 0))
+def kinematics_info(own: Calibration) -> bytes:
+    """Encode the Denavit–Hartenberg parameters; a robot without calibration sends checksums of all ones."""
+    rows = (struct.pack(">4d", *row) for row in zip(own.theta, own.a, own.d, own.alpha, strict=True))
+    checksums = (zlib.crc32(row) if own.checksum else 0xFFFFFFFF for row in rows)
+    numbers = (*own.theta, *own.a, *own.d, *own.alpha)
+    return package(KINEMATICS_INFO, struct.pack(">6I24dI", *checksums, *numbers, 0))
 
 
 def configuration_data(
@@ -149,7 +157,7 @@ def configuration_data(
 ) -> bytes:
     """Encode limits, defaults and lengths."""
     limits = [angle for pair in ranges for angle in pair]
-    motion = [value for speed in speeds for value in (speed, 40.0)]
+    motion = [value for speed in speeds for value in (speed, ACCELERATION)]
     defaults = (1.05, 1.4, 0.25, 1.2, 0.3)
     numbers = struct.pack(">53d", *limits, *motion, *defaults, *a, *d, *alpha, *((0.0,) * 6))
     return package(CONFIGURATION_DATA, numbers, struct.pack(">4i", 1, 1, *robot_type))

@@ -5,8 +5,7 @@ Ports 30011 and 30012 are read-only. On the others, a connection that was opened
 
 from __future__ import annotations
 
-from math import pi
-
+from actors.arm.ur.robot_models import TWISTS
 from actors.emulators.ur_controller.controller import Controller, RuntimeState
 from actors.emulators.ur_controller.safety_system import SafetyMode
 from actors.emulators.ur_controller.servers import primary_messages as primary
@@ -20,7 +19,6 @@ INTERVAL = 0.1
 """Time between two states [s]."""
 
 _READ_ONLY = 210
-_ALPHA = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
 
 
 class PrimaryServer:
@@ -64,7 +62,7 @@ class PrimaryServer:
                 safety_mode=mode,
                 joint_mode=253 if power.running else 255 if power.powered else 239,
                 slider=robot.mover.slider,
-                scaling=robot.mover.rate,
+                scaling=robot.mover.scaling,
                 q=robot.q,
                 target_q=robot.mover.q,
                 qd=robot.qd,
@@ -84,13 +82,12 @@ class PrimaryServer:
     def first(self) -> bytes:
         """Return the first bytes for a new client: version, and a state with the data that rarely changes."""
         c, m = self.controller, self.controller.model
-        a, d = (0.0, m.a2, m.a3, 0.0, 0.0, 0.0), (m.d1, 0.0, 0.0, m.d4, m.d5, m.d6)
         limits = c.safety.configuration
         configuration = primary.configuration_data(
-            limits.joint_ranges, limits.joint_speeds, a, d, _ALPHA, m.primary_type
+            limits.joint_ranges, limits.joint_speeds, m.a, m.d, TWISTS, m.primary_type
         )
         return primary.version_message(c.now, m.version) + self.state(
-            primary.kinematics_info(a, d, _ALPHA), configuration
+            primary.kinematics_info(m.parameters), configuration
         )
 
     def _on_message(self, message: ControllerMessage) -> None:

@@ -231,6 +231,7 @@ def calibrated_in_four():
     return strategy, StrategyHarness(spill_by_two).run(strategy)
 
 
+@pytest.mark.slow
 def test_of_four_parameters_the_result_maps_the_two_that_matter_with_the_others_at_theta_star():
     strategy, _ = calibrated_in_four()
     result = strategy.result()

@@ -142,7 +142,11 @@ def questions(play: StrategyHarness) -> list[Any]:
     return [request.query for request in play.asked if isinstance(request, Suggest)]
 
 
-CASES = [pytest.param(name, dimension, id=f"{name}-{dimension}") for name in NAMES for dimension in (2, 4, 6)]
+CASES = [
+    pytest.param(name, dimension, id=f"{name}-{dimension}", marks=[pytest.mark.slow] if dimension == 4 else [])
+    for name in NAMES
+    for dimension in (2, 4, 6)
+]
 
 
 @pytest.mark.parametrize(("name", "dimension"), CASES)
