@@ -340,6 +340,59 @@ def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 
+def picture(path: Path, seed: int = 3) -> None:
+    """Draw one dose of 50 g with all its signals.
+
+    Args:
+        path: of the PNG.
+        seed: of a development series.
+    """
+    from orchestrator.results import figure_style as style
+
+    series = Series(next(iter(GROUPS.values())), seed, cup_flows())
+    series.refill_for(0.3)
+    rng = np.random.default_rng((seed, 3))
+    lag = identify_lag(series.bench.place_receiver(), PARTICLES, rng, step=series.scale.step)
+    content = series.bench.content / series.density
+    belief = DoseBelief.prior((content, 5e-7), lag, rng)
+    controller = DoseController(
+        series.cup, DoseOrder(0.05), belief, DosingSettings(), step=series.scale.step, seed=seed
+    )
+    seen: list[tuple[float, str, float, float]] = []
+
+    class Recorder:
+        """Notes what the controller believes at every step."""
+
+        def step(self, time: float, tilt: float, readings: Any) -> Any:
+            """See `actors.dosing.virtual_dosing_bench.Doser`."""
+            command = controller.step(time, tilt, readings)
+            seen.append((time, str(controller.phase), *controller.amount))
+            return command
+
+    record = series.bench.dose(Recorder())
+    figure, (masses, tilts, flows) = style.new_figure(3, 1, size=(7.2, 6.4), sharex=True)
+    times = np.array([s[0] for s in seen])
+    mean, deviation = np.array([s[2] for s in seen]), np.array([s[3] for s in seen])
+    zero = float(np.median([r.mass for r in record.readings[:4]]))
+    masses.fill_between(times, 1e3 * (mean - 2 * deviation), 1e3 * (mean + 2 * deviation), color=style.PALE)
+    masses.plot(times, 1e3 * mean, color=style.PREDICTED, label="estimated, past the lip (± 2 σ)")
+    masses.plot(record.times, 1e3 * record.true_mass, color=style.MEASURED, label="true, in the receiver")
+    shown = [(r.time, 1e3 * (r.mass - zero)) for r in record.readings]
+    masses.plot(*zip(*shown, strict=True), ".", color=style.GREY, ms=4, label="reading")
+    masses.axhline(50.0, color=style.BEST, lw=1.0, label="wanted")
+    stop = next((t for t, phase, _, _ in seen if phase == "return"), None)
+    for axes in (masses, tilts, flows):
+        if stop is not None:
+            axes.axvline(stop, color=style.BEST, lw=1.0, ls=":")
+    tilts.plot(record.times, np.degrees(record.tilts), color=style.MEASURED)
+    flows.plot(record.times, 1e3 * record.flow, color=style.MEASURED)
+    masses.legend(fontsize=8, frameon=False)
+    style.dress(masses, title="A first dose of 50 g; dotted: the order to turn back", y="mass [g]")
+    style.dress(tilts, y="tilt [deg]")
+    style.dress(flows, x="time [s]", y="flow past the lip [g/s]")
+    figure.savefig(path, dpi=120)
+
+
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -350,7 +403,10 @@ def main() -> None:
     parser.add_argument("--controllers", nargs="*", choices=list(CONTROLLERS), default=list(CONTROLLERS))
     parser.add_argument("--json", action="store_true", help=f"write {DATA.relative_to(ROOT)}")
     parser.add_argument("--dump", type=Path, help="write all doses to a JSON file")
+    parser.add_argument("--picture", type=Path, help="draw one dose, and nothing else")
     options = parser.parse_args()
+    if options.picture:
+        return picture(options.picture)
     names = list(GROUPS) if options.groups is None else [list(GROUPS)[k] for k in options.groups]
 
     def seeds(group: Group) -> range:

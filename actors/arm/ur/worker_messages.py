@@ -15,7 +15,7 @@ STOP_ORDER, HEARTBEAT, GO = 0, 1, 2
 order has no effect."""
 
 TILT_SPEED, TILT_COUNTER = 0, 1
-"""Double inputs of a dose, counted from the same setting: the wanted speed [rad/s], and a number that changes with every
+"""Double inputs of a dose, counted from the same setting: the wanted speed [rad/s]; a number that changes with each
 command."""
 
 NUMBER, STATUS = 12, 13
