@@ -159,6 +159,9 @@ PARK = math.radians(18.0)
 SEEN = 0.25e-3
 """Smallest rise of the reading that counts as the stream [kg]."""
 
+ARM_PATIENCE = 0.2
+"""Time without a command after which the arm turns back by itself [s]."""
+
 LATEST_ONSET = math.radians(1.5)
 """Tilt by which outflow can begin later than expected, even after many doses: the lip may have dried [rad]."""
 
@@ -266,8 +269,12 @@ class DoseController:
             self._begin = self._now = time
             self._estimator.start(time, tilt)
         paused = time - self._now > 0.3 and self.phase in (DosePhase.APPROACH, DosePhase.POUR)
-        for reading in readings:
-            self._take(reading, tilt, time)
+        if paused:
+            self._pass_over(time, tilt)
+            self._recent = [*self._recent, *readings][-12:]
+        else:
+            for reading in readings:
+                self._take(reading, tilt, time)
         if self.phase is DosePhase.CHECK:
             self._estimator.start(time, tilt)
         else:
@@ -452,6 +459,13 @@ class DoseController:
         )
         e.update(net)
 
+    def _pass_over(self, time: float, tilt: float) -> None:
+        """Move the particles over a pause of the caller, in which the arm has turned back by itself."""
+        highest = self._tilt + self._speed * ARM_PATIENCE
+        turned = self._now + ARM_PATIENCE
+        self._estimator.advance(min(turned, time), highest)
+        self._estimator.advance(min(turned + abs(highest - tilt) / self._settings.return_speed, time), tilt)
+
     def _note_late_stream(self, seconds: float, tilt: float) -> None:
         """Integrate the slowest plausible stream; a reading far behind it misses liquid."""
         if self.phase in (DosePhase.CHECK, DosePhase.DONE) or seconds <= 0.0:
@@ -482,7 +496,7 @@ class DoseController:
             or (self.phase is DosePhase.POUR and float(np.median(e.flow_factor)) < 0.3 * self._factor_before)
         ):
             left = float(np.median(e.volume))
-            self._turn_back(DoseEnd.SOURCE_EMPTY if left < 0.08 * self._cup.capacity else DoseEnd.STREAM_MISSED)
+            self._turn_back(DoseEnd.SOURCE_EMPTY if left < 0.12 * self._cup.capacity else DoseEnd.STREAM_MISSED)
 
     def _rate(self) -> float:
         """Slope of the last readings [kg/s]."""
