@@ -36,7 +36,7 @@ from sim_engine.vessel.vessel import Vessel, build_vessel
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(Path(__file__).parent))
 
-from dosing_rivals import FastPid, LearntPreact, OpenLoop, Pid, Preact, Rival, RivalMemory  # noqa: E402
+from dosing_rivals import FastPid, LearnedPreact, OpenLoop, Pid, Preact, Rival, RivalMemory  # noqa: E402
 
 DATA = ROOT / "docs" / "data" / "dosing.json"
 
@@ -240,7 +240,7 @@ def with_rival(rival: type[Rival]) -> Callable[[Series], list[Dose]]:
 CONTROLLERS: dict[str, Callable[[Series], list[Dose]]] = {
     "open loop": with_rival(OpenLoop),
     "fixed preact": with_rival(Preact),
-    "learnt preact": with_rival(LearntPreact),
+    "learned preact": with_rival(LearnedPreact),
     "PID": with_rival(Pid),
     "PID, fast": with_rival(FastPid),
     "particles": with_particles,

@@ -1,4 +1,4 @@
-"""Rivals of the dose controller: open loop, fixed and learnt preact, and PID, on the same bench with the same cup.
+"""Rivals of the dose controller: open loop, fixed and learned preact, and PID, on the same bench with the same cup.
 
 All of them know the geometry of the cup, the weighed content of the source, and the zero of the balance. They begin
 alike: fast to the earliest plausible onset, then slowly until two readings have risen.
@@ -220,7 +220,7 @@ class Preact(Rival):
                 self.memory.preact += self.gain * math.fsum(self.memory.errors) / len(self.memory.errors)
 
 
-class LearntPreact(Preact):
+class LearnedPreact(Preact):
     """The preact learns from fill to fill."""
 
     gain = 0.5

@@ -11,8 +11,8 @@ tilt. The phases are:
    is likelier than 1 %.
 5. SETTLE: weigh. If more is missing than the smallest dependable amount, continue with 2.
 
-In doubt the cup is turned back: a tilted cup pours on while it stands still. `DoseResult` says how the dose ended and
-how much is in the receiver, or that this is unknown.
+In doubt the cup is turned back: a tilted cup pours on while it stands still. `DoseResult` has the end of the dose and
+the amount in the receiver, if it is known.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def fine_flow(cup: CupFlow, tilt: float, settings: DosingSettings) -> float:
 
 
 class DosePhase(StrEnum):
-    """What the controller does."""
+    """Phase of a dose."""
 
     CHECK = "check"
     APPROACH = "approach"
@@ -191,7 +191,7 @@ class DoseController:
     Args:
         cup: flow of the source vessel.
         order: the dose.
-        belief: what is known before it.
+        belief: from the doses before it.
         settings: limits.
         fall_time: of the stream from the lip into the receiver [s].
         step: of the balance's display [kg].
@@ -243,7 +243,7 @@ class DoseController:
         self._late_mass, self._late_flow = 0.0, 0.0
         self.fine_flow = settings.smallest_flow
 
-    # ---- what a display shows
+    # ---- for displays
 
     @property
     def amount(self) -> tuple[float, float]:

@@ -7,7 +7,7 @@ arm reports; `DoseEstimator.update` corrects them with a time-stamped reading:
     load = m(t − t_f) + ρq(t − t_f)·t_f                      (the impact of liquid that falls from rest)
     y = four first-order lags of the load in a row, of ρ_s·T, (1 − ρ_s)T/3, (1 − ρ_s)T/3, (1 − ρ_s)T/3
 
-- `DoseBelief` is what one dose passes on to the next one. `DoseBelief.prior` makes the first one.
+- `DoseBelief` holds the values that one dose passes on to the next one. `DoseBelief.prior` makes the first one.
 - `identify_lag` estimates the lag of the balance from the step when the empty receiver is put on it.
 
 The filter of a balance is rarely documented. Its total lag T decides the error of a dose, its shape ρ_s only the
@@ -64,7 +64,7 @@ class DoseReading:
 
 @dataclass(frozen=True)
 class DoseBelief:
-    """What is known before a dose; arrays (N,), one value for each particle.
+    """The state of knowledge before a dose; arrays (N,), one value for each particle.
 
     Attributes:
         onset_bias: tilt by which outflow begins later than the equation says [rad].
@@ -73,7 +73,7 @@ class DoseBelief:
         lag_shape: ρ_s of the balance's filter.
         volume: in the source vessel [m³].
         aim: mass to subtract from the target, because it arrives after the predicted end of the flow [kg].
-        doses: number of doses that it was learnt from.
+        doses: number of doses that it was estimated from.
     """
 
     onset_bias: Floats
@@ -214,7 +214,7 @@ class DoseEstimator:
             self.volume -= flow * TIME_STEP
             gained = cup.density * flow * TIME_STEP
             self.mass += gained + 0.02 * cup.density * flow * noise[0]
-            # flow and onset wander: what they stand for (wetting, film) is not constant
+            # flow and onset wander, because wetting and film are not constant
             self.flow_factor *= np.exp(np.where(flows, 0.03 * noise[1], 0.0))
             self.onset_bias += np.where(flows, math.radians(0.1) * noise[2], 0.0)
             self.flow = flow
@@ -316,7 +316,7 @@ class DoseEstimator:
             aim: see `DoseBelief.aim`.
         """
         volume = self.volume
-        if weighed is not None:  # what is in the receiver has left the source
+        if weighed is not None:  # the content of the receiver has left the source
             volume = np.maximum(self._belief.volume - weighed / self.cup.density, 0.0)
         return DoseBelief(
             self.onset_bias, self.flow_factor, self.lag, self.lag_shape, volume, aim, self._belief.doses + 1

@@ -123,7 +123,7 @@ class DoseRecord:
 
     Attributes:
         received: in the receiver at the end [kg].
-        spilled: beside it [kg].
+        spilled: next to it [kg].
         duration: from the first command to `finished` [s]; LONGEST_DOSE if it never came.
         stopped: time of the last outflow [s].
         upright: time at which the cup had turned back to its rest [s].

@@ -128,7 +128,7 @@ def test_the_same_seed_makes_the_same_dose() -> None:
     assert np.array_equal(first.tilts, second.tilts)
 
 
-def test_a_dose_passes_on_what_it_learnt() -> None:
+def test_a_dose_passes_on_its_estimates() -> None:
     record, controller = one_dose(0.1)
     assert controller.result is not None
     after = controller.result.belief
