@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 
 from actors.dosing.cup_flow import CupFlow
-from actors.dosing.dose_controller import DoseController, DoseOrder, DosingSettings, fine_flow
-from actors.dosing.dose_estimator import DoseBelief, identify_lag
+from actors.dosing.dose_controller import DoseOrder, DosingSettings, fine_flow
+from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
 from sim_engine.liquids import Liquid
 from sim_engine.vessel import profile
@@ -190,25 +190,24 @@ class Series:
 def with_particles(series: Series) -> list[Dose]:
     """The dose controller."""
     rng = np.random.default_rng((series.seed, 3))
-    settings = DosingSettings()
-    beliefs: list[DoseBelief] = []
+    started: list[DoseSeries] = []
 
     def pour(amount: float, filled: bool) -> tuple[Any, str]:
-        step = series.bench.place_receiver()
-        sigma = 0.5e-3 / series.density
-        if not beliefs:
-            lag = identify_lag(step, PARTICLES, rng, step=series.scale.step)
-            content = series.weighed_content() / series.density
-            beliefs.append(DoseBelief.prior((content, sigma), lag, rng))
+        placed = series.bench.place_receiver()
+        if not started:
+            content = SourceContent(series.weighed_content())
+            started.append(
+                DoseSeries(
+                    series.cup, DosingSettings(), content, placed, rng, particles=PARTICLES, step=series.scale.step
+                )
+            )
         elif filled:
-            beliefs[0] = beliefs[0].refilled((series.weighed_content() / series.density, sigma), rng)
+            started[0].fill(SourceContent(series.weighed_content()))
         order = DoseOrder(amount, receiver_mass=series.bench.receiver_mass)
-        controller = DoseController(
-            series.cup, order, beliefs[0].widened(rng), settings, step=series.scale.step, seed=series.seed
-        )
+        controller = started[0].controller(order, seed=series.seed)
         record = series.bench.dose(controller)
         assert controller.result is not None
-        beliefs[0] = controller.result.belief
+        started[0].finish(controller.result)
         return record, str(controller.result.end)
 
     return list(series.doses(pour))
@@ -352,12 +351,9 @@ def picture(path: Path, seed: int = 3) -> None:
     series = Series(next(iter(GROUPS.values())), seed, cup_flows())
     series.refill_for(0.3)
     rng = np.random.default_rng((seed, 3))
-    lag = identify_lag(series.bench.place_receiver(), PARTICLES, rng, step=series.scale.step)
-    content = series.bench.content / series.density
-    belief = DoseBelief.prior((content, 5e-7), lag, rng)
-    controller = DoseController(
-        series.cup, DoseOrder(0.05), belief, DosingSettings(), step=series.scale.step, seed=seed
-    )
+    content, placed = SourceContent(series.bench.content), series.bench.place_receiver()
+    doses = DoseSeries(series.cup, DosingSettings(), content, placed, rng, particles=PARTICLES, step=series.scale.step)
+    controller = doses.controller(DoseOrder(0.05), seed=seed)
     seen: list[tuple[float, str, float, float]] = []
 
     class Recorder:

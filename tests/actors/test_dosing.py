@@ -10,6 +10,7 @@ import pytest
 from actors.dosing.cup_flow import CupFlow
 from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder, DosingSettings
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, identify_lag
+from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.virtual_dosing_bench import DoseRecord, DosingFault, TrueCup, TrueScale, VirtualDosingBench
 from sim_engine.hydrostatics import level, tilting_cup_outflow
 from sim_engine.liquids import Liquid
@@ -195,3 +196,44 @@ def test_a_killed_program_leaves_the_cup_upright_within_a_second_and_a_half() ->
     # 0.2 s watchdog, then 60° per second
     assert record.stopped < float(flowing[0]) + 1.0 + 0.2 + 0.4
     assert record.upright < float(flowing[0]) + 1.0 + 0.2 + 1.4
+
+
+def a_series(mass: float = 0.3, seed: int = 5) -> DoseSeries:
+    return DoseSeries(CUP, DosingSettings(), SourceContent(mass), [], np.random.default_rng(seed), particles=80)
+
+
+def test_a_forecast_says_amount_time_and_whether_the_source_holds_enough() -> None:
+    series = a_series()
+    forecast = series.forecast(DoseOrder(0.05), seed=1, count=8)
+    assert forecast.amount == pytest.approx(0.05, abs=1.5e-3)
+    assert forecast.interval[0] < forecast.amount < forecast.interval[1]
+    assert 4.0 < forecast.duration <= forecast.longest < 15.0
+    assert forecast.enough > 0.999
+    assert forecast.ends == {DoseEnd.REACHED: 8}
+    assert a_series(0.04).forecast(DoseOrder(0.05), seed=1, count=2).enough < 0.001
+
+
+def test_a_forecast_changes_no_later_dose() -> None:
+    beliefs = []
+    for asked in (False, True):
+        series = a_series()
+        if asked:
+            series.forecast(DoseOrder(0.025), seed=1, count=2)
+        beliefs.append(series.belief.widened(np.random.default_rng(2)).volume)
+    assert np.array_equal(*beliefs)
+
+
+def test_the_content_of_the_source_follows_the_doses_and_the_weighings() -> None:
+    bench = VirtualDosingBench(SPOUTED, WATER, TrueScale(lag=0.3), 4)
+    placed = bench.place_receiver()
+    series = DoseSeries(CUP, DosingSettings(), SourceContent(0.3), placed, np.random.default_rng(4), particles=80)
+    poured = 0.0
+    for amount in (0.05, 0.025):
+        controller = series.controller(DoseOrder(amount, receiver_mass=bench.receiver_mass), seed=4)
+        poured += bench.dose(controller).received
+        assert controller.result is not None
+        series.finish(controller.result)
+    assert series.content.mass == pytest.approx(0.3 - poured, abs=2e-3)
+    series.fill(SourceContent(0.28, 0.2e-3))
+    assert series.content.mass == pytest.approx(0.28, abs=1e-4)
+    assert series.content.deviation == pytest.approx(0.2e-3, rel=0.05)
