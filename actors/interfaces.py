@@ -115,6 +115,19 @@ class PourProgress:
 ProgressCallback = Callable[[PourProgress], None]
 
 
+@dataclass(frozen=True)
+class DoseTarget:
+    """A wanted amount in the receiver; the tilt is then decided while the liquid flows.
+
+    Attributes:
+        amount: [kg].
+        limit: excess that may be exceeded with a probability of 1 % only [kg].
+    """
+
+    amount: float
+    limit: float = 1e-3
+
+
 class Bench(Protocol):
     """Arm, balance and operator together: it makes one pour and weighs its outcome."""
 
@@ -124,13 +137,20 @@ class Bench(Protocol):
         ...
 
     async def pour(
-        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
+        self,
+        scene: Scene,
+        action: Any,
+        *,
+        seed: int,
+        progress: ProgressCallback | None = None,
+        dose: DoseTarget | None = None,
     ) -> PourMeasurement:
         """One whole pour: operator ready → tare → start pose → tilt → hold → return → settle → weigh → record.
 
         Args:
             action: `sim_engine.action.Action`.
             seed: of the hidden noise of a virtual bench; ignored by hardware.
+            dose: wanted amount; None: the action is the whole motion.
 
         Raises:
             InvalidActionError: refused before anything moved.

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import Literal
 
+from actors.interfaces import DoseTarget
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
@@ -82,6 +83,7 @@ class Pour:
         number: 1, 2, … within the stage.
         seed: seed of the virtual bench's hidden noise for this pour; a real bench ignores it.
         predicted: the strategy's prediction, for display.
+        dose: wanted amount in the receiver; the action then gives the place and the range of the tilt only.
     """
 
     scene: str
@@ -90,6 +92,7 @@ class Pour:
     seed: int
     predicted: Prediction | None = None
     purpose: str = "pour"
+    dose: DoseTarget | None = None
 
 
 @dataclass(frozen=True)

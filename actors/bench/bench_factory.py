@@ -25,7 +25,16 @@ from actors.bench.ground_truth import GroundTruth
 from actors.bench.pour_procedure import PourProcedure
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.virtual_bench import BenchEmulators, DeviceEmulators, FollowedBench, VirtualBench
-from actors.interfaces import InvalidActionError, LaboratoryError, Notice, Operator, ProgressCallback, SimulatorPool
+from actors.dosing.simulated_dose import simulated_dose
+from actors.interfaces import (
+    DoseTarget,
+    InvalidActionError,
+    LaboratoryError,
+    Notice,
+    Operator,
+    ProgressCallback,
+    SimulatorPool,
+)
 from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from actors.runtime.remote_object import Device
 from sim_engine.action import Action
@@ -52,7 +61,13 @@ class PouringBench:
         return self._setup.mode
 
     async def pour(
-        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
+        self,
+        scene: Scene,
+        action: Any,
+        *,
+        seed: int,
+        progress: ProgressCallback | None = None,
+        dose: DoseTarget | None = None,
     ) -> PourMeasurement:
         """See `Bench.pour`. Cancelling stops the arm.
 
@@ -62,6 +77,13 @@ class PouringBench:
             UnknownPourError: the pour began, but did not run as planned.
         """
         async with self._one_at_a_time:
+            if dose is not None:
+                if not isinstance(self.ground_truth, SimulatedBench):
+                    raise InvalidActionError(
+                        "wanted amounts are poured on simulated benches only, such as configs/laboratories/twin.yaml; "
+                        "remove the amount, or choose such a laboratory"
+                    )
+                return await asyncio.to_thread(simulated_dose, scene, dose, seed)
             with contextlib.suppress(LaboratoryError):  # the procedure reports why the arm is not ready
                 self._arm_spec = self._arm_spec.fitted_to(await self.arm.ready())
             path = await asyncio.to_thread(self._checked, scene, action)

@@ -14,6 +14,7 @@ import typer
 from orchestrator.cli import (
     balance_commands,
     campaign_commands,
+    dose_command,
     file_commands,
     physics_command,
     pour_command,
@@ -115,6 +116,11 @@ _add(
     "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --dry-run --png path.png",
     "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --empty --slow 0.2 --enable-motion",
     "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --enable-motion",
+)
+_add(
+    dose_command.dose,
+    "decant dose configs/campaigns/quickstart.yaml --amount '50 g' --dry-run",
+    "decant dose configs/campaigns/quickstart.yaml --amount '50 g' --amount '25 g' --tolerance '1 g'",
 )
 _add(
     report_command.report,

@@ -238,7 +238,7 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
     from orchestrator.strategies.single_action import OnePour, OnePoured
 
     plan = dataclasses.replace(
-        _only(chosen),
+        plan_of_scene(chosen.plan, chosen.scene),
         name=f"{chosen.plan.name}-pour",
         outputs=chosen.plan.outputs.model_copy(update={"figures": False}),
     )
@@ -270,11 +270,10 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
         print(told(result.weighed))
 
 
-def _only(chosen: Chosen) -> CampaignPlan:
-    """The campaign without everything that this pour isn't of."""
-    plan = chosen.plan
-    if plan.deployment is not None and chosen.scene in plan.deployment.scenes:
-        deployment = dataclasses.replace(plan.deployment.with_settings(pours=1), scenes=(chosen.scene,))
+def plan_of_scene(plan: CampaignPlan, scene: Scene) -> CampaignPlan:
+    """The campaign without everything that pours in one of its scenes do not need."""
+    if plan.deployment is not None and scene in plan.deployment.scenes:
+        deployment = dataclasses.replace(plan.deployment.with_settings(pours=1), scenes=(scene,))
         return dataclasses.replace(plan, calibration=None, deployment=deployment)
     return dataclasses.replace(plan, deployment=None)
 

@@ -305,6 +305,7 @@ DECLARED_IN = (
     "orchestrator.strategies.calibration.calibration_scores",
     "orchestrator.strategies.deployment.deployment_result",
     "orchestrator.strategies.single_action",
+    "orchestrator.strategies.dispense",
     "orchestrator.study.study_strategies",
 )
 """Modules that declare Decant's own kinds of results; named as text, so that results do not import strategies."""

@@ -1,0 +1,80 @@
+"""`decant dose`: predicted amounts, doses in a journal, and refusals before anything moves."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from orchestrator.cli.app import app
+from orchestrator.journal.run_record import read_result
+from orchestrator.strategies.dispense import Dispensed
+from tests.support import small_campaign
+
+
+def decant(*arguments: str) -> Result:
+    return CliRunner().invoke(app, list(arguments), catch_exceptions=False)
+
+
+@pytest.fixture
+def campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return small_campaign.write_campaign(tmp_path)
+
+
+def test_a_dry_run_predicts_and_pours_nothing(campaign: Path) -> None:
+    result = decant("dose", str(campaign), "--amount", "25 g", "--dry-run")
+    assert result.exit_code == 0, result.output
+    found = re.search(r"25 g: ([\d.]+) to ([\d.]+) g expected", result.stdout)
+    assert found is not None
+    low, high = map(float, found.groups())
+    assert 22.0 < low < high < 28.0
+    assert "probability of 100 %" in result.stdout
+    assert not Path("runs").exists()
+
+
+def test_doses_are_poured_weighed_and_recorded(campaign: Path) -> None:
+    result = decant("dose", str(campaign), "--amount", "25 g", "--amount", "40 g", "--in-process")
+    assert result.exit_code == 0, result.output
+    weighed = re.findall(r"dose (\d), (\d+) g: ([\d.]+) g weighed", result.stdout)
+    assert [(number, wanted) for number, wanted, _ in weighed] == [("1", "25"), ("2", "40")]
+    for _, wanted, received in weighed:
+        assert float(received) == pytest.approx(float(wanted), abs=2.0)
+    run = next(Path("runs").iterdir())
+    recorded = read_result(run).results["dose"]
+    assert isinstance(recorded, Dispensed)
+    assert [dose.number for dose in recorded.doses] == [1, 2]
+
+
+def test_the_same_seed_pours_the_same_doses(campaign: Path) -> None:
+    lines = [
+        [line for line in decant(*command).stdout.splitlines() if line.startswith("dose")]
+        for command in 2 * [("dose", str(campaign), "--amount", "25 g", "--seed", "7", "--in-process")]
+    ]
+    assert lines[0] == lines[1] != []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("--amount", "25"), "--amount: "),
+        (("--amount", "25 mL"), "--amount: "),
+        (("--amount", "0.5 g"), "larger than the tolerance"),
+        (("--amount", "25 g", "--scene", "nowhere"), "--scene nowhere"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_written(
+    campaign: Path, arguments: tuple[str, ...], text: str
+) -> None:
+    result = decant("dose", str(campaign), *arguments)
+    assert result.exit_code == 2
+    assert text in result.stderr
+    assert not Path("runs").exists()
+
+
+def test_more_than_the_source_holds_is_refused_by_the_bench(campaign: Path) -> None:
+    result = decant("dose", str(campaign), "--amount", "150 g", "--in-process")
+    assert result.exit_code == 1
+    assert "the pourer holds 100 g, and 150 g are wanted" in result.stdout
