@@ -34,7 +34,7 @@ from orchestrator.config.scene_builder import DEFAULTS, NEEDED
 from orchestrator.config.weighed_pours import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.yaml.section_validation import sections_in
 from orchestrator.daemon import daemon_settings as daemon
-from orchestrator.daemon.notifications import NotifySection
+from orchestrator.daemon.notifications import NotifySettings
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import OutputSettings
 from orchestrator.strategies.deployment.costing import CostSettings
@@ -62,7 +62,7 @@ MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", r
 
 SECTIONS: dict[str, type[Settings]] = {
     "campaign": campaign.CampaignFile,
-    "simulator": campaign.SimulatorSection,
+    "simulator": campaign.SimulatorSettings,
     "calibration": campaign.CalibrationSection,
     "pours": campaign.PoursSettings,
     "transfer": campaign.TransferSettings,
@@ -95,11 +95,11 @@ SECTIONS: dict[str, type[Settings]] = {
     "compared-calibrations": study.CalibrationsSettings,
     "compared-deployments": study.DeploymentsSettings,
     "daemon": daemon.DaemonFile,
-    "listen": daemon.ListenSection,
-    "tls": daemon.TlsSection,
-    "live": daemon.LiveSection,
-    "recordings": daemon.RecordingsSection,
-    "notify": NotifySection,
+    "listen": daemon.ListenSettings,
+    "tls": daemon.TlsSettings,
+    "live": daemon.LiveSettings,
+    "recordings": daemon.RecordingsSettings,
+    "notify": NotifySettings,
 }
 
 OF_SECTIONS = {
