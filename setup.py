@@ -19,7 +19,9 @@ ROOT = Path(__file__).parent
 NO_TAG = "0.0"
 """The tag that setuptools_scm reports for a repository without tags."""
 
-SHIPPED = ("README.md", "campaigns", "data", "laboratories", "schema", "studies", "vessels")
+SHIPPED = (
+    "README.md", "campaigns", "daemon.yaml", "data", "laboratories", "schema", "studies", "systemd", "vessels",
+)  # fmt: skip
 
 
 class BuildWithShippedFiles(build_py):

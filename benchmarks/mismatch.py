@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mismatch_worlds import LEVELS, SIMULATED_SCATTER, Valley
+from mismatch_worlds import CLIFFS, LEVELS, Valley
 from players import SCENE, Numbers, interval, play
 
 from orchestrator.runs.stages import DEPLOYMENT, with_bench
@@ -61,7 +61,9 @@ FEWEST = 20
 
 def numbers(valley: Valley) -> Numbers:
     """What answers in that world."""
-    return Numbers(valley.space, valley.true, valley.observe, valley.simulated, SIMULATED_SCATTER)
+    world = Numbers(valley.space, valley.true, valley.observe, valley.simulated, valley.scatter)
+    world.true = lambda unit: valley.true(unit, len(world.poured))
+    return world
 
 
 def campaign(arm: str, level: str, seed: int, pours: int, simulations: int) -> dict[str, Any]:
@@ -72,7 +74,7 @@ def campaign(arm: str, level: str, seed: int, pours: int, simulations: int) -> d
     strategy, world = settings.build(plan, SCENE, SimulationParameters(), seed), numbers(valley)
     play(strategy, world.answer)
     best = strategy.best_values
-    reported = 1.0 if best is None else valley.true(valley.space.encode(best))
+    reported = 1.0 if best is None else world.true(valley.space.encode(best))
     weighed = strategy.result().weighed
     shown = [[*pour.predicted_interval, pour.loss] for pour in weighed if pour.predicted_interval is not None]
     return {"arm": arm, "level": level, "seed": seed, "poured": world.poured, "reported": reported, "bands": shown}
@@ -146,7 +148,7 @@ def table(runs: list[dict[str, Any]], fewest: int = 1) -> str:
         "| action in the end | in their 90 % bands, the first pours and all others |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for level in LEVELS:
+    for level in (*LEVELS, *CLIFFS):
         for arm, name in NAMES.items():
             chosen = [run for run in runs if (run["level"], run["arm"]) == (level, arm)]
             found = [figures(run) for run in chosen]
@@ -177,7 +179,7 @@ def _row(line: str) -> tuple[str, ...]:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--levels", nargs="+", choices=list(LEVELS), default=list(LEVELS))
+    parser.add_argument("--levels", nargs="+", choices=[*LEVELS, *CLIFFS], default=list(LEVELS))
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
     parser.add_argument("--seeds", type=int, default=24)
     parser.add_argument("--first", type=int, default=1000)

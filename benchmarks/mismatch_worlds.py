@@ -3,6 +3,9 @@
 Four shapes, in the units of a robot's actions, so that an error has a size in millimetres and per cent. What is lost is
 0 inside a valley, rises around it as 1 − exp(−r^1.5) and levels off at 1; see `Valley`. A seed draws place and size of
 the valley, what is wrong with the simulator, and the scatter of every pour. Written before anything was tuned on them.
+
+`CLIFFS` are the same valleys with steep walls and little scatter: everything is lost on most of the actions. On one of
+them the bench changes after pour `CHANGED_AFTER`.
 """
 
 from __future__ import annotations
@@ -18,10 +21,11 @@ from sim_engine.search_space import Axis, Space
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 
-SPEED, OFFSET, HEIGHT = (
+SPEED, OFFSET, HEIGHT, ANGLE = (
     Axis("angular_velocity", 15 * DEG, 120 * DEG),
     Axis("x_offset", 0.08, 0.15),
     Axis("height", 0.03, 0.1),
+    Axis("max_angle", 70 * DEG, 125 * DEG),
 )
 SHAPES: dict[str, Space] = {
     "jet": Space((SPEED, OFFSET)),
@@ -32,7 +36,11 @@ SHAPES: dict[str, Space] = {
 """A jet that reaches farther when it is fast; a tilted ellipse; a valley beside a cliff; a jet that falls from higher,
 too."""
 
+FOUR_AXES = Space((SPEED, OFFSET, HEIGHT, ANGLE))
+"""The space of the level `FOUR`: the jet from higher, and less is poured at another angle than the best one."""
+
 SIMULATED_SCATTER = 0.02
+CHANGED_AFTER = 8
 
 
 @dataclass(frozen=True)
@@ -63,6 +71,13 @@ LEVELS: dict[str, Wrong] = {
     "large": Wrong(0.018, 0.12, 0.5, 0.5, 0.1),
     "anti-correlated": Wrong(inverted=True),
 }
+CLIFFS: dict[str, Wrong] = {
+    **{f"cliff, {name}": wrong for name, wrong in LEVELS.items()},
+    "cliff, changed": LEVELS["small"],
+    "cliff, four axes": LEVELS["small"],
+}
+CHANGE = Wrong(offset=0.010, speed=0.05)
+"""How the bench differs from itself after the change."""
 
 
 class Valley:
@@ -72,12 +87,14 @@ class Valley:
         """Draw.
 
         Args:
-            level: of `LEVELS`.
+            level: of `LEVELS` or `CLIFFS`.
             seed: its remainder by four is the shape.
             bench: seed of the errors' signs, the same for all receivers on a bench; None: the seed's own.
         """
-        self.shape = list(SHAPES)[seed % len(SHAPES)]
-        self.space, self._wrong = SHAPES[self.shape], LEVELS[level]
+        self.cliff, self.changes = level in CLIFFS, level == "cliff, changed"
+        self.shape = "jet4" if level == "cliff, four axes" else list(SHAPES)[seed % len(SHAPES)]
+        self.space, self._wrong = SHAPES.get(self.shape, FOUR_AXES), (LEVELS | CLIFFS)[level]
+        self.scatter = 0.003 if self.cliff else SIMULATED_SCATTER
         rng = np.random.default_rng([seed, 20261121])
         self._speed, self._offset = rng.uniform(0.3, 0.7), rng.uniform(0.3, 0.7)
         self._slope, self._width = rng.uniform(0.35, 0.7), rng.uniform(0.03, 0.05)
@@ -88,14 +105,15 @@ class Valley:
         if bench is not None:
             self._signs = np.random.default_rng([bench, 20261122]).choice([-1.0, 1.0], 4)
 
-    def true(self, unit: Floats) -> float:
-        """What is lost on the bench at a point of the unit cube (dimension,), without scatter."""
-        return self._lost(np.clip(np.asarray(unit, dtype=float), 0.0, 1.0), 1.0)
+    def true(self, unit: Floats, index: int = 0) -> float:
+        """What the `index`-th pour, from 0, loses at a point of the unit cube (dimension,), without scatter."""
+        u = np.clip(np.asarray(unit, dtype=float), 0.0, 1.0)
+        return self._lost(self._moved(u, CHANGE, -1.0) if self.changes and index >= CHANGED_AFTER else u, 1.0)
 
     def observe(self, unit: Floats, index: int) -> float:
-        """The same as the `index`-th pour shows it."""
-        lost = self.true(unit)
-        return min(max(lost + (0.01 + 0.12 * lost) * float(self._noise[index]), 0.0), 1.0)
+        """The same as that pour shows it."""
+        lost, (least, growth) = self.true(unit, index), (0.003, 0.03) if self.cliff else (0.01, 0.12)
+        return min(max(lost + (least + growth * lost) * float(self._noise[index]), 0.0), 1.0)
 
     def simulated(self, unit: Floats) -> float:
         """What the simulator says at a point of the unit cube (dimension,), without scatter."""
@@ -103,13 +121,17 @@ class Valley:
         u = np.clip(np.asarray(unit, dtype=float), 0.0, 1.0)
         if wrong.inverted:
             return 1.0 - 0.8 * self._lost(u, 1.0)
-        moved = u.copy()
-        factor = 1.0 + signs[0] * wrong.speed
-        moved[0] = factor * u[0] + (factor - 1.0) * SPEED.lower / (SPEED.upper - SPEED.lower)
-        moved[1] += signs[1] * wrong.offset / (OFFSET.upper - OFFSET.lower)
+        moved = self._moved(u, wrong, 1.0)
         lost = math.exp(signs[2] * wrong.gain) * self._lost(moved, math.exp(signs[3] * wrong.width))
-        waves = self._bumps[:, : len(u)] @ u * 3.0 + self._bumps[:, 3] * math.pi
+        waves = self._bumps[:, : len(u)][:, :3] @ u[:3] * 3.0 + self._bumps[:, 3] * math.pi
         return float(np.clip(lost + wrong.bump * float(np.sin(waves).mean()) * 6**0.5, 0.0, 1.0))
+
+    def _moved(self, u: Floats, wrong: Wrong, sign: float) -> Floats:
+        """The action with the errors of speed and offset."""
+        moved, factor = u.copy(), 1.0 + sign * self._signs[0] * wrong.speed
+        moved[0] = factor * u[0] + (factor - 1.0) * SPEED.lower / (SPEED.upper - SPEED.lower)
+        moved[1] += sign * self._signs[1] * wrong.offset / (OFFSET.upper - OFFSET.lower)
+        return moved
 
     def _lost(self, u: Floats, widened: float) -> float:
         speed, offset, width = u[0] - self._speed, u[1] - self._offset, widened * self._width
@@ -119,10 +141,12 @@ class Valley:
             distance = math.hypot(along / (widened * self._length), across / width)
         else:
             across = offset - self._slope * speed - 0.3 * speed * speed
-            if self.shape == "jet3":
+            if self.shape in ("jet3", "jet4"):
                 across -= 0.5 * (math.sqrt(0.3 + u[2]) - math.sqrt(0.3 + self._height))
             slow = max(-speed, 0.0) / (widened * self._length) + max(speed, 0.0) / (3.0 * widened * self._length)
             if self.shape == "edge":  # beyond it the jet misses altogether; before it, it is lost bit by bit
                 across = across if across > 0.0 else 0.4 * across
             distance = math.hypot(slow, across / width)
-        return 1.0 - math.exp(-((0.5 * max(distance - 1.0, 0.0)) ** 1.5))
+            if self.shape == "jet4":
+                distance = math.hypot(distance, (u[3] - self._height) / (4.0 * width))
+        return 1.0 - math.exp(-(((1.0 if self.cliff else 0.5) * max(distance - 1.0, 0.0)) ** 1.5))

@@ -24,7 +24,7 @@ def scenes(record: Record | None) -> str:
     ]
     head = ("scenes in a call", "CPU s a pour", "one by one", "ratio", "pours a minute", "process [MB]")
     about = prose(
-        f"""Standard pours with {r["particles"]:,} particles, many in one call beside the same pours one by one, in the
+        f"""Standard pours with {r["particles"]:,} particles, many in one call and the same pours one by one, in the
         same process ({r["backend"]}). On a CPU the scenes of a call follow each other, so that a call costs what its
         pours cost, and memory does not grow with it."""
     )
@@ -78,9 +78,9 @@ def pool(record: Record | None) -> str:
         return missing(title, "pool_speed.py")
     r = record["result"]
     about = prose(
-        f"""{r["workers"]} simulators of the pool (Ray actors) beside {r["workers"]} plain processes without Ray,
+        f"""{r["workers"]} simulators of the pool (Ray actors) compared with {r["workers"]} plain processes without Ray,
         the same {r["pours"]} standard pours with {r["particles"]:,} particles each, in turns, in one go; medians.
-        Overhead is what a worker's time holds beside simulating, by the number of simulations, while all had work."""
+        Overhead is the time of a worker without simulating, per simulation, while all had work."""
     )
     rows = [
         ("pours a minute, pool", f"{r['pours_per_minute_pool']:.0f}", "", ""),
@@ -88,7 +88,7 @@ def pool(record: Record | None) -> str:
         ("pool over plain", f"**{r['throughput_ratio']:.3f}**", "≥ 0.95", _met(r["throughput_met"])),
         ("the same by CPU seconds", f"{r['throughput_ratio_by_cpu']:.3f}", "", ""),
         ("workers busy while work was queued", f"{100 * r['busy_fraction']:.1f} %", "", ""),
-        ("CPU of everything beside the workers", f"{100 * r['cpu_beside_the_workers']:.1f} %", "", ""),
+        ("CPU of all other processes", f"{100 * r['cpu_beside_the_workers']:.1f} %", "", ""),
         (
             f"overhead a simulation, pours of {r['tiny_pour_ms']:.0f} ms",
             f"**{r['overhead_ms']:.1f} ms**",

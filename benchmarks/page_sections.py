@@ -77,8 +77,8 @@ def targets(pours: Sequence[Record]) -> str:
 {speed_table}
 {about}
 
-Speed counts only with the physics right. Infinitely fine particles have .945, .675 and .31 left in the pourer at these
-times, and within .01 of that is right; density inside is that of Voronoi cells in the tilted cup at 1 s.
+Speed counts only with the physics right. Infinitely fine particles have 0.945, 0.675 and 0.31 left in the pourer at
+these times, and a deviation of 0.01 is accepted; density inside is that of Voronoi cells in the tilted cup at 1 s.
 
 {physics_table}
 {settings(pours)}"""
@@ -88,7 +88,7 @@ def beside_the_peer(pours: Sequence[Record]) -> str:
     """The peer's figures, measured in the same go."""
     both = [record for record in pours if "peer" in record["result"]]
     if not both:
-        return missing("Beside the fastest peer", "pour_speed.py --particles 2000 --peer")
+        return missing("Compared with the fastest peer", "pour_speed.py --particles 2000 --peer")
     rows, physics = [], []
     for record in both:
         r, peer = record["result"], record["result"]["peer"]
@@ -114,7 +114,7 @@ def beside_the_peer(pours: Sequence[Record]) -> str:
         thread each, set-up counted for neither. The peer always simulates 6 s; ours stops when nothing can change any
         more, so the second ratio leaves that advantage out."""
     )
-    return f"""## Beside the fastest peer
+    return f"""## Compared with the fastest peer
 
 {about}
 
@@ -148,7 +148,7 @@ def passes(record: Record | None, limit: Record | None) -> str:
         clock = "What the clock itself takes is within the noise of two pours"
     about = prose(
         f"""The solver's kernel with a clock built into it, around every pass, in one standard pour with
-        {r["particles"]:,} particles. {clock}; the passes make up {100 * r["explained"]:.0f} % of what is then measured
+        {r["particles"]:,} particles. {clock}; the passes make up {100 * r["explained"]:.0f} % of the time measured
         from outside."""
     )
     return f"""## {title}
@@ -219,7 +219,7 @@ def memory(record: Record | None) -> str:
     head = ("N", "packages", "Taichi", "the solver's arrays", "kernels and vessels", "the pour", "in all [MB]")
     return f"""## {title}
 
-Resident memory of a process with one simulator, early in a pour, and what it went to [MB].
+Resident memory of a process with one simulator, early in a pour, by its use [MB].
 
 {table(head, rows, "rrrrrrr")}
 {settings([record])}"""
@@ -245,7 +245,7 @@ def start_up(record: Record | None) -> str:
     about = prose(
         f"""Seconds from the start of a process to the answer to its first standard pour with {r["particles"]:,}
         particles, and where they go. Required: {r["limit_s"]:g} s with a warm cache ({word}), {r["cold_limit_s"]:g} s
-        with an empty one ({cold}). CPU seconds of the process beside them, which other work on the machine can't spoil.
+        with an empty one ({cold}). CPU seconds of the process next to them do not depend on other work on the machine.
         The cache has {r["cache_mb"]:g} MB of compiled kernels and vessels' grids."""
     )
     return f"""## {title}

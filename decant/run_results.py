@@ -103,7 +103,7 @@ class Run:
 
     @property
     def predictions(self) -> dict[str, dict[str, SampleStatistics]]:
-        """Outcomes of the recommended actions with fresh seeds, by receiver and quantity."""
+        """Outcomes of the recommended actions with new seeds, by receiver and quantity."""
         names = receiver_names(self.campaign)
         return {names.get(scene, scene): one.over_seeds for scene, one in predictions_of(self.results).items()}
 

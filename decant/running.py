@@ -169,7 +169,7 @@ def plan(
     watch: Sequence[Watch] = (),
     in_process: bool = True,
 ) -> Run:
-    """Find the action to pour with in simulation alone (D1), and what to expect of it with fresh seeds.
+    """Find the action to pour with in simulation alone (D1), and what to expect of it with new seeds.
 
     Args:
         campaign: with a deployment: it says which actions may be planned, and what is minimised.
@@ -177,12 +177,12 @@ def plan(
         theta: parameters to plan with; the campaign's unless given. A run that has calibrated, or its `theta.json`,
             also gives what a campaign with `risk: {theta: posterior}` needs, the draws of the posterior.
         iterations: actions that are tried, 1 or more; as the campaign says unless given.
-        seeds: number of fresh seeds, 1 or more, that the recommended action is simulated with.
+        seeds: number of new seeds, 1 or more, that the recommended action is simulated with.
         watch: see `run`.
         in_process: see `run`.
 
     Returns:
-        The run: `recommended` has the action of each receiver, `predictions` what the fresh seeds came to.
+        The run: `recommended` has the action of each receiver, `predictions` what the new seeds came to.
 
     Raises:
         ConfigError: the file of `theta` or of the receiver is wrong.

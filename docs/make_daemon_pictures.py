@@ -26,7 +26,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from actors.runtime.child_process import child_environment
 
 FOLDER = Path(__file__).parent / "images" / "daemon"
-SIZES = {"phone": (390, 844), "tablet": (1024, 768), "desk": (1440, 1080)}
+SIZES = {"tablet": (1024, 768), "desk": (1440, 1080)}
 PATIENCE = 300.0
 
 VESSEL = """\
@@ -207,7 +207,6 @@ def draw(browser: Browser, lab: Lab) -> None:
 
     lab.answer_until(fifth)
     picture(browser, lab, "question-tablet", "tablet")
-    picture(browser, lab, "question-phone", "phone")
     lab.answer_until(lambda question: question["wants"] == "yes or no")
     with seen(browser, lab, "desk") as page:
         page.get_by_role("button", name="Yes").click()
@@ -224,14 +223,7 @@ def draw(browser: Browser, lab: Lab) -> None:
         page.get_by_label("Left in the pourer").fill("0,4")
         page.get_by_role("button", name="It was weighed").click()
         page.locator("#pours").get_by_text("3.20 %").first.wait_for(timeout=1e3 * PATIENCE)
-        page.get_by_role("heading", name="Last pours").scroll_into_view_if_needed()
-        page.wait_for_timeout(600)
-        page.screenshot(path=FOLDER / "answered-tablet.png")
     lab.answer_until(lambda question: lab.call(f"campaigns/{first}")["state"] == "finished")
-    with seen(browser, lab, "tablet") as page:
-        page.locator("#ended").scroll_into_view_if_needed()
-        page.wait_for_timeout(600)
-        page.screenshot(path=FOLDER / "ended-tablet.png")
     lab.answer_until(lambda question: question["wants"] == "yes or no")
     number = lab.call("questions")[0]["id"]
     lab.call(f"questions/{number}/answer", {"answer": "yes"}, "POST")

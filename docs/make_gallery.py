@@ -19,10 +19,7 @@ ROOT = Path(__file__).resolve().parent.parent
 IMAGES, VESSELS = ROOT / "docs" / "images", ROOT / "configs" / "vessels"
 
 POURS: dict[str, tuple[str, dict[str, str | float]]] = {
-    "fast": ("narrow", {"angular_velocity": "132 deg/s", "x_offset": "115 mm"}),
     "short": ("narrow", {"angular_velocity": "62 deg/s", "x_offset": "128 mm"}),
-    "cone": ("cone", {"angular_velocity": "100 deg/s", "x_offset": "110 mm"}),
-    "bowl": ("bowl", {"angular_velocity": "60 deg/s", "x_offset": "130 mm"}),
 }
 """Name of the picture → receiver, action."""
 

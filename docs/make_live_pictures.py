@@ -1,7 +1,7 @@
-"""Pictures of the live view for `docs/laboratory/live-view.md`, by a headless browser.
+"""Picture of the live view for `docs/laboratory/live-view.md`, by a headless browser.
 
-It runs the quickstart with `--live` in a folder of its own, looks at it while it calibrates and while it pours, and
-afterwards at its recording. Needs Playwright and a Chromium (`--chromium`), no display; some five minutes on two cores.
+It runs the quickstart with `--live` in a folder of its own, and takes a screenshot while it pours. Needs Playwright and
+a Chromium (`--chromium`), no display; some five minutes on two cores.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from typing import Any
 
 from actors.runtime.child_process import child_environment
 from orchestrator.journal.journal import JOURNAL_NAME, JournalError, JournalReader, Kind
-from orchestrator.live_view.live_server import LiveView
 
 ROOT = Path(__file__).parents[1]
 
@@ -35,47 +34,31 @@ SMALL = {"width": 320, "height": 180}
 SETTLING = 30.0
 """So long it takes to draw a large picture well [s]."""
 
-LATE = (1570.0, 1065.0)
-"""Near the end of the time line [pixels of the large picture]: at the beginning of a replay little is known."""
-
-CATCHING_UP = 60.0
-"""For a recording that is opened at once [s]."""
-
 
 def main() -> None:
-    """All pictures."""
+    """Draw the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--chromium", default=shutil.which("chromium") or shutil.which("chromium-browser"))
-    parser.add_argument("--recording", type=Path, help="only look at this one")
     parser.add_argument("--to", type=Path, default=FOLDER)
     arguments = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # what was started is ended
     arguments.to.mkdir(parents=True, exist_ok=True)
-    recording = arguments.recording
-    if recording is None:
-        recording = during_a_run(arguments.chromium, arguments.to)
-    with LiveView(shown=(recording,)) as view, looking(arguments.chromium, view.url) as page:
-        time.sleep(CATCHING_UP)
-        picture(page, arguments.to / "replaying.png", LATE)
+    during_a_run(arguments.chromium, arguments.to)
 
 
-def during_a_run(chromium: str, to: Path) -> Path:
-    """Look at a running quickstart while it calibrates and while it pours; returns its recording."""
+def during_a_run(chromium: str, to: Path) -> None:
+    """Take the screenshot of a running quickstart after its third pour into the narrow cup."""
     with tempfile.TemporaryDirectory() as name:
         shutil.copytree(ROOT / "configs", Path(name) / "configs")
         campaign = Path(name) / "configs" / "campaigns" / "quickstart.yaml"
         with running(campaign) as (process, url, run), looking(chromium, url) as page:
-            # each a little before what it is to show: the picture itself takes half a minute, the whole run some two
-            wait(process, run, stage="pours", kind=Kind.POUR_FINISHED, count=7)
-            picture(page, to / "calibrating.png")
-            wait(process, run, stage="deployment", kind=Kind.TOLD, count=4)
+            wait(process, run, stage="deployment", kind=Kind.POUR_FINISHED, count=3)
             picture(page, to / "deploying.png")
             process.wait(1800.0)
         kept = Path(tempfile.gettempdir()) / "live-quickstart-run"
         shutil.rmtree(kept, ignore_errors=True)
         shutil.copytree(run, kept)
-        print(f"the run is kept in {kept}: decant report makes its page anew", flush=True)
-        return kept / "campaign.rrd"
+        print(f"the run is kept in {kept}, for make_report_pictures.py", flush=True)
 
 
 @contextlib.contextmanager
@@ -139,13 +122,10 @@ def looking(chromium: str, url: str) -> Iterator[Any]:
             browser.close()
 
 
-def picture(page: Any, to: Path, at: tuple[float, float] | None = None) -> None:
-    """Keep what a page shows, drawn large; once it was clicked on at a place, if one is given."""
+def picture(page: Any, to: Path) -> None:
+    """Take a large screenshot of a page."""
     page.set_viewport_size(SIZE)
     time.sleep(SETTLING)
-    if at is not None:
-        page.mouse.click(*at)
-        time.sleep(SETTLING)
     page.screenshot(path=str(to), timeout=180_000)
     page.set_viewport_size(SMALL)
     print(to, flush=True)

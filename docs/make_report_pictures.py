@@ -1,19 +1,15 @@
 """Reports of the docs and their pictures: `python docs/make_report_pictures.py RUN STUDY`.
 
 RUN and STUDY are folders of a quickstart and of the quick study that have ended. Copies both pages to docs/reports and
-draws what docs/tutorials/first-pour.md shows of them. Needs Playwright and a Chromium (`--chromium`), and pypdfium2 for
-the pages as they are printed.
+draws what docs/tutorials/first-pour.md shows of them. Needs Playwright and a Chromium (`--chromium`).
 """
 
 from __future__ import annotations
 
 import argparse
 import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
-
-from PIL import Image
 
 from orchestrator.results.html_report import REPORT_NAME
 from orchestrator.study.study_page import PAGE, REPORT
@@ -22,14 +18,6 @@ DOCS = Path(__file__).parent
 
 WIDTH = 900
 """Of a page on the screen [pixels]."""
-
-PRINTED = 4
-"""Pages that are shown as they are printed."""
-
-SHEET = (366, 522)
-"""Each [pixels]."""
-
-GAP = 10
 
 
 def main() -> None:
@@ -53,8 +41,6 @@ def main() -> None:
                 shutil.copyfile(made, kept)
                 page.goto(kept.absolute().as_uri())
                 first(page, DOCS / "images" / f"{picture}.png")
-                if name == "quickstart":
-                    printed(page, DOCS / "images" / "report-printed.png")
         browser.close()
 
 
@@ -66,22 +52,6 @@ def first(page: Any, to: Path) -> None:
         clip={"x": 0, "y": 0, "width": WIDTH, "height": below["y"] + below["height"] + 8},
         full_page=True,
     )
-
-
-def printed(page: Any, to: Path) -> None:
-    """Keep the first sheets of a page, side by side."""
-    import pypdfium2
-
-    with tempfile.TemporaryDirectory() as folder:
-        sheets = Path(folder) / "sheets.pdf"
-        page.pdf(path=str(sheets), format="A4", print_background=True)
-        document = pypdfium2.PdfDocument(sheets)
-        drawn = [document[n].render(scale=2.0).to_pil() for n in range(min(PRINTED, len(document)))]
-        strip = Image.new("RGB", (len(drawn) * (SHEET[0] + GAP) - GAP, SHEET[1]), (200, 200, 200))
-        for number, sheet in enumerate(drawn):
-            strip.paste(sheet.convert("RGB").resize(SHEET, Image.Resampling.LANCZOS), (number * (SHEET[0] + GAP), 0))
-        document.close()
-    strip.save(to, optimize=True)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from pathlib import Path
 DOCS = Path(__file__).parent
 PAGE, IMAGES = DOCS / "evidence" / "results.md", DOCS / "images" / "study"
 MARKED = re.compile(r"(<!-- study: (?P<name>[\w-]+)(?P<wanted>[^>]*) -->\n).*?(<!-- end of study -->)", re.DOTALL)
-FIGURES = ("3b", "5b", "6", "final")
+FIGURES = ("3b", "6", "final")
 """Those that the page shows."""
 
 

@@ -34,7 +34,7 @@ from orchestrator.config.scene_builder import DEFAULTS, NEEDED
 from orchestrator.config.weighed_pours import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.yaml.section_validation import sections_in
 from orchestrator.daemon import daemon_settings as daemon
-from orchestrator.daemon.notifications import NotifySection
+from orchestrator.daemon.notifications import NotifySettings
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import OutputSettings
 from orchestrator.strategies.deployment.costing import CostSettings
@@ -62,7 +62,7 @@ MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", r
 
 SECTIONS: dict[str, type[Settings]] = {
     "campaign": campaign.CampaignFile,
-    "simulator": campaign.SimulatorSection,
+    "simulator": campaign.SimulatorSettings,
     "calibration": campaign.CalibrationSection,
     "pours": campaign.PoursSettings,
     "transfer": campaign.TransferSettings,
@@ -95,11 +95,11 @@ SECTIONS: dict[str, type[Settings]] = {
     "compared-calibrations": study.CalibrationsSettings,
     "compared-deployments": study.DeploymentsSettings,
     "daemon": daemon.DaemonFile,
-    "listen": daemon.ListenSection,
-    "tls": daemon.TlsSection,
-    "live": daemon.LiveSection,
-    "recordings": daemon.RecordingsSection,
-    "notify": NotifySection,
+    "listen": daemon.ListenSettings,
+    "tls": daemon.TlsSettings,
+    "live": daemon.LiveSettings,
+    "recordings": daemon.RecordingsSettings,
+    "notify": NotifySettings,
 }
 
 OF_SECTIONS = {
@@ -374,6 +374,44 @@ def command_line() -> str:
     return "\n".join(parts)
 
 
+def json_output() -> str:
+    """The output of every command with --json, from its schema."""
+    from orchestrator.cli.json_output import output_schema
+
+    schema = output_schema()
+    kinds, parts = schema["$defs"], []
+    for command, output in schema["properties"].items():
+        parts.append(f"## `decant {command} --json`\n")
+        for reference in output.get("anyOf", [output]):
+            model = kinds[reference["$ref"].rpartition("/")[2]]
+            rows = [
+                (f"`{key}`", _json_type(part), _prose(part.get("description")))
+                for key, part in model["properties"].items()
+            ]
+            parts.append(f"{_prose(model['description'])}\n\n{_table(('key', 'value', 'meaning'), rows)}")
+    return "\n".join(parts)
+
+
+def _json_type(part: Mapping[str, Any]) -> str:
+    if "anyOf" in part:
+        return " or ".join(dict.fromkeys(map(_json_type, part["anyOf"])))
+    if "$ref" in part:
+        return f"`{part['$ref'].rpartition('/')[2]}`"
+    if "enum" in part or "const" in part:
+        return ", ".join(f"`{word}`" for word in part.get("enum", [part.get("const")]))
+    match part.get("type"):
+        case "array":
+            return f"list of: {_json_type(part['items'])}" if "items" in part else "list"
+        case "object":
+            values = part.get("additionalProperties")
+            return f"mapping to: {_json_type(values)}" if isinstance(values, dict) else "mapping"
+        case None:
+            return "any"
+        case kind:
+            names = {"string": "text", "integer": "whole number", "boolean": "`true` or `false`", "null": "`null`"}
+            return names.get(str(kind), str(kind))
+
+
 def _usage(argument: Any) -> str:
     name = str(argument.metavar or argument.name.upper())
     name = f"{name}…" if argument.nargs == -1 else name
@@ -449,6 +487,7 @@ TABLES: dict[str, Callable[[], str]] = {
         for name in ("recorded", "recorded-run", "bands", "risk", "optimizers")
     },
     "command-line": command_line,
+    "output": json_output,
     "rest": rest,
     "events": events,
     "plugin-names": plugin_names,

@@ -465,7 +465,7 @@ def task_request(
         plan: of the campaign.
         task: 'run', 'calibrate' or 'plan'.
         given, receiver, iterations: for 'plan'; see `planned`.
-        seeds: for 'plan': number of fresh seeds of each prediction.
+        seeds: for 'plan': number of new seeds of each prediction.
 
     Raises:
         RunTaskError: the campaign has no section for it.
@@ -494,7 +494,7 @@ def planned(
     """A campaign turned into D1 without pours, and its record.
 
     Unless the campaign has D1's own settings, each action is simulated once: simulations of other actions tell about
-    it, too, and its prediction is made with fresh seeds.
+    it, too, and its prediction is made with new seeds.
 
     Args:
         plan: of the campaign.

@@ -1,11 +1,13 @@
-"""The files that are shipped with Decant: campaigns, laboratories, studies, vessels, weighed pours."""
+"""The shipped files: campaigns, laboratories, studies, vessels, weighed pours, settings and unit file of a daemon."""
 
 from __future__ import annotations
 
 import shutil
 from pathlib import Path
 
-STARTING_SET = ("README.md", "campaigns", "data", "laboratories", "schema", "studies", "vessels")
+STARTING_SET = (
+    "README.md", "campaigns", "daemon.yaml", "data", "laboratories", "schema", "studies", "systemd", "vessels",
+)  # fmt: skip
 """The shipped files that `starting_set` copies."""
 
 
@@ -24,7 +26,7 @@ def shipped(name: str = "") -> Path:
 
 
 def starting_set(directory: Path | str) -> list[Path]:
-    """Copy the shipped campaigns, laboratories, studies, vessels and data into a folder: `decant init DIR`.
+    """Copy the shipped files into a folder: `decant init DIR`.
 
     Args:
         directory: created if needed; must be empty.

@@ -8,8 +8,9 @@ balance reports several stable readings in a row and they agree. The drivers the
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass
+from itertools import zip_longest
 from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 
@@ -19,6 +20,7 @@ from actors.balance.balance_interface import BalanceDriver
 from actors.balance.dialect_registry import BALANCES, dialects
 from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.scale_model import Duration, Error, PositiveDuration, PositiveMass, ScaleSettings
+from actors.balance.serial_port import look_at_port, tcp_address
 from actors.balance.weighing_plan import Placement
 from actors.interfaces import DeviceCheck, LaboratoryError
 from sim_engine.settings.model import (
@@ -277,7 +279,7 @@ class SerialBalanceSettings(BalanceSettings):
     """A balance on a serial line."""
 
     port: Annotated[Text, NOT_IN_FINGERPRINT] = ""
-    """Serial port; names under /dev/serial/by-id/ do not change when the balance is reconnected."""
+    """Serial port, or host:port of a serial server or a balance in the network. Names under /dev/serial/by-id/ do not change when the balance is reconnected."""  # noqa: E501
 
     virtual: ScaleSettings | None = None
     """A virtual balance instead of a port."""
@@ -293,6 +295,12 @@ class SerialBalanceSettings(BalanceSettings):
 
     handshake: Annotated[Literal["none", "software", "hardware"], NOT_IN_FINGERPRINT] = "none"
     """Flow control by the balance: characters (Xon/Xoff), wires (CTS), or none."""
+
+    dtr: Annotated[bool, NOT_IN_FINGERPRINT] = True
+    """Whether the wire DTR is on; some balances stay silent without it."""
+
+    rts: Annotated[bool, NOT_IN_FINGERPRINT] = True
+    """Whether the wire RTS is on; some balances stay silent without it. With handshake 'hardware' it follows the handshake."""  # noqa: E501
 
     step: PositiveMass | None = None
     """Step of the display, if it is not one unit of the last digit."""
@@ -333,6 +341,10 @@ class SerialBalanceSettings(BalanceSettings):
             problems.add(text, of="port")
 
     def _check_line(self, problems: Problems) -> None:
+        if tcp_address(self.port) is not None:
+            for key in ("baud", "format", "handshake", "dtr", "rts"):
+                if key in self.model_fields_set:
+                    problems.add("has no effect over TCP; set it in the serial server", key)
         if self.baud is not None and self.baud not in USUAL_BAUDS:
             usual = ", ".join(str(baud) for baud in USUAL_BAUDS)
             problems.add(f"no balance talks at {self.baud} baud; should be one of {usual}", "baud")
@@ -364,8 +376,6 @@ class SerialBalanceSettings(BalanceSettings):
 
     def diagnostics(self, *, tare: bool) -> list[DeviceCheck]:
         """See `BalanceSettings.diagnostics`; checks the port first."""
-        from actors.balance.serial_port import look_at_port
-
         port = look_at_port(self.port)
         return [port] if port.state == "fail" else [port, *super().diagnostics(tare=tare)]
 
@@ -381,6 +391,8 @@ class SerialBalanceSettings(BalanceSettings):
 
     def candidates(self) -> tuple[LineSettings, ...]:
         """Line settings to try, the most likely first."""
+        if tcp_address(self.port) is not None:
+            return (LineSettings(0),)
         usual = _interleaved([dialect.lines for dialect in self.allowed])
         if self.baud is None and self.format is None:
             return usual
@@ -420,9 +432,9 @@ def parse_format(text: str) -> tuple[int, str, int]:
 
 
 def _interleaved(tables: list[tuple[LineSettings, ...]]) -> tuple[LineSettings, ...]:
-    """Merge the tables: the first entries of all, then the second entries, and so on."""
-    longest = max(len(table) for table in tables)
-    return tuple(dict.fromkeys(table[i] for i in range(longest) for table in tables if i < len(table)))
+    """Merge the tables: the first entries of all, the most common first, then the second entries, and so on."""
+    ranks = [[line for line in rank if line is not None] for rank in zip_longest(*tables)]
+    return tuple(dict.fromkeys(line for rank in ranks for line, _ in Counter(rank).most_common()))
 
 
 def balance_diagnostics(balance: BalanceSettings | None, *, tare: bool) -> list[DeviceCheck]:

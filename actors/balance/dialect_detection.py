@@ -22,8 +22,11 @@ LISTENING = 0.3
 ANSWERING = 0.35
 """Wait for a reply in the quick search, in addition to the transmission time of its characters [s]."""
 
+LISTING = 5.0
+"""Longest time of an answer of many lines [s], such as the list of all commands."""
+
 _LONGEST_ANSWER = 48
-_OTHER_KERN = re.compile(rb"\s*(?:ST|US|OL),")
+_SHOWN = 60
 
 
 @dataclass
@@ -33,7 +36,7 @@ class Attempt:
     Attributes:
         line: the setting.
         heard: unsolicited bytes.
-        answers: query → received bytes.
+        answers: sent bytes → received bytes.
         possible: whether the port accepts the setting.
         began, ended: time of the attempt [s of `time.monotonic`].
         moments: times at which bytes arrived [s of `time.monotonic`].
@@ -41,7 +44,7 @@ class Attempt:
 
     line: LineSettings
     heard: bytes = b""
-    answers: dict[str, bytes] = field(default_factory=dict)
+    answers: dict[bytes, bytes] = field(default_factory=dict)
     possible: bool = True
     began: float = 0.0
     ended: float = 0.0
@@ -56,8 +59,8 @@ class Attempt:
     def __str__(self) -> str:
         if not self.possible:
             return f"{self.line}: the port can't be set so"
-        parts = [f"unasked {_shown(self.heard)}"] if self.heard else []
-        parts += [f"{title} → {_shown(came)}" for title, came in self.answers.items()]
+        parts = [f"unasked came {_shown(self.heard)}"] if self.heard else []
+        parts += [f"{_shown(sent)} → {_shown(came)}" for sent, came in self.answers.items()]
         return f"{self.line}: {', '.join(parts)}"
 
 
@@ -70,12 +73,14 @@ class Detected:
         line: its line settings.
         identity: its identification, '' if it sends none.
         unasked: whether it sends without a query.
+        commands: as it lists them, without line ends; empty if it lists none.
     """
 
     dialect: Dialect
     line: LineSettings
     identity: str = ""
     unasked: bool = False
+    commands: frozenset[str] = frozenset()
 
 
 def detect(
@@ -162,20 +167,27 @@ def _attempt(
 
 def _try(wire: Wire, attempt: Attempt, allowed: Sequence[Dialect], patience: float) -> Detected | None:
     lines = _lines(wire, LISTENING, attempt=attempt)
-    attempt.heard = b"\n".join(lines)
-    for dialect in allowed:
-        if sum(_is_weight(dialect, line) for line in lines) >= 2:
-            return _recognised(wire, dialect, allowed, patience, unasked=True)
+    attempt.heard = bytes(wire.received)
+    weights = {dialect: sum(_is_weight(dialect, line) for line in lines) for dialect in allowed}
+    if (most := max(weights.values())) >= 2:
+        alike = sorted((dialect for dialect in allowed if weights[dialect] == most), key=lambda one: one.turn)
+        shared = [dialect for dialect in alike if dialect.query == alike[0].query]
+        return _recognised(wire, shared, patience, unasked=True)
     wait = patience + _LONGEST_ANSWER * attempt.line.character_time
     for probe, speakers in _probes(allowed).items():
         wire.flush()
         # A leading line end terminates an incomplete earlier query in the balance's input buffer.
         wire.send(b"\r\n" + probe if probe.endswith(b"\r\n") and attempt.answers else probe)
-        lines = _lines(wire, wait, lambda line, speakers=speakers: _is_weight(speakers[0], line), attempt)  # type: ignore[misc]
-        attempt.answers[", ".join(dialect.title for dialect in speakers)] = b"\n".join(lines)
-        if any(_is_weight(speakers[0], line) for line in lines):
-            return _recognised(wire, speakers[0], allowed, patience, unasked=False)
+        lines = _lines(wire, wait, lambda line, speakers=speakers: bool(_alike(speakers, [line])), attempt)  # type: ignore[misc]
+        attempt.answers[probe] = bytes(wire.received)
+        if alike := _alike(speakers, lines):
+            return _recognised(wire, alike, patience, unasked=False)
     return None
+
+
+def _alike(dialects: Sequence[Dialect], lines: Sequence[bytes]) -> list[Dialect]:
+    """Dialects that read a weight in one of the lines."""
+    return [dialect for dialect in dialects if any(_is_weight(dialect, line) for line in lines)]
 
 
 def _probes(allowed: Sequence[Dialect]) -> dict[bytes, list[Dialect]]:
@@ -186,31 +198,40 @@ def _probes(allowed: Sequence[Dialect]) -> dict[bytes, list[Dialect]]:
     return probes
 
 
-def _recognised(
-    wire: Wire, dialect: Dialect, allowed: Sequence[Dialect], patience: float, *, unasked: bool
-) -> Detected:
+def _recognised(wire: Wire, alike: Sequence[Dialect], patience: float, *, unasked: bool) -> Detected:
+    """Identify the balance, to tell dialects with the same query and lines apart."""
+    dialect = alike[0]
     if not dialect.identity:
         return Detected(dialect, wire.line, unasked=unasked)
     if unasked and dialect.cancel is not None:
         wire.send(dialect.cancel)
         _lines(wire, ANSWERING)
     said = {question: _identity(wire, question, patience) for question in dialect.identity}
-    alike = [other for other in allowed if other.query == dialect.query]
     found = max(alike, key=lambda other: other.likeness(said))
-    return Detected(found, wire.line, said[dialect.identity[-1]].replace('"', ""), unasked)
+    identity = said[dialect.identity[-1]].replace('"', "")
+    return Detected(found, wire.line, identity, unasked, found.commands_in(said))
 
 
 def _identity(wire: Wire, question: str, patience: float) -> str:
-    """Return the reply to I1, I2 …, without the echo of the query; '' for no reply."""
+    """Return the reply to I0, I2 …, without the echo of the query; '' for no reply.
+
+    'B' marks a line that others follow, and 'A' the last one.
+    """
     wire.flush()
     wire.send(question.encode("ascii") + b"\r\n")
+    end = time.monotonic() + LISTING
     wait = patience + _LONGEST_ANSWER * wire.line.character_time
-    start = f"{question} A "
-    for line in _lines(wire, wait, lambda line: line.startswith(question.encode("ascii"))):
-        text = line.decode("ascii", "replace")
-        if text.startswith(start):
-            return text.removeprefix(start).strip()
-    return ""
+    last = re.compile(rf"(?:{question} (?P<state>\S)|E[STL]\s*$)(?P<text>.*)")
+    texts: list[str] = []
+    while time.monotonic() < end and (line := wire.line_until(min(time.monotonic() + wait, end))) is not None:
+        match = last.match(line.decode("ascii", "replace"))
+        if match is None:
+            continue
+        if match["state"] in ("A", "B"):
+            texts.append(match["text"].strip())
+        if match["state"] != "B":
+            break
+    return " ".join(texts)
 
 
 def _is_weight(dialect: Dialect, line: bytes) -> bool:
@@ -252,8 +273,8 @@ def _lines(
 def _shown(data: bytes) -> str:
     if not data:
         return "nothing"
-    text = repr(data[:40])[1:]
-    return text if len(data) <= 40 else f"{text}…"
+    text = repr(data[:_SHOWN])[1:]
+    return text if len(data) <= _SHOWN else f"{text}… ({len(data)} bytes)"
 
 
 def _failure(port: str, attempts: Sequence[Attempt], allowed: Sequence[Dialect]) -> str:
@@ -265,20 +286,18 @@ def _failure(port: str, attempts: Sequence[Attempt], allowed: Sequence[Dialect])
     elif not came:
         advice = (
             "Nothing came at all: is the balance switched on, is its interface set to remote control and to one of "
-            "these protocols, is it the right port and the right cable (some need a crossed one)?"
+            "these protocols, is it the right port and the right cable (some need a crossed one)? Some stay silent "
+            "without a handshake ('handshake: hardware'), others with DTR or RTS on ('dtr: false', 'rts: false')."
         )
     elif sum(not 0x20 <= byte < 0x7F and byte not in b"\r\n" for byte in everything) * 5 > len(everything):
         advice = (
             "What came is not text: speed or parity differ; read them in the balance's menu, and set 'baud' and "
             "'format'."
         )
-    elif any(_OTHER_KERN.match(line) for data in came for line in data.splitlines()):
-        advice = (
-            "Lines like 'ST,GS 1.000 kg' are another protocol of Kern's; choose KCP, or remote control (rE Cr), in "
-            "its menu."
-        )
+    elif b"\r" in everything and b"\n" not in everything:
+        advice = "Its lines end with CR alone; choose CR LF as their end in its menu."
     else:
         advice = "It answers, but not in this way; choose another protocol in its menu, or name its dialect."
     titles = ", ".join(dialect.title for dialect in allowed)
     tried = "\n  ".join(map(str, attempts))
-    return f"{port}: no balance recognised (looked for {titles}). {advice} Tried:\n  {tried}"
+    return f"{port}: no balance recognised (looked for {titles}). {advice} Sent, and received:\n  {tried}"

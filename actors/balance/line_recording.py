@@ -11,6 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
+from actors.balance.dialects.dialect import Dialect
+from actors.balance.readings import LineError, Reading, ReadingStatus
+
 Direction = Literal["out", "in"]
 Source = Literal["hardware", "virtual", "typed"]
 """Origin of the bytes: a real balance, an emulated one, or a person who typed them from a manual."""
@@ -40,7 +43,7 @@ class LineRecording:
     Attributes:
         source: origin of the bytes.
         events: in order of time.
-        about: metadata: balance, line settings, dialect, date, remarks.
+        about: metadata: balance, line settings, dialect, date, remarks, and the stable weights as they were read.
     """
 
     source: Source
@@ -67,12 +70,30 @@ class LineRecording:
             for line in lines[1:]:
                 number += 1
                 entry = json.loads(line)
+                if "about" in entry:
+                    head.update(entry["about"])
+                    continue
                 if entry["dir"] not in ("in", "out"):
                     raise ValueError(f"direction {entry['dir']!r}")
                 events.append(LineEvent(float(entry["t"]), entry["dir"], bytes.fromhex(entry["hex"])))
         except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}:{number + 1}: not a recording of a serial line ({error})") from error
         return cls(source, tuple(events), head)
+
+    def weights(self, dialect: Dialect) -> list[str]:
+        """The stable weights in it as a dialect reads them, each as long as it stays: ['0.0 g', '200.0 g']."""
+        received = b"".join(event.data for event in self.events if event.direction == "in")
+        found: list[str] = []
+        for line in received.split(b"\n"):
+            try:
+                reading = dialect.decode(line.removesuffix(b"\r"))
+            except LineError:
+                continue
+            if isinstance(reading, Reading) and reading.status is ReadingStatus.STABLE and reading.value is not None:
+                shown = f"{reading.value} {reading.unit}"
+                if found[-1:] != [shown]:
+                    found.append(shown)
+        return found
 
     def save(self, path: Path) -> None:
         """Write a file."""
@@ -102,6 +123,11 @@ class Recorder:
         self.count += len(data)
         way: Direction = "out" if direction == "out" else "in"
         self._file.write(line_of(LineEvent(time.monotonic() - self._start, way, data)))
+        self._file.flush()
+
+    def add(self, **about: Any) -> None:
+        """Add metadata that was not known at the start."""
+        self._file.write(json.dumps({"about": about}, ensure_ascii=False) + "\n")
         self._file.flush()
 
 

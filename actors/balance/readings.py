@@ -107,6 +107,9 @@ class ReadingReply(StrEnum):
     """Result in the reply to a command that is not a query for a weight."""
 
     DONE = "done"
+    BEGUN = "begun"
+    """The balance has understood the command; another reply follows."""
+
     BUSY = "busy"
     OVER = "over range"
     UNDER = "under range"

@@ -1,4 +1,4 @@
-"""The driver for balances on a serial line, for all dialects.
+"""The driver for balances on a serial line or behind a serial server (TCP), for all dialects.
 
 `SerialBalance` is the `BalanceDriver`. It blocks; `actors.runtime.remote_object` runs it in a process. Every call has a
 deadline. A weight counts once it has settled (`settling`), and a tare is confirmed by reading it back. `read` and
@@ -137,7 +137,7 @@ class Conversation:
                 reply = self._decoded(line)
                 if isinstance(reply, Reading):
                     return reply, time.monotonic()
-                if isinstance(reply, Acknowledgement) and not reply.command:
+                if isinstance(reply, Acknowledgement) and not reply.command and reply.answer is ReadingReply.REFUSED:
                     return Reading(ReadingStatus.BUSY, detail=f"{REFUSED}: {reply.text}"), time.monotonic()
         self.counters.unanswered += 1
         return Reading(ReadingStatus.SILENT), time.monotonic()
@@ -150,7 +150,7 @@ class Conversation:
             patience: longest time for which the balance may wait for stability before it replies [s of the clock].
 
         Returns:
-            The reply; None if the dialect has none.
+            The reply; None if the dialect has none, or if it is optional and none came.
 
         Raises:
             NoConnectionError: the port vanished.
@@ -158,14 +158,21 @@ class Conversation:
         """
         with self._wire_at_rest() as wire:
             wire.send(data)
-            if not self.dialect.acknowledged:
+            if self.dialect.acknowledged is False:
                 return None
             wanted = data.strip().decode("ascii")
-            end = time.monotonic() + max(patience, self._spec.answer_time)
+            wait = max(patience, self._spec.answer_time) if self.dialect.acknowledged else self._spec.answer_time
+            end = time.monotonic() + wait
             while (line := self._line(wire, end)) is not None:
                 reply = self._decoded(line)
-                if isinstance(reply, Acknowledgement) and reply.command in (wanted, ""):
+                if (
+                    isinstance(reply, Acknowledgement)
+                    and reply.command in (wanted, "")
+                    and reply.answer is not ReadingReply.BEGUN
+                ):
                     return reply
+            if self.dialect.acknowledged is None:
+                return None
         self.counters.unanswered += 1
         raise CommandError(f"it does not answer '{wanted}'")
 
@@ -215,7 +222,8 @@ class Conversation:
         return reply
 
     def _open_wire(self, line: LineSettings) -> Wire:
-        return Wire(self._spec.port, line, self._spec.handshake, self.counters, self._tap)
+        spec = self._spec
+        return Wire(spec.port, line, spec.handshake, self.counters, self._tap, dtr=spec.dtr, rts=spec.rts)
 
 
 ZERO_STEPS = 2.0
@@ -257,6 +265,11 @@ class SerialBalance:
         self._display = BalanceDisplay(spec.step)
         self._tared = self._reference_lost = False
         self._losses = self._strange_units = 0
+
+    @property
+    def found(self) -> Detected | None:
+        """The balance as it was detected; None before it is connected."""
+        return self._conversation.found
 
     # Measurements.
 
@@ -360,6 +373,10 @@ class SerialBalance:
 
     def _set_reference(self, name: str, data: bytes) -> None:
         """Wait for a stable weight, send the command, and verify that the display is near zero."""
+        found, word = self._conversation.found, data.strip().decode("ascii", "replace")
+        if found is not None and found.commands and word not in found.commands:
+            text = f"it has no {name}: the commands that it lists (I0) leave '{word}' out. Use its key"
+            raise self._error(CommandError, text)
         said, end = "", time.monotonic() + 2.0 * self._rule.deadline
         for _ in range(COMMAND_ATTEMPTS):
             if time.monotonic() > end:
@@ -508,17 +525,20 @@ class SerialBalance:
             raise self._error(ReferenceLostError, LOST_REFERENCE.format(shown=self._display.last.shown or "nothing"))
 
     def _check_unit(self, reading: Reading) -> None:
-        """Reject a unit that is not a mass. A unit that lost a letter on the line is no mass either, so this needs
-        several readings.
+        """Reject a unit that is not a mass, or a stable number without one. A unit that lost a letter on the line is no
+        mass either, so this needs several readings.
         """
-        strange = reading.value is not None and bool(reading.unit) and reading.mass() is None
+        unit = bool(reading.unit) or reading.status is ReadingStatus.STABLE
+        strange = reading.value is not None and unit and reading.mass() is None
         self._strange_units = self._strange_units + 1 if strange else 0
         if self._strange_units >= STRANGE_UNITS:
             self._strange_units = 0
-            raise self._error(
-                UnitError,
-                f"it shows {reading.value} {reading.unit}, and that is not a mass that is understood; switch it to g",
+            wrong = (
+                f"it shows {reading.value} {reading.unit}, and that is not a mass that is understood; switch it to g"
+                if reading.unit
+                else f"it sends {reading.value} without a unit; switch on the unit in the print settings of its menu"
             )
+            raise self._error(UnitError, wrong)
 
     @contextlib.contextmanager
     def _exclusive(self) -> Iterator[None]:

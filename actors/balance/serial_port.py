@@ -1,6 +1,7 @@
 """A serial port that may vanish and return: it reads lines and writes bytes, and every call has a deadline.
 
-`Wire` is one open port, and `Counters` holds its statistics. `look_at_port` returns the check of a serial port for
+`Wire` is one open port, and `Counters` holds its statistics. The port is one of this machine, or `host:port` of a
+serial server or a balance in the network (`TcpPort`). `look_at_port` returns the check of a serial port for
 `decant robot check`. The meaning of the bytes belongs to the dialects.
 """
 
@@ -8,6 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
+import select
+import socket
 import stat
 import time
 from collections.abc import Callable
@@ -31,6 +35,8 @@ except ImportError:  # not on Windows, where it is not raised either
 Tap = Callable[[str, bytes], None]
 """Receives the bytes of a wire: direction 'out' (to the balance) or 'in', and the bytes."""
 
+_TCP = re.compile(r"(?:\[(?P<v6>[0-9A-Fa-f:.%]+)\]|(?P<host>[A-Za-z0-9._-]+)):(?P<port>[0-9]{1,5})")
+_CONNECT_TIME = 3.0
 _WRITE_TIME = 2.0
 _GLANCE = 0.02
 """Longest single wait for a character [s]; fixed, because pyserial reconfigures the whole port for another value."""
@@ -68,6 +74,7 @@ class Wire:
         handshake: 'none', 'software' or 'hardware'.
         counters: where to count.
         tap: receives all bytes.
+        dtr, rts: whether these wires are on while the port is open.
 
     Raises:
         LineSettingsError: the port cannot be set to that line.
@@ -81,12 +88,17 @@ class Wire:
         handshake: str = "none",
         counters: Counters | None = None,
         tap: Tap | None = None,
+        *,
+        dtr: bool = True,
+        rts: bool = True,
     ) -> None:
         self.port, self.line = port, line
+        self.received = bytearray()
+        """All bytes since the last `flush`, as they came."""
         self.counters = counters or Counters()
         self._tap = tap
         self._buffer = bytearray()
-        self._serial = _open(port, line, handshake)
+        self._serial = _open(port, line, handshake, dtr=dtr, rts=rts)
 
     def send(self, data: bytes) -> None:
         """Write bytes.
@@ -107,6 +119,7 @@ class Wire:
             pass
         self.counters.stale += self._buffer.count(b"\n")
         self._buffer.clear()
+        self.received.clear()
 
     def line_until(self, moment: float) -> bytes | None:
         """Return the next line, without its end.
@@ -159,6 +172,7 @@ class Wire:
         if data and self._tap is not None:
             self._tap("in", data)
         self._buffer += data
+        self.received += data
         return bool(data)
 
     def _lost(self, error: OSError) -> PortLostError:
@@ -167,13 +181,88 @@ class Wire:
         return PortLostError(f"{self.port}: the connection was lost ({error.strerror or error})")
 
 
-def _open(port: str, line: LineSettings, handshake: str) -> Serial:
+def tcp_address(port: str) -> tuple[str, int] | None:
+    """Host and port of `host:port` or `[IPv6]:port`; None for a port of this machine."""
+    match = _TCP.fullmatch(port)
+    return None if match is None else (match["v6"] or match["host"], int(match["port"]))
+
+
+class TcpPort:
+    """A TCP connection with the part of pyserial's interface that a wire uses.
+
+    pyserial's own `socket://` reads single bytes, and its errors do not say what to check.
+
+    Raises:
+        NoConnectionError: no connection; the text gives the reason and a remedy.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        try:
+            self._socket = socket.create_connection((host, port), timeout=_CONNECT_TIME)
+        except socket.gaierror as error:
+            raise NoConnectionError(
+                f"{host}:{port}: no host has this name; check it, or give its IP address"
+            ) from error
+        except ConnectionRefusedError as error:
+            raise NoConnectionError(
+                f"{host}:{port}: the host is there, but nothing listens on port {port}. Check the port's number and "
+                "the mode of the serial server (TCP server, raw), and that no other program has it open"
+            ) from error
+        except (OSError, OverflowError) as error:
+            raise NoConnectionError(
+                f"{host}:{port}: no answer from this address ({error}). Is the serial server switched on, is its "
+                "network cable plugged in, is the address right and in this machine's network?"
+            ) from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self._socket.settimeout(_WRITE_TIME)
+
+    @property
+    def in_waiting(self) -> int:
+        """Upper limit of the number of bytes that can be read now; 0 for none."""
+        try:
+            return 4096 if select.select([self._socket], [], [], 0.0)[0] else 0
+        except ValueError:  # closed by another thread; `read` reports it
+            return 1
+
+    def read(self, size: int) -> bytes:
+        """Return at most `size` bytes; none if none comes soon.
+
+        Raises:
+            OSError: the connection was closed.
+        """
+        try:
+            if not select.select([self._socket], [], [], _GLANCE)[0]:
+                return b""
+            data = self._socket.recv(size)
+        except ValueError:  # closed by another thread
+            data = b""
+        if not data:
+            raise OSError("closed by the other side")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        self._socket.sendall(data)
+
+    def reset_output_buffer(self) -> None:
+        """Do nothing: sent bytes are on their way."""
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+
+
+def _open(port: str, line: LineSettings, handshake: str, *, dtr: bool, rts: bool) -> Serial | TcpPort:
+    address = tcp_address(port)
+    if address is not None:
+        return TcpPort(*address)
     require("serial", f"balance at {port}")
     import serial
 
     try:
-        return serial.Serial(
-            port,
+        opened = serial.Serial(
+            None,  # not opened yet: DTR and RTS change when it opens
             line.baud,
             bytesize=line.bits,
             parity=line.parity,
@@ -184,6 +273,11 @@ def _open(port: str, line: LineSettings, handshake: str) -> Serial:
             write_timeout=_WRITE_TIME,
             exclusive=True,
         )
+        opened.dtr, opened.port = dtr, port
+        if handshake != "hardware":  # then the handshake drives RTS
+            opened.rts = rts
+        opened.open()
+        return opened
     except (_TermiosError, ValueError) as error:
         if isinstance(error, OSError):
             raise NoConnectionError(f"{port}: {_reason(port, error)}") from error
@@ -232,11 +326,13 @@ def port_advice(port: str) -> str | None:
 
 
 def look_at_port(name: str) -> DeviceCheck:
-    """Check that a port exists, is a serial port, and may be opened.
+    """Check that a port of this machine exists, is a serial port, and may be opened; others are checked on connecting.
 
     Args:
         name: as in the laboratory's file.
     """
+    if tcp_address(name) is not None:
+        return DeviceCheck("balance port", "ok", f"{name}, over TCP")
     port = Path(name)
     if not port.exists():
         known = ports()

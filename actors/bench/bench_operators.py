@@ -108,7 +108,7 @@ class OperatorQuestions:
                 return answering.result()
             waited = time.monotonic() - begun
             if waited >= self._deadline:
-                raise NoAnswerError(f"nobody answered within {self._deadline:g} s: '{question.text}'")
+                raise NoAnswerError(f"no answer within {self._deadline:g} s: '{question.text}'")
             unseen: Literal["note", "warning"] = "note" if self._on_screen else "warning"
             self._notify(Notice(unseen, f"still waiting, for {waited:.0f} s now: {question.text}"))
 

@@ -28,6 +28,30 @@ def lower_confidence_bound(surrogate: Surrogate, kappa: float) -> Score:
     return score
 
 
+RESOLVED = 2.0
+"""Posterior deviation, in units of the noise, below which a further observation is a replicate."""
+
+
+def without_replicates(score: Score, surrogate: Surrogate, noise: float) -> Score:
+    """Return a score that prefers places (to be minimised) which the surrogate does not know to within the noise.
+
+    Among places that are all known so well, the one with the largest deviation has the lowest score.
+
+    Source: Binois et al., Replication or exploration? Sequential design for stochastic simulation experiments,
+    Technometrics 2019: a replicate pays only if the noise dominates.
+    """
+
+    def changed(points: Array) -> Array:
+        deviation = surrogate.predict(points)[1]
+        return np.where(deviation >= RESOLVED * noise, score(points), _REPLICATE - deviation / noise)
+
+    return changed
+
+
+_REPLICATE = 1e9
+"""Score of a replicate, larger than that of any other place."""
+
+
 def penalised(
     score: Score, surrogate: Surrogate, busy: Array, candidates: Array, feasibility: Feasibility | None = None
 ) -> Score:

@@ -38,9 +38,9 @@ poured action is good (b is large), much is tried. Before the first pour, H coun
 count whose probability of exceeding it is small enough; if there is none, the action with the smallest probability
 counts.
 
-**Lookahead** (`looked_ahead`). The place found by `least_loss` competes with places that are informative about other
-places: a pour on the slope of the valley distinguishes the hypotheses, one on a plateau hardly does, whatever their
-losses. With H pours to follow (4 at most), the next pour minimises
+**Lookahead** (`looked_ahead`). After the first pour, the place found by `least_loss` competes with places that are
+informative about other places: a pour on the slope of the valley distinguishes the hypotheses, one on a plateau hardly
+does, whatever their losses. With H pours to follow (4 at most), the next pour minimises
 
     E c(x) − H (min_x′ E c(x′) − E_y min_x′ E[c(x′) | y at x]),    c = clip(f, 0, 1)
 
@@ -396,7 +396,7 @@ def proposals(
     candidates = np.concatenate([candidates, known])
     pour = acquisition.minimise(score, candidates, arrays.region, rng)
     left, allowed = min(query.discrepancy.pours_left, FORESIGHT), _allowed(process, query.discrepancy, feasibility)
-    if query.discrepancy.lookahead:
+    if query.discrepancy.lookahead and len(known):
         pour = looked_ahead(process, pour, candidates, known, left, allowed, feasibility)
     simulations = instructive(process, query.count - 1, candidates, score, pour, arrays.busy, arrays.region)
     return np.concatenate([pour[None, :], simulations])
@@ -441,6 +441,7 @@ def found(
         exceedances=() if limit is None else tuple(map(float, process.exceedance(points, limit.loss))),
         least_exceedance=None if limit is None else float(over.min()),
         drawn=drawn,
+        since_change=None if process.since is None else len(process.points) - process.since,
     )
 
 

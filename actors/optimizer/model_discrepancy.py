@@ -8,8 +8,9 @@ from the simulator's best action x̂, with a scaled cost, plus a discrepancy δ 
     y = f(x) + ε,    ε ~ N(0, (n_j + 0.15 μ_j(x))²)
 
 f̂_s and s_s are posterior mean and deviation of a GP of the simulations, with costs in units of the largest one. h
-makes the valley wider or narrower than simulated, as deviating walls and lips do. n, the scatter of pours of one
-action, belongs to the hypothesis, too: a few pours close together determine it.
+makes the valley wider or narrower than simulated, as deviating walls and lips do. Each hypothesis has a factor on the
+deviations of these errors: by some the simulator is nearly right, by others it is far off. n, the scatter of pours of
+one action, belongs to the hypothesis, too: a few pours close together determine it.
 
 Two further groups of hypotheses, of equal prior weight, do not rely on the simulator. In the contrary group it predicts
 the opposite, μ_j = clip(e^{g_j} (1 − f̂_s(z_j(x))), 0, 1). In the uninformative group it contains no information about
@@ -18,7 +19,13 @@ this bench, and f is a GP around 0.6, more towards corners.
 The posterior weights are prior times marginal likelihood of the observations. No hypothesis is removed: the weight of a
 failing one decreases. The weight of the two further groups measures how unreliable the simulator is.
 
-Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001.
+**A bench that changes.** Once an observation lies outside its 99 % prediction interval, the hypotheses are weighed
+together with the start of the present segment: the observations before it were made on another bench, and say nothing
+of this one. Two Cholesky factors of every hypothesis, in both orders, give the marginal likelihoods of all beginnings
+and ends. Alternatively the latest observation is an outlier.
+
+Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001;
+changes, Adams & MacKay, Bayesian online changepoint detection, 2007, and binary segmentation, Scott & Knott 1974.
 Limitations: the set of hypotheses is fixed; predictions use at most 32 draws of them, and the uninformative group.
 """
 
@@ -48,8 +55,12 @@ WIDTH = 0.25
 RESTS = (0.02, 0.3)
 """Smallest and largest σ, in units of the largest cost; log-uniform, like ℓ."""
 LENGTHS = (0.15, 0.6)
-FARTHER = (0.4, 3.0)
-"""Range of factors on the standard deviations of an offset, log-uniform: tails for a bench that deviates far."""
+NEAR, FARTHER = (0.03, 0.4), (0.4, 3.0)
+"""Ranges of a hypothesis' factor s on the standard deviations of its offset, and up to 1 of g and h, too; log-uniform.
+The far ones are tails for a bench that deviates far."""
+NEAR_SHARE = 0.3
+"""Fraction of the hypotheses by which the simulator is nearly right. A first pour can thus rely on it; where it is
+wrong, that pour refutes them."""
 NOISES, NOISE_GROWTH = (0.002, 0.05), 0.15
 """Smallest and largest standard deviation of one observation at zero cost, log-uniform; and its increase at the largest
 cost."""
@@ -64,6 +75,13 @@ against it."""
 CONTRARY, CONTRARY_REST = 128, 0.15
 """Number of contrary hypotheses, which hold half of the prior weight of both groups; and their smallest σ. If they were
 certain of a total loss where the simulation has none, any failed pour would count for them."""
+SURPRISE = 0.99
+"""Probability of the prediction intervals; an observation outside makes a change of the bench possible."""
+CHANGE, MISHAP, NOTICED = 0.02, 0.005, 0.9
+"""Prior probabilities of a change before each observation, and that the latest one is an outlier with any cost;
+posterior probability of a change from which it is reported, with two observations since then at least."""
+FORGOTTEN = 1e3
+"""Noise of an observation that does not count."""
 KNOWN_SHARE = 0.75
 """Fraction of the hypotheses around earlier bench offsets, if there are any."""
 KNOWN_SPREAD = 0.25
@@ -103,7 +121,10 @@ class Hypotheses:
         rows = np.clip(np.concatenate([rows, rows[:CONTRARY]]), 1e-6, 1.0 - 1e-6)
         z = ndtri(rows[:, : 2 * dimension])
         width, gain, rest, length, far, known, noise = rows[:, 2 * dimension :].T
-        spread, contrary = _evenly(FARTHER, far), np.arange(len(rows)) >= HYPOTHESES
+        near, contrary = far < NEAR_SHARE, np.arange(len(rows)) >= HYPOTHESES
+        beyond = (far - NEAR_SHARE) / (1.0 - NEAR_SHARE)
+        spread = np.where(near, _evenly(NEAR, far / NEAR_SHARE), _evenly(FARTHER, beyond))
+        less = np.minimum(spread, 1.0)
         scales, shifts = np.ones((len(rows), dimension)), np.zeros((len(rows), dimension))
         if discrepancy.drawn:
             index = np.minimum((known / KNOWN_SHARE * len(discrepancy.drawn)).astype(int), len(discrepancy.drawn) - 1)
@@ -120,8 +141,8 @@ class Hypotheses:
         return cls(
             factors * scales,
             factors * shifts + moved,
-            WIDTH * ndtri(width),
-            GAIN * ndtri(gain),
+            less * WIDTH * ndtri(width),
+            less * GAIN * ndtri(gain),
             np.where(contrary, _evenly((CONTRARY_REST, RESTS[1]), rest), _evenly(RESTS, rest)),
             _evenly(LENGTHS, length),
             _evenly(NOISES, noise),
@@ -149,14 +170,34 @@ class _Prior:
     noises: Array
 
 
+def _joined(*parts: _Prior) -> _Prior:
+    return _Prior(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("means", "spreads", "noises")))
+
+
+@dataclass(frozen=True)
+class _Segments:
+    """Which observations (n) are of the present bench, in S ways, and the posterior weights of these with J hypotheses.
+
+    Attributes:
+        counting: (S, n), the observations that count.
+        weights: (S, J).
+        surprised: whether an observation lies outside its prediction interval.
+        since: index of the first observation after the likeliest change; None if none is noticed.
+    """
+
+    counting: NDArray[np.bool_]
+    weights: Array
+    surprised: bool
+    since: int | None
+
+
 class ModelAveragedProcess:
     """The real cost, averaged over hypotheses; see the module docstring. Its `predict` is a `Surrogate`'s.
 
     Attributes:
         simulated: surrogate of the simulations.
-        weights: posterior weights (J + uninformative ones,); the last `len(UNINFORMATIVE_LENGTHS)` are those of the
-            uninformative group.
-        uninformative: the sum of these and of the contrary ones.
+        uninformative: sum of the weights of the uninformative and the contrary hypotheses.
+        since: index of the first observation since which the bench behaves differently; None if it does not.
     """
 
     def __init__(self, simulated: GaussianProcess, points: Array, costs: Array, discrepancy: ModelDiscrepancy) -> None:
@@ -164,29 +205,29 @@ class ModelAveragedProcess:
 
         Args:
             simulated: of the same cost.
-            points: (n, dimension), real observations, n ≥ 0.
+            points: (n, dimension), real observations in the order in which they were made, n ≥ 0.
             costs: (n,).
             discrepancy: of the question.
         """
         self.simulated, self.points, self.worst = simulated, points, discrepancy.worst
         self._costs = np.clip(costs / discrepancy.worst, 0.0, 1.0)
         self._all = Hypotheses.of(discrepancy, _least(simulated))
-        informed = self._evidences(self._informed(self._all, points), self._all.lengths)
-        uninformative = self._evidences(self._uninformative(points, self._costs), UNINFORMATIVE_LENGTHS)
-        half = 0.5 * discrepancy.uninformative
+        half, J = 0.5 * discrepancy.uninformative, len(self._all.gains)
         prior = np.where(self._all.contrary, half / CONTRARY, (1.0 - discrepancy.uninformative) / HYPOTHESES)
-        logs = np.concatenate([informed + np.log(prior), uninformative + np.log(half / len(uninformative))])
-        weights = np.exp(logs - logs.max())
-        self.weights = weights / weights.sum()
-        informed_weights, uninformative_weights = self.weights[: len(informed)], self.weights[len(informed) :]
-        self._trusting = np.where(self._all.contrary, 0.0, informed_weights)
-        self.uninformative = float(informed_weights[self._all.contrary].sum() + uninformative_weights.sum())
-        kept, times = np.unique(_evenly_drawn(informed_weights, KEPT), return_counts=True)
-        self._kept = self._all.only(kept)
-        self.mixture = np.concatenate([times / KEPT * informed_weights.sum(), uninformative_weights])
+        ignorant = np.full(len(UNINFORMATIVE_LENGTHS), half / len(UNINFORMATIVE_LENGTHS))
+        segments = self._segments(np.log(np.concatenate([prior, ignorant])))
+        self.since, weights = segments.since, segments.weights
+        informed, uninformative = weights[:, :J], weights[:, J:]
+        self._trusting = np.where(self._all.contrary, 0.0, informed.sum(axis=0))
+        self.uninformative = float(informed[:, self._all.contrary].sum() + uninformative.sum())
+        drawn, times = np.unique(_evenly_drawn(informed.ravel(), KEPT), return_counts=True)
+        self._kept = self._all.only(drawn % J)
+        self.mixture = np.concatenate([times / KEPT * informed.sum(), uninformative.sum(axis=0)])
         self._lengths = np.concatenate([self._kept.lengths, UNINFORMATIVE_LENGTHS])
         self._least_noises = np.concatenate([self._kept.noises, UNINFORMATIVE_NOISES])
-        self._at_data = self._prior(points, self._costs)
+        at_data = self._prior(points, self._costs)
+        counting = segments.counting[np.concatenate([drawn // J, uninformative.argmax(axis=0)])]
+        self._at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
         self._factors = self._factorised(self._at_data, self._lengths, points)
 
     # -- prior moments ---------------------------------------------------------------------------------------------
@@ -213,19 +254,62 @@ class ModelAveragedProcess:
         return _Prior(means, np.full(shape, UNINFORMATIVE_SIGNAL), noises)
 
     def _prior(self, points: Array, seen: Array | float = UNINFORMATIVE_MEAN) -> _Prior:
-        parts = self._informed(self._kept, points), self._uninformative(points, seen)
-        return _Prior(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("means", "spreads", "noises")))
+        return _joined(self._informed(self._kept, points), self._uninformative(points, seen))
+
+    # -- posterior weights -----------------------------------------------------------------------------------------
+
+    def _segments(self, prior: Array) -> _Segments:
+        """Weigh the starts of the present segment together with the hypotheses, of log prior weights (J,).
+
+        If the observations after the likeliest change hold another one, they alone are weighed.
+        """
+        at_data = _joined(self._informed(self._all, self.points), self._uninformative(self.points, self._costs))
+        lengths = np.concatenate([self._all.lengths, UNINFORMATIVE_LENGTHS])
+        found = self._weighed(at_data, lengths, prior, 0)
+        while found.since is not None:
+            later = self._weighed(at_data, lengths, prior, found.since)
+            if later.since is None:
+                return replace(later, since=found.since) if later.surprised else found
+            found = later
+        return found
+
+    def _weighed(self, at_data: _Prior, lengths: Array, prior: Array, begin: int) -> _Segments:
+        """Weights of the starts of a segment among the observations from `begin`, with at most one change there."""
+        n, m = len(self.points), len(self.points) - begin
+        order = np.arange(begin, n)
+        densities, residuals = self._sequential(at_data, lengths, order)
+        before = prior[:, None] + np.concatenate([np.zeros((len(prior), 1)), np.cumsum(densities, axis=1)], axis=1)
+        so_far = np.exp(before[:, :-1] - before[:, :-1].max(axis=0, initial=-np.inf))
+        below = (so_far * ndtr(residuals)).sum(axis=0) / so_far.sum(axis=0)  # of each observation, given those before
+        surprising = np.abs(below - 0.5) > 0.5 * SURPRISE
+        counting, logs = [np.arange(n) >= begin], [before[:, m]]
+        if surprising.any():
+            after = np.cumsum(self._sequential(at_data, lengths, order[::-1])[0], axis=1)[:, ::-1]
+            for start in range(1, m):
+                counting.append(np.arange(n) >= begin + start)
+                logs.append(prior + after[:, start] + _log_sum(before[:, start]) + np.log(CHANGE))
+            if surprising[-1]:
+                counting.append(counting[0] & (np.arange(n) < n - 1))
+                logs.append(before[:, m - 1] + np.log(MISHAP))
+        weights = np.exp(np.array(logs) - np.max(logs))
+        weights /= weights.sum()
+        starts = weights[1:m].sum(axis=1)
+        since = begin + 1 + int(np.argmax(starts)) if starts.sum() > NOTICED else None
+        since = None if since == n - 1 else since  # a single observation may be a mishap
+        return _Segments(np.array(counting), weights, bool(surprising.any()), since)
+
+    def _sequential(self, prior: _Prior, lengths: Array, order: NDArray[np.int_]) -> tuple[Array, Array]:
+        """Log densities (J, n) of observations given those before them in an order, and standardised residuals."""
+        if not len(order):
+            return np.empty((len(lengths), 0)), np.empty((len(lengths), 0))
+        prior = _Prior(*(getattr(prior, name)[:, order] for name in ("means", "spreads", "noises")))
+        L = self._factorised(prior, lengths, self.points[order])
+        residuals = np.linalg.solve(L, (self._costs[order] - prior.means)[:, :, None])[:, :, 0]
+        deviations = np.diagonal(L, axis1=1, axis2=2)
+        densities = -0.5 * residuals**2 - np.log(deviations * np.sqrt(2.0 * np.pi))
+        return np.asarray(densities), np.asarray(residuals)
 
     # -- posterior moments -----------------------------------------------------------------------------------------
-
-    def _evidences(self, prior: _Prior, lengths: Array) -> Array:
-        """Log marginal likelihoods (J,)."""
-        if not len(self._costs):
-            return np.zeros(len(lengths))
-        L = self._factorised(prior, lengths, self.points)
-        residuals = np.linalg.solve(L, (self._costs - prior.means)[:, :, None])[:, :, 0]
-        logs = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
-        return np.asarray(-0.5 * (residuals**2).sum(axis=1) - logs)
 
     def _factorised(self, prior: _Prior, lengths: Array, points: Array) -> Array:
         """Lower Cholesky factors (J, n, n) of the observations' covariances."""
@@ -360,6 +444,10 @@ def _evenly_drawn(weights: Array, count: int) -> NDArray[np.int_]:
     order = np.argsort(-weights, kind="stable")
     levels = (np.arange(count) + 0.5) / count * weights.sum()
     return np.asarray(order[np.searchsorted(np.cumsum(weights[order]), levels).clip(max=len(order) - 1)])
+
+
+def _log_sum(logs: Array) -> float:
+    return float(logs.max() + np.log(np.exp(logs - logs.max()).sum()))
 
 
 def _evenly(bounds: tuple[float, float], u: Array) -> Array:

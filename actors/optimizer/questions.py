@@ -84,6 +84,7 @@ class DiscrepancyFound:
         exceedances: at the proposals: probabilities that an observation is above the limit; empty without one.
         least_exceedance: smallest probability over all actions; None without a limit.
         drawn: bench offsets drawn from the posterior, for another receiver; only with `count=0`.
+        since_change: number of observations since the bench has behaved differently; None if it does not.
     """
 
     uninformative: float
@@ -94,6 +95,7 @@ class DiscrepancyFound:
     exceedances: Numbers = ()
     least_exceedance: float | None = None
     drawn: tuple[BenchOffset, ...] = ()
+    since_change: int | None = None
 
 
 Point = tuple[float, ...]
@@ -352,11 +354,14 @@ class MinimumQuery(ProposalQuery):
         acquisition: see `AcquisitionName`.
         mean: prior mean of the surrogate. 'constant' is fitted; 'zero' is the paper's.
         plain: 'lcb' as in the paper: κ is constant, and no point only fills space on a plateau.
+        replicates: whether a proposal may repeat an observation. Without replicates the observations describe the whole
+            cost: one point in three fills space, and the others are where the surrogate is uncertain.
     """
 
     acquisition: AcquisitionName = "lcb"
     mean: MeanName = "constant"
     plain: bool = False
+    replicates: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)

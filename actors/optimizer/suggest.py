@@ -170,7 +170,7 @@ def mapped(
 
 
 FILL_EVERY = 3
-"""One proposal in this many only fills space while the costs may be pure noise."""
+"""One proposal in this many only fills space; see `_fills_space`."""
 
 STRUCTURE = 2.0
 """Gain of the log-likelihood above which the costs are more than noise."""
@@ -278,6 +278,8 @@ def _search(
         conclude = _seeks_minimum(query) and index == 0
         score = acquisition.lower_confidence_bound(surrogate, 0.0 if conclude else _kappa(query, model))
         score = acquisition.penalised(score, surrogate, pending[:0] if conclude else pending, candidates, feasibility)
+        if isinstance(query, MinimumQuery) and not query.replicates:
+            score = acquisition.without_replicates(score, surrogate, model.process.noise)
         chosen.append(acquisition.minimise(score, candidates, arrays.region, rng))
     return np.array(chosen).reshape(query.count, query.space.dimension)
 
@@ -290,13 +292,17 @@ def _seeks_minimum(query: SurrogateQuery) -> bool:
 def _fills_space(query: ProposalQuery, arrays: QueryArrays, model: Model, index: int) -> bool:
     """Whether the next point only fills space: every third one, while the costs may be pure noise.
 
+    Without replicates, every third one always does, and two of three while the costs may be pure noise.
+
     On a plateau the best pours look like a slope by chance. Following them, mostly along the faces of the cube, would
     use up the whole budget. Only a `MinimumQuery` does so, without `plain` and with a constant mean.
     """
     if not isinstance(query, MinimumQuery) or query.plain or query.mean != "constant" or _seeks_minimum(query):
         return False
     number = len(arrays.known) + len(arrays.busy) + index
-    return number % FILL_EVERY == FILL_EVERY - 1 and model.process.evidence < STRUCTURE
+    if query.replicates:
+        return number % FILL_EVERY == FILL_EVERY - 1 and model.process.evidence < STRUCTURE
+    return (number % FILL_EVERY == FILL_EVERY - 1) if model.process.evidence >= STRUCTURE else number % FILL_EVERY != 0
 
 
 def _kappa(query: ProposalQuery, model: Model) -> float:

@@ -45,7 +45,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class QueryArrays:
-    """A query as arrays. Their order does not depend on the order of the answers; integer axes are rounded.
+    """A query as arrays; integer axes are rounded. Their order does not depend on the order of the answers, except that
+    the pours of a query with a discrepancy keep theirs: the bench may change.
 
     Attributes:
         points: (n, dimension and context) of the observations, with their costs (n,).
@@ -75,7 +76,8 @@ class QueryArrays:
         """Convert a query."""
         dimension = query.space.dimension
         region = Region(query.space, query.constraints)
-        points, costs = _sorted(query.data, dimension + query.context_dimension)
+        ordered = isinstance(query, PourQuery) and query.discrepancy is not None
+        points, costs = (_arrays if ordered else _sorted)(query.data, dimension + query.context_dimension)
         simulations = query.simulated if isinstance(query, PourQuery | SimulationQuery) else Data()
         simulated, simulated_costs = _sorted(simulations, dimension)
         points = region.snap(points)
@@ -123,10 +125,15 @@ class QueryArrays:
         return Feasibility(*present) if present else None
 
 
+def _arrays(data: Data, dimension: int) -> tuple[Array, Array]:
+    """Points (n, dimension) and costs (n,)."""
+    return array(data.points, dimension), np.array(data.costs, dtype=np.float64)
+
+
 def _sorted(data: Data, dimension: int) -> tuple[Array, Array]:
-    """Points (n, dimension) and costs (n,), sorted by their numbers."""
+    """The same, sorted by their numbers."""
     pairs = sorted(zip(data.points, data.costs, strict=True))
-    return array([point for point, _ in pairs], dimension), np.array([cost for _, cost in pairs], dtype=np.float64)
+    return _arrays(Data(tuple(point for point, _ in pairs), tuple(cost for _, cost in pairs)), dimension)
 
 
 def array(points: Sequence[Point], dimension: int) -> Array:

@@ -1,6 +1,6 @@
 """The catalogue's rows: their columns, and their content, read from a run's folder.
 
-- `RUNS` and `POURS` declare the columns once.
+- `RUNS` and `POURS` declare the columns once; `PreviousRun` and `PreviousPour` are models of the rows.
 - `read_run` reads the plan from the journal's header, and the outcomes from its entries. Vessels are not built, and
   meshes and plug-ins may be missing.
 """
@@ -13,7 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from orchestrator.catalogue.annotations import Annotations, AnnotationsError, read_annotations
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from orchestrator.catalogue.annotations import Annotations, AnnotationsError, Note, read_annotations
 from orchestrator.journal.codec import CodecError, from_json
 from orchestrator.journal.run_record import RecordedPour, Row, pour_row, read_record
 from orchestrator.run_errors import RunError
@@ -113,6 +115,50 @@ POURS = (
 
 TABLES: dict[str, tuple[Column, ...]] = {"run": RUNS, "pour": POURS}
 """The columns of both tables: for the index, exports, their data dictionary and the API."""
+
+_TYPES: dict[str, Any] = {
+    "text": str | None,
+    "texts": list[str],
+    "integer": int | None,
+    "number": float | None,
+    "time": float | None,
+    "values": dict[str, Any],
+}
+
+
+def _row(name: str, columns: tuple[Column, ...], about: str) -> type[BaseModel]:
+    fields: dict[str, Any] = {}
+    for column in columns:
+        unit = "seconds since 1970" if column.type == "time" else column.unit
+        fields[column.name] = (_TYPES[column.type], Field(description=column.meaning + (f" [{unit}]" if unit else "")))
+    return create_model(name, __doc__=about, **fields)
+
+
+PreviousRun = _row("PreviousRun", TABLES["run"], "One run of this machine, made by the daemon or the command line.")
+PreviousPour = _row("PreviousPour", TABLES["pour"], "One pour that has started.")
+PreviousRunDetail = create_model(
+    "PreviousRunDetail",
+    __base__=PreviousRun,
+    __doc__="One run with its notes and its pours.",
+    notes=(list[Note], ...),
+    list_of_pours=(list[PreviousPour], ...),  # type: ignore[valid-type]
+)
+
+
+class RunComparison(BaseModel):
+    """Runs side by side, with one value for each run."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    runs: list[str]
+    """Paths of their folders."""
+
+    settings: dict[str, list[Any]]
+    """Settings in which the runs differ: path in the plan → values."""
+
+    outcomes: list[dict[str, Any]]
+    """Outcome of each run."""
+
 
 UNREADABLE = "unreadable"
 """The state of a run of which only the folder is known; its reason is why it can't be read."""

@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from orchestrator.cli import (
+    balance_commands,
     campaign_commands,
     file_commands,
     physics_command,
@@ -170,6 +171,26 @@ _add(
     "decant robot jog configs/laboratories/virtual.yaml         # practise without a robot",
     "decant robot jog configs/laboratories/ur10-kern.yaml --enable-motion",
     to=_robot,
+)
+_add(
+    robot_commands.home,
+    "decant robot home configs/laboratories/virtual.yaml        # practise without a robot",
+    "decant robot home configs/laboratories/ur10-kern.yaml --enable-motion",
+    to=_robot,
+)
+
+_balance = _group("balance", "Check a balance before the first pour, and record its raw traffic.")
+_add(
+    balance_commands.check,
+    "decant balance check configs/laboratories/virtual.yaml       # practise without a balance",
+    "decant balance check /dev/serial/by-id/usb-FTDI_FT232R-if00-port0 --record day-one.jsonl",
+    "decant balance check 192.168.0.20:4001 --set dialect=a-and-d",
+    to=_balance,
+)
+_add(
+    balance_commands.record,
+    "decant balance record rig.yaml --to kern.jsonl --remarks 'Kern PCB 3500-2; 200 g put on after 10 s'",
+    to=_balance,
 )
 
 _server = _group("server", "Run a laboratory as a service.")

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 _TOLD = {
     "prediction",
-    "prediction_band",
+    "prediction_interval",
     "at_bounds",
     "predicted_delivered_g",
     "predicted_delivered_ml",
@@ -219,7 +219,7 @@ def plan(
     run_result, published = run_in_front_of_people(
         dataclasses.replace(request, stages=stages, folder=directory),
         resources,
-        again=f"Plan anew: decant plan {campaign}",
+        again=f"Plan again: decant plan {campaign}",
         not_resumed="this planning is not resumed; what was simulated",
     )
     answers = []

@@ -15,11 +15,20 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from orchestrator.cli.console import BAD_INPUT, INTERRUPTED, RefusalError, fail, set_quiet
+from orchestrator.cli.shell_completion import files_of, local_runs
 
-Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", show_default=False)]
+Campaign = Annotated[
+    Path,
+    typer.Argument(
+        help="Campaign file (YAML).", metavar="CAMPAIGN", show_default=False, autocompletion=files_of("campaign")
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue the newest unfinished run of this campaign.")]
-RunId = Annotated[str | None, typer.Option("--run", help="With --resume: name of the run's folder.")]
+RunId = Annotated[
+    str | None,
+    typer.Option("--run", help="With --resume: name of the run's folder.", autocompletion=local_runs),
+]
 Answer = Annotated[
     str | None,
     typer.Option(
@@ -28,10 +37,20 @@ Answer = Annotated[
         show_default=False,
     ),
 ]
-Laboratory = Annotated[Path, typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY", show_default=False)]
+Laboratory = Annotated[
+    Path,
+    typer.Argument(
+        help="Laboratory file (YAML).", metavar="LABORATORY", show_default=False, autocompletion=files_of("laboratory")
+    ),
+]
 OtherLaboratory = Annotated[
     Path | None,
-    typer.Option("--laboratory", help="Laboratory file (YAML) instead of the campaign's.", show_default=False),
+    typer.Option(
+        "--laboratory",
+        help="Laboratory file (YAML) instead of the campaign's.",
+        show_default=False,
+        autocompletion=files_of("laboratory"),
+    ),
 ]
 Quiet = Annotated[
     bool,
@@ -96,7 +115,12 @@ Parameters = Annotated[
     Path | None, typer.Option(help="θ: theta.json of a calibration, or a YAML or JSON file.", show_default=False)
 ]
 Receiver = Annotated[
-    Path | None, typer.Option(help="Vessel file (YAML) instead of the campaign's receiver.", show_default=False)
+    Path | None,
+    typer.Option(
+        help="Vessel file (YAML) instead of the campaign's receiver.",
+        show_default=False,
+        autocompletion=files_of("vessel"),
+    ),
 ]
 
 

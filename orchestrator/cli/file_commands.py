@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -30,7 +31,7 @@ from orchestrator.cli.console import (
 
 def validate(
     files: Annotated[
-        list[Path], typer.Argument(help="Campaign, study, vessel or laboratory files.", show_default=False)
+        list[Path], typer.Argument(help="Campaign, study, vessel, laboratory or daemon files.", show_default=False)
     ],
     quiet: Quiet = False,
 ) -> None:
@@ -80,6 +81,10 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
 
             study = load_study(path)
             return f"study, {len(cells_of(study))} cells, seed {study.seed}", []
+        case "daemon":
+            from orchestrator.daemon.daemon_settings import load_settings
+
+            return f"daemon, rigs: {', '.join(rig.name for rig in load_settings(path).rigs)}", []
         case _:
             from orchestrator.config.campaign_checks import check_campaign
 
@@ -109,19 +114,23 @@ def migrate(
 
         return load_study(path)
 
-    def load_other(path: Path) -> object:
-        from orchestrator.daemon.daemon_settings import DaemonFile, load_settings
+    def load_daemon(path: Path) -> object:
+        from orchestrator.daemon.daemon_settings import load_settings
 
-        data = Document.read(path).data
-        of_daemon = isinstance(data, dict) and bool(data.keys() & DaemonFile.written_keys().keys())
-        return load_settings(path) if of_daemon else load_parameters(path)
+        return load_settings(path)
 
-    kinds = {"vessel": load_vessel, "laboratory": load_laboratory, "study": load_study, "campaign": load_campaign}
+    kinds: dict[str, Callable[[Path], object]] = {
+        "vessel": load_vessel,
+        "laboratory": load_laboratory,
+        "study": load_study,
+        "campaign": load_campaign,
+        "daemon": load_daemon,
+    }
     left = 0
     for path in files:
         try:
             kind = kind_of(Document.read(resolved(path)).data)
-            result = migrate_file(path, load_other if kind is None else kinds[kind])
+            result = migrate_file(path, load_parameters if kind is None else kinds[kind])
         except (ConfigError, OSError) as error:
             print_message(str(error))
             left += 1
@@ -175,9 +184,11 @@ def plugins(as_json: Json = False) -> None:
 
 
 def schema(
-    which: Annotated[str, typer.Argument(help="campaign, study, vessel, laboratory, or result.")] = "campaign",
+    which: Annotated[
+        str, typer.Argument(help="campaign, study, vessel, laboratory, daemon, result, or output.")
+    ] = "campaign",
 ) -> None:
-    """Print the JSON schema of campaign files (editors use it for completion), of other files, or of summary.json."""
+    """Print a JSON schema: of campaign or other files, for editors; of summary.json; of the output of `--json`."""
     from orchestrator.config.json_schema import SCHEMAS, schema_text
 
     if which not in SCHEMAS:

@@ -279,21 +279,21 @@ def interruption(directory: Path, plan: CampaignPlan, again: str) -> str:
     """
     pours = given_up_pours(directory)
     if not pours:
-        return f"; nothing is lost. Go on with: {again}"
+        return f"; nothing is lost. Continue with: {again}"
     what = " and ".join(pours)
     if plan.laboratory.mode != "virtual":
         rescue = (
             "What it poured is lost unless you weigh it now: wait until the arm stands still, move nothing else, and "
-            "weigh what was spilled and what is left in the pourer. Resuming asks what came of it: "
+            "weigh the spilled liquid and the liquid in the pourer. Resuming asks for its outcome: "
             "'weighed SPILLED RETAINED' (in grams) or 'lost'"
         )
     elif plan.on_unknown == "repeat":
         rescue = "Resuming pours it again with the same chance, as 'on_unknown: repeat' says"
     else:
-        rescue = "Resuming asks what came of it: on a virtual bench 'repeat' pours it again with the same chance"
+        rescue = "Resuming asks for its outcome: on a virtual bench 'repeat' pours it again with the same chance"
     return (
-        f" while {what} was under way: it was given up, and nobody knows what came of it. {rescue}. Everything "
-        f"before it is kept. Go on with: {again}"
+        f" while {what} was under way: it was abandoned, and its outcome is unknown. {rescue}. Everything "
+        f"before it is kept. Continue with: {again}"
     )
 
 

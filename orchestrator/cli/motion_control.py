@@ -2,7 +2,8 @@
 
 - Hardware moves only after the operator has read what will move and has typed the laboratory's name. The arm is
   connected, its safety settings are compared, and Ctrl-C stops it. Virtual laboratories need no approval.
-- `Jogging` is the session of `decant robot jog`; `parse_step` parses a line, `steps_home` computes the way home.
+- `Jogging` is the session of `decant robot jog` and `decant robot home`; `parse_step` parses a line, `steps_home`
+  computes the steps home.
 - `EmptyCycle` is the cycle of `decant pour --empty`.
 """
 
@@ -330,30 +331,35 @@ class Jogging:
         self._move(step)
         self.where()
 
-    def home(self) -> None:
+    def home(self) -> bool:
         """Bring all joints home by small steps, after a confirmation.
+
+        Returns:
+            Whether the arm is at home; False if the operator did not confirm the motion.
 
         Raises:
             JogError: the arm does not report its joints or its home position.
+            LaboratoryError: the motion is refused or stopped.
         """
         here = self._arm.where()
         if len(here.home) != len(here.joints) or not here.home:
-            raise JogError("this arm doesn't tell its joints, or where home is; bring it home by steps")
+            raise JogError("this arm does not report its joints or its home configuration; bring it home by steps")
         steps = steps_home(here.joints, here.home)
         if not steps:
             self._print("at home")
-            return
+            return True
         self._print(
-            f"{len(steps)} small steps, one joint after the other, in nearly a straight line in the joints. Nothing "
-            "knows what stands in the way: watch it, Ctrl-C stops it."
+            f"{len(steps)} small steps, one joint after the other, in nearly a straight line in joint space. "
+            "Obstacles are not checked: watch the arm. Ctrl-C stops it."
         )
         if self._read("type 'home' to begin > ").strip() != "home":
             self._print("not moved")
-            return
+            return False
         for number, step in enumerate(steps, start=1):
             self._print(f"{number}/{len(steps)}  {step}")
             self._move(step)
         self.where()
+        return True
 
     def _move(self, step: JogStep) -> None:
         amount, speed = step.si
@@ -391,7 +397,7 @@ class EmptyCycle:
         print_message(str(error))
         if not self._ask:
             return
-        if not _yes("Find the cause and mend it. Shall the arm bring the pourer upright, slowly, and go home?"):
+        if not _yes("Find the cause and fix it. Shall the arm bring the pourer upright, slowly, and go home?"):
             return
         with contextlib.suppress(LaboratoryError):
             self._arm.release()
@@ -417,4 +423,4 @@ class EmptyCycle:
 
 def _yes(text: str) -> bool:
     print_message(f"\n{text}")
-    return typed_line("type 'yes' to go on > ").strip().lower() == "yes"
+    return typed_line("type 'yes' to continue > ").strip().lower() == "yes"

@@ -52,7 +52,7 @@ INTRODUCTION = """# Validation
 
 <!-- written by `decant validate-solver`; edit the cases, not this page -->
 
-What the solver does in cases whose outcome is known: from theory, from experiments, from other solvers. Every quantity
+Results of the solver in cases whose outcome is known from theory, experiments or other solvers. Every quantity
 is measured, not assumed, and judged by a criterion that was set beforehand; what fails is shown as failing. The page is
 written by
 

@@ -321,7 +321,7 @@ def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float, as_json: bool)
     if hardware:
         confirm(laboratory, lines)
     else:
-        print_message(f"laboratory {laboratory.name}, virtual: nothing moves but numbers\n" + "\n".join(lines))
+        print_message(f"laboratory {laboratory.name}, virtual: no hardware moves\n" + "\n".join(lines))
     try:
         directory = create_run(dataclasses.replace(plan, name=f"{plan.name}-empty"))
         with reached(laboratory) as ready:

@@ -24,6 +24,7 @@ from orchestrator.cli.command_options import (
     Seed,
 )
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message, print_note
+from orchestrator.cli.shell_completion import files_of, queued_campaigns
 
 if TYPE_CHECKING:
     from orchestrator.daemon.daemon_client import Client
@@ -31,8 +32,15 @@ if TYPE_CHECKING:
 CampaignId = Annotated[
     str,
     typer.Argument(
-        metavar="CAMPAIGN_ID", help="Id as shown by 'decant queue list', or a prefix of it.", show_default=False
+        metavar="CAMPAIGN_ID",
+        help="Id as shown by 'decant queue list', or a prefix of it.",
+        show_default=False,
+        autocompletion=queued_campaigns,
     ),
+]
+CampaignOrQueue = Annotated[
+    str | None,
+    typer.Argument(metavar="[CAMPAIGN_ID]", help="Default: the whole queue.", autocompletion=queued_campaigns),
 ]
 Url = Annotated[
     str | None,
@@ -45,7 +53,12 @@ State = Annotated[
 
 def start(
     settings: Annotated[
-        Path | None, typer.Argument(help="Settings file (YAML); default: a virtual laboratory.", show_default=False)
+        Path | None,
+        typer.Argument(
+            help="Settings file (YAML); default: a virtual laboratory.",
+            show_default=False,
+            autocompletion=files_of("daemon"),
+        ),
     ] = None,
     state: State = None,
     port: Annotated[
@@ -231,7 +244,12 @@ def show(key: CampaignId, url: Url = None, state: State = None, as_json: Json = 
 
 def logs(
     key: Annotated[
-        str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Only events of this campaign; default: all events.")
+        str | None,
+        typer.Argument(
+            metavar="[CAMPAIGN_ID]",
+            help="Only events of this campaign; default: all events.",
+            autocompletion=queued_campaigns,
+        ),
     ] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Wait for new events; Ctrl-C ends it.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print every event as one line of JSON.")] = False,
@@ -297,7 +315,7 @@ def _finished(event: dict[str, Any]) -> str:
 
 
 def pause(
-    key: Annotated[str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Default: the whole queue.")] = None,
+    key: CampaignOrQueue = None,
     url: Url = None,
     state: State = None,
 ) -> None:
@@ -309,7 +327,7 @@ def pause(
 
 
 def resume(
-    key: Annotated[str | None, typer.Argument(metavar="[CAMPAIGN_ID]", help="Default: the whole queue.")] = None,
+    key: CampaignOrQueue = None,
     url: Url = None,
     state: State = None,
 ) -> None:
@@ -327,7 +345,7 @@ def _change(key: str | None, what: str, url: str | None, state: Path | None) -> 
     with connected_client(url, state) as client:
         found = client.post(f"/queue/{what}" if key is None else f"/campaigns/{key}/{what}")
     if key is None:
-        print("queue paused" if found["queue_paused"] else "queue goes on")
+        print("queue paused" if found["queue_paused"] else "queue resumed")
     else:
         print(f"{found['id']}: {found['state']}, wanted: {found['desired_state']}")
 
@@ -357,9 +375,9 @@ def estop(
     of = f" of {rig}" if rig else ""
     option = f" --rig {rig}" if rig else ""
     if clear:
-        print(f"emergency stop{of} cleared: what was given up rests until it is resumed")
+        print(f"emergency stop{of} cleared: abandoned campaigns wait until they are resumed")
     else:
-        print(f"EMERGENCY STOP{of}: the work is given up; nothing begins there before 'decant estop --clear{option}'")
+        print(f"EMERGENCY STOP{of}: the work is abandoned; nothing starts there before 'decant estop --clear{option}'")
 
 
 def answer(

@@ -9,9 +9,7 @@ import typer
 
 from orchestrator.cli.command_options import Json, Quiet
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message, print_note
-
-RUNS = Path("runs")
-"""Folder in which names without a folder are searched."""
+from orchestrator.cli.shell_completion import RUNS, files_of, local_runs
 
 
 def report(
@@ -21,6 +19,7 @@ def report(
             help="Folder of a run, or its name in runs/; folder or file of a study.",
             metavar="RUN|STUDY",
             show_default=False,
+            autocompletion=lambda incomplete: local_runs(incomplete) + files_of("study")(incomplete),
         ),
     ],
     output: Annotated[

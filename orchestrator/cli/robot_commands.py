@@ -1,16 +1,18 @@
-"""The commands `decant robot check` and `decant robot jog`: check a laboratory, move its arm by small steps.
+"""The commands `decant robot …`: check a laboratory, move its arm by small steps.
 
 - `check` checks whether a bench is ready to pour, and advises how to solve each problem. Nothing moves; the balance is
   tared only on request.
-- `jog` moves the arm by typed steps; the session itself is in `motion_control`.
+- `jog` moves the arm by typed steps, `home` brings it home; the session itself is in `motion_control`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import getpass
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
     from actors.interfaces import DeviceCheck
     from actors.laboratory_settings import LaboratorySettings
+    from orchestrator.cli.motion_control import Jogging
 
 
 _MARKS = {"ok": ("ok", "green"), "warn": ("warn", "yellow"), "fail": ("FAIL", "bold red")}
@@ -83,7 +86,7 @@ def check(
         checks = look.checks(record, accept=f"decant robot check {laboratory} --accept-safety", virtual=virtual)
         checks += balance_diagnostics(ready.balance, tare=tare)
     checks += _packages(spec)
-    checks += [DeviceCheck("plug-in", "warn", str(one), f"mend or remove {one.package}") for one in broken()]
+    checks += [DeviceCheck("plug-in", "warn", str(one), f"repair or remove {one.package}") for one in broken()]
     failed = [check for check in checks if check.state == "fail"]
     if as_json:
         table = [dataclasses.asdict(check) for check in checks]
@@ -91,7 +94,7 @@ def check(
     else:
         print_table(checks)
     if failed:
-        raise RefusalError(f"{len(failed)} of {len(checks)} checks fail; nothing should move before they are mended")
+        raise RefusalError(f"{len(failed)} of {len(checks)} checks fail; nothing should move before they are fixed")
     print_message("ready" if all(check.state == "ok" for check in checks) else "ready, with warnings")
 
 
@@ -191,6 +194,43 @@ def jog(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
     'j5 +2' turns joint 5 by 2 deg, 'z -5' moves the tool by 5 mm, 'home' goes home. The first step along an axis is
     confirmed with Enter; Ctrl-C stops the arm.
     """
+    with _session(
+        laboratory, "jog", "one at a time, as typed: at most 10 deg at 5 deg/s, or 50 mm at 20 mm/s", enable_motion
+    ) as session:
+        session.run()
+
+
+def home(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
+    """Move the arm slowly to the home configuration of the laboratory file.
+
+    All joints move by small steps of at most 10 deg at 5 deg/s, in nearly a straight line in joint space, after 'home'
+    has been typed. Obstacles are not checked: watch the arm. Ctrl-C stops it. Exit code 2 if nothing was moved.
+    """
+    from actors.interfaces import LaboratoryError
+    from orchestrator.cli.motion_control import JogError
+
+    lines = "all joints to 'home': steps of at most 10 deg at 5 deg/s; obstacles are not checked"
+    with _session(laboratory, "home", lines, enable_motion) as session:
+        session.where()
+        with Refused(JogError, LaboratoryError, code=FAILED):
+            confirmed = session.home()
+        if not confirmed:
+            raise RefusalError("not confirmed; nothing has moved", BAD_INPUT)
+
+
+@contextlib.contextmanager
+def _session(laboratory: Path, command: str, steps: str, enabled: bool) -> Iterator[Jogging]:
+    """Connect the arm for motion by small steps, after the operator's approval.
+
+    Args:
+        laboratory: the laboratory's file.
+        command: name of the command, for messages.
+        steps: description of the steps, for the operator.
+        enabled: whether `--enable-motion` was given.
+
+    Raises:
+        RefusalError: the laboratory has no arm, its motion is not enabled, or the arm can't be connected.
+    """
     from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
     from orchestrator.cli.motion_control import WARNING_TIME, Jogging, confirm, connected, require_flag, typed_line
@@ -198,21 +238,21 @@ def jog(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
 
     spec = read_laboratory(laboratory)
     if spec.arm is None:
-        raise without_arm(laboratory, spec, "steps are typed for an arm that a driver moves")
-    require_flag(spec, enabled=enable_motion, again=f"decant robot jog {laboratory} --enable-motion")
+        raise without_arm(laboratory, spec, f"'decant robot {command}' moves an arm that a driver controls")
+    require_flag(spec, enabled=enabled, again=f"decant robot {command} {laboratory} --enable-motion")
     if not sys.stdin.isatty():
-        raise RefusalError("jogging is typed at a terminal, step by step, with nothing piped into it", BAD_INPUT)
+        raise RefusalError(
+            f"'decant robot {command}' asks for confirmation at a terminal, with nothing piped into it", BAD_INPUT
+        )
     with Refused(SafetyRecordError):
         accepted = accepted_checksum(laboratory) if spec.mode == "hardware" else None
     if spec.mode == "hardware":
-        confirm(spec, ["steps          one at a time, as typed: at most 10 deg at 5 deg/s, or 50 mm at 20 mm/s"])
+        confirm(spec, [f"steps          {steps}"])
     else:
-        print_message(f"laboratory {spec.name}, virtual: nothing moves but numbers")
+        print_message(f"laboratory {spec.name}, virtual: no hardware moves")
     with Refused(LaboratoryError, code=FAILED), reached(spec) as ready:
         assert ready.arm is not None
         soon = ready.with_values(arm=ready.arm.with_values(warning_time=WARNING_TIME))
         with connected(soon, accepted) as (driver, facts):
-            print_message(
-                f"{facts.model} {facts.serial}, {spec.mode}; nothing moves before a step is typed and confirmed"
-            )
-            Jogging(driver, typed_line).run()
+            print_message(f"{facts.model} {facts.serial}, {spec.mode}; nothing moves before you confirm it")
+            yield Jogging(driver, typed_line)

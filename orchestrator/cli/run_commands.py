@@ -20,6 +20,7 @@ import typer
 from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.cli.command_options import Json, call, examples
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, print_json, print_message, print_note
+from orchestrator.cli.shell_completion import catalogued, catalogued_runs
 
 if TYPE_CHECKING:
     from orchestrator.catalogue.catalogue import Catalogue, CatalogueClient
@@ -74,17 +75,29 @@ Daemon = Annotated[
         "one that uses the state directory.",
     ),
 ]
-Which = Annotated[str, typer.Argument(help="A run: its folder's name, a prefix of the name, or its path.")]
+Which = Annotated[
+    str,
+    typer.Argument(help="A run: its folder's name, a prefix of the name, or its path.", autocompletion=catalogued_runs),
+]
 
 _LIMIT = Annotated[int | None, typer.Option("--limit", min=1, help="Show at most this many, the newest.")]
 _WORDS = Annotated[list[str] | None, typer.Argument(metavar="[WORDS]", help="Words in a run's names, tags or notes.")]
 _OTHERS: dict[str, Any] = {
     "words": _WORDS,
-    "run": Annotated[str | None, typer.Option("--run", help="Folder name or path of one run.")],
+    "run": Annotated[
+        str | None, typer.Option("--run", help="Folder name or path of one run.", autocompletion=catalogued_runs)
+    ],
     "limit": _LIMIT,
 }
 _CONDITIONS: dict[str, Any] = {
-    name: Annotated[str | None, typer.Option("--in-state" if name == "state" else f"--{name}", help=text)]
+    name: Annotated[
+        str | None,
+        typer.Option(
+            "--in-state" if name == "state" else f"--{name}",
+            help=text,
+            autocompletion=catalogued("tags" if name == "tag" else name),
+        ),
+    ]
     for name, text in CONDITIONS.items()
 }
 
@@ -266,7 +279,9 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
 
 @_command("decant runs compare quickstart-20300301-1 quickstart-20300301-2")
 def compare(
-    which: Annotated[list[str], typer.Argument(help="Two or more runs.", show_default=False)],
+    which: Annotated[
+        list[str], typer.Argument(help="Two or more runs.", show_default=False, autocompletion=catalogued_runs)
+    ],
     state: State = None,
     daemon: Daemon = False,
     as_json: Json = False,
@@ -287,8 +302,8 @@ def compare(
     outcomes = found["outcomes"]
     keys = dict.fromkeys(key for one in outcomes for key in one)
     ended = [_compared(key, heads, [one.get(key) for one in outcomes]) for key in keys]
-    print_table(asked or [_compared("(the same settings)", heads, [""] * len(heads))], title="asked for")
-    print_table(ended, title="came to")
+    print_table(asked or [_compared("(the same settings)", heads, [""] * len(heads))], title="settings")
+    print_table(ended, title="outcomes")
 
 
 @_command("decant runs tag quickstart-20300301-1 good paper", "decant runs tag RUN --remove good")

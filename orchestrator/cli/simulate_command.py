@@ -546,9 +546,9 @@ class PredictionInputs:
         if scene.uncertain:
             parts.insert(1, "shapes that the vessels may have")
         if self.discrepancy is not None:
-            parts.append("what calibration left over")
-            return f"bands of {', '.join(parts[:-1])} and {parts[-1]}"
-        return f"bands of {', '.join(parts[:-1])} and {parts[-1]} alone (no calibration says what it left over)"
+            parts.append("the residual of calibration")
+            return f"intervals from {', '.join(parts[:-1])} and {parts[-1]}"
+        return f"intervals from {', '.join(parts[:-1])} and {parts[-1]} alone (the residual of calibration is unknown)"
 
     def as_json(self) -> dict[str, Any]:
         """Return the shifts in the prediction intervals, JSON-ready."""

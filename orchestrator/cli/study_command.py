@@ -13,6 +13,7 @@ import typer
 
 from orchestrator.cli.command_options import Json, Quiet
 from orchestrator.cli.console import INTERRUPTED, RefusalError, Refused, print_json, print_note
+from orchestrator.cli.shell_completion import files_of
 
 if TYPE_CHECKING:
     from orchestrator.study.study_plan import StudyCell, StudyPlan
@@ -21,7 +22,10 @@ if TYPE_CHECKING:
 SHOWN_FAILURES = 5
 
 
-StudyPath = Annotated[Path, typer.Argument(help="Study file (YAML).", metavar="STUDY", show_default=False)]
+StudyPath = Annotated[
+    Path,
+    typer.Argument(help="Study file (YAML).", metavar="STUDY", show_default=False, autocompletion=files_of("study")),
+]
 
 
 def run_study(
@@ -160,7 +164,9 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> CellStatus:
 
             return run_cells(plan, folder, jobs=jobs, watch=watch)
     except KeyboardInterrupt:
-        raise RefusalError(f"interrupted; nothing is lost. Go on with: decant study run {path}", INTERRUPTED) from None
+        raise RefusalError(
+            f"interrupted; nothing is lost. Continue with: decant study run {path}", INTERRUPTED
+        ) from None
 
 
 @contextlib.contextmanager

@@ -103,7 +103,7 @@ class TerminalOperator:
             if left <= 0.0:
                 self._write("\n")
                 raise LaboratoryError(
-                    f"nobody answered within {_time(self._spec.deadline)}: {question.text} Nothing moves until the run "
+                    f"no answer within {_time(self._spec.deadline)}: {question.text} Nothing moves until the run "
                     "is resumed"
                 )
             wait = min(left, max(self._reminded + self._spec.reminder - loop.time(), 0.0))
@@ -118,7 +118,7 @@ class TerminalOperator:
                 ends += 1
                 if ends >= _ENDS_OF_INPUT:
                     what = question.text.rstrip(".")
-                    raise LaboratoryError(f"the terminal was closed; nobody can answer: {what}") from None
+                    raise LaboratoryError(f"the terminal was closed; no answer is possible: {what}") from None
                 self._write(f"\nThe question is still open: {self._expected(question)}\n> ")
                 continue
             ends = 0
@@ -132,7 +132,7 @@ class TerminalOperator:
         """Return the answer in a line, or print the valid answers and return None."""
         said = " ".join(line.lower().split())
         if said == GIVE_UP:
-            raise LaboratoryError(f"given up by the operator at: {question.text.rstrip('.')}")
+            raise LaboratoryError(f"abandoned by the operator at: {question.text.rstrip('.')}")
         if question.wants == "weight":
             try:
                 weight = typed_weight(line)

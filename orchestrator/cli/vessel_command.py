@@ -215,7 +215,7 @@ def _turned(out: Path, name: str, sources: Sources) -> Made:
     spec = VesselSpec(name=name, shape=outline.shape())
     build_vessel(spec)
     doubts = _doubts(outline, sources)
-    used = [f"{fit.count} from the {fit.name}, {fit.rms:.1f} of their own deviations off" for fit in outline.fits]
+    used = [f"{fit.count} from the {fit.name}, off by {fit.rms:.1f} standard deviations (rms)" for fit in outline.fits]
     picture = _draw_outline(name, outline, evidence, out.with_suffix(".png"))
     out.write_text(_profile_file(name, outline, used, doubts))
     return Made(outline.capacity, outline.capacity_deviation, outline.radius_deviation, picture, notes + used, doubts)

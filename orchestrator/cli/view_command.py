@@ -18,6 +18,7 @@ import typer
 
 from orchestrator.cli.command_options import LiveAt, Quiet
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_message, print_note
+from orchestrator.cli.shell_completion import local_runs
 
 if TYPE_CHECKING:
     from orchestrator.live_view.live_server import LiveView
@@ -28,7 +29,10 @@ def view(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            help="Folders of runs, their names in runs/, or recordings (.rrd).", metavar="RUN…", show_default=False
+            help="Folders of runs, their names in runs/, or recordings (.rrd).",
+            metavar="RUN…",
+            show_default=False,
+            autocompletion=local_runs,
         ),
     ],
     pour: Annotated[

@@ -244,7 +244,7 @@ class DeploymentSection(StageSettings):
         return settings_in(self, DeploymentSettings)  # type: ignore[type-abstract]
 
 
-class LearningSection(DeploymentSection):
+class LearningSettings(DeploymentSection):
     """A deployment that learns from real pours."""
 
     data: DataSettings | None = None
@@ -266,7 +266,7 @@ def _variants(settings: Mapping[str, type[StrategySettings]], base: type[Setting
     found: dict[str, type[Settings]] = {}
     for name, own in settings.items():
         learns = issubclass(own, DeploymentSettings) and own.learns_on_pours
-        bases = (own, LearningSection if learns else base)
+        bases = (own, LearningSettings if learns else base)
         found[name] = create_model(f"{name}Settings", __base__=bases, __doc__=own.__doc__, __cls_kwargs__=MADE)
         found[name].required = own.required | base.required
     return found
@@ -280,7 +280,7 @@ AnyCalibration: Any = tagged(CALIBRATIONS)
 AnyDeployment: Any = tagged(DEPLOYMENTS)
 
 
-class SimulatorSection(Settings):
+class SimulatorSettings(Settings):
     """The simulator."""
 
     parameters: Parameters | None = None
@@ -317,7 +317,7 @@ class CampaignFile(Settings):
     actions: Actions | None = None
     """Searched dimensions, for sections without their own."""
 
-    simulator: SimulatorSection = SimulatorSection()
+    simulator: SimulatorSettings = SimulatorSettings()
     """The simulator."""
 
     calibration: AnyCalibration | None = None

@@ -18,7 +18,7 @@ from orchestrator.config.campaign_file import (
     CalibrationSection,
     CampaignFile,
     DeploymentSection,
-    LearningSection,
+    LearningSettings,
     PoursSettings,
     StageSettings,
     owners_of_priors,
@@ -126,7 +126,7 @@ def resolve_deployment(
     if actions is None or not known:
         return None
     data = None
-    if isinstance(section, LearningSection) and section.data is not None:
+    if isinstance(section, LearningSettings) and section.data is not None:
         data = resolve_data(section.data, place.at("data"), tuple(scenes), actions, laboratory, report)
     return DeploymentPlan(
         settings=settings,

@@ -1,4 +1,4 @@
-"""JSON schemas of the input files, for completion and checks in editors, and of `summary.json`, for programs."""
+"""JSON schemas: of input files, for editors; of `summary.json` and the output of commands, for programs."""
 
 from __future__ import annotations
 
@@ -36,6 +36,13 @@ def study_schema() -> dict[str, Any]:
     return _schema(StudyFile, "Study")
 
 
+def daemon_schema() -> dict[str, Any]:
+    """Schema of the settings file of a daemon."""
+    from orchestrator.daemon.daemon_settings import DaemonFile
+
+    return _schema(DaemonFile, "Daemon")
+
+
 def result_schema() -> dict[str, Any]:
     """Schema of a run's `summary.json`, with every kind of result."""
     from orchestrator.results.run_summary import summary_schema
@@ -43,12 +50,21 @@ def result_schema() -> dict[str, Any]:
     return {"$schema": DIALECT, **summary_schema()}
 
 
+def output_schema() -> dict[str, Any]:
+    """Schema of the output of commands with `--json`; its properties are the commands."""
+    from orchestrator.cli import json_output
+
+    return {"$schema": DIALECT, **json_output.output_schema()}
+
+
 SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "campaign": campaign_schema,
     "vessel": vessel_schema,
     "laboratory": laboratory_schema,
     "study": study_schema,
+    "daemon": daemon_schema,
     "result": result_schema,
+    "output": output_schema,
 }
 """Functions that create the schemas, by the names of the schema files."""
 

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from pydantic import Tag
 
-from orchestrator.config.campaign_file import CalibrationSection, LearningSection
+from orchestrator.config.campaign_file import CalibrationSection, LearningSettings
 from orchestrator.config.search_ranges import Parameters
 from orchestrator.config.yaml.file_access import resolved
 from orchestrator.config.yaml.references import References
@@ -89,7 +89,7 @@ def _deployment(base: Mapping[str, Any], plan: DeploymentPlan) -> dict[str, Any]
     named = next(table for table in (section, base) if "receivers" in table or "receiver" in table)
     receivers = named["receivers"] if "receivers" in named else [named["receiver"]]
     known = {one["name"]: one for one in receivers}
-    common = {key: value for key, value in _common(section, LearningSection).items() if key != "receiver"}
+    common = {key: value for key, value in _common(section, LearningSettings).items() if key != "receiver"}
     if plan.data is None:
         common.pop("data", None)
     common["confirm"] = plan.confirm

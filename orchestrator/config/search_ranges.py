@@ -2,8 +2,8 @@
 
 The sections are derived from the declarations in `sim_engine.action` and `sim_engine.liquids`.
 
-- `RangeSection`: bounds and scale of a searched quantity. `ActionRangeSection` adds a prior, `ParameterRangeSection` a
-  measured value.
+- `RangeSettings`: bounds and scale of a searched quantity. `ActionRangeSettings` adds a prior, `ParameterRangeSettings`
+  a measured value.
 - `MotionBase`: values of the motion that are not searched; `ActionsBase`: searched dimensions and their constraints.
 - `ParametersBase`: simulation parameters, each with a value or a range.
 """
@@ -37,7 +37,7 @@ EXAMPLES = {
 """A valid value of every action dimension and simulation parameter, for messages and schemas."""
 
 
-class RangeSection(Settings):
+class RangeSettings(Settings):
     """Bounds of a searched quantity: `[lowest, highest]`, or with a scale `{range: [...], scale: log}`."""
 
     required: ClassVar[dict[str, str]] = {"range": "[lowest, highest]"}
@@ -116,7 +116,7 @@ def dimension_quantity(dimension: Dimension, *, words: bool = False) -> Quantity
     )
 
 
-class PriorSection(Settings):
+class PriorSettings(Settings):
     """Prior of a searched dimension: a normal distribution, truncated at the ends of the range."""
 
     mean: Any = None
@@ -126,7 +126,7 @@ class PriorSection(Settings):
     """Standard deviation."""
 
 
-class ActionRangeSection(RangeSection):
+class ActionRangeSettings(RangeSettings):
     """Bounds of a searched dimension: `[lowest, highest]`, or `{range: [...], scale: log, prior: {...}}`."""
 
     prior: Any = None
@@ -134,7 +134,7 @@ class ActionRangeSection(RangeSection):
 
     def normal(self, name: str) -> NormalPrior | None:
         """The prior of the dimension; None if it is uniform or the section has a problem."""
-        prior: PriorSection | None = self.prior
+        prior: PriorSettings | None = self.prior
         if self.range is None or prior is None or prior.mean is None or prior.deviation is None:
             return None
         return NormalPrior(name, float(prior.mean), float(prior.deviation))
@@ -145,9 +145,9 @@ def _action_range(dimension: Dimension) -> Any:
     width = dimension.upper - dimension.lower
     spread = Quantity(dimension.unit, DEVIATIONS[dimension.unit], 0.0, width, positive=True)
     moments = {"mean": Annotated[float, quantity], "deviation": Annotated[float, spread]}
-    prior = _section(f"{title}Prior", PriorSection, moments)
+    prior = _section(f"{title}Prior", PriorSettings, moments)
     prior.required = {"mean": quantity.example, "deviation": spread.example}
-    return _section(f"{title}Range", ActionRangeSection, {"range": _range(quantity), "prior": prior})
+    return _section(f"{title}Range", ActionRangeSettings, {"range": _range(quantity), "prior": prior})
 
 
 class PivotPoint(Settings):
@@ -234,7 +234,7 @@ SEARCHED_TOLERANCES = 3.0
 """The default range of a measured value, in standard deviations to both sides."""
 
 
-class ParameterRangeSection(RangeSection):
+class ParameterRangeSettings(RangeSettings):
     """A searched parameter: `[lowest, highest]` for a uniform prior, or `{measured: …, tolerance: …}` for a normal
     prior, which an additional range truncates."""
 
@@ -298,7 +298,7 @@ def _parameter_range(info: ParameterInfo) -> Any:
         "measured": Annotated[float, quantity],
         "tolerance": Annotated[float, spread],
     }
-    model = _section(f"{_title(info.name)}Range", ParameterRangeSection, types)
+    model = _section(f"{_title(info.name)}Range", ParameterRangeSettings, types)
     model.info = info
     return model
 
@@ -316,10 +316,10 @@ class ParametersBase(Settings):
         """Parameters with a value, SI."""
         return {name: float(v) for name in self.written_keys() if isinstance(v := self.value(name), (int, float))}
 
-    def ranges(self) -> dict[str, ParameterRangeSection]:
+    def ranges(self) -> dict[str, ParameterRangeSettings]:
         """Searched parameters."""
         given = {name: self.value(name) for name in self.written_keys()}
-        return {name: section for name, section in given.items() if isinstance(section, ParameterRangeSection)}
+        return {name: section for name, section in given.items() if isinstance(section, ParameterRangeSettings)}
 
     def searched(self) -> dict[str, Axis]:
         """Axes of the searched parameters."""

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from orchestrator.catalogue.annotations import Note
 from orchestrator.catalogue.catalogue import Catalogue, NoSuchRunError
 from orchestrator.catalogue.queries import CONDITIONS
-from orchestrator.catalogue.run_reading import TABLES, Column
+from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail, RunComparison
 from orchestrator.daemon.access_control import Daemon, Operator, Viewer
 from orchestrator.daemon.run_readout import REPORT
 from orchestrator.daemon.supervisor import Supervisor
@@ -33,34 +33,9 @@ T = TypeVar("T")
 
 router = APIRouter(tags=["previous runs"])
 
-_TYPES: dict[str, Any] = {
-    "text": str | None,
-    "texts": list[str],
-    "integer": int | None,
-    "number": float | None,
-    "time": float | None,
-    "values": dict[str, Any],
-}
-
-
-def _row(name: str, columns: tuple[Column, ...], about: str) -> type[BaseModel]:
-    fields: dict[str, Any] = {}
-    for column in columns:
-        unit = "seconds since 1970" if column.type == "time" else column.unit
-        fields[column.name] = (_TYPES[column.type], Field(description=column.meaning + (f" [{unit}]" if unit else "")))
-    return create_model(name, __doc__=about, **fields)
-
 
 def _several(model: Any) -> Any:
     return list[model]
-
-
-PreviousRunOut = _row("PreviousRun", TABLES["run"], "One run of this machine, made by the daemon or the command line.")
-PreviousPour = _row("PreviousPour", TABLES["pour"], "One pour that has started.")
-_DETAILS: dict[str, Any] = {"notes": (list[Note], ...), "list_of_pours": (_several(PreviousPour), ...)}
-PreviousRunDetail = create_model(
-    "PreviousRunDetail", __base__=PreviousRunOut, __doc__="One run with its notes and its pours.", **_DETAILS
-)
 
 
 def _filters(name: str, **more: Any) -> Callable[..., dict[str, Any]]:
@@ -92,21 +67,6 @@ _FORMATS = (
 RunsAsked = Annotated[dict[str, Any], Depends(_filters("RunsAsked"))]
 PoursAsked = Annotated[dict[str, Any], Depends(_filters("PoursAsked", run=_RUN))]
 ExportAsked = Annotated[dict[str, Any], Depends(_filters("ExportAsked", format=_FORMATS))]
-
-
-class RunComparison(BaseModel):
-    """Runs side by side, with one value for each run."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
-    runs: list[str]
-    """Paths of their folders."""
-
-    settings: dict[str, list[Any]]
-    """Settings in which the runs differ: path in the plan → values."""
-
-    outcomes: list[dict[str, Any]]
-    """Outcome of each run."""
 
 
 class TagsIn(BaseModel):
@@ -158,7 +118,7 @@ async def _in_catalogue(daemon: Supervisor, query: Callable[[Catalogue], T]) -> 
         raise HTTPException(409, str(error)) from None
 
 
-@router.get("/runs", operation_id="runs", response_model=_several(PreviousRunOut))
+@router.get("/runs", operation_id="runs", response_model=_several(PreviousRun))
 async def runs(daemon: Daemon, person: Viewer, asked: RunsAsked) -> Any:
     """List the runs of this machine, newest first.
 

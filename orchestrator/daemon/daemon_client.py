@@ -196,11 +196,14 @@ def _stored_url(state: Path) -> str | None:
 
 def _token(state: Path) -> str:
     path = state / "tokens"
-    found = token_of(path, Role.ADMIN) or token_of(path, Role.VIEWER) if path.exists() else None
+    try:
+        found = token_of(path, Role.ADMIN) or token_of(path, Role.VIEWER) if path.exists() else None
+    except PermissionError:  # the daemon of another user, such as a service
+        found = None
     if found is None:
         raise DaemonError(
-            f"no token: {path} is not there. Say where the daemon keeps its state (--state, $DECANT_STATE), or set "
-            "$DECANT_TOKEN",
+            f"no token: {path} does not exist or belongs to another user. Set $DECANT_TOKEN to a token that the "
+            "daemon's administrator gives you, or name the state directory of your own daemon (--state, $DECANT_STATE)",
             2,
         )
     return found

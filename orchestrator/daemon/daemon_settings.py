@@ -21,7 +21,7 @@ from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
-from orchestrator.daemon.notifications import NotifySection, problem_of
+from orchestrator.daemon.notifications import NotifySettings, problem_of
 from sim_engine.settings.model import Count, FilePath, Name, PositiveCount, Settings, Switch, Text
 from sim_engine.settings.quantity import Quantity
 
@@ -37,7 +37,7 @@ Port = Annotated[int, Field(strict=True, ge=0, le=65535)]
 DAY = 86400.0
 
 
-class TlsSection(Settings):
+class TlsSettings(Settings):
     """A TLS certificate, for addresses that other machines can reach."""
 
     required: ClassVar[dict[str, str]] = {"certificate": "decant.crt", "key": "decant.key"}
@@ -49,7 +49,7 @@ class TlsSection(Settings):
     """Its private key (PEM)."""
 
 
-class ListenSection(Settings):
+class ListenSettings(Settings):
     """Address of the API. By default, only this machine can reach it."""
 
     host: Text = "127.0.0.1"
@@ -58,7 +58,7 @@ class ListenSection(Settings):
     port: Port = PORT
     """TCP port; 0 selects a free one, which is written to the state directory."""
 
-    tls: TlsSection | None = None
+    tls: TlsSettings | None = None
     """TLS certificate; required for addresses other than loopback."""
 
     plain: Switch = False
@@ -68,7 +68,7 @@ class ListenSection(Settings):
     """Largest request: a campaign with all files that it refers to."""
 
 
-class LiveSection(Settings):
+class LiveSettings(Settings):
     """A live view of running campaigns for browsers."""
 
     host: Text = "127.0.0.1"
@@ -78,7 +78,7 @@ class LiveSection(Settings):
     """TCP port of the viewer's page; by default the usual one or the next free one."""
 
 
-class RecordingsSection(Settings):
+class RecordingsSettings(Settings):
     """Retention of recordings (`.rrd`). Journals, figures and summaries are always kept."""
 
     keep: Count | None = None
@@ -94,7 +94,7 @@ class DaemonFile(Settings):
     state: FilePath | None = None
     """State directory: queue, questions, events, tokens and runs."""
 
-    listen: ListenSection = ListenSection()
+    listen: ListenSettings = ListenSettings()
     """Address of the API."""
 
     rigs: dict[Name, FilePath] | None = None
@@ -109,13 +109,13 @@ class DaemonFile(Settings):
     in_process: Switch = False
     """Use one simulator in the daemon's own process, without Ray; for trying Decant out."""
 
-    recordings: RecordingsSection = RecordingsSection()
+    recordings: RecordingsSettings = RecordingsSettings()
     """Retention of recordings."""
 
-    live: LiveSection | None = None
+    live: LiveSettings | None = None
     """Serve a live view; off by default."""
 
-    notify: NotifySection | None = None
+    notify: NotifySettings | None = None
     """Receivers of notifications; none by default."""
 
     keep_free: Annotated[float, Quantity("MB", "500 MB", 40.0, 1e7)] = 500.0
@@ -166,7 +166,7 @@ class DaemonSettings:
     keep_free: int = 500_000_000
     events: int = 50_000
     live: tuple[str, int | None] | None = None
-    notify: NotifySection | None = None
+    notify: NotifySettings | None = None
     quick_start: bool = field(default=True, compare=False)
     """Whether simulators start at once instead of with the first campaign."""
 
@@ -244,7 +244,7 @@ def _check_tls(certificate: Path | None, key: Path | None, at: Place, report: Re
         report.add(at, f"{certificate.name} and {key and key.name} are not a certificate and its key in PEM ({said})")
 
 
-def _check_receivers(section: NotifySection, at: Place, report: Report) -> None:
+def _check_receivers(section: NotifySettings, at: Place, report: Report) -> None:
     for i, receiver in enumerate(section.to or ()):
         if (problem := problem_of(receiver)) is not None:
             report.add(at.at("to", i), problem)

@@ -50,7 +50,7 @@ _EVENTS_WITH_DATA = (
 _log = logging.getLogger(__name__)
 
 
-class NotifySection(Settings):
+class NotifySettings(Settings):
     """Notifications by mail, webhook or chat."""
 
     required: ClassVar[dict[str, str]] = {"to": "['mailtos://user:password@smtp.example.org?to=me@example.org']"}

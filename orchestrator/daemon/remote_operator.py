@@ -156,7 +156,7 @@ class RemoteOperator:
             hands=question.hands,
         )
         if answer == GIVE_UP:
-            raise LaboratoryError(f"given up by the operator at: {question.text.rstrip('.')}")
+            raise LaboratoryError(f"abandoned by the operator at: {question.text.rstrip('.')}")
         return answer
 
     async def announce(self, text: str, seconds: float) -> None:

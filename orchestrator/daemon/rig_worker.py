@@ -464,7 +464,7 @@ class RigWorker:
             try:
                 await running.tidy()
             except Exception as error:  # what is in the journal is safe
-                reason = f"what came of it could not be published: {error}"
+                reason = f"its results could not be published: {error}"
                 _log.exception("campaign %s: not published", key)
         ended = time.time() if state in ENDED else None
         store.change(key, state=state, reason=reason, desired_state=str(desired), ended=ended)

@@ -312,7 +312,7 @@ class Supervisor:
         if item.state in (STOPPED, WITHDRAWN) and item.run is None:
             self.store.change(item.id, state="queued", desired_state=str(DesiredState.RUN), reason="")
         elif self._running(item) is not None or item.state in ("queued", "finished"):
-            raise RequestRefusedError(f"{item.id} is {item.state}; only what rests can be resumed")
+            raise RequestRefusedError(f"{item.id} is {item.state}; it can be resumed when it is paused")
         else:
             state = "queued" if item.run is None else "paused" if item.state == STOPPED else item.state
             self.store.change(item.id, state=state, desired_state=str(DesiredState.RUN), ended=None)

@@ -82,6 +82,8 @@ def upgraded_request(data: Data) -> Data:
     if kind == "PourQuery" and (found := problem.get("mismatch")):
         names = {"play": "offset_priors", "ignorance": "uninformative", "left": "pours_left"}
         query["discrepancy"] = _renamed(found, names | {"looks_ahead": "lookahead"})
+    if kind == "MinimumQuery" and data.get("purpose") == "prior":
+        query["replicates"] = problem["plain"]  # of D3
     if problem["count"] == 0:
         query.pop("pending", None)  # a query without a proposal has no pending points
     return {**{key: value for key, value in data.items() if key != "problem"}, "query": query}

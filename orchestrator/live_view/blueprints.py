@@ -53,7 +53,7 @@ def campaign_blueprint(
     def losses() -> list[Any]:
         named = [(safe_name(scene), name) for scene, name in receivers.items()]
         return [_loss(place, f"{name}: {loss_label}") for place, name in named] + [
-            _trust(place, f"{name}: distrust") for place, name in named
+            _trust(place, f"{name}: model check") for place, name in named
         ]
 
     def maps() -> list[Any]:
@@ -251,7 +251,7 @@ def _picture(entity: str, name: str) -> Any:
 def _lanes() -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.Tabs(rrb.StateTimelineView(origin="/machine/lanes", name="Who works at what"), _machine())
+    return rrb.Tabs(rrb.StateTimelineView(origin="/machine/lanes", name="Activity"), _machine())
 
 
 def _machine() -> Any:
@@ -262,7 +262,7 @@ def _machine() -> Any:
 def _status(under: str = "") -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.TextDocumentView(origin=f"{under}/status", name="What is going on")
+    return rrb.TextDocumentView(origin=f"{under}/status", name="Status")
 
 
 def _outcome(under: str = "") -> Any:

@@ -177,11 +177,11 @@ class LearningStage:
                 self.trust = result.model_check.text
                 if result.model_check.after:
                     share = result.model_check.after[-1].ignorance
-                    label = "probability that the simulator says nothing of this bench"
+                    label = "probability that the simulator does not describe this bench"
                     self._number(place, share, label, style.ESCAPED, marker=8.0)
             elif result.model_check.z_scores:
                 z = result.model_check.z_scores[-1]
-                label = "worse than simulated by so many σ (2 and more: distrust)"
+                label = "standard deviations above the prediction (2 or more: warning)"
                 self._number(place, z, label, style.ESCAPED, marker=8.0)
 
     def flush(self, now: float) -> None:

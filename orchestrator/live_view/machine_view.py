@@ -213,7 +213,7 @@ class StatusView:
         for scene, best in now.best.items():
             lines.append(f"**Best into {_plain(receiver_name(self._plan, scene))}: {best.unit.text(best.loss)}**")
         if trust:
-            lines.append(f"Trust: {_plain(trust)}")
+            lines.append(f"Model check: {_plain(trust)}")
         lines.append(f"{self._pours} pours and {now.simulations} simulations so far")
         return "\n\n".join(lines) + "\n"
 

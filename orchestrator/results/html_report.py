@@ -53,22 +53,22 @@ _FIGURES: dict[str, tuple[str, str]] = {
     "test discrepancy": (
         "Bars: mean difference of simulated and weighed spillage for θ*, for uncalibrated and random θ, and for "
         "regressions, on pours used for calibration and on others.",
-        "What calibration was worth: θ* beside its rivals, on pours that it was made with and on others.",
+        "Gain of calibration: θ* and its rivals, on the pours of the calibration and on others.",
     ),
     "spillage": (
-        "Loss of every pour in the order made, with what was predicted of it and the best so far.",
-        "What every pour came to (dots), what was expected of it (bars: where nine in ten such pours lie), and the "
-        "best so far (line).",
+        "Loss of every pour in the order made, with its prediction and the best so far.",
+        "Loss of every pour (dots), its prediction (bars: nine in ten such pours lie inside), and the best so far "
+        "(line).",
     ),
     "loss map": (
         "Map of the expected loss over the searched actions with the pours as numbered dots and the recommended action "
         "as a star.",
-        "What is expected of actions. Numbers are pours in their order, the star is the recommended action.",
+        "Expected loss by action. Numbers are pours in their order, the star is the recommended action.",
     ),
     "safe window": (
         "Loss along each dimension of the action, with the recommended action, the tolerance and the range inside "
         "which it is kept.",
-        "How far the action may be missed before too much is spilled.",
+        "Tolerance of the recommended action: the ranges in which its loss stays within the limit.",
     ),
 }
 """Alt text and caption of a figure, by the beginning of its name."""

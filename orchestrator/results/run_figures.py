@@ -102,7 +102,7 @@ def _drawings(plan: CampaignPlan, results: Results) -> dict[str, Callable[[], Fi
         return found
     unit = deployment_unit(plan.deployment)
     if series := pour_series(plan, results, unit):
-        title = f"What every pour came to: {plan.name}"
+        title = f"Loss of every pour: {plan.name}"
         found["spillage against pours"] = partial(draw_spillage, series, cost=unit.label, title=title)
     for scene, result in deployments_of(results).items():
         picture, name = deployment_picture(plan, result), receiver_name(plan, scene)

@@ -366,7 +366,7 @@ class RunSummary(Totals):
     """Results of the stages, in order."""
 
 
-class _NoTitles(GenerateJsonSchema):
+class UntitledSchema(GenerateJsonSchema):
     """JSON schema without titles, which only repeat the keys."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:
@@ -378,7 +378,7 @@ def summary_schema() -> dict[str, Any]:
     """JSON schema of `summary.json`, with all kinds of results of the installed packages."""
     tagged: Any = Annotated[reduce(or_, cast("Any", kinds())), Field(discriminator="kind")]
     documented = create_model("RunSummary", __base__=RunSummary, __doc__=RunSummary.__doc__, results=dict[str, tagged])
-    schema = documented.model_json_schema(mode="serialization", schema_generator=_NoTitles)
+    schema = documented.model_json_schema(mode="serialization", schema_generator=UntitledSchema)
     return {**schema, "title": "Result"}
 
 

@@ -295,7 +295,7 @@ def _remark(state: str, pour: RecordedPour) -> str:
     said = {
         "unknown": "UNKNOWN: it had begun, and its outcome is not known",
         "under way": "under way",
-        "asked": "asked for, not begun",
+        "asked": "requested, not started",
         "failed": f"failed: {pour.reason}",
     }.get(state, "")
     answer = f"the operator answered: {pour.answer}" if pour.answer else ""
@@ -461,8 +461,8 @@ def _settings(
         "laboratory": f"{plan.laboratory.name} ({MODES.get(plan.laboratory.mode, plan.laboratory.mode)})",
         "simulations side by side": str(plan.parallel_simulations),
         **_programs(versions),
-        "recording": "none" if recording is None else f"{recording.name}, beside this page",
-        "every number": "summary.json, resolved.json, versions.json and journal.sqlite, beside this page",
+        "recording": "none" if recording is None else f"{recording.name}, next to this page",
+        "every number": "summary.json, resolved.json, versions.json and journal.sqlite, next to this page",
         "figures": "" if figures else "none were drawn; 'decant report' draws them",
         "records": "" if check is None else check.verdict,
     }

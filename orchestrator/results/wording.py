@@ -45,7 +45,7 @@ def trust_line(trust: PredictionCheck | Believed) -> str | None:
     if isinstance(trust, Believed):
         return trust.text or None
     return (
-        "the first pours were far from what was predicted; the simulator may not fit this vessel"
+        "the first pours were far from their predictions; the simulator may not fit this vessel"
         if trust.alarm
         else None
     )
@@ -66,13 +66,13 @@ def window_line(window: WindowFound, unit: LossUnit) -> str:
     checked = f"checked by {window.simulations} simulations"
     tolerance = unit.text(window.tolerance)
     if not window.axes:
-        return f"safe window: none; the action itself comes to more than {tolerance}, {checked}"
+        return f"safe window: none; the loss of the action itself exceeds {tolerance}, {checked}"
     parts = []
     for name, ends in window.axes.items():
         low, high = (end / style.display_factor(name) for end in (ends.low, ends.high))
         more = {(): "", ("low",): " or less", ("high",): " or more"}.get(ends.cut_off, " or farther")
         parts.append(f"{name.replace('_', ' ')} {low:.4g} … {high:.4g} {style.display_unit(name)}{more}")
-    return f"safe window: {', '.join(parts)} at ≤ {tolerance}, one missed at a time, {checked}"
+    return f"safe window: {', '.join(parts)} at ≤ {tolerance}, one dimension varied at a time, {checked}"
 
 
 FEW = 5
@@ -91,15 +91,15 @@ def advice(plan: CampaignPlan, receivers: Mapping[str, ReceiverSummary]) -> tupl
 def _advice(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> Advice:
     window, open_points = "", tuple(_open(row))
     if row.recommended is None:
-        why = row.gave_up or "nothing was learnt that an action could be chosen by"
+        why = row.gave_up or "there is no result from which to choose an action"
         said = (f"No action is recommended: {why}.",)
         return Advice(receiver=row.receiver, action={}, fixed={}, sentences=said, window="", open=open_points)
     if row.window is not None:
         window = _sentence(window_line(row.window, unit))
     else:
         window = (
-            "No safe window was looked for: how far this action may be missed is not known. D1 looks for one "
-            "where the campaign has 'window: {tolerance: …}'."
+            "No safe window was computed: the tolerance of this action to execution errors is unknown. D1 computes "
+            "one if the campaign contains 'window: {tolerance: …}'."
         )
     return Advice(
         receiver=row.receiver,
@@ -130,13 +130,13 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
     if row.confirmed is not None and row.confirmed.loss is not None:
         loss = row.confirmed.loss
         times = "once more" if loss.count == 1 else f"{loss.count} more times"
-        said.append(f"Poured {times} after it was chosen, it came to {unit.text(loss.mean, loss.deviation)}.")
+        said.append(f"Poured {times} after the choice, its measured loss was {unit.text(loss.mean, loss.deviation)}.")
     if row.texts["best measured"]:
-        best = f"The best of {row.pours} weighed pours came to {row.texts['best measured']}"
-        said.append(f"{best}; the least of several is a lucky one, so that it is not what to expect of the next.")
+        best = f"The smallest loss of {row.pours} weighed pours was {row.texts['best measured']}"
+        said.append(f"{best}; the smallest of several is partly luck, so expect more of the next pour.")
     if row.risk is not None:
         said.append(_sentence(risk_line(row.risk, unit)))
-    said += [f"Nothing beats {_compromise(one)}." for one in row.pareto_front or ()]
+    said += [f"Pareto-optimal: {_compromise(one)}." for one in row.pareto_front or ()]
     if row.ended:
         said.append(f"The search ended: {row.ended.rstrip('.')}.")
     if _is_confirmed(row) and (trust := trust_line(row.model_check)) is not None:
@@ -145,17 +145,17 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
 
 
 def _prediction(row: ReceiverSummary) -> str:
-    """'Simulated again with 5 fresh seeds: spilled / poured 1.20 ± 0.40 %, retained …; delivered 193.2 g, 193.6 mL.'"""
+    """'Simulated again with 5 new seeds: spilled / poured 1.20 ± 0.40 %, retained …; delivered 193.2 g, 193.6 mL.'"""
     assert row.prediction is not None
     words = {"spillage": "spilled / poured", "spilled": "spilled", "retained": "retained"}
     shown = {text: row.prediction[name] for name, text in words.items() if name in row.prediction}
     if not shown:
-        return "No simulation of it with fresh seeds could be used."
+        return "No simulation of it with new seeds could be used."
     count = max(spread.count for spread in shown.values())
     shares = ", ".join(f"{text} {spread.percent(2)}" for text, spread in shown.items())
     amount = amount_text(row.predicted_delivered_g, row.predicted_delivered_ml)
     delivered = f"; delivered {amount} in the mean" if amount else ""
-    return f"Simulated again with {count} fresh seeds: {shares} (mean ± standard deviation){delivered}."
+    return f"Simulated again with {count} new seeds: {shares} (mean ± standard deviation){delivered}."
 
 
 def _compromise(one: ParetoAction) -> str:
@@ -174,10 +174,10 @@ def amount_text(grams: float | None, millilitres: float | None) -> str:
 
 def band_line(band: PredictionInterval) -> str:
     """'nine single pours in ten spill 0.8 … 5.7 % of what is poured (simulations ± 0.3, …)'."""
-    causes = {"simulations": band.simulations, "left over by calibration": band.discrepancy}
+    causes = {"simulations": band.simulations, "residual of calibration": band.discrepancy}
     causes["resolution"] = band.resolution
     said = ", ".join(f"{name} ± {100 * value:.2f}" for name, value in causes.items() if value is not None)
-    lacking = "" if band.discrepancy is not None else "; what calibration left over is not known"
+    lacking = "" if band.discrepancy is not None else "; the residual of calibration is unknown"
     return f"nine single pours in ten spill {band.percent(2)} of what is poured ({said}{lacking})"
 
 
@@ -200,7 +200,7 @@ def _is_confirmed(row: ReceiverSummary) -> bool:
 def _open(row: ReceiverSummary) -> list[str]:
     said = []
     if row.at_bounds:
-        said.append(f"Better actions may lie beyond what was searched: {', '.join(row.at_bounds)}.")
+        said.append(f"Better actions may lie outside the searched range: {', '.join(row.at_bounds)}.")
     if not _is_confirmed(row) and (alarm := trust_line(row.model_check)) is not None:
         said.append(_sentence(alarm))
     if row.gave_up and row.recommended is not None:
@@ -215,7 +215,7 @@ def _open(row: ReceiverSummary) -> list[str]:
     if lost := [f"pour {pour.number}: {pour.failed}" for pour in confirming if pour.failed]:
         said.append(f"Confirming pours that failed: {'; '.join(lost)}.")
     if row.risk is None and row.recommended is not None:
-        said.append("Errors of grip, placement and speed entered only as far as they happened in these pours.")
+        said.append("Errors of grip, placement and speed are included only as they occurred in these pours.")
     return said + [f"Not simulated at this action, {one.kind}: {one.text}." for one in row.not_covered]
 
 
@@ -223,16 +223,16 @@ def _poured_again(row: ReceiverSummary) -> list[str]:
     """How well the recommended action is known from pours of it."""
     count = 0 if row.confirmed is None or row.confirmed.loss is None else row.confirmed.loss.count
     if not row.pours and not count:
-        return ["Nothing was poured into this receiver: what is expected of the action is simulated, not weighed."]
+        return ["Nothing was poured into this receiver: the expected loss is simulated, not weighed."]
     if not count:
         return [
-            "The recommended action was not poured again after it was chosen ('confirm' in the campaign does that): "
-            "what is expected of it is a prediction."
+            "The recommended action was not poured again after the choice ('confirm' in the campaign does that): its "
+            "expected loss is a prediction."
         ]
     if count >= FEW:
         return []
     pours = "one pour" if count == 1 else f"{count} pours"
-    return [f"What it comes to is known from {pours} of it; that many say little about how much pours differ."]
+    return [f"Its loss is known from {pours}; this is too few to estimate how much pours differ."]
 
 
 def open_questions(
@@ -248,20 +248,20 @@ def open_questions(
     said = []
     if plan.laboratory.mode == "virtual" and (record.pours or plan.laboratory.pours):
         said.append(
-            "The bench was VIRTUAL: no robot moved and no liquid was weighed. What the hidden liquid of that bench did "
-            "is simulated, too, and a real cup may behave otherwise."
+            "The bench was VIRTUAL: no robot moved and no liquid was weighed. Its hidden liquid "
+            "is simulated, too; a real cup may behave differently."
         )
     said += theta
     if not calibrated and plan.calibration is None:
-        said.append("The simulator was not calibrated in this run: its parameters were taken as the campaign has them.")
+        said.append("The simulator was not calibrated in this run: its parameters are those of the campaign.")
     liquids = {scene.liquid.name for scene in plan.deployment.scenes} if plan.deployment is not None else set()
     if liquids:
         said.append(
-            f"All of this holds for {', '.join(sorted(liquids))}, this load, these vessels and what the campaign "
-            "fixes of the motion. For other ones, plan anew."
+            f"These results hold for {', '.join(sorted(liquids))}, this load, these vessels and the fixed values of "
+            "the motion. For other ones, plan again."
         )
     if dropped_events:
-        said.append(f"The recording lacks {dropped_events} events, because it could not keep up.")
+        said.append(f"The recording lacks {dropped_events} events, because writing was too slow.")
     return said
 
 
@@ -281,10 +281,10 @@ def about_theta(
     if gain is not None and gain.recommended != used:
         said, used = [_sentence(gain.text)], gain.recommended
     if posterior is None:
-        said.append("Which other θ fit the weighed pours as well was not asked: θ* may be one of many.")
+        said.append("Other θ may fit the weighed pours as well as θ*; their region was not computed.")
     elif posterior.open:
         names = ", ".join(name.replace("_", " ") for name in posterior.open)
-        said.append(f"The pours don't determine {names}: nearly all of what was searched fits them as well as θ*.")
+        said.append(f"The pours do not determine {names}: nearly the whole searched range fits them as well as θ*.")
     unseen = [
         f"{DISCREPANCY.text(own)} on {SPLITS[split]}"
         for split, row in discrepancy.items()
@@ -335,7 +335,7 @@ def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
         lines.append(f"{100 * posterior.level:.0f} % of the θ that fit the pours have {', '.join(known)}")
     if unknown:
         lines.append(
-            f"the pours don't determine {', '.join(unknown)}: nearly all of what was searched fits them as well as θ*"
+            f"the pours do not determine {', '.join(unknown)}: nearly the whole searched range fits them as well as θ*"
         )
     return [*lines, *posterior.directions]
 
@@ -352,7 +352,7 @@ def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -
         calibrated: whether θ* was found.
     """
     if plan.deployment is not None and any(name.startswith("deployment") for name in record.stages):
-        said = ["No action is recommended yet: what deployment has learnt is written down when its stage is closed."]
+        said = ["No action is recommended yet: the result of a deployment is written when its stage ends."]
         poured = [pour for pour in record.weighed if not is_calibration(plan, pour.request)]
         losses = {loss_of_pour(plan, p.request, m): p for p in poured if (m := p.measured) is not None}
         known = [loss for loss in losses if loss is not None]
@@ -360,7 +360,7 @@ def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -
             action = losses[min(known)].request.action.values()
             best = style.display_values({name: action[name] for name in plan.deployment.actions.names})
             unit = deployment_unit(plan.deployment)
-            said.append(f"The best of {len(known)} pours so far came to {unit.text(min(known))}, with {best}.")
+            said.append(f"The smallest loss of {len(known)} pours so far is {unit.text(min(known))}, with {best}.")
         return said
     if calibrated:
         return [
@@ -400,7 +400,7 @@ def cost(record: RunRecord, occupancy: Mapping[str, PoolUse], time_scale: float 
     if record.simulations:
         each = f", {record.cpu_s / record.simulations:.1f} s each" if record.cpu_s else ""
         found["simulations"] = f"{record.simulations}, {minutes(record.cpu_s)} of CPU time{each}"
-    pools = {f"pool beside the arm, {stage.rpartition(':')[2]}": use.text for stage, use in occupancy.items()}
+    pools = {f"pool during pours, {stage.rpartition(':')[2]}": use.text for stage, use in occupancy.items()}
     return found | {name: text for name, text in pools.items() if text}
 
 
@@ -425,21 +425,21 @@ def standing(record: RunRecord, run: str) -> list[str]:
     unknown = [f"pour {pour.request.number} of {pour.stage}" for pour in record.unknown_pours]
     if unknown:
         said.append(
-            f"{' and '.join(unknown).capitalize()} had begun, and its outcome is not known. It is not repeated by "
-            "software. Weigh what was spilled and what is left in the pourer, and answer on resuming."
+            f"{' and '.join(unknown).capitalize()} had begun, and its outcome is not known. The software does "
+            "not repeat it. Weigh the spilled liquid and the liquid in the pourer, and give the answer on resuming."
         )
     said += [f"A question is open: {q.text}" for q in record.questions if q.answer is None]
     match state:
         case State.FAILED:
-            said.append(f"What is done is kept. Mend what is named above, then go on by {again}.")
+            said.append(f"Finished work is kept. Fix the problem above, then continue with {again}.")
         case State.PAUSED | State.UNKNOWN:
-            said.append(f"What is done is kept. Go on by {again}.")
+            said.append(f"Finished work is kept. Continue with {again}.")
         case State.QUEUED:
             said.append("Nothing was started yet.")
         case _:
             said.append(
-                "When this page was made, a process had the run, or had died with it: the page shows "
-                f"what the journal held at that moment. If it no longer runs, go on by {again}."
+                "When this page was made, the run was in progress or its process had died; the page shows the "
+                f"journal at that moment. If it no longer runs, continue with {again}."
             )
     return said
 
@@ -600,7 +600,7 @@ def score_table(summary: RunSummary) -> ResultTable:
         for split, row in summary.discrepancy.items()
         if any(value is not None for value in row.values())
     ]
-    caption = "Mean |measured − predicted| spillage [% of what was poured]: less is better"
+    caption = "Mean |measured − predicted| spillage [% of the poured liquid]; smaller is better"
     return ResultTable(caption, ["pours", *columns.values()], rows, frozenset(range(1, len(columns) + 1))).filled()
 
 
@@ -642,8 +642,8 @@ def _pour_table(stage: str, pours: Sequence[PourSummary]) -> ResultTable:
         look = "best" if pour.best else "bad" if pour.state in ("failed", "unknown") else ""
         rows.append(ResultRow(cells, look))
     header = ["pour", *(style.label(name) for name in searched), "loaded [g]", "spilled [g]", "retained [g]"]
-    header += ["spilled / poured [%]", "expected", "came to", "remark"]
-    what = "" if pours[0].calibration else f"; expected and came to: {pours[0].loss}"
+    header += ["spilled / poured [%]", "expected", "measured", "remark"]
+    what = "" if pours[0].calibration else f"; expected and measured: {pours[0].loss}"
     what += "; the best is bold" if any(pour.best for pour in pours) else ""
     caption = f"{stage}: {len(pours)} pours into {pours[0].receiver}{what}"
     return ResultTable(caption, header, rows, frozenset(range(len(header) - 1))).filled()

@@ -326,7 +326,7 @@ class RequestExecutor:
                 raise PourNotMadeError(str(error), "; see to it, then resume the run") from error
             except UnknownPourError as error:
                 _raise_if_cancelled()
-                raise PourUnknownError(str(error), "; resuming asks what came of it") from error
+                raise PourUnknownError(str(error), "; resuming asks for its outcome") from error
             except BenchLostError as error:
                 # No outcome: the operator must inspect the bench, and there is nothing left to pour with.
                 _raise_if_cancelled()
@@ -340,7 +340,7 @@ class RequestExecutor:
                 raise PourUnknownError(
                     f"the pour had begun and was not weighed within {_duration(self.deadlines.pour)}; the bench was "
                     "told to stop, and what was poured is unknown",
-                    "; see to the bench. Resuming asks what came of it",
+                    "; see to the bench. Resuming asks for its outcome",
                 ) from None
         return Poured(measurement)
 

@@ -245,7 +245,7 @@ async def settle_unknown_pours(
             journal.append(Kind.NOTE, {"text": text}, stage=stage)
             continue
         options = (*((REPEAT,) if virtual else ()), LOST, WEIGHED)
-        question = f"{what} had begun when the run was interrupted; what came of it?"
+        question = f"{what} had begun when the run was interrupted; what was its outcome?"
         answer, outcome = await _ask(ask, question, options, scene.liquid.mass, on_waiting)
         drafts = [
             Draft(Kind.OPERATOR_ASKED, {"id": key, "question": question, "options": list(options)}, stage),
@@ -347,7 +347,7 @@ def weighed_by_hand(pour: Pour, measured: PourMeasurement) -> str:
     loaded, spilled, retained = (f"{1e3 * mass:.1f}" for mass in (measured.loaded, measured.spilled, measured.retained))
     return (
         f"Pour {pour.number} was made and weighed, and is not written down: {loaded} g loaded, {spilled} g spilled, "
-        f"{retained} g retained. Resuming asks what came of it; answer: weighed {spilled} {retained} {loaded}"
+        f"{retained} g retained. Resuming asks for its outcome; answer: weighed {spilled} {retained} {loaded}"
     )
 
 

@@ -334,7 +334,7 @@ class _Run:
 
     def _come_to_rest(self, state: State, reason: str) -> None:
         if self._unknown_pours:
-            state, reason = State.UNKNOWN, f"{reason}, while a pour was under way: nobody knows what came of it"
+            state, reason = State.UNKNOWN, f"{reason}, while a pour was under way: its outcome is unknown"
         try:
             self._enter(state, reason)
         except JournalError as problem:  # the next process finds the run interrupted

@@ -89,7 +89,7 @@ class OnePour:
         self._liquid = scene.liquid
         self._asked = False
         self._outcome: PourMeasurement | Failed | None = None
-        self.decisions = [Decision(f"one pour, as it was asked for: {action.display()}")]
+        self.decisions = [Decision(f"one pour, as requested: {action.display()}")]
 
     @property
     def finished(self) -> bool:
@@ -225,7 +225,7 @@ class RepeatedSimulation:
             among = f" and {len(set(thetas))} θ of the posterior" if thetas else ""
             among += f" under {len(errors)} draws of the pose error" if any(errors) else ""
             among += ", each with shapes that the vessels may have" if drawn else ""
-            self.decisions.append(Decision(f"simulate the planned action with {count} fresh seeds{among}"))
+            self.decisions.append(Decision(f"simulate the planned action with {count} new seeds{among}"))
         self._thetas = len(set(thetas))
         self._touching = 0
 
@@ -354,7 +354,7 @@ class Confirmation:
         self._pours: list[ConfirmingPour] = []
         self.decisions: list[Decision] = []
         if recommended is None:
-            self.decisions.append(Decision("nothing was recommended, so that there is nothing to confirm"))
+            self.decisions.append(Decision("no action is recommended, so there is nothing to confirm"))
 
     @property
     def finished(self) -> bool:
@@ -371,7 +371,7 @@ class Confirmation:
         )
         action, number = self._costing.scene.action(dict(recommended.action_si)), len(self._pours) + 1
         self._pouring = Pour(self._costing.scene.name, action, number, self._seeds.next(), predicted, CONFIRM)
-        self.decisions.append(Decision(f"confirm {number}/{self._count} what is recommended"))
+        self.decisions.append(Decision(f"confirm the recommended action, pour {number}/{self._count}"))
         return [self._pouring]
 
     def tell(self, request: Request, outcome: Outcome) -> None:

@@ -220,7 +220,7 @@ CASES: tuple[Case, ...] = (
         "outflow",
         "Outflow of the standard pour",
         "200 mL, 30 °/s to 120° about the inner lip. Reference: the limit of fine particles, to which SPlisHSPlasH "
-        "(DFSPH) and Decant with two corrections of the lip extrapolate within .003.",
+        "(DFSPH) and Decant with two corrections of the lip extrapolate within 0.003.",
         _outflow,
     ),
     Case(
@@ -260,8 +260,8 @@ CASES: tuple[Case, ...] = (
         "dam-break",
         "Dam break",
         "A column of width a and height 2a collapses in a channel ten spacings wide. Reference: Martin & Moyce 1952, "
-        "n² = 2. Their gate took a time to go that nobody measured: fronts are compared after the delay that fits "
-        "best. The floor rubs a little (friction 0.05) in place of the boundary layer that slows the small tank.",
+        "n² = 2. Their gate opened in an unknown time: fronts are compared after the delay that fits "
+        "best. Friction of the floor (0.05) replaces the boundary layer that slows the small tank.",
         _dam_break,
     ),
     Case(

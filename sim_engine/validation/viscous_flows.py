@@ -217,7 +217,7 @@ def left_on_a_wall(
     thin = math.sqrt(viscosity * height / (GRAVITY * float(times[-1])))
     return [
         within(
-            f"largest distance of what is left on the wall, a film of {layers} spacings, ν = {_mm2(viscosity)}",
+            f"largest distance of the rest on the wall, a film of {layers} spacings, ν = {_mm2(viscosity)}",
             max(far),
             0.0,
             0.05,
@@ -300,8 +300,8 @@ TUBE = (
 DRAINAGE = "A film of 8 mm, ν = 1,000 mm²/s, drains from a vertical wall of 100 mm: e = √(νz/gt) (Jeffreys 1930)."
 PUDDLE = "250 mL are let go on a plane: the radius is 0.894 (gV³t/3ν)^⅛ once they are flat (Huppert 1982)."
 CUP = (
-    "The standard pour with .1 and 1 Pa s, at 1,000 kg/m³. Reference: SPlisHSPlasH 2.19 with the implicit viscosity of "
-    "Weiler et al. 2018, in the liquid and on walls."
+    "The standard pour with 0.1 and 1 Pa s, at 1,000 kg/m³. Reference: SPlisHSPlasH 2.19 with the implicit viscosity "
+    "of Weiler et al. 2018, in the liquid and on walls."
 )
 
 SIDE, VOLUME = 0.07, 200e-6
@@ -450,7 +450,7 @@ def cup(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure
             if nu in PEER:
                 far = float(np.max(np.abs(left - np.array(PEER[nu]))))
                 found.append(
-                    within(f"largest distance of what is left from SPlisHSPlasH's, {name}", far, 0.0, FAR,
+                    within(f"largest difference of the rest from SPlisHSPlasH's, {name}", far, 0.0, FAR,
                            criterion=f"within {FAR:g}", particles=particles)
                 )  # fmt: skip
             found.append(reported(f"left at 3.1 s, {name}", float(left[TIMES.index(3.1)]), particles=particles))

@@ -124,25 +124,17 @@ def test_a_pour_where_hypotheses_differ_promises_more_than_one_where_all_is_lost
     assert plateau == pytest.approx(now, rel=0.05)
 
 
-def test_with_pours_to_follow_the_first_one_goes_where_it_tells_more():
+def test_the_first_pour_goes_where_least_is_lost_however_many_follow():
     question = asked(shelf, [], acquisition="least_loss")
-    last, first = propose(replace(question, discrepancy=replace(question.discrepancy, pours_left=0))), propose(question)
-    assert first.means[0] > last.means[0]
-    model, everywhere = averaged(question), np.random.default_rng(0).random((200, 2))
-    after_first, after_last = predicted_minimum(model, np.array([first.points[0], last.points[0]]), everywhere)
-    assert after_first < after_last
-
-
-def test_a_pour_that_is_not_to_look_ahead_goes_where_least_is_lost():
-    question = asked(shelf, [], acquisition="least_loss")
-    ahead, here = (
-        propose(replace(question, discrepancy=replace(question.discrepancy, lookahead=looks)))
-        for looks in (True, False)
-    )
-    assert here.means[0] < ahead.means[0]
     everywhere = tuple((x, y) for x in np.linspace(0, 1, 21) for y in np.linspace(0, 1, 21))
     grid = replace(question, count=0, predict_at=everywhere)
-    assert here.means[0] < min(propose(grid).predictions) + 0.001
+    assert propose(question).means[0] < min(propose(grid).predictions) + 0.001
+
+
+def test_before_any_pour_the_simulator_is_expected_to_be_nearly_right():
+    first = propose(asked(cup, [], acquisition="least_loss"))
+    assert cup(first.points[0])[0] < 0.01
+    assert first.means[0] < 0.22
 
 
 @pytest.mark.parametrize("middle", [0.004, 0.4, 0.99])
@@ -207,15 +199,35 @@ def test_what_was_learnt_with_one_receiver_makes_the_first_prediction_for_the_ne
     assert error(propose(told)) < 0.9 * error(propose(fresh))
 
 
-def test_the_order_of_what_is_known_changes_no_bit():
+def test_the_order_of_the_simulations_changes_no_bit():
     question = asked(displaced, POURED, acquisition="least_loss", count=3)
-    turned = replace(
-        question,
-        data=Data(question.data.points[::-1], question.data.costs[::-1]),
-        simulated=Data(question.simulated.points[::-1], question.simulated.costs[::-1]),
-    )
+    turned = replace(question, simulated=Data(question.simulated.points[::-1], question.simulated.costs[::-1]))
     first, second = propose(question), propose(turned)
     assert replace(first, seconds=0.0) == replace(second, seconds=0.0)
+
+
+GOOD = (0.35, 0.6)
+
+
+def on_a_changed_bench(costs):
+    """The same good action again and again."""
+    return asked(cup, [], acquisition="least_loss", data=Data((GOOD,) * len(costs), tuple(costs)))
+
+
+def test_two_pours_outside_their_intervals_are_taken_for_a_change_of_the_bench():
+    before = (0.0, 0.004, 0.0, 0.002, 0.0, 0.003)
+    assert propose(on_a_changed_bench(before)).discrepancy.since_change is None
+    assert propose(on_a_changed_bench((*before, 0.9))).discrepancy.since_change is None  # it may be a mishap
+    changed = propose(on_a_changed_bench((*before, 0.9, 0.92)))
+    assert changed.discrepancy.since_change == 2
+    assert np.linalg.norm(np.array(changed.points[0]) - GOOD) > 0.08
+    back = propose(on_a_changed_bench((0.9, 0.92, *before)))
+    assert np.linalg.norm(np.array(back.points[0]) - GOOD) < 0.08
+
+
+def test_a_second_change_is_noticed_like_the_first():
+    costs = (0.0, 0.004, 0.0, 0.002, 0.9, 0.92, 0.91, 0.9, 0.0, 0.003, 0.002)
+    assert propose(on_a_changed_bench(costs)).discrepancy.since_change == 3
 
 
 def test_question_and_answer_survive_the_journal():

@@ -160,7 +160,7 @@ def assert_a_person_is_asked(place: Workplace) -> None:
         _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 3
     assert "pour 2 of stage pours" in errors
-    assert "what came of it?" in errors
+    assert "what was its outcome?" in errors
     assert "for example --answer lost" in errors
     assert all(entry.kind == Kind.CAMPAIGN_STATE for entry in place.entries()[before:])
 
@@ -183,7 +183,9 @@ def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(workplace: Wo
     workplace.assert_nothing_is_left()
 
     advice = errors.strip().splitlines()[-1]
-    assert advice.startswith("decant: interrupted; nothing is lost. Go on with: decant run small.yaml --resume --run ")
+    assert advice.startswith(
+        "decant: interrupted; nothing is lost. Continue with: decant run small.yaml --resume --run "
+    )
     command = advice.rpartition("Go on with: decant ")[2].split()
     result = workplace.finish(*command)
     assert_same_run(workplace, undisturbed)

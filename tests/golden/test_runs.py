@@ -251,6 +251,14 @@ def test_old_run_with_a_model_that_is_retired_is_listed_and_reported_but_not_res
     assert re.search(r"pooled\.yaml:\d+:\d+: deployment\.trust: was retired; remove it", refused)
 
 
+def _numbers(result: StageResult) -> str:
+    """A result without the words about the simulator, which a later version may choose differently."""
+    data = result.model_dump(mode="json")
+    if isinstance(check := data.get("model_check"), dict):
+        check.pop("text", None)
+    return _sorted(data)
+
+
 @pytest.mark.parametrize("name", RUNS)
 def test_old_run_is_replayed(name: str, runs: Path) -> None:
     """Strategies that are told what the journal has ask again for what it has."""
@@ -275,8 +283,8 @@ def test_old_run_is_replayed(name: str, runs: Path) -> None:
                     assert agree(before, now), f"stage {stage.name}, request {key}:\n- {before}\n+ {now}"
                     open_[key], asked = request, asked + 1
             if history.result is not None:
-                before = _sorted(history.result.model_dump(mode="json"))
-                assert agree(before, _sorted(strategy.result().model_dump(mode="json")))
+                before, now = (_numbers(one) for one in (history.result, strategy.result()))
+                assert agree(before, now)
                 results[stage.name] = history.result
     assert asked > 0
 

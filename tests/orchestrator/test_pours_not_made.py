@@ -48,7 +48,7 @@ def test_a_pour_that_did_not_begin_stops_the_run_and_is_made_on_resume_without_a
 
 def test_a_pour_that_broke_off_is_nobody_s_guess(tmp_path):
     laboratory, script = failing_once(UNKNOWN), Script(pour(1), pour(2))
-    with pytest.raises(PourUnknownError, match=r"pourer_full 512.1 g; resuming asks what came of it") as error:
+    with pytest.raises(PourUnknownError, match=r"pourer_full 512.1 g; resuming asks for its outcome") as error:
         run(tmp_path, laboratory, stages=one_stage(script))
     assert error.value.exit_code == 3
     assert states(tmp_path)[-1] == "unknown"

@@ -146,13 +146,13 @@ def test_a_plan_ends_with_fresh_simulations_of_what_it_recommends(tmp_path: Path
     assert summary.receivers["cup"].prediction == found
     text = " ".join(shown(summary_table(summary)).split())
     mean, deviation = (100 * getattr(found["spillage"], name) for name in ("mean", "deviation"))
-    assert f"Simulated again with 3 fresh seeds: spilled / poured {mean:.2f} ± {deviation:.2f} %" in text
+    assert f"Simulated again with 3 new seeds: spilled / poured {mean:.2f} ± {deviation:.2f} %" in text
     assert "(mean ± standard deviation)" in text
     band = summary.receivers["cup"].prediction_interval
     assert band is not None
     assert band.low < found["spillage"].mean < band.high
     assert f"Nine single pours in ten spill {band.percent(2)} of what is poured" in text
-    assert "what calibration left over is not known" in text
+    assert "the residual of calibration is unknown" in text
 
 
 def test_what_calibration_left_over_widens_the_band_of_a_planned_pour() -> None:
@@ -185,7 +185,7 @@ def test_a_planned_action_at_the_edge_of_the_box_is_said_to_be(tmp_path: Path) -
         changed_result = deployed.model_copy(update={"recommended": recommended})
         summary = summarise(plan, {"deployment:cup": changed_result})
         text = " ".join(shown(summary_table(summary)).split())
-        assert text.count("Better actions may lie beyond what was searched: ") == said
+        assert text.count("Better actions may lie outside the searched range: ") == said
         assert len(summary.receivers["cup"].at_bounds) == said
 
 

@@ -146,7 +146,7 @@ def test_what_never_answers_is_given_up_at_its_deadline(tmp_path: Path) -> None:
     laboratory = ToyLaboratory(ToySimulators(lambda: 60.0), ToyBench(lambda: 60.0))
     strategy = Script(simulate(1), pour())
     deadlines = Deadlines(simulate=0.05, pour=0.1)
-    with pytest.raises(PourUnknownError, match=r"not weighed within 0.1 s.*unknown.*Resuming asks what came of it"):
+    with pytest.raises(PourUnknownError, match=r"not weighed within 0.1 s.*unknown.*Resuming asks for its outcome"):
         run(tmp_path / "run", laboratory, stages=one_stage(strategy), deadlines=deadlines)
     # A simulation that never ends says nothing; a pour that had begun may have poured anything: that is not an outcome.
     assert [outcome for _, outcome in strategy.told] == [Failed("simulation", "no result within 0.05 s")]

@@ -60,4 +60,6 @@ def test_the_table_says_what_was_foretold_of_each_line(tmp_path: Path) -> None:
 
 
 def test_measured_is_drawn_over_predicted(tmp_path: Path) -> None:
-    assert is_picture(save(draw_scored(ROWS, title="beaker into cup", note="bands of seeds"), tmp_path / "scored.png"))
+    assert is_picture(
+        save(draw_scored(ROWS, title="beaker into cup", note="intervals from seeds"), tmp_path / "scored.png")
+    )

@@ -47,7 +47,7 @@ def test_an_unknown_pour_is_put_to_the_operator(unknown: Callable[[], Path]) -> 
     events: list[Event] = []
     run(directory, resume=True, plan=asking(directory), ask_operator=operator, subscribers=[events.append])
     assert "pour 1 of stage first (angular_velocity" in questions[0][0]
-    assert "what came of it?" in questions[0][0]
+    assert "what was its outcome?" in questions[0][0]
     assert questions[0][1] == (REPEAT, LOST, WEIGHED)
     assert "'no idea' is not an answer" in questions[1][0]
     first = next(e.outcome for e in events if isinstance(e, RequestFinished) and hasattr(e.request, "number"))

@@ -20,7 +20,7 @@ class LineSettings:
     """Settings of a serial line.
 
     Attributes:
-        baud: bits per second.
+        baud: bits per second; 0 for a connection over TCP, which has no settings.
         bits: per character, 7 or 8.
         parity: 'N', 'O' or 'E'.
         stop: stop bits.
@@ -37,12 +37,12 @@ class LineSettings:
         return f"{self.bits}{self.parity}{self.stop}"
 
     def __str__(self) -> str:
-        return f"{self.baud} baud {self.format}"
+        return f"{self.baud} baud {self.format}" if self.baud else "TCP"
 
     @property
     def character_time(self) -> float:
         """Transmission time of one character [s]."""
-        return (1 + self.bits + (self.parity != "N") + self.stop) / self.baud
+        return (1 + self.bits + (self.parity != "N") + self.stop) / self.baud if self.baud else 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ class Dialect(ABC):
         tare: tares the balance.
         zero: sets the empty balance's zero; None if only a key does.
         cancel: ends repeated output and waiting commands; None if there is no such command.
-        acknowledged: whether the balance replies to tare and zero with a line.
+        acknowledged: whether the balance replies to tare and zero with a line; None: only with a setting of its menu.
         turn: order of the query during detection. A query without meaning to other balances comes first, one that they
             may take for a command comes last.
         identity: queries that return the balance's identification, without line ends.
@@ -73,7 +73,7 @@ class Dialect(ABC):
     gap: float = 0.1
     zero: bytes | None = None
     cancel: bytes | None = None
-    acknowledged: bool = False
+    acknowledged: bool | None = False
     turn: int = 5
     identity: tuple[str, ...] = ()
 
@@ -104,6 +104,14 @@ class Dialect(ABC):
             said: its replies to the queries of `identity`, '' for none.
         """
         return 0
+
+    def commands_in(self, said: Mapping[str, str]) -> frozenset[str]:
+        """The commands that the balance lists, without line ends; empty if it lists none.
+
+        Args:
+            said: as in `likeness`.
+        """
+        return frozenset()
 
     def encoders(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
         """Protocol encoders for emulated balances: one under the dialect's name, and one per further mode of such

@@ -6,7 +6,8 @@ command pending. Sources: Mettler-Toledo AL/AB operating instructions (commands,
 `handshake`).
 
 An emulated balance answers all commands of levels 0 and 1 as listed in the reference manual for weigh modules
-(11781363), and `M21` of level 2, which selects the unit. Two replies are assumed, not verified on a balance: `M21`
+(11781363), and `M21` of level 2, which selects the unit. In the mode `mt-sics-weigh-module` it claims level 1 and lacks
+six commands of it, as a WXS205SDU does. Two replies are assumed, not verified on a balance: `M21`
 without parameters lists host and display unit in two lines, and `ZC` answers like `ZI`.
 """
 
@@ -41,11 +42,15 @@ class MtSics(status_lines.StatusLines):
 
     def likeness(self, said: Mapping[str, str]) -> int:
         """See `Dialect.likeness`."""
-        return 2 if status_lines.levels_of_sics(said) else 0
+        return 2 if self.commands_in(said) else 0
 
     def encoders(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
         """See `Dialect.encoders`."""
-        return {self.name: lambda: MtSicsVoice(self, '"01" "2.30" "2.22"', "VIRTUAL")}
+        identity = ('"01" "2.30" "2.22"', "VIRTUAL")
+        return {
+            self.name: lambda: MtSicsVoice(self, *identity),
+            f"{self.name}-weigh-module": lambda: MtSicsVoice(self, *identity, lacks=_LACKING),
+        }
 
 
 HOST, DISPLAY = 0, 1
@@ -53,6 +58,9 @@ HOST, DISPLAY = 0, 1
 
 UNITS = {"0": "g", "1": "kg", "3": "mg", "5": "ct"}
 """Numbers of the units. Pounds and ounces are refused because their conversion is not a power of ten."""
+
+_LACKING = frozenset(("C", "D", "DW", "SC", "TC", "ZC"))
+"""Commands of level 1 that a weigh module WXS205SDU lacks, although its I1 claims this level."""
 
 LONGEST_WAIT = 65_535
 """Longest wait that SC, TC and ZC accept [ms]."""
@@ -69,8 +77,9 @@ class MtSicsVoice(status_lines.StatusLineEncoder):
         "M21": 2,
     }
 
-    def __init__(self, dialect: Lines, levels: str, model: str) -> None:
+    def __init__(self, dialect: Lines, levels: str, model: str, lacks: frozenset[str] = frozenset()) -> None:
         super().__init__(dialect, levels, model)
+        self.known = {name: level for name, level in self.LEVELS.items() if name not in lacks}
         self._model = model
         self._units: dict[int, str] = {}
 

@@ -1,13 +1,15 @@
 """The balance's side of a dialect, for emulated balances: received bytes to replies. No clock, no ports.
 
-`ProtocolEncoder` is the interface and `PlainEncoder` its simplest implementation. A reply is either bytes or one of
+`ProtocolEncoder` is the interface, `PlainEncoder` its simplest implementation, and `CommandEncoder` a table of commands
+that end with a line end. A reply is either bytes or one of
 `PendingReply`, `Repeat`, `Follow` and `Cancel`, which the emulator carries out.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from typing import Protocol
@@ -28,11 +30,13 @@ class PendingReply:
         expired: line if the display does not become stable in time, or a function that executes the command in any case
             and returns the line; None: wait without limit.
         patience: longest wait [s of bench time]; None: the balance's limit for every command.
+        first: line that confirms the command before it is executed; empty for none.
     """
 
     done: Callable[[], bytes]
     expired: bytes | Callable[[], bytes] | None = None
     patience: float | None = None
+    first: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -41,9 +45,11 @@ class Repeat:
 
     Attributes:
         line: returns the line for a reading; None: the dialect's line.
+        interval: between two readings [s of bench time].
     """
 
     line: Callable[[Reading], bytes] | None = None
+    interval: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -168,6 +174,39 @@ class PlainEncoder:
             return weight_line(self.dialect, display.reading())
         act = display.tare if command == self._tare else display.zero
         return PendingReply(lambda: silently(act))
+
+
+class CommandEncoder:
+    """A balance whose commands are lines.
+
+    Args:
+        dialect: encodes its lines.
+        answers: command → function of the display that returns the reply.
+        unknown: reply to any other command.
+    """
+
+    def __init__(
+        self, dialect: Lines, answers: Mapping[str, Callable[[EncoderDisplay], Said]], unknown: bytes = b""
+    ) -> None:
+        self.dialect = dialect
+        self._answers, self._unknown = answers, unknown
+
+    def commands(self, heard: bytearray) -> list[bytes]:
+        """See `ProtocolEncoder.commands`."""
+        return complete_lines(heard)
+
+    def answer(self, command: bytes, display: EncoderDisplay) -> Said:
+        """See `ProtocolEncoder.answer`."""
+        word = command.decode("ascii", "replace").strip()
+        answer = self._answers.get(word)
+        return answer(display) if answer is not None else self._unknown if word else b""
+
+
+def complete_lines(heard: bytearray) -> list[bytes]:
+    """Remove complete lines from the receive buffer and return them, without their ends."""
+    *whole, rest = re.split(rb"\r\n|\n", bytes(heard))
+    heard[:] = rest
+    return whole
 
 
 def silently(act: Callable[[], ReadingStatus]) -> bytes:

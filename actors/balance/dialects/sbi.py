@@ -10,7 +10,7 @@ The unit is blank while the weight is unstable. Instead of a value, a line may c
 (legal-for-trade) range may be in brackets. A line of another width has lost characters and is invalid.
 
 Sources: Sartorius Quintix manual p. 87, Entris II interface description p. 3 and 4, LE2202S p. 51, CP operating
-instructions p. 55 (1200 baud 7O1 and printing 'at stability' as factory setting of that series).
+instructions p. 55 (1200 baud 7O1 and printing 'at stability' as factory setting of that series; Entris II: 9600 8O1).
 
 Limitations: commands are not acknowledged. Set 'print: manual, without stability' and no automatic printing in the
 menu: with 'at stability', the query is answered only once the weight is stable; with automatic printing, `ESC P`
@@ -67,8 +67,9 @@ class Sbi(Dialect):
     lines: tuple[LineSettings, ...] = (
         LineSettings(9600),
         LineSettings(1200, bits=7, parity="O"),
-        LineSettings(19200),
+        LineSettings(9600, parity="O"),
         LineSettings(9600, bits=7, parity="O"),
+        LineSettings(19200),
         LineSettings(1200),
     )
     query: bytes = b"\x1bP\r\n"

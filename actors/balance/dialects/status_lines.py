@@ -24,6 +24,7 @@ from actors.balance.dialects.protocol_encoder import (
     PendingReply,
     Repeat,
     Said,
+    complete_lines,
     line_of,
     weight_line,
 )
@@ -120,8 +121,9 @@ def encode(reading: Reading) -> bytes:
     raise ValueError(f"no line says '{reading.status}'")
 
 
-IDENTITY = ("I1", "I2")
-"""Queries for the command levels and for the model."""
+IDENTITY = ("I0", "I2")
+"""Queries for the list of commands and for the model. I1, the command levels, is not a reliable source: a weigh module
+(WXS205SDU) claims level 1, but lacks six of its commands."""
 
 _SIGNS = {ReadingStatus.OVER: "+", ReadingStatus.UNDER: "-"}
 
@@ -134,7 +136,7 @@ class StatusLines(Dialect):
     tare: bytes = b"T\r\n"
     zero: bytes | None = b"Z\r\n"
     cancel: bytes | None = b"@\r\n"
-    acknowledged: bool = True
+    acknowledged: bool | None = True
     turn: int = 2
     identity: tuple[str, ...] = IDENTITY
 
@@ -145,6 +147,10 @@ class StatusLines(Dialect):
     def encode(self, reading: Reading) -> bytes:
         """See `Dialect.encode`."""
         return encode(reading)
+
+    def commands_in(self, said: Mapping[str, str]) -> frozenset[str]:
+        """See `Dialect.commands_in`."""
+        return frozenset(re.findall(r'[0-9]+ "([^"]+)"', said.get("I0", "")))
 
 
 class StatusLineEncoder:
@@ -164,6 +170,8 @@ class StatusLineEncoder:
 
     def __init__(self, dialect: Lines, levels: str, model: str) -> None:
         self.dialect = dialect
+        self.known = self.LEVELS
+        """Known commands, each with its level."""
         self._identity = {
             "I1": levels,
             "I2": f'"{model}"',
@@ -174,16 +182,14 @@ class StatusLineEncoder:
 
     def commands(self, heard: bytearray) -> list[bytes]:
         """See `ProtocolEncoder.commands`."""
-        *whole, rest = re.split(rb"\r\n|\n", bytes(heard))
-        heard[:] = rest
-        return whole
+        return complete_lines(heard)
 
     def answer(self, command: bytes, display: EncoderDisplay) -> Said:
         """See `ProtocolEncoder.answer`."""
         word, _, parameters = command.decode("ascii", "replace").partition(" ")
         if not word and not parameters:
             return b""
-        if word not in self.LEVELS:
+        if word not in self.known:
             return line_of("ES")
         if parameters:
             return self.answer_with(word, parameters.strip(), display)
@@ -269,21 +275,11 @@ class StatusLineEncoder:
         return line_of(f"{word} {letter} {self.tared(display)}")
 
     def _list(self) -> bytes:
-        listed = sorted(self.LEVELS.items(), key=lambda entry: entry[1])
+        listed = sorted(self.known.items(), key=lambda entry: entry[1])
         states = ["B"] * (len(listed) - 1) + ["A"]
         return b"".join(
             line_of(f'I0 {state} {level} "{name}"') for state, (name, level) in zip(states, listed, strict=True)
         )
-
-
-def levels_of_sics(said: Mapping[str, str]) -> bool:
-    """Whether the reply to I1 has the form of MT-SICS: its levels, and one version of two numbers for each.
-
-    KCP took its queries and replies from MT-SICS; for this driver only the query interval differs. MT-SICS reports its
-    levels and versions as "0123" "2.30" "2.22" …; KCP's versions have three numbers (1.1.2). The print format of KCP is
-    not documented.
-    """
-    return re.fullmatch(r'"[0-9]{1,4}"( "[0-9]+\.[0-9]+[A-Z]?")+', said.get("I1", "")) is not None
 
 
 def is_kern(said: Mapping[str, str]) -> bool:

@@ -1,1 +1,1 @@
-"""Emulated balances behind a pseudo-terminal."""
+"""Emulated balances behind a pseudo-terminal or a TCP port."""

@@ -2,7 +2,7 @@
 
 `VirtualSerialBalance` starts an emulated balance and controls it; `RecordedBalance` replays a recording.
 `SerialBalanceEmulator` is the balance of a virtual bench. The emulation itself is in `emulated_balance`, the process in
-`pty_server`.
+`line_server`.
 """
 
 from __future__ import annotations
@@ -30,26 +30,27 @@ GRACE = 10.0
 
 
 class FarProcess:
-    """A child process that serves a pseudo-terminal.
+    """A child process that serves a pseudo-terminal, or a TCP connection as a serial server does.
 
     Args:
-        settings: for `pty_server.make_character`.
+        settings: for `line_server.make_character`.
         baud: speed of the line; 0: any speed, and characters take no time.
+        tcp: serve a TCP connection.
 
     Raises:
         LaboratoryError: the process did not start.
     """
 
-    def __init__(self, settings: dict[str, Any], baud: int) -> None:
+    def __init__(self, settings: dict[str, Any], baud: int, tcp: bool = False) -> None:
         # With a Ray cluster of its own, in that cluster's folder, which is removed even after the program was killed.
         folder = Path(tempfile.mkdtemp(prefix="decant-balance-", dir=os.environ.get(MARK)))
-        self.port = str(folder / "balance")
-        """Path of the line; it stays the same when the line is unplugged and plugged in again."""
+        self.port = self._link = str(folder / "balance")
+        """Address of the line; it stays the same when the line is unplugged and plugged in again."""
         self._lock = threading.Lock()
-        text = json.dumps({**settings, "link": self.port, "baud": baud})
-        self._process = ChildProcess(python_module("actors.emulators.serial_balance.pty_server", text))
+        text = json.dumps({**settings, "link": self._link, "baud": baud, "tcp": tcp})
+        self._process = ChildProcess(python_module("actors.emulators.serial_balance.line_server", text))
         try:
-            self._answer()
+            self.port = self._answer()["port"]
         except BaseException:
             self.close()
             raise
@@ -84,8 +85,8 @@ class FarProcess:
         """End the process. May be called again."""
         self._process.close(GRACE)
         with contextlib.suppress(OSError):
-            Path(self.port).unlink(missing_ok=True)
-            Path(self.port).parent.rmdir()
+            Path(self._link).unlink(missing_ok=True)
+            Path(self._link).parent.rmdir()
 
     def _answer(self) -> dict[str, Any]:
         try:
@@ -121,6 +122,7 @@ class VirtualSerialBalance(FarProcess):
         time_scale: float = 1.0,
         latency: float = 0.01,
         seed: tuple[int, ...] = (0,),
+        tcp: bool = False,
     ) -> VirtualSerialBalance:
         """Start an emulated balance without a load.
 
@@ -131,6 +133,7 @@ class VirtualSerialBalance(FarProcess):
             time_scale: bench seconds per second of the clock; 0: bench time passes by `advance` only.
             latency: time between query and reply [s of the clock].
             seed: of noise and of faults.
+            tcp: behind a serial server: its `port` is then `127.0.0.1:…`.
 
         Raises:
             LaboratoryError: it did not start.
@@ -144,7 +147,7 @@ class VirtualSerialBalance(FarProcess):
             "latency": latency,
             "seed": list(seed),
         }
-        return cls(settings, baud)
+        return cls(settings, baud, tcp)
 
     def put(self, load: Load | float) -> None:
         """Set the load from now on.
@@ -184,7 +187,7 @@ class RecordedBalance(FarProcess):
         """Start the replay; unsolicited bytes arrive at their times, replies after their queries.
 
         Args:
-            recording: file made by `python -m actors.balance.record_line`.
+            recording: file made by `decant balance record`.
             speed: replay speed relative to the recording.
 
         Raises:

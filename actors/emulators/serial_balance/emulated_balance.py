@@ -101,9 +101,6 @@ def spoil(line: bytes, faults: BalanceFaults, rng: np.random.Generator) -> bytes
     return line
 
 
-REPEAT_INTERVAL = 0.2
-"""Interval of repeated readings [s of bench time]."""
-
 COMMAND_PATIENCE = 5.0
 """Longest time that a command waits for a stable display [s of bench time]."""
 
@@ -180,7 +177,7 @@ class Emulation:
         if self._waiting is not None:
             self._wait_on(now)
         if self._repeat_at is not None and now >= self._repeat_at:
-            self._repeat_at = now + REPEAT_INTERVAL / (self._time_scale or 1.0)
+            self._repeat_at = now + self._repeat.interval / (self._time_scale or 1.0)
             reading = self._display.reading()
             self._answers.append((now, self._repeat.line(reading) if self._repeat.line is not None else self._weight()))
         if self._following is not None:
@@ -246,6 +243,7 @@ class Emulation:
             self._waiting = None
             self._reply(reply.line, now)
         elif isinstance(reply, PendingReply):
+            self._reply(reply.first, now)
             patience = COMMAND_PATIENCE if reply.patience is None else reply.patience
             self._waiting = (reply, now + (patience / self._time_scale if self._time_scale > 0.0 else math.inf))
             self._wait_on(now)

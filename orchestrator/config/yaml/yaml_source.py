@@ -325,6 +325,7 @@ TELLING = {
     "study": {"mismatch", "compared", "campaign"},
     "campaign": {"calibration", "deployment", "seed", "liquid", "pourer", "receiver", "laboratory"},
     "vessel": {"profile", "mesh", "inner", "wall", "up"},
+    "daemon": {"state", "listen", "rigs", "roots", "recordings", "live", "notify", "keep_free", "events"},
     "laboratory": {"bench", "mode", "simulators", "arm", "cell"},
 }
 """Top-level keys that identify one kind of file, including wrong keys with a clear meaning; checked in this order."""
@@ -333,12 +334,13 @@ NEEDED = {
     "study": "a study has keys such as campaign, mismatch, calibration, deployment",
     "campaign": "a campaign has keys such as laboratory, liquid, calibration, deployment",
     "vessel": "a vessel has a name and a profile or mesh",
+    "daemon": "the settings of a daemon have keys such as state, listen, rigs",
     "laboratory": "a laboratory has keys such as mode, simulators, arm, bench",
 }
 
 
 def kind_of(data: Any) -> str | None:
-    """'study', 'campaign', 'vessel' or 'laboratory'; None if no key identifies it."""
+    """'study', 'campaign', 'vessel', 'daemon' or 'laboratory'; None if no key identifies it."""
     keys = set(data) if isinstance(data, dict) else set()
     return next((kind for kind in TELLING if keys & telling(kind)), None)
 

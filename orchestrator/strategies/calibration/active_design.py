@@ -143,7 +143,7 @@ class ActivePours(DesignedPours):
         data = self._trials.data(everything=True)
         if len(data) < LEAST_SIMULATED:
             self._aim = self._candidates[self._current % len(self._candidates)]
-            self.decisions.append(Decision("too few simulations came to something: this pour is any of the candidates"))
+            self.decisions.append(Decision("too few simulations were usable: this pour is any of the candidates"))
             return
         measured = [pour for pour in self.measured if pour.spillage is not None and pour.split == "train"]
         weighed = PosteriorQuestion(

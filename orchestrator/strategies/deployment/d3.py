@@ -72,7 +72,7 @@ class D3Settings(SearchSettings):
     """Real pours with a simulated prior."""
 
     prior_simulations: SimulationCount = 37
-    """Simulations before the first pour; with 'simulations_per_pour: free' at most so many."""
+    """Simulations before the first pour; with 'simulations_per_pour: free', the largest number."""
 
     simulations_per_pour: CountOrFree = 2
     """Simulations told between two pours; 'free': for as long as they are worth it."""
@@ -85,7 +85,7 @@ class D3Settings(SearchSettings):
     'residual' is the paper's, which always believes it."""
 
     discrepancy_policy: DiscrepancyPolicySettings | None = None
-    """With 'model: adaptive': what follows when the simulator seems to say nothing of this bench."""
+    """With 'model: adaptive': what follows when the simulator seems not to describe this bench."""
 
     risk_limit: RiskLimitSettings | None = None
     """With 'model: adaptive': what no pour may lose, once one has kept it."""
@@ -235,7 +235,7 @@ class Hybrid(Deployment[D3Settings]):
             self._scalarization.weigh(exploring=True)
             # in the paper κ is constant, and no simulation only fills space
             known, pending, plain = self._simulated(), self._trials.pending(), not self._settings.adaptive
-            query = self._query(MinimumQuery, known, everything=False, pending=pending, plain=plain)
+            query = self._query(MinimumQuery, known, everything=False, pending=pending, plain=plain, replicates=plain)
             self._questions.put(query, "prior", simulate)
 
     def _next_pour(self) -> None:
@@ -448,7 +448,7 @@ class FreeHybrid(Hybrid):
             count = min(max(settings.initial_samples, trials.width), settings.prior_simulations)
             self._put(self._space_filling(count=count), "start", lambda suggestion: self._simulate(suggestion, "prior"))
         elif len(trials) >= settings.prior_simulations:
-            self._decide_to_pour("all prior simulations are asked for")
+            self._decide_to_pour("all prior simulations are requested")
         elif trials.answered >= min(2, len(trials)) and trials.waiting < trials.width:
 
             def weighed(suggestion: Suggestion) -> None:
@@ -479,7 +479,7 @@ class FreeHybrid(Hybrid):
             if exhausted and not self._scalarization.exploring:
                 self._rest(f"what is left to learn, only pours tell: {self._comparison(one, pour)}", one, pour)
             elif self._trials.lost_in_a_row >= LOST_IN_A_ROW:
-                self._rest(f"the last {LOST_IN_A_ROW} simulations came to nothing", one, pour)
+                self._rest(f"the last {LOST_IN_A_ROW} simulations failed", one, pour)
             else:
                 self._simulate(suggestion, "refine")
 

@@ -33,18 +33,23 @@ OPTIONS = (GO_ON, STOP)
 DOUBT = 0.3
 """Probability of an uninformative simulator from which it is in doubt."""
 
-WORDS = ((0.05, "is borne out"), (DOUBT, "is borne out so far"), (0.7, "is in doubt"), (0.95, "is probably wrong here"))
+WORDS = (
+    (0.05, "agrees with the pours"),
+    (DOUBT, "agrees with the pours so far"),
+    (0.7, "is uncertain"),
+    (0.95, "is probably wrong here"),
+)
 """Description of the simulator below each probability of being uninformative; above all, it is wrong here."""
 
 
 class DiscrepancyPolicySettings(Settings):
-    """D3 with `model: adaptive`: what follows when the simulator seems to say nothing of this bench."""
+    """D3 with `model: adaptive`: what follows when the simulator seems not to describe this bench."""
 
     limit: Annotated[float, Quantity("1", "90 %", 0.1, 1.0)] = 0.9
-    """Probability that it says nothing of this bench, from which the policy follows."""
+    """Probability that it does not describe this bench, from which the policy follows."""
 
     policy: Fallback = GO_ON
-    """go on: what it says counts for as little as that; stop: the deployment ends; ask: the campaign pauses with a
+    """go on: its predictions are weighted accordingly; stop: the deployment ends; ask: the campaign pauses with a
     question."""
 
 
@@ -120,6 +125,9 @@ class Believed(ResultPart):
     alarm: bool
     """Whether the probability is at or above the limit."""
 
+    changed_since: int | None = None
+    """Number of the first pour since which the bench has behaved differently; None if it has not."""
+
     text: str
     """The last state as a sentence."""
 
@@ -175,6 +183,7 @@ class SimulatorMonitor:
         self._after: list[Belief] = []
         self._latest: DiscrepancyFound | None = None
         self._followed: str | None = None
+        self._changed: int | None = None
         self._accepted = False
         self.decisions: list[Decision] = []
 
@@ -184,7 +193,11 @@ class SimulatorMonitor:
         """Record the conclusions of an answer, and log those of the latest pour."""
         known = [pour for pour in pours if pour.cost is not None]
         number = known[-1].number if known else 0
-        self._latest = found
+        self._latest, since = found, found.since_change
+        before, self._changed = self._changed, known[-since].number if since and since <= len(known) else None
+        if self._changed is not None and (before is None or self._changed > before + 1):
+            text = f"since pour {self._changed} the bench behaves differently: what was poured before no longer counts"
+            self.decisions.append(Decision(text, {"changed_since": float(self._changed)}, urgent=True))
         if self._after and self._after[-1].pour == number:
             return
         self._after.append(Belief(pour=number, ignorance=found.uninformative, gain=found.gain))
@@ -194,12 +207,14 @@ class SimulatorMonitor:
 
     @property
     def text(self) -> str:
-        """The latest conclusions: 'the simulator is borne out: 2 % that it says nothing of this bench; …'."""
+        """'the simulator agrees with the pours: probability 2 % that it does not describe this bench; …'."""
         if self._latest is None:
             return ""
         share = self._latest.uninformative
         word = next((word for limit, word in WORDS if share < limit), "is wrong here")
-        text = f"the simulator {word}: {_percent(share)} that it says nothing of this bench"
+        text = f"the simulator {word}: probability {_percent(share)} that it does not describe this bench"
+        if self._changed is not None:
+            text += f"; since pour {self._changed} the bench behaves differently"
         if share >= WORDS[-2][0]:
             return text
         moved = [
@@ -207,9 +222,9 @@ class SimulatorMonitor:
             if abs(one.mean) > one.deviation
         ]  # fmt: skip
         if moved:
-            text += f"; it is as if {' and '.join(moved)} than commanded"
+            text += f"; the pours look as if {' and '.join(moved)} than commanded"
         if abs(math.log(self._latest.factor)) > 0.2:
-            text += f"; {self._latest.factor:.2g} times as much is lost as it says"
+            text += f"; {self._latest.factor:.2g} times the predicted loss"
         return text
 
     def _shifts(self) -> list[Displaced]:
@@ -236,10 +251,10 @@ class SimulatorMonitor:
             if rules.good_enough is not None and best <= rules.good_enough:
                 return self._saved(left, f"good enough: the best action is expected to lose {self._share(best)}")
             if rules.min_gain is not None and found.gain is not None and found.gain < rules.min_gain:
-                why = f"no further pour is worth it: one more is expected to save {self._share(found.gain)}"
+                why = f"no further pour is worthwhile: the next one is expected to save {self._share(found.gain)}"
                 return self._saved(left, f"{why}, the best action to lose {self._share(best)}")
         if found.uninformative >= rules.discrepancy_policy.limit and self._followed is None and weighed:
-            return self._by(rules.discrepancy_policy.policy, self.text, "the simulator counts for as little as that")
+            return self._by(rules.discrepancy_policy.policy, self.text, "the simulator is weighted accordingly")
         limit = rules.limit
         if limit is None or not any(cost <= limit.loss for cost in weighed) or not found.exceedances:
             return Verdict()
@@ -298,6 +313,7 @@ class SimulatorMonitor:
             policy=self._rules.discrepancy_policy.policy,
             followed=self._followed,
             alarm=share >= self._rules.discrepancy_policy.limit,
+            changed_since=self._changed,
             text=self.text,
         )
 

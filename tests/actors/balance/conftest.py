@@ -12,14 +12,15 @@ from actors.balance.balance_settings import SerialBalanceSettings, SettlingRule
 from actors.balance.dialect_registry import dialects
 from actors.balance.scale_model import ScaleSettings
 from actors.balance.serial_balance import SerialBalance
+from actors.balance.serial_port import tcp_address
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.serial_balance.emulated_balance import BalanceFaults
 
 PACE = 20.0
 """Bench seconds per second in these tests."""
 
-OF_VOICE = {"kern-swt-short": "kern-swt", "sbi-identified": "sbi", "sbi-at-stability": "sbi"}
-"""Dialects of voices that are not named after theirs."""
+OF_VOICE = {voice: name for name, dialect in dialects().items() for voice in dialect.encoders()}
+"""The dialect of each voice."""
 
 SOON = {"settling": SettlingRule(deadline=4.0)}
 """Gives up early, where giving up is what is tested."""
@@ -27,11 +28,11 @@ SOON = {"settling": SettlingRule(deadline=4.0)}
 
 def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSettings:
     """Settings that leave nothing to be found out."""
+    line = {} if tcp_address(virtual.port) else {"baud": 9600, "format": "8N1"}
     spec = SerialBalanceSettings(
         port=virtual.port,
         dialect=dialect,
-        baud=9600,
-        format="8N1",
+        **line,
         settling=SettlingRule(deadline=10.0),
         answer_time=0.3,
         reconnect_time=2.0,
@@ -41,19 +42,19 @@ def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSetting
 
 
 @pytest.fixture(scope="module")
-def voices() -> Iterator[Callable[[str], VirtualSerialBalance]]:
+def voices() -> Iterator[Callable[..., VirtualSerialBalance]]:
     """One virtual balance of each voice, started when first asked for.
 
     They end with the file that needs them: at this pace each keeps an eighth of a core busy.
     """
-    started: dict[str, VirtualSerialBalance] = {}
+    started: dict[tuple[str, bool], VirtualSerialBalance] = {}
 
-    def of(voice: str) -> VirtualSerialBalance:
-        if voice not in started:
-            started[voice] = VirtualSerialBalance.start(
-                voice, baud=0, scale=ScaleSettings(settling_time=0.4), time_scale=PACE, latency=0.001
+    def of(voice: str, tcp: bool = False) -> VirtualSerialBalance:
+        if (voice, tcp) not in started:
+            started[voice, tcp] = VirtualSerialBalance.start(
+                voice, baud=0, scale=ScaleSettings(settling_time=0.4), time_scale=PACE, latency=0.001, tcp=tcp
             )
-        return started[voice]
+        return started[voice, tcp]
 
     yield of
     for virtual in started.values():
@@ -61,11 +62,11 @@ def voices() -> Iterator[Callable[[str], VirtualSerialBalance]]:
 
 
 @pytest.fixture
-def virtual(voices: Callable[[str], VirtualSerialBalance]) -> Callable[[str], VirtualSerialBalance]:
-    """An empty, healthy virtual balance of a voice."""
+def virtual(voices: Callable[..., VirtualSerialBalance]) -> Callable[..., VirtualSerialBalance]:
+    """An empty, healthy virtual balance of a voice, on a serial line or over TCP."""
 
-    def of(voice: str) -> VirtualSerialBalance:
-        balance = voices(voice)
+    def of(voice: str, tcp: bool = False) -> VirtualSerialBalance:
+        balance = voices(voice, tcp)
         balance.plug()
         balance.faults(**asdict(BalanceFaults()))
         balance.prepare((1,))
@@ -89,7 +90,11 @@ def driver(virtual: Any) -> Iterator[Callable[..., tuple[VirtualSerialBalance, S
         balance.close()
 
 
-@pytest.fixture(params=list(dialects()))
+VARIANTS = ("kcp", "kern-continuous", "ohaus")
+"""Dialects whose lines are much like those of another one: the long tests run them."""
+
+
+@pytest.fixture(params=[pytest.param(name, marks=[pytest.mark.slow] * (name in VARIANTS)) for name in dialects()])
 def each_dialect(request: pytest.FixtureRequest) -> str:
     name: str = request.param
     return name

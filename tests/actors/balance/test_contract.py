@@ -74,6 +74,14 @@ class TestABalanceOnASerialLine(BalanceContract):
         bench.driver.close()
 
 
+class TestABalanceOverTcp(BalanceContract):
+    @pytest.fixture(params=["a-and-d", "mt-sics"])
+    def bench(self, request: pytest.FixtureRequest, virtual: Any) -> Iterator[BalanceBench]:
+        bench = on_a_line(SerialBalance, virtual(request.param, tcp=True), request.param)
+        yield bench
+        bench.driver.close()
+
+
 # -- balances that the contract finds ----------------------------------------------------------------------------------
 
 

@@ -10,13 +10,14 @@ from dataclasses import asdict
 import pytest
 import serial
 
-from actors.balance.balance_interface import BalanceError, LineSettingsError, UnknownDialectError
+from actors.balance.balance_interface import BalanceError, LineSettingsError, NoConnectionError, UnknownDialectError
 from actors.balance.balance_settings import SerialBalanceSettings, SettlingRule, parse_format
 from actors.balance.dialect_registry import dialects
 from actors.balance.dialects.dialect import LineSettings
+from actors.balance.line_recording import LineEvent, LineRecording
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.serial_port import port_advice
-from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
+from actors.balance.serial_port import port_advice, tcp_address
+from actors.emulators.serial_balance.balance_process import RecordedBalance, VirtualSerialBalance
 from actors.emulators.serial_balance.emulated_balance import BalanceFaults
 
 from .conftest import OF_VOICE, PACE
@@ -39,7 +40,14 @@ def unknown(virtual: Callable[[str], VirtualSerialBalance]) -> Iterator[Callable
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("voice", ["kcp", "kern-swt", "kern-swt-short", "mt-sics", "sbi", "sbi-identified"])
+@pytest.mark.parametrize(
+    "voice",
+    [
+        pytest.param(voice, marks=[pytest.mark.slow] * (voice not in dialects()))
+        for voice in OF_VOICE
+        if voice != "sbi-at-stability"
+    ],
+)
 def test_the_dialect_is_found_out_and_then_used(unknown, voice):
     far, balance = unknown(voice)
     said = balance.connect()
@@ -83,9 +91,11 @@ def test_where_nothing_answers_it_is_said_what_was_tried(unknown):
     with pytest.raises(UnknownDialectError) as caught:
         balance.connect()
     said = str(caught.value)
-    assert said.startswith(f"balance kern-1 ({far.port}): no balance recognised (looked for Kern KCP, older Kern")
+    assert said.startswith(
+        f"balance kern-1 ({far.port}): no balance recognised (looked for A&D, Kern KCP, Kern continuous"
+    )
     assert "Nothing came at all: is the balance switched on" in said
-    assert "9600 baud 8N1: Sartorius SBI → nothing, older Kern (s/w/t) → nothing, Kern KCP, Mettler-Toledo" in said
+    assert r"9600 baud 8N1: '\x1bP\r\n' → nothing, 'w' → nothing, 'SI\r\n' → nothing, 'W\r\n'" in said
 
 
 @pytest.mark.realtime
@@ -122,8 +132,103 @@ def test_another_dialect_than_the_one_named_is_shown_as_it_came(unknown):
     _, balance = unknown("mt-sics", dialect="sbi", baud=9600)
     with pytest.raises(
         UnknownDialectError, match=re.escape("looked for Sartorius SBI). It answers, but not in this way")
-    ):
+    ) as caught:
         balance.connect()
+    assert r"9600 baud 8N1: '\x1bP\r\n' → 'ES\r\n'" in str(caught.value), "byte for byte, as it was sent and as it came"
+
+
+def test_lines_that_end_with_a_carriage_return_alone_are_named(tmp_path):
+    path = tmp_path / "cr.jsonl"
+    said = LineEvent(0.01, "in", b"ST,+00123.45  g\r")
+    LineRecording("typed", (LineEvent(0.0, "out", b"SI\r\n"), said)).save(path)
+    far = RecordedBalance.start(path)
+    try:
+        settings = SerialBalanceSettings(port=far.port, dialect="a-and-d", baud=2400, answer_time=0.2)
+        with pytest.raises(UnknownDialectError, match="end with CR alone; choose CR LF") as caught:
+            SerialBalance(settings).connect()
+        assert r"'SI\r\n' → 'ST,+00123.45  g\r'" in str(caught.value)
+    finally:
+        far.close()
+
+
+@pytest.mark.realtime
+def test_a_weigh_module_that_claims_a_level_without_its_commands_is_recognised_by_its_list(unknown):
+    _, balance = unknown("mt-sics-weigh-module")
+    assert balance.connect().startswith("Mettler-Toledo MT-SICS (VIRTUAL")
+    found = balance._conversation.found
+    assert found is not None
+    assert {"SI", "T", "Z", "@"} <= found.commands
+    assert not {"C", "D", "DW", "SC", "TC", "ZC"} & found.commands
+    balance.tare()
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("voice", ["kern-continuous", "kern-continuous-indicator", "a-and-d"])
+def test_a_balance_that_only_streams_is_recognised_and_weighed(unknown, voice):
+    """At the ten lines a second of the manuals; it hears no command."""
+    far, balance = unknown(voice)
+    far.faults(unasked=0.1, stranger=True)
+    assert balance.connect().startswith(dialects()[OF_VOICE[voice]].title)
+    far.put(0.2)
+    assert balance.weigh().mass == pytest.approx(0.2, abs=1e-9)
+
+
+@pytest.mark.realtime
+def test_over_tcp_only_the_dialect_is_searched_for(unknown, virtual, each_dialect):
+    far, balance = unknown(virtual(each_dialect, tcp=True))
+    assert balance.connect().endswith(f"on {far.port}, TCP")
+    far.put(0.2)
+    assert balance.weigh().mass == pytest.approx(0.2, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("port", "said"),
+    [
+        (
+            "127.0.0.1:1",
+            "the host is there, but nothing listens on port 1. Check the port's number",
+        ),
+        ("no-such-host.invalid:4001", "no host has this name; check it, or give its IP address"),
+    ],
+)
+def test_an_address_without_a_balance_says_what_to_check(port, said):
+    with pytest.raises(NoConnectionError, match=re.escape(f"balance kern-1 ({port}): {said}")):
+        SerialBalance(SerialBalanceSettings(port=port), "kern-1").connect()
+
+
+@pytest.mark.parametrize(
+    ("port", "address"),
+    [
+        ("192.168.1.20:4001", ("192.168.1.20", 4001)),
+        ("balance-3.lab:8001", ("balance-3.lab", 8001)),
+        ("[fe80::1]:23", ("fe80::1", 23)),
+        ("/dev/serial/by-id/usb-a:b:23", None),
+        ("COM3", None),
+    ],
+)
+def test_an_address_is_told_from_a_port_of_this_machine(port, address):
+    assert tcp_address(port) == address
+
+
+def test_dtr_and_rts_are_on_unless_switched_off_before_the_port_opens(monkeypatch):
+    opened = []
+
+    class Wires:
+        dtr = rts = None
+
+        def __init__(self, port, baud, **others):
+            assert port is None
+
+        def open(self):
+            opened.append((self.port, self.dtr, self.rts))
+            raise OSError(2, "gone")
+
+    monkeypatch.setattr(serial, "Serial", Wires)
+    for changes in ({}, {"dtr": False}, {"rts": False}, {"handshake": "hardware"}):
+        spec = SerialBalanceSettings(port="/dev/x", dialect="kcp", baud=9600, format="8N1", **changes)
+        with pytest.raises(NoConnectionError):
+            SerialBalance(spec).connect()
+    assert [wires for _, *wires in opened] == [[True, True], [False, True], [True, False], [True, None]]
 
 
 def test_a_search_can_be_interrupted(unknown):

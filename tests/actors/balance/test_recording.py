@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 import serial
+from typer.testing import CliRunner, Result
 
+from actors.balance.dialect_registry import dialects
 from actors.balance.line_recording import LineEvent, LineRecording
-from actors.balance.record_line import main
 from actors.balance.serial_balance import SerialBalance
 from actors.emulators.serial_balance.balance_process import RecordedBalance
-from actors.runtime.child_process import child_environment
-from tests.support.waiting import PATIENCE, wait_for
+from orchestrator.cli.app import app
+from tests.support.waiting import wait_for
 
 from .conftest import spec_for
+
+
+def record(port: str, path: Path, *options: str) -> Result:
+    """Run `decant balance record`."""
+    return CliRunner().invoke(app, ["balance", "record", port, "--to", str(path), "--virtual", *options])
+
+
+def recorded(port: str, path: Path, *options: str) -> Result:
+    """Record, which succeeds."""
+    line = ["--set", "baud=9600", "--set", "format=8N1"]
+    result = record(port, path, *line, *options)
+    assert result.exit_code == 0, result.stderr
+    return result
+
 
 KERN_TYPED = LineRecording(
     "typed",
@@ -156,16 +169,17 @@ def test_a_question_that_was_never_asked_gets_no_answer_and_the_next_one_does(tm
 
 
 @pytest.mark.realtime
-def test_a_session_with_a_balance_is_recorded_and_played_back_to_the_driver(virtual, tmp_path, capsys):
+def test_a_session_with_a_balance_is_recorded_and_played_back_to_the_driver(virtual, tmp_path):
     far = virtual("mt-sics")
     far.put(0.0123)
     far.advance(10.0)
     path = tmp_path / "session.jsonl"
-    arguments = f"--port {far.port} --to {path} --dialect mt-sics --baud 9600 --format 8N1 --seconds 1 --source virtual"
-    assert main(arguments.split()) == 0
-    assert "12.3 g" in capsys.readouterr().err
+    result = recorded(far.port, path, "--seconds", "1", "--set", "dialect=mt-sics")
+    assert "12.3 g" in result.stderr
     recording = LineRecording.load(path)
     assert recording.source == "virtual"
+    assert recording.about["dialect"] == "mt-sics"
+    assert recording.about["weights"] == ["12.3 g"]
     assert {event.data for event in recording.events if event.direction == "out"} == {b"SI\r\n"}
     player = RecordedBalance.start(path, speed=20.0)
     try:
@@ -180,37 +194,44 @@ def test_listening_records_what_comes_unasked(virtual, tmp_path):
     far = virtual("kern-swt")
     far.faults(unasked=0.05)
     path = tmp_path / "heard.jsonl"
-    arguments = f"--port {far.port} --to {path} --dialect kern-swt --baud 9600 --format 8N1 --seconds 0.5 --listen"
-    assert main([*arguments.split(), "--source", "virtual"]) == 0
+    recorded(far.port, path, "--set", "dialect=kern-swt", "--seconds", "0.5", "--listen")
     events = LineRecording.load(path).events
     assert {event.direction for event in events} == {"in"}
     assert b"".join(event.data for event in events).count(b"\n") >= 3
 
 
-@pytest.mark.realtime
-def test_the_recorder_is_a_command_and_says_why_it_can_not(tmp_path):
-    ended = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "actors.balance.record_line",
-            "--port",
-            "/dev/no-balance",
-            "--to",
-            str(tmp_path / "x.jsonl"),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        env=child_environment(),
-    )
-    assert ended.returncode == 1
-    assert "/dev/no-balance): there is no such port" in ended.stderr
+def test_the_recorder_says_why_it_can_not(tmp_path):
+    result = record("/dev/no-balance", tmp_path / "x.jsonl")
+    assert result.exit_code == 1
+    assert "/dev/no-balance): there is no such port" in result.stderr
 
 
 def test_an_existing_recording_is_not_overwritten(tmp_path):
-    path = Path(tmp_path / "kept.jsonl")
+    path = tmp_path / "kept.jsonl"
     path.write_text("kept")
-    with pytest.raises(SystemExit):
-        main(["--port", "/dev/no-balance", "--to", str(path)])
+    assert record("/dev/no-balance", path).exit_code == 2
     assert path.read_text() == "kept"
+
+
+DAYS = sorted((Path(__file__).parents[2] / "data" / "balances").glob("*.jsonl"))
+"""Recordings of `decant balance record` and `decant balance check --record`."""
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("path", DAYS, ids=lambda path: path.stem)
+def test_a_recorded_day_reads_as_it_did(path):
+    """Add the file of a real balance to tests/data/balances; nothing else is needed."""
+    day = LineRecording.load(path)
+    dialect, weights = dialects()[day.about["dialect"]], day.about["weights"]
+    assert day.weights(dialect) == weights
+    far = RecordedBalance.start(path, speed=50.0)
+    try:
+        driver = SerialBalance(spec_for(far, dialect.name, interval=0.02, time_scale=50.0))
+        driver.connect()
+        queries = sum(event.data == dialect.query for event in day.events)
+        seen = [weight.shown for _ in range(queries) if (weight := driver.read()).stable]
+        driver.close()
+    finally:
+        far.close()
+    assert seen
+    assert set(seen) <= set(weights), "never a weight that was not recorded"

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 
 import pytest
 
-from actors.balance.balance_interface import BalanceFaultError, CommandError, NotStableError, OutOfRangeError, UnitError
+from actors.balance.balance_interface import (
+    BalanceFaultError,
+    CommandError,
+    NoConnectionError,
+    NotStableError,
+    OutOfRangeError,
+    UnitError,
+)
 from actors.balance.balance_settings import SettlingRule
-from actors.balance.dialect_registry import encoders
+from actors.balance.dialect_registry import dialects, encoders
 from actors.balance.scale_model import Load
 
 from .conftest import SOON
@@ -40,7 +48,7 @@ def test_a_step_that_is_not_one_of_the_last_digit_is_taken_from_the_settings(dri
 def test_zero_takes_drift_away_where_there_is_a_command_for_it(driver, each_dialect):
     far, balance = driver(each_dialect)
     far.put(0.05)
-    if each_dialect == "kern-swt":
+    if dialects()[each_dialect].zero is None:
         with pytest.raises(CommandError, match="no command for zero; use its key, or tare"):
             balance.zero()
         return
@@ -48,7 +56,7 @@ def test_zero_takes_drift_away_where_there_is_a_command_for_it(driver, each_dial
     assert balance.weigh().mass == 0.0
 
 
-@pytest.mark.parametrize("dialect", ["kcp", "mt-sics"])
+@pytest.mark.parametrize("dialect", ["kcp", "mt-sics", "radwag"])
 def test_zero_with_a_load_is_refused_with_what_to_do(driver, dialect):
     far, balance = driver(dialect)
     far.put(1.0)
@@ -90,7 +98,7 @@ def test_an_overload_is_named_and_not_waited_out(driver, each_dialect):
     assert not weight.stable
 
 
-@pytest.mark.parametrize("dialect", ["kcp", "mt-sics", "sbi"])
+@pytest.mark.parametrize("dialect", ["a-and-d", "kcp", "kern-continuous", "mt-sics", "ohaus", "radwag", "sbi"])
 def test_a_missing_pan_is_named(driver, dialect):
     far, balance = driver(dialect)
     far.put(-2.0)
@@ -99,8 +107,12 @@ def test_a_missing_pan_is_named(driver, dialect):
 
 
 def test_a_fault_of_the_balance_is_passed_on(driver, each_dialect):
-    far, balance = driver(each_dialect)
+    far, balance = driver(each_dialect, **SOON)
     far.faults(fault="9")
+    if each_dialect in ("a-and-d", "kern-continuous", "radwag"):  # they have no line for it
+        with pytest.raises(NoConnectionError, match="no answer within"):
+            balance.weigh()
+        return
     with pytest.raises(BalanceFaultError, match="reports a fault"):
         balance.weigh()
 
@@ -141,9 +153,29 @@ def test_a_frozen_display_is_noticed_when_taring(driver, each_dialect):
         balance.tare()
 
 
-@pytest.mark.parametrize("dialect", ["kcp", "mt-sics"])
-def test_a_balance_that_knows_another_command_set_says_so(driver, dialect):
-    far, balance = driver(dialect, **SOON)
+@pytest.mark.parametrize("voice", ["a-and-d-error-code", "kcp", "mt-sics", "ohaus", "radwag"])
+def test_a_balance_that_knows_another_command_set_says_so(driver, voice):
+    far, balance = driver(voice, **SOON)
     far.faults(stranger=True)
-    with pytest.raises(CommandError, match=r"refuses the question: syntax error.*dialect: auto"):
+    with pytest.raises(CommandError, match=r"refuses the question: .*does not know the command.*dialect: auto"):
         balance.weigh()
+
+
+def test_numbers_without_a_unit_are_no_weight(driver):
+    far, balance = driver("kern-continuous", **SOON)
+    far.put(0.2)
+    far.faults(unit=" ")
+    with pytest.raises(UnitError, match=r"it sends 200\.0 without a unit; switch on the unit"):
+        balance.weigh()
+
+
+def test_a_tare_that_the_balance_does_not_list_is_refused(driver):
+    """Its I1 claims level 1, to which tare belongs, but its I0 leaves it out."""
+    _, balance = driver("mt-sics")
+    balance.connect()
+    found = balance._conversation.found
+    assert found is not None
+    balance._conversation.found = replace(found, commands=frozenset(("@", "I0", "S", "SI", "Z")))
+    with pytest.raises(CommandError, match=r"it has no tare: the commands that it lists \(I0\) leave 'T' out"):
+        balance.tare()
+    balance.zero()

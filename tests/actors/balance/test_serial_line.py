@@ -9,6 +9,7 @@ import pytest
 
 from actors.balance.balance_interface import BalanceError, NoConnectionError
 from actors.balance.balance_settings import SettlingRule
+from actors.balance.dialect_registry import dialects
 from tests.support.waiting import PATIENCE
 
 from .conftest import SOON
@@ -25,8 +26,9 @@ def test_silence_is_not_taken_for_rest(driver, each_dialect):
     assert balance.statistics()["unanswered"] >= 1
 
 
-def test_a_bad_cable_costs_time_but_never_gives_another_weight(driver, each_dialect):
-    far, balance = driver(each_dialect, settling=SettlingRule(deadline=400.0), answer_time=0.05)
+@pytest.mark.parametrize("dialect", dialects())
+def test_a_bad_cable_costs_time_but_never_gives_another_weight(driver, dialect):
+    far, balance = driver(dialect, settling=SettlingRule(deadline=400.0), answer_time=0.05)
     far.put(0.35)
     balance.tare()
     far.faults(garbage=0.25, halved=0.15)

@@ -398,7 +398,7 @@ def test_an_order_that_is_unknown_or_comes_too_late_is_refused():
     far = VirtualSerialBalance.start("sbi")
     with pytest.raises(LaboratoryError, match="unexpected keyword argument 'quiet'"):
         far.faults(quiet=True)
-    with pytest.raises(LaboratoryError, match="no virtual balance speaks 'latin'; there are kcp"):
+    with pytest.raises(LaboratoryError, match="no virtual balance speaks 'latin'; there are a-and-d, "):
         VirtualSerialBalance.start("latin")
     far.close()
     far.close()

@@ -161,7 +161,7 @@ def test_nobody_there_is_reminded_then_given_up_and_nothing_moves(open_stage):
     async def play():
         async with open_stage(wired_spec(operator=patience), late={"start": math.inf}) as stage:
             since = await stage.now()
-            with pytest.raises(NotPouredError, match=r"nobody answered within .*Nothing was poured"):
+            with pytest.raises(NotPouredError, match=r"no answer within .*Nothing was poured"):
                 await stage.pour()
             return stage, await stage.moved(since)
 

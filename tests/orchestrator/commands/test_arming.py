@@ -132,7 +132,7 @@ def test_what_will_move_is_shown_the_name_arms_one_run_and_its_questions_come_to
         terminal.expect("> ")
         terminal.type("give up")
         code = terminal.end()
-    assert "given up by the operator" in terminal.screen
+    assert "abandoned by the operator" in terminal.screen
     assert code == 3
     assert joints(controller) == before
     assert decant("run", str(campaign), "--resume").exit_code == 2  # motion is enabled for one run only

@@ -35,7 +35,7 @@ def test_after_ctrl_c_once_nothing_is_lost(tmp_path: Path) -> None:
     interrupted(tmp_path / "run", 1)
     assert states(tmp_path / "run")[-1] == "paused"
     said = interruption(tmp_path / "run", toy_plan(tmp_path), "decant run toy.yaml --resume")
-    assert said == "; nothing is lost. Go on with: decant run toy.yaml --resume"
+    assert said == "; nothing is lost. Continue with: decant run toy.yaml --resume"
 
 
 def test_after_ctrl_c_twice_it_is_said_what_may_be_lost_and_what_to_do(tmp_path: Path) -> None:
@@ -45,14 +45,14 @@ def test_after_ctrl_c_twice_it_is_said_what_may_be_lost_and_what_to_do(tmp_path:
     assert given_up_pours(tmp_path / "run") == ["pour 1 of stage only"]
     real = replace(plan, laboratory=plan.laboratory.with_values(mode="hardware"))
     for each, advice in (
-        (real, "lost unless you weigh it now.*Resuming asks what came of it: 'weighed SPILLED RETAINED'"),
-        (plan, "Resuming asks what came of it: on a virtual bench 'repeat'"),
+        (real, "lost unless you weigh it now.*Resuming asks for its outcome: 'weighed SPILLED RETAINED'"),
+        (plan, "Resuming asks for its outcome: on a virtual bench 'repeat'"),
         (replace(plan, on_unknown="repeat"), "Resuming pours it again with the same chance"),
     ):
         said = interruption(tmp_path / "run", each, "decant run toy.yaml --resume")
         assert "nothing is lost" not in said
-        assert said.startswith(" while pour 1 of stage only was under way: it was given up")
-        assert said.endswith("Go on with: decant run toy.yaml --resume")
+        assert said.startswith(" while pour 1 of stage only was under way: it was abandoned")
+        assert said.endswith("Continue with: decant run toy.yaml --resume")
         with pytest.raises(ValueError, match=advice):
             raise ValueError(said)
 

@@ -17,6 +17,7 @@ from orchestrator.cli.motion_control import JogError, Jogging, JogStep, parse_st
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.runs.motion_approval import SafetyRecord, write_record
 from tests.support import hardware_laboratory
+from tests.support.cli_inputs import invoke
 from tests.support.loopback import free_address
 from tests.support.terminal import Terminal
 
@@ -149,3 +150,24 @@ def test_arm_of_hardware_moves_by_what_was_typed_and_ctrl_c_stops_it(tmp_path: P
             terminal.type("quit")
             assert terminal.end() == 0
         assert degrees(controller.fault("state")["joints"][5] - start[5]) == pytest.approx(stopped, abs=0.2)
+
+
+@pytest.mark.realtime
+def test_arm_of_hardware_goes_home_after_its_laboratory_and_home_were_typed(tmp_path: Path) -> None:
+    home = [radians(q) for q in hardware_laboratory.HOME]
+    start = [*home[:4], home[4] + radians(3.0), home[5] - radians(12.0)]
+    with VirtualController.start(free_address(), "ur10", joints=start) as controller:
+        laboratory = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", controller.address)
+        write_record(laboratory, SafetyRecord(controller.fault("state")["checksum"], "2016300123", "", "", "", ""))
+        refused = invoke(f"robot home {laboratory}")
+        assert refused.exit_code == 2
+        assert f"decant robot home {laboratory} --enable-motion" in refused.stderr
+        for answer, status, reached in (("no", 2, start), ("home", 0, home)):
+            with Terminal("robot", "home", str(laboratory), "--enable-motion", cwd=str(tmp_path)) as terminal:
+                terminal.expect("> ")
+                terminal.type("rig")
+                terminal.expect("type 'home' to begin > ")
+                terminal.type(answer)
+                assert terminal.end() == status
+            joints = [degrees(q) for q in controller.fault("state")["joints"]]
+            assert joints == pytest.approx([degrees(q) for q in reached], abs=0.1)

@@ -21,6 +21,7 @@ from sim_engine import solver_fingerprint as sources
 from sim_engine.validation import cases as suite
 from sim_engine.validation.case_result import CaseResult, Figure, Measurement, Series, reported, within
 from tests.support.example_results import strays
+from tests.support.output_schema import validated
 
 ROOT = Path(__file__).parents[3]
 runner = CliRunner()
@@ -64,7 +65,7 @@ def test_a_criterion_that_is_not_met_is_shown_and_ends_with_code_1() -> None:
 def test_a_case_alone_passes_and_its_json_is_valid() -> None:
     result = runner.invoke(app, ["validate-solver", "good", "--json"])
     assert result.exit_code == 0
-    data = json.loads(result.stdout.splitlines()[-1])
+    data = validated("validate-solver", result.stdout)
     assert list(data["cases"]) == ["good"]
     measured, spread = data["cases"]["good"]["measurements"]
     assert measured["value"] == 0.0397

@@ -69,7 +69,7 @@ def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path
     assert re.search(r"received \d+\.\d ± \d+\.\d %", done.stdout)
     assert "mean ± standard deviation, 2 seeds" in done.stdout
     assert re.search(
-        r"spilled / poured \d+\.\d ± \d+\.\d %, a pour: \d+\.\d … \d+\.\d %   \(bands of seeds", done.stdout
+        r"spilled / poured \d+\.\d ± \d+\.\d %, a pour: \d+\.\d … \d+\.\d %   \(intervals from seeds", done.stdout
     )
     assert re.search(r"delivered \d+\.\d g, \d+\.\d mL", done.stdout)
     assert done.stderr.count("not simulated, dribbling: ") == 1  # for both seeds
@@ -101,7 +101,7 @@ def test_a_table_of_weighed_pours_is_predicted_and_scored(inputs: Path) -> None:
         assert pour["band"]["low"] <= pour["predicted"]["mean"] <= pour["band"]["high"]
     assert len((inputs / "scored.csv").read_text(encoding="utf-8").splitlines()) == 4
     assert (inputs / "scored.png").read_bytes().startswith(b"\x89PNG")
-    assert "3 pours, 2 simulations each, bands of seeds, 2 θ of the posterior" in done.stderr
+    assert "3 pours, 2 simulations each, intervals from seeds, 2 θ of the posterior" in done.stderr
 
 
 def test_one_seed_has_no_spread_and_says_so() -> None:

@@ -130,7 +130,7 @@ def test_giving_up_ends_the_pour_with_the_question_that_it_was_given_up_at(keybo
         asking = asyncio.create_task(keyboard.operator().ask(DONE))
         await keyboard.shows("> ")
         keyboard.type("Give  up\n")
-        with pytest.raises(LaboratoryError, match="given up by the operator at: Put the full pourer"):
+        with pytest.raises(LaboratoryError, match="abandoned by the operator at: Put the full pourer"):
             await asking
 
     played(scene)
@@ -138,7 +138,7 @@ def test_giving_up_ends_the_pour_with_the_question_that_it_was_given_up_at(keybo
 
 def test_nobody_answers_reminders_then_the_question_is_given_up(keyboard: Keyboard) -> None:
     async def scene() -> None:
-        with pytest.raises(LaboratoryError, match="nobody answered within 1 s"):
+        with pytest.raises(LaboratoryError, match="no answer within 1 s"):
             await keyboard.operator(OperatorSettings(reminder=0.3, deadline=1.0)).ask(DONE)
 
     played(scene)

@@ -36,6 +36,8 @@ FULL = """
     baud: 4800
     format: "7E1"
     handshake: software
+    dtr: false
+    rts: false
     step: 0.05 g
     repeatability: 0.02 g
     settling: {readings: 6, span: 2 s, steps: 2, deadline: 30 s}
@@ -49,6 +51,15 @@ SIMPLE = "placement: tray\nport: /dev/serial/by-id/usb-KERN\n"
 VIRTUAL = "virtual: {resolution: 0.01 g, noise: 0.02 g, drift: 0.001 g/s, settling_time: 2 s, capacity: 3 kg}\n"
 
 
+def test_an_address_in_the_network_is_a_port_without_line_settings():
+    balance = load("placement: tray\nport: 192.168.0.20:4001\ndialect: ohaus\n")
+    assert (balance.port, len(balance.candidates())) == ("192.168.0.20:4001", 1)
+    with pytest.raises(ConfigError) as caught:
+        load("placement: tray\nport: 192.168.0.20:4001\nbaud: 9600\nrts: false\n")
+    assert len(caught.value.problems) == 2
+    assert "baud: has no effect over TCP; set it in the serial server" in str(caught.value)
+
+
 def test_every_key_reaches_the_balance():
     serial = load(FULL)
     assert serial.position is Placement.RECEIVER
@@ -57,6 +68,7 @@ def test_every_key_reaches_the_balance():
     assert (serial.port, serial.dialect, serial.baud, serial.format) == (
         "/dev/serial/by-id/usb-KERN", "kern-swt", 4800, "7E1")  # fmt: skip
     assert serial.handshake == "software"
+    assert (serial.dtr, serial.rts) == (False, False)
     assert serial.step == pytest.approx(5e-5)
     assert serial.repeatability == pytest.approx(2e-5)
     assert serial.settling == SettlingRule(readings=6, span=2.0, steps=2.0, deadline=30.0)

@@ -7,7 +7,9 @@ import itertools
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import pytest
@@ -20,6 +22,7 @@ from orchestrator.config.campaign_checks import check_campaign
 from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
 from orchestrator.config.json_schema import (
     campaign_schema,
+    daemon_schema,
     laboratory_schema,
     result_schema,
     schema_text,
@@ -39,7 +42,7 @@ SCHEMAS = {
     "laboratories": laboratory_schema,
     "studies": study_schema,
 }
-SHIPPED = [path for kind in SCHEMAS for path in sorted((CONFIGS / kind).glob("*.yaml"))]
+SHIPPED = [CONFIGS / "daemon.yaml", *(path for kind in SCHEMAS for path in sorted((CONFIGS / kind).glob("*.yaml")))]
 
 
 def named(path: Path) -> str:
@@ -85,8 +88,9 @@ def test_committed_schema_is_current(kind: str) -> None:
     assert (CONFIGS / "schema" / f"{name}.json").read_text(encoding="utf-8") == schema_text(SCHEMAS[kind]())
 
 
-def test_committed_schema_of_results_is_current() -> None:
-    assert (CONFIGS / "schema" / "result.json").read_text(encoding="utf-8") == schema_text(result_schema())
+@pytest.mark.parametrize(("name", "schema"), [("result", result_schema), ("daemon", daemon_schema)])
+def test_committed_schema_of_other_files_is_current(name: str, schema: Callable[[], dict[str, Any]]) -> None:
+    assert (CONFIGS / "schema" / f"{name}.json").read_text(encoding="utf-8") == schema_text(schema())
 
 
 def test_schema_refuses_what_an_editor_should_underline() -> None:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 from actors.runtime.child_process import child_environment
+from orchestrator.cli.app import app
+from orchestrator.daemon.access_control import Role
+from orchestrator.shipped import shipped
+from tests.support.daemon_thread import Real
 
 UNIT = Path(__file__).parents[3] / "configs" / "systemd" / "decant.service"
 
@@ -31,3 +39,30 @@ def test_the_unit_gives_a_pour_the_time_to_be_weighed() -> None:
     assert "KillMode=mixed" in text, "simulators would be told to end before the pour they compute has landed"
     assert "TimeoutStopSec=10min" in text
     assert "Restart=on-failure" in text
+
+
+def test_the_unit_names_shipped_settings_and_a_folder_for_every_file_that_is_written() -> None:
+    text = UNIT.read_text()
+    (settings,) = re.findall(r"^ExecStart=\S+/decant server start /etc/decant/(\S+)$", text, re.MULTILINE)
+    assert shipped(settings).is_file()
+    assert "StateDirectory=decant\n" in text
+    assert "CacheDirectory=decant\nEnvironment=XDG_CACHE_HOME=/var/cache\n" in text, "the service user has no home"
+
+
+def test_other_users_submit_and_look_with_a_token_and_nothing_else(tmp_path: Path) -> None:
+    real = Real(tmp_path / "service")
+
+    def typed(command: str, role: Role) -> Any:
+        environment = {"DECANT_URL": real.url, "DECANT_TOKEN": real.token(role), "DECANT_STATE": str(tmp_path / "own")}
+        return CliRunner().invoke(app, shlex.split(command), env=environment)
+
+    try:
+        assert typed("queue pause", Role.OPERATOR).exit_code == 0
+        submitted = typed(f"queue submit {shipped('campaigns/quickstart.yaml')}", Role.OPERATOR)
+        assert submitted.exit_code == 0, submitted.stderr
+        assert submitted.stdout.strip() in typed("queue list", Role.VIEWER).stdout
+        refused = typed(f"queue submit {shipped('campaigns/quickstart.yaml')}", Role.VIEWER)
+        assert refused.exit_code != 0
+        assert "this takes operator" in refused.stderr
+    finally:
+        real.close()

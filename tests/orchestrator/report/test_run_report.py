@@ -114,7 +114,7 @@ def test_it_says_what_to_do_what_to_expect_and_what_nobody_knows(made: Made) -> 
     assert row.recommended is not None
     assert f"{row.recommended.action_si['x_offset'] * 1e3:.3g} mm" in said
     assert "To pour 100 g of water from beaker into narrow, use the recommended action." in said
-    assert "No safe window was looked for" in said
+    assert "No safe window was computed" in said
     assert "The recommended action was not poured again" in said
     assert "The bench was VIRTUAL: no robot moved and no liquid was weighed." in said
     assert "θ* with its region" in said
@@ -227,7 +227,7 @@ def test_a_pour_that_nobody_knows_of_is_called_so_and_its_liquid_is_not_made_up(
     assert "Pour 2 of pours had begun, and its outcome is not known." in said
     assert "2 begun, 1 weighed, 1 of unknown outcome" in said
     assert f"--resume --run {directory.name}" in said
-    assert "It is not repeated by software" in said
+    assert "The software does not repeat it" in said
 
 
 def test_a_failed_run_says_why_and_what_stands(tmp_path: Path) -> None:
@@ -243,7 +243,7 @@ def test_a_failed_run_says_why_and_what_stands(tmp_path: Path) -> None:
     assert "Its state is 'failed'" in said
     assert "a cable came off <b>" in said
     assert "failed: the hose came off" in said
-    assert "The best of 1 pours so far came to" in said
+    assert "The smallest loss of 1 pours so far is" in said
     assert "θ* with its region" in said, "calibration was closed before"
 
 

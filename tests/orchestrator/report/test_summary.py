@@ -164,7 +164,7 @@ def test_planning_alone_shows_no_columns_about_pours_and_no_empty_table(results:
     fruitless = changed(planned, recommended=None)
     text = shown(summary_table(summarise(plan, {"narrow cup": fruitless})))
     assert "expected of" not in text
-    assert "No action is recommended: nothing was learnt" in text
+    assert "No action is recommended: there is no result" in text
 
 
 def test_table_in_a_log_file_breaks_neither_paths_nor_rows(

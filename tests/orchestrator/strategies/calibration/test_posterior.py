@@ -163,7 +163,7 @@ def test_people_read_what_is_determined_and_what_is_not() -> None:
     )
     assert posterior_lines(said, PARAMETERS) == [
         "90 % of the θ that fit the pours have particles 900 … 1 300 (searched 500 … 4 000)",
-        "the pours don't determine cohesion (0 … 0.1 N/m): nearly all of what was searched fits them as well as θ*",
+        "the pours do not determine cohesion (0 … 0.1 N/m): nearly the whole searched range fits them as well as θ*",
     ]
 
 

@@ -1,7 +1,8 @@
-"""The process of an emulated balance: commands on standard input, characters on a pseudo-terminal.
+"""The process of an emulated balance: commands on standard input, characters on a terminal or TCP connection.
 
 `PtyEnd` is the balance's end of the terminal. It sends characters at the line's speed, garbles them for a client with
-another speed, and can be unplugged. `Replay` is an `EmulatedBalance` that gives each query the recorded reply.
+another speed, and can be unplugged. `TcpEnd` is a serial server with one client at a time. `Replay` is an
+`EmulatedBalance` that gives each query the recorded reply.
 
 The process ends when its standard input ends or its parent ends, whichever comes first. A killed test therefore leaves
 no process behind.
@@ -14,10 +15,12 @@ import json
 import os
 import select
 import signal
+import socket
 import sys
 import termios
 import time
 import tty
+from abc import ABC, abstractmethod
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -27,8 +30,77 @@ from actors.balance.scale_model import ScaleSettings
 from actors.emulators.serial_balance.emulated_balance import EmulatedBalance, Emulation
 
 
-class PtyEnd:
-    """The balance's end of a serial line.
+class LineEnd(ABC):
+    """The balance's end of a line: it sends characters one by one, at the line's speed.
+
+    Args:
+        baud: the speed; 0: characters take no time.
+    """
+
+    def __init__(self, baud: int) -> None:
+        self._baud = baud
+        self._queue: deque[tuple[float, int]] = deque()
+        self._free_at = 0.0
+        self.plug()
+
+    @property
+    @abstractmethod
+    def port(self) -> str:
+        """Address for clients."""
+
+    @property
+    @abstractmethod
+    def descriptor(self) -> int | None:
+        """File descriptor to wait for; None while unplugged."""
+
+    @abstractmethod
+    def plug(self) -> None:
+        """Plug the line in."""
+
+    @abstractmethod
+    def unplug(self) -> None:
+        """Unplug the line; unsent characters are lost."""
+
+    @abstractmethod
+    def receive(self) -> bytes:
+        """Return the bytes from the client."""
+
+    @abstractmethod
+    def _write(self, data: bytes) -> None:
+        """Send bytes now; they are lost if there is no client."""
+
+    def send(self, data: bytes, now: float) -> None:
+        """Queue bytes; they are sent character by character.
+
+        Args:
+            data: the bytes.
+            now: time of the clock [s].
+        """
+        if self.descriptor is None:
+            return
+        time_each = 10.0 / self._baud if self._baud else 0.0
+        at = max(now, self._free_at)
+        for byte in data:
+            at += time_each
+            self._queue.append((at, byte))
+        self._free_at = at
+
+    def pump(self, now: float) -> float | None:
+        """Send the characters that are due.
+
+        Returns:
+            Time of the next character; None if none is left.
+        """
+        due = bytearray()
+        while self._queue and self._queue[0][0] <= now:
+            due.append(self._queue.popleft()[1])
+        if due:
+            self._write(bytes(due))
+        return self._queue[0][0] if self._queue else None
+
+
+class PtyEnd(LineEnd):
+    """A serial line.
 
     Args:
         link: path of the line while it is plugged in, like those under /dev/serial/by-id.
@@ -40,12 +112,15 @@ class PtyEnd:
     """
 
     def __init__(self, link: Path, baud: int) -> None:
-        self.link, self._baud = link, baud
+        self.link = link
         self._speed = getattr(termios, f"B{baud}") if baud else None
         self._master = self._slave = -1
-        self._queue: deque[tuple[float, int]] = deque()
-        self._free_at = 0.0
-        self.plug()
+        super().__init__(baud)
+
+    @property
+    def port(self) -> str:
+        """See `LineEnd.port`."""
+        return str(self.link)
 
     @property
     def descriptor(self) -> int | None:
@@ -78,36 +153,12 @@ class PtyEnd:
             return data if self._speed_matches() else b""
         return b""
 
-    def send(self, data: bytes, now: float) -> None:
-        """Queue bytes; they are sent character by character.
-
-        Args:
-            data: the bytes.
-            now: time of the clock [s].
-        """
-        if self._master < 0:
-            return
-        time_each = 10.0 / self._baud if self._baud else 0.0
-        at = max(now, self._free_at)
-        for byte in data:
-            at += time_each
-            self._queue.append((at, byte))
-        self._free_at = at
-
-    def pump(self, now: float) -> float | None:
-        """Send the characters that are due.
-
-        Returns:
-            Time of the next character; None if none is left.
-        """
-        due = bytearray()
-        while self._queue and self._queue[0][0] <= now:
-            due.append(self._queue.popleft()[1])
-        if due:
-            data = bytes(due) if self._speed_matches() else bytes((37 * byte + 91) & 0xFF for byte in due)
-            with contextlib.suppress(OSError):  # if the client does not read, bytes beyond the buffer are lost
-                os.write(self._master, data)
-        return self._queue[0][0] if self._queue else None
+    def _write(self, data: bytes) -> None:
+        """See `LineEnd._write`."""
+        if not self._speed_matches():
+            data = bytes((37 * byte + 91) & 0xFF for byte in data)
+        with contextlib.suppress(OSError):  # if the client does not read, bytes beyond the buffer are lost
+            os.write(self._master, data)
 
     def _speed_matches(self) -> bool:
         if self._speed is None:
@@ -115,6 +166,66 @@ class PtyEnd:
         with contextlib.suppress(termios.error):
             return bool(termios.tcgetattr(self._master)[5] == self._speed)
         return False
+
+
+class TcpEnd(LineEnd):
+    """A serial server on a loopback port of its own, which stays the same when it is unplugged and plugged in again.
+
+    Args:
+        baud: speed of the line behind it; 0: characters take no time.
+    """
+
+    def __init__(self, baud: int) -> None:
+        self._address = ("127.0.0.1", 0)
+        self._listener: socket.socket | None = None
+        self._client: socket.socket | None = None
+        super().__init__(baud)
+
+    @property
+    def port(self) -> str:
+        """See `LineEnd.port`."""
+        return f"{self._address[0]}:{self._address[1]}"
+
+    @property
+    def descriptor(self) -> int | None:
+        """See `LineEnd.descriptor`."""
+        waiting = self._client or self._listener
+        return None if waiting is None else waiting.fileno()
+
+    def plug(self) -> None:
+        """See `LineEnd.plug`."""
+        if self._listener is None:
+            self._listener = socket.create_server(self._address)
+            self._address = self._listener.getsockname()[:2]
+
+    def unplug(self) -> None:
+        """See `LineEnd.unplug`."""
+        for one in (self._client, self._listener):
+            if one is not None:
+                one.close()
+        self._client = self._listener = None
+        self._queue.clear()
+
+    def receive(self) -> bytes:
+        """See `LineEnd.receive`; accepts a client if there is none."""
+        if self._client is None:
+            assert self._listener is not None
+            self._client, _ = self._listener.accept()
+            self._client.setblocking(False)
+            return b""
+        data = b""
+        with contextlib.suppress(ConnectionError):
+            data = self._client.recv(4096)
+        if not data:  # the client has gone
+            self._client.close()
+            self._client = None
+        return data
+
+    def _write(self, data: bytes) -> None:
+        """See `LineEnd._write`."""
+        if self._client is not None:
+            with contextlib.suppress(OSError):
+                self._client.send(data)
 
 
 class Replay:
@@ -203,7 +314,7 @@ class Server:
         character: the emulated balance.
     """
 
-    def __init__(self, line: PtyEnd, character: EmulatedBalance) -> None:
+    def __init__(self, line: LineEnd, character: EmulatedBalance) -> None:
         self._line, self._balance = line, character
         self._orders = bytearray()
         self._parent = os.getppid()
@@ -279,15 +390,16 @@ def main() -> None:
     """Serve with the settings of the first argument, JSON, until the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C reaches the whole group; the parent decides
     settings = json.loads(sys.argv[1])
-    line = PtyEnd(Path(settings["link"]), settings["baud"])
+    link = Path(settings["link"])
+    line = TcpEnd(settings["baud"]) if settings["tcp"] else PtyEnd(link, settings["baud"])
     try:
         character = make_character(settings)
-        tell({"port": str(line.link)})
+        tell({"port": line.port})
         Server(line, character).run()
     finally:
         line.unplug()
         with contextlib.suppress(OSError):
-            line.link.parent.rmdir()
+            link.parent.rmdir()
 
 
 if __name__ == "__main__":

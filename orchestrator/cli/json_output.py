@@ -1,0 +1,457 @@
+"""The JSON output of commands with `--json`: one model for each command, as documentation and as schema.
+
+`OUTPUTS` lists the models by command. The commands print plain dictionaries; tests validate them against the schema
+(`decant schema output`). Quantities are in SI units unless a name has a unit: `spilled_g`, `capacity_mL`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from actors.arm.arm_interface import PathReport
+from actors.interfaces import DeviceCheck
+from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail, RunComparison
+from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, StatusOut
+from orchestrator.results.run_summary import ReceiverSummary, RunSummary, UntitledSchema
+from orchestrator.strategies.single_action import WeighedPour
+from sim_engine.liquids import SimulationParameters
+
+
+class _Output(BaseModel):
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True, arbitrary_types_allowed=True)
+
+
+class CalibrateOutput(BaseModel):
+    """Result of a calibration. Further keys are `test_discrepancy_NAME` and `transfer_discrepancy_NAME` of other θ."""
+
+    model_config = ConfigDict(extra="allow", use_attribute_docstrings=True)
+
+    theta: SimulationParameters
+    """θ to simulate with: θ*, or the uncalibrated θ if the weighed pours do not justify θ*."""
+
+    calibrated_theta: SimulationParameters
+    """θ*."""
+
+    calibration_gain: dict[str, Any] | None
+    """Whether the weighed pours justify θ*; null if θ* was not compared with the uncalibrated θ."""
+
+    train_discrepancy: float | None
+    """Mean |r − c_s| of θ* on the pours of the calibration."""
+
+    test_discrepancy: float | None
+    """The same on pours that were kept for testing."""
+
+    transfer_discrepancy: float | None
+    """The same on pours into another receiver."""
+
+    simulations: int
+    calibration_simulations: int
+    """Simulations without those of the evaluation."""
+
+    cpu_s: float
+    run: str
+    """Folder of the run."""
+
+    figures: dict[str, Path]
+    recording: Path | None
+    report: Path | None
+
+
+class _PlannedParts(_Output):
+    receiver: str
+    """Name of the receiver."""
+
+    action: dict[str, Any]
+    """The recommended action, in deg, deg/s, mm and s."""
+
+    action_si: dict[str, float | None]
+    predicted_loss: float | None
+    predicted_deviation: float | None
+    predicted_spillage: float | None
+    """Mean spilled / poured of the simulations with further seeds."""
+
+    predicted_spillage_deviation: float | None
+    loss: str
+    """Name of the loss that was minimised."""
+
+
+_PLANNED = ("prediction", "prediction_interval", "at_bounds", "predicted_delivered_g", "predicted_delivered_ml", "risk",
+            "window", "not_covered")  # fmt: skip
+
+
+def _part(model: type[BaseModel], names: Any) -> dict[str, Any]:
+    """Fields of another model, for `create_model`."""
+    return {name: (model.model_fields[name].annotation, model.model_fields[name]) for name in names}
+
+
+PlannedOutput = create_model(
+    "PlannedOutput",
+    __base__=_PlannedParts,
+    __doc__="The planned action for one receiver.",
+    **_part(ReceiverSummary, _PLANNED),
+)
+PlanOutput = create_model(
+    "PlanOutput",
+    __base__=PlannedOutput,
+    __doc__="The planned action for the first receiver, and for all of them if there are several.",
+    theta=(SimulationParameters, Field(description="θ of the simulations.")),
+    simulations=(int, ...),
+    cpu_s=(float, ...),
+    run=(str, Field(description="Folder of the run.")),
+    plans=(list[PlannedOutput], Field(default=[], description="All receivers, if there are several.")),  # type: ignore[valid-type]
+)
+RunOutput = create_model(
+    "RunOutput",
+    __base__=_Output,
+    __doc__="Summary of a run: `summary.json` without results, decisions and notes.",
+    **_part(RunSummary, [name for name in RunSummary.model_fields if name not in ("results", "decisions", "notes")]),
+    report=(Path | None, Field(description="The report, report.html.")),
+)
+
+
+class StatisticsOutput(_Output):
+    """Sample statistics over simulations with different seeds."""
+
+    mean: float
+    deviation: float | None
+    """Standard deviation; null for one simulation."""
+
+    count: int
+
+
+class IntervalOutput(_Output):
+    """Prediction interval of r = spilled / poured for a single pour."""
+
+    low: float
+    high: float
+    level: float
+    """Probability, such as 0.9."""
+
+    deviations: dict[str, float | None]
+    """Standard deviations by source: simulations, discrepancy, resolution."""
+
+
+class PredictionOutput(BaseModel):
+    """Prediction over seeds: `StatisticsOutput` by quantity, such as received, spilled, retained and spillage."""
+
+    model_config = ConfigDict(extra="allow", use_attribute_docstrings=True)
+
+    band: IntervalOutput | None
+    seeds: list[int]
+    __pydantic_extra__: dict[str, StatisticsOutput]
+
+
+class SimulateOutput(_Output):
+    """A simulated pour. Fractions are of the load: received + spilled + retained + in_flight + escaped = 1."""
+
+    received: float
+    spilled: float
+    retained: float
+    in_flight: float
+    """Fraction in the air at the end."""
+
+    escaped: float
+    """Fraction that left the simulated box."""
+
+    particles: int
+    spacing_mm: float
+    density_error: float
+    simulated_time_s: float
+    steps: int
+    cpu_s: float
+    seed: int
+    curve: dict[str, list[float]]
+    """Poured and spilled fractions over time: `time_s`, `poured`, `spilled`."""
+
+    invalid: str | None
+    """Why the outcome must not be used; null if it is valid."""
+
+    action: dict[str, float | None]
+    theta: SimulationParameters
+    thetas: int
+    """Number of posterior draws of θ."""
+
+    scene: str
+    delivered_g: float | None
+    """Mean mass in the receiver."""
+
+    delivered_ml: float | None
+    prediction: PredictionOutput
+    regimes: dict[str, Any] | None
+    """Flow at the lip and in the stream: Reynolds, Weber and Bond numbers, thickness, velocity."""
+
+    not_covered: list[dict[str, Any]]
+    """Effects of this pour that are not simulated: `kind`, `share`, `text`."""
+
+
+class ScoredPourOutput(_Output):
+    """A weighed pour of the table with its prediction."""
+
+    line: int
+    """Line in the table."""
+
+    split: str
+    action: dict[str, float | None]
+    measured: float | None
+    """r = spilled / poured as weighed; null if it is undefined."""
+
+    predicted: StatisticsOutput | None
+    band: IntervalOutput | None
+    inside: bool | None
+    """Whether the measured value is inside the interval."""
+
+
+class ScoresOutput(_Output):
+    """Agreement of predictions and weighed pours."""
+
+    pours: int
+    mean_error: float | None
+    """Mean absolute difference of r."""
+
+    spearman: float | None
+    """Rank correlation."""
+
+    held: int
+    """Number of pours inside their interval."""
+
+    share_held: float | None
+
+
+class SimulateTableOutput(_Output):
+    """Predictions for a table of weighed pours (`--from`)."""
+
+    scene: str
+    from_: Path = Field(alias="from")
+    scores: dict[str, ScoresOutput]
+    """By split, and for all."""
+
+    level: float
+    """Level of the intervals."""
+
+    theta: SimulationParameters
+    thetas: int
+    simulations: int
+    cpu_s: float
+    bands: dict[str, float | None]
+    """Standard deviations of the shifts in the intervals."""
+
+    pours: list[ScoredPourOutput]
+
+
+class DryRunOutput(_Output):
+    """A planned pour (`--dry-run`)."""
+
+    mode: str
+    action: dict[str, float | None]
+    report: PathReport
+    phases: list[dict[str, Any]]
+    """Phases of the tilt: `name`, `start` and `end` [s]."""
+
+    at_home: bool | None
+    """Whether the arm stands at home; null without `--connect`."""
+
+
+class EmptyPourOutput(_Output):
+    """A cycle with an empty pourer (`--empty`), as in pour.json."""
+
+    run: str
+    mode: str
+    laboratory: str
+    date: str
+    robot: dict[str, str]
+    action: dict[str, float | None]
+    slow: float
+    planned: PathReport
+    tracking: dict[str, float]
+    """Deviations of the executed motion from the planned one."""
+
+    executed_s: float
+    """Duration of the pour."""
+
+
+class PourOutput(WeighedPour):
+    """A weighed pour."""
+
+    run: str
+    mode: str
+    action: dict[str, float | None]
+
+
+class ReportOutput(_Output):
+    """A written report."""
+
+    report: Path
+    figures: list[Path]
+
+
+class CheckOutput(_Output):
+    """Checks of a laboratory."""
+
+    laboratory: str
+    mode: str
+    ready: bool
+    """Whether no check fails."""
+
+    checks: list[DeviceCheck]
+
+
+class BalanceCheckOutput(_Output):
+    """Checks of a balance."""
+
+    balance: str
+    """The balance as it was named on the command line."""
+
+    ready: bool
+    """Whether no check fails."""
+
+    checks: list[DeviceCheck]
+
+
+class ValidateSolverOutput(_Output):
+    """Results of the solver's validation cases."""
+
+    solver: str
+    """Fingerprint of the solver's source."""
+
+    full: bool
+    cases: dict[str, dict[str, Any]]
+    """By case: title, cpu_s, figure, and measurements with value, bounds and whether they passed."""
+
+
+class VesselOutput(_Output):
+    """A vessel file that was made."""
+
+    file: Path
+    picture: Path
+    capacity_mL: float  # noqa: N815
+    capacity_deviation_mL: float  # noqa: N815
+    radius_deviation_mm: float | None
+    notes: list[str]
+    doubts: list[str]
+    """Checks that failed."""
+
+
+class PluginsOutput(_Output):
+    """Plug-ins of installed packages."""
+
+    plugins: list[dict[str, str]]
+    """`group`, `name` and `package`."""
+
+    broken: list[dict[str, str]]
+    """Plug-ins that can't be used, with the reason."""
+
+
+class StudyOutput(_Output):
+    """A study that was run or reported."""
+
+    study: str
+    folder: Path
+    page: Path
+    cells: int
+    finished: int | None
+    """Number of finished cells; null for a report."""
+
+
+class StudyCostOutput(_Output):
+    """Unfinished work of a study (`--dry-run`)."""
+
+    cells: list[str]
+    left: int
+    simulations: int
+    pours: int
+    cpu_hours: float
+
+
+class RunsOutput(_Output):
+    """Runs, newest first."""
+
+    runs: list[PreviousRun]  # type: ignore[valid-type]
+
+
+class PoursOutput(_Output):
+    """Pours, oldest first."""
+
+    pours: list[PreviousPour]  # type: ignore[valid-type]
+
+
+class RunCheckOutput(_Output):
+    """Check of a run's records."""
+
+    run: Path
+    complete: bool
+    """Whether the check found no problem."""
+
+    problems: list[str]
+    entries: int
+    entries_without_chain: int
+    """Entries of older versions, which have no hash chain."""
+
+    pours: list[str]
+
+
+class ExportOutput(_Output):
+    """Exported tables."""
+
+    files: list[str]
+    runs: int
+    pours: int
+
+
+class QueueOutput(_Output):
+    """State of the daemon, its campaigns and open questions."""
+
+    status: StatusOut
+    campaigns: list[CampaignOut]
+    questions: list[QuestionOut]
+
+
+class EventOutput(BaseModel):
+    """One event per line; further keys depend on `type`: see the reference of events."""
+
+    model_config = ConfigDict(extra="allow", use_attribute_docstrings=True)
+
+    id: int
+    type: str
+    time: float
+    """Seconds since 1970."""
+
+    campaign: str | None = None
+
+
+OUTPUTS: dict[str, Any] = {
+    "run": RunOutput,
+    "calibrate": CalibrateOutput,
+    "plan": PlanOutput,
+    "simulate": SimulateOutput | SimulateTableOutput,
+    "pour": PourOutput | EmptyPourOutput | DryRunOutput,
+    "report": ReportOutput,
+    "plugins": PluginsOutput,
+    "vessel": VesselOutput,
+    "validate-solver": ValidateSolverOutput,
+    "runs list": RunsOutput,
+    "runs pours": PoursOutput,
+    "runs show": PreviousRunDetail,
+    "runs check": RunCheckOutput,
+    "runs compare": RunComparison,
+    "runs export": ExportOutput,
+    "study run": StudyOutput | StudyCostOutput,
+    "study report": StudyOutput,
+    "robot check": CheckOutput,
+    "balance check": BalanceCheckOutput,
+    "queue submit": CampaignOut,
+    "queue list": QueueOutput,
+    "queue show": CampaignDetailOut,
+    "queue logs": EventOutput,
+}
+"""Models of the output, by command."""
+
+
+def output_schema() -> dict[str, Any]:
+    """JSON schema of all outputs: the properties are the commands."""
+    fields: dict[str, Any] = {name: (model, ...) for name, model in OUTPUTS.items()}
+    model = create_model("Output", __doc__="Output of commands with --json, by command.", **fields)
+    schema = model.model_json_schema(mode="serialization", schema_generator=UntitledSchema)
+    return {**{name: part for name, part in schema.items() if name != "required"}, "title": "Output"}

@@ -1,0 +1,134 @@
+"""The output of commands with --json agrees with its documented schema."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+from typer.testing import CliRunner
+
+from orchestrator.cli.app import app
+from orchestrator.cli.json_output import OUTPUTS
+from orchestrator.study.study_folder import run_folder, write_result
+from orchestrator.study.study_plan import cells_of
+from tests.orchestrator.study.test_study_report import made_up
+from tests.orchestrator.test_catalogue import made
+from tests.support import small_campaign, study_files
+from tests.support.cli_inputs import CSV, ROOT, process
+from tests.support.daemon_thread import Real
+from tests.support.output_schema import validated
+
+ACTION = "--set angular_velocity=100 --set x_offset=70"
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("outputs")
+    small_campaign.write_campaign(folder)
+    (folder / "pours.csv").write_text(CSV)
+    return folder
+
+
+def commands(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    if isinstance(getattr(command, "commands", None), dict):
+        for name, below in command.commands.items():
+            yield from commands(below, (*words, name))
+    else:
+        yield " ".join(words), command
+
+
+def test_every_command_with_json_has_a_schema() -> None:
+    printing = {
+        name
+        for name, command in commands(typer.main.get_command(app))
+        if any("--json" in option.opts for option in command.params)
+    }
+    assert printing == set(OUTPUTS)
+
+
+def said(command: str) -> str:
+    done = CliRunner().invoke(app, shlex.split(command), catch_exceptions=False)
+    assert done.exit_code == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("run", "--in-process"),
+        ("calibrate", "--in-process"),
+        ("plan", "--in-process --iterations 2 --seeds 2"),
+        ("simulate", f"{ACTION} --seeds 2"),
+        ("simulate", "--from pours.csv --seeds 2"),
+        ("pour", f"{ACTION} --in-process"),
+    ],
+)
+def test_work_on_a_campaign_prints_what_is_documented(campaign: Path, command: str, options: str) -> None:
+    done = process(f"{command} small.yaml {options} --json", campaign)
+    assert done.returncode == 0, done.stderr
+    found = validated(command, done.stdout)
+    if command == "plan":
+        assert (
+            found["prediction_interval"]["low"] <= found["predicted_spillage"] <= found["prediction_interval"]["high"]
+        )
+
+
+def test_queries_of_the_catalogue_print_what_is_documented(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DECANT_STATE", str(tmp_path / "state"))
+    run = made(tmp_path)
+    assert validated("runs list", said("runs list --json"))["runs"]
+    assert validated("runs pours", said("runs pours --json"))["pours"]
+    for command in (f"show {run.name}", f"check {run.name}", f"compare {run.name} {run.name}", f"export {tmp_path}/t"):
+        name = f"runs {command.partition(' ')[0]}"
+        validated(name, said(f"runs {command} --json" + (" --format csv" if "export" in name else "")))
+    validated("report", said(f"report {run} --json"))
+
+
+def test_a_study_prints_what_is_documented(tmp_path: Path) -> None:
+    plan = study_files.small(tmp_path)
+    file = tmp_path / "study.yaml"
+    assert validated("study run", said(f"study run {file} --dry-run --json"))["left"] == len(cells_of(plan))
+    for cell in cells_of(plan):
+        run_folder(plan.folder, cell.id).mkdir(parents=True)
+        write_result(plan.folder, cell.id, made_up(cell))
+    assert validated("study run", said(f"study run {file} --json"))["finished"] == len(cells_of(plan))
+    validated("study report", said(f"study report {file} --json"))
+
+
+def test_vessels_plugins_and_checks_print_what_is_documented(tmp_path: Path) -> None:
+    sizes = "--height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'"
+    validated("vessel", said(f"vessel {tmp_path / 'cup.yaml'} {sizes} --json"))
+    validated("plugins", said("plugins --json"))
+
+
+@pytest.mark.realtime
+def test_checks_and_paths_of_the_virtual_arm_print_what_is_documented(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    monkeypatch.chdir(tmp_path)
+    laboratory = "configs/laboratories/virtual.yaml"
+    assert validated("robot check", said(f"robot check {laboratory} --json"))["checks"]
+    pour = "pour configs/campaigns/quickstart.yaml --set angular_velocity=100 --set x_offset=90"
+    assert validated("pour", said(f"{pour} --dry-run --json"))["phases"]
+    assert validated("pour", said(f"{pour} --empty --json"))["tracking"]
+
+
+def test_queries_of_a_daemon_print_what_is_documented(tmp_path: Path) -> None:
+    real = Real(tmp_path / "state")
+    try:
+        reach = f"--url {real.url} --state {tmp_path / 'state'}"
+        said(f"queue pause {reach}")
+        submitted = said(f"queue submit {ROOT / 'configs/campaigns/quickstart.yaml'} {reach} --json")
+        key = validated("queue submit", submitted)["id"]
+        assert validated("queue list", said(f"queue list {reach} --json"))["campaigns"]
+        assert validated("queue show", said(f"queue show {key} {reach} --json"))["id"] == key
+        for line in said(f"queue logs {reach} --json").splitlines():
+            validated("queue logs", line)
+    finally:
+        real.close()
