@@ -186,7 +186,7 @@ def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(workplace: Wo
     assert advice.startswith(
         "decant: interrupted; nothing is lost. Continue with: decant run small.yaml --resume --run "
     )
-    command = advice.rpartition("Go on with: decant ")[2].split()
+    command = advice.rpartition("Continue with: decant ")[2].split()
     result = workplace.finish(*command)
     assert_same_run(workplace, undisturbed)
     assert result["receivers"] == undisturbed.summary["receivers"]
