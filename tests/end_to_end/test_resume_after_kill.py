@@ -173,6 +173,7 @@ def closed(stage: str, entries: list[Entry]) -> bool:
     return any(e.stage == stage and e.kind == Kind.STAGE_CLOSED for e in entries)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(workplace: Workplace, undisturbed: Finished) -> None:
     process, errors = workplace.interrupt(pouring_into_the_narrow_cup, signal.SIGINT, *RUN)
