@@ -60,7 +60,7 @@ def bench_of(cls: type[UrArm], model: str = "ur10e") -> Iterator[ArmBench]:
 
 
 QUICK = ("ur3e",)
-"""Models in the default suite, whose other tests use the UR10 and the UR10e; the rest are slow because they are many."""
+"""Models in the default suite, whose other tests use UR10 and UR10e; the rest are slow because they are many."""
 
 
 class TestUrArm(ArmContract):
