@@ -298,6 +298,18 @@ class CheckOutput(_Output):
     checks: list[DeviceCheck]
 
 
+class BalanceCheckOutput(_Output):
+    """Checks of a balance."""
+
+    balance: str
+    """The balance as it was named on the command line."""
+
+    ready: bool
+    """Whether no check fails."""
+
+    checks: list[DeviceCheck]
+
+
 class ValidateSolverOutput(_Output):
     """Results of the solver's validation cases."""
 
@@ -428,6 +440,7 @@ OUTPUTS: dict[str, Any] = {
     "study run": StudyOutput | StudyCostOutput,
     "study report": StudyOutput,
     "robot check": CheckOutput,
+    "balance check": BalanceCheckOutput,
     "queue submit": CampaignOut,
     "queue list": QueueOutput,
     "queue show": CampaignDetailOut,

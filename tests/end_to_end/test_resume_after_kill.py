@@ -173,6 +173,7 @@ def closed(stage: str, entries: list[Entry]) -> bool:
     return any(e.stage == stage and e.kind == Kind.STAGE_CLOSED for e in entries)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(workplace: Workplace, undisturbed: Finished) -> None:
     process, errors = workplace.interrupt(pouring_into_the_narrow_cup, signal.SIGINT, *RUN)
@@ -186,7 +187,7 @@ def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(workplace: Wo
     assert advice.startswith(
         "decant: interrupted; nothing is lost. Continue with: decant run small.yaml --resume --run "
     )
-    command = advice.rpartition("Go on with: decant ")[2].split()
+    command = advice.rpartition("Continue with: decant ")[2].split()
     result = workplace.finish(*command)
     assert_same_run(workplace, undisturbed)
     assert result["receivers"] == undisturbed.summary["receivers"]

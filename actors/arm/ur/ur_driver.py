@@ -195,7 +195,8 @@ class UrArm:
         """See `Arm.jog`; at most 10° or 50 mm."""
         with self._at_work("jogging"):
             self._consent()
-            self._go(MotionSegment.of("jog", jog_path(self._spec, self._joints(), axis, amount, speed), self._spec))
+            way = jog_path(self._spec, self._joints(), axis, amount, speed)
+            self._go(MotionSegment.of("jog", way, self._spec), pours=True)
             self.lock()
 
     def recover(self) -> str:
@@ -288,7 +289,7 @@ class UrArm:
 
         Args:
             segment: the motion.
-            pours: it carries or pours liquid. Other motions are allowed in reduced mode, where they are slowed.
+            pours: it may carry or pour liquid. Other motions are allowed in reduced mode, where they are slowed.
         """
         stops = self._stops.count  # before consent is checked, so that a stop in between counts
         released, spec = self._consent(), self._spec

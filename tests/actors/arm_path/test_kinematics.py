@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -17,6 +17,9 @@ from tests.support.planning_cell import SPEC, turned
 
 MODEL = MODELS["ur10e"]
 joints = arrays(float, 6, elements=st.floats(-3.1, 3.1))
+bent = st.floats(0.4, 2.7) | st.floats(-2.7, -0.4)
+regular = st.builds(lambda q, elbow, wrist: np.array([*q[:2], elbow, q[3], wrist, q[5]]), joints, bent, bent)
+"""Joints that are far from the singularities of elbow and wrist."""
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -45,15 +48,16 @@ def test_all_postures_that_the_controller_finds_are_found(name, q):
 
 
 @pytest.mark.parametrize("name", MODELS)
-@given(q=joints)
-@settings(max_examples=examples(50), deadline=None)
+@given(q=regular)
+@settings(max_examples=examples(50), deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
 def test_a_calibrated_robot_is_where_its_controller_has_it_and_is_led_back_there(name, q):
     model = calibrated(CONTROLLED[name])
     rotation, position = forward(q[None], model)
     theirs, at = Kinematics(model).flange(q)
     np.testing.assert_allclose(rotation[0].ravel(), theirs, atol=1e-12)
     np.testing.assert_allclose(position[0], at, atol=1e-11)
-    assume(singularities(q, MODELS[name]).min() > 0.15)  # closer by, two solutions may be within the calibration
+    # Closer by, a pose may be beyond the nominal reach, or two solutions within the calibration.
+    assume(singularities(q, MODELS[name]).min() > 0.3)
     found = inverse(rotation, position, model)[0]
     reached = found[np.isfinite(found).all(axis=1)]
     assert np.abs(np.exp(1j * reached) - np.exp(1j * q)).max(axis=1).min() < 1e-7

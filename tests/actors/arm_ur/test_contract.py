@@ -59,8 +59,8 @@ def bench_of(cls: type[UrArm], model: str = "ur10e") -> Iterator[ArmBench]:
         arm.close()
 
 
-QUICK = ("ur3e", "ur10", "ur20")
-"""Models of different sizes and both generations; the others are slow only because they are many."""
+QUICK = ("ur3e",)
+"""Models in the default suite, whose other tests use UR10 and UR10e; the rest are slow because they are many."""
 
 
 class TestUrArm(ArmContract):

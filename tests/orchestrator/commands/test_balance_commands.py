@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ from actors.balance.dialect_registry import dialects
 from actors.balance.line_recording import LineRecording
 from orchestrator.cli import balance_commands, motion_control
 from orchestrator.cli.app import app
+from tests.support.output_schema import validated
 
 SHIPPED = Path(__file__).parents[3] / "configs" / "laboratories"
 
@@ -28,7 +28,7 @@ def test_the_balance_of_a_virtual_laboratory_is_checked_and_recorded_without_a_p
     path = tmp_path / "day.jsonl"
     result = check(str(SHIPPED / "virtual.yaml"), "--record", str(path), "--json")
     assert result.exit_code == 0, result.stderr
-    said = json.loads(result.stdout.splitlines()[-1])
+    said = validated("balance check", result.stdout)
     assert said["ready"]
     names = [one["name"] for one in said["checks"]]
     assert {"lag", "drift", "linearity", "vibration"} <= set(names)

@@ -120,6 +120,7 @@ def test_a_question_is_answered_with_one_press_and_the_pour_goes_on(page: Any, t
         wait_until(page, lambda: lab.do(lab.served.get(f"/campaigns/{key}"))["pours_made"][0]["state"] == "weighed")
 
 
+@pytest.mark.slow
 def test_a_keyboard_alone_answers_and_stops(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path, asking(**REFILL | {"wants": "yes or no", "text": "May the arm move?"})) as lab:
         asked(lab)
@@ -156,6 +157,7 @@ def test_a_weight_is_typed_as_people_type_it_and_a_wrong_one_is_told(page: Any, 
         wait_until(page, lambda: lab.served.laboratories[0].bench.answers[:1] == ["12.3 g"])
 
 
+@pytest.mark.slow
 def test_what_somebody_types_survives_all_news(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path, asking(text="Weigh the tray.", wants="weight")) as lab:
         key = asked(lab)
@@ -348,6 +350,7 @@ def test_a_pour_without_outcome_reads_unknown_while_its_question_is_open(page: A
         assert page.locator("#pours").get_by_text("under way").count() == 0
 
 
+@pytest.mark.slow
 def test_news_that_never_pause_hide_nothing(page: Any, tmp_path: Path) -> None:
     """An arm tells where it is many times a second; what else happens is seen all the same."""
     with on_port(tmp_path) as lab:
@@ -416,6 +419,7 @@ def test_a_stop_that_is_pressed_in_vain_is_not_missed(page: Any, tmp_path: Path)
         assert in_view(alert)
 
 
+@pytest.mark.slow
 def test_nothing_but_the_operator_scrolls_the_page(page: Any, tmp_path: Path) -> None:
     """A question comes and goes while the operator looks at something else: that stays where it is."""
     page.set_viewport_size({"width": 390, "height": 600})
@@ -521,6 +525,7 @@ def test_it_fits_every_screen_with_the_stop_in_reach(page: Any, tmp_path: Path, 
         assert answer["height"] >= 72
 
 
+@pytest.mark.slow
 def test_a_screen_reader_finds_its_way(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path, asking(**REFILL)) as lab:
         asked(lab)
