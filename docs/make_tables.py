@@ -343,6 +343,40 @@ def measured(name: str) -> str:
     return f"{_table(found['head'], found['rows'])}\n{how}\n"
 
 
+DOSING = {
+    "dosing-spout": "spout, water, lag 0.1 to 0.5 s",
+    "dosing-round": "round rim",
+    "dosing-oil": "oil",
+    "dosing-slow": "lag 1 s",
+}
+"""Tables of docs/data/dosing.json, and their groups."""
+
+
+def dosing(group: str) -> str:
+    """The figures of one group of doses, with how they were measured."""
+    data = json.loads((FOLDER / "data" / "dosing.json").read_text(encoding="utf-8"))
+    found = data["groups"][group]
+    rows = []
+    for name, f in found.items():
+        if name == "paired":
+            continue
+        more = found["paired"].get(name)
+        figures = (
+            *(f"{f[key]:.2f}" for key in ("mean", "bias", "p95", "worst")),
+            f"{100 * f['over_1g']:.1f} %",
+            *(f"{f[key]:.2f}" for key in ("first_p95", "spill_mean")),
+            *(f"{f[key]:.1f}" for key in ("time_50_p95", "time_200_p95")),
+            "–" if more is None else f"{more[0]:+.2f} ({more[1]:+.2f} … {more[2]:+.2f})",
+        )
+        rows.append((f"**{name}**" if more is None else name, *(text.replace("-", "−") for text in figures)))
+    head = (
+        *("controller", "mean error g", "bias g", "95 % g", "worst g", "over +1 g", "first dose, 95 % g", "spilled g"),
+        *("50 g weighed, 95 % s", "200 g, 95 % s", "mean error more than particles g"),
+    )
+    how = f"{found['particles']['doses']} doses of each controller, same seeds; {data['machine']['date']}"
+    return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing.py --final --json`; {how}.</sub>\n"
+
+
 def command_line() -> str:
     """Every command with its arguments, options and examples."""
     import typer.main
@@ -486,6 +520,7 @@ TABLES: dict[str, Callable[[], str]] = {
         f"result-{name}": partial(measured, name)
         for name in ("recorded", "recorded-run", "bands", "cliffs", "risk", "optimizers")
     },
+    **{name: partial(dosing, group) for name, group in DOSING.items()},
     "command-line": command_line,
     "output": json_output,
     "rest": rest,

@@ -160,14 +160,29 @@ def _table(vessel: Vessel) -> _Table:
     if vessel not in _tables:
         tilts = np.linspace(0.0, np.pi, 73)
         volumes = np.linspace(0.0, vessel.capacity, 129)
-        levels = np.empty((len(tilts), len(volumes)))
-        for row, tilt in enumerate(tilts):
-            levels[row] = _surfaces(*_heights(vessel, float(tilt)), volumes)
+        levels = level_table(vessel, tilts, volumes)
         head = max(float(levels.max()), 1e-6)
         heads = head * np.linspace(0.0, 1.0, 97) ** 2
         flows = np.stack([_lip_flow(vessel.opening_radius, heads, float(tilt)) for tilt in tilts])
         _tables[vessel] = _Table(tilts, volumes, levels, head, flows)
     return _tables[vessel]
+
+
+def level_table(vessel: Vessel, tilts: Floats, volumes: Floats) -> Floats:
+    """Heights of the free surface above the spill point on a grid, to 1/`BINS` of the liquid's extent.
+
+    Args:
+        vessel: any vessel.
+        tilts: (A,) [rad], −π … π.
+        volumes: (K,) [m³], between 0 and the capacity.
+
+    Returns:
+        Shape (A, K) [m]; see `level`.
+    """
+    levels = np.empty((len(tilts), len(volumes)))
+    for row, tilt in enumerate(tilts):
+        levels[row] = _surfaces(*_heights(vessel, float(tilt)), volumes)
+    return levels
 
 
 def _surfaces(heights: Floats, each: float, volumes: Floats) -> Floats:

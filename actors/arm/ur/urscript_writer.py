@@ -7,9 +7,14 @@ Targets streamed from this machine would jitter with its load; a program on the 
 - sets tool and payload and reports the controller's values;
 - waits for its start, monitors a heartbeat and checks for a stop order in every cycle;
 - reports its progress.
+
+`path_program` runs a path on its own schedule. `tilt_program` runs along a path at the speed that this machine writes
+10 to 20 times a second; without news it turns the cup back.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,6 +32,8 @@ from actors.arm.ur.worker_messages import (
     STATUS,
     STOP_ORDER,
     STOPPED,
+    TILT_COUNTER,
+    TILT_SPEED,
     TOOL,
     MotionSettings,
 )
@@ -44,6 +51,9 @@ THINNING = 1e-5
 """Points within this distance of the line between others are left out [rad]: a hundredth of a millimetre at 1 m."""
 
 MOST_POINTS = 1_800
+
+NEWS_TIMEOUT, FIRST_NEWS_TIMEOUT = 0.2, 2.0
+"""Time without a new command after which a dose's program turns the cup back, and the same before the first [s]."""
 
 _ALIGNING_SPEED, _ALIGNING_ACCELERATION = 0.05, 0.3
 
@@ -145,6 +155,125 @@ def path_program(path: JointPath, settings: MotionSettings, number: int, *, cb3:
     )
 
 
+@dataclass(frozen=True)
+class TiltLimits:
+    """Limits of a dose's program, which it enforces whatever is written to its registers.
+
+    Attributes:
+        speed: largest speed of the tilt in both directions, and the speed of its own return [rad/s].
+        acceleration: [rad/s²].
+    """
+
+    speed: float
+    acceleration: float
+
+
+def tilt_program(
+    tilts: FloatArray, joints: FloatArray, limits: TiltLimits, settings: MotionSettings, number: int, *, cb3: bool
+) -> str:
+    """A program that tilts the pourer at the speed in a register, within a checked range of tilts.
+
+    A client writes the speed to `TILT_SPEED` and then changes `TILT_COUNTER`. If the counter does not change for
+    `NEWS_TIMEOUT`, the program turns the cup back and ends: a tilted cup that stands still pours on. A dose ends in
+    the same way, by silence. The heartbeat's watchdog of `path_program` would stop the arm where it is, so this program
+    has none. An order to stop still stops the arm at once.
+
+    Args:
+        tilts: of the checked path, increasing from upright, shape (T,) [rad].
+        joints: at these tilts, linear in between, shape (T, 6) [rad]; the arm stands at the first.
+        limits: of the motion.
+        settings, number, cb3: see `path_program`.
+
+    Raises:
+        ArmRefusedError: there are too many points, or the path is invalid.
+    """
+    points = thinned(checked(JointPath(np.asarray(tilts, dtype=float) - tilts[0], joints)))
+    if len(points.times) > MOST_POINTS:
+        raise ArmRefusedError(f"the path has {len(points.times)} points; a program takes {MOST_POINTS}")
+    end = float(points.times[-1])
+    return "\n".join(
+        [
+            "def decant():",
+            f"  global d_step = {'0.008' if cb3 else 'get_steptime()'}",
+            "  global d_tilt = 0.0",
+            "  global d_speed = 0.0",
+            f"  global d_silence = {NEWS_TIMEOUT - FIRST_NEWS_TIMEOUT}",
+            *_stop_function(number, settings.registers),
+            "  def d_clip(x, low, high):",
+            "    if x < low:",
+            "      return low",
+            "    elif x > high:",
+            "      return high",
+            "    end",
+            "    return x",
+            "  end",
+            "  def d_joints(s):",
+            *_search(points, 0, len(points.times) - 1, "    "),
+            "  end",
+            *_preparation(settings, number, heartbeat=False),
+            f"  movej({_list(points.joints[0])}, a={_ALIGNING_ACCELERATION}, v={_ALIGNING_SPEED})",
+            f"  local d_counter = read_input_float_register({settings.registers + TILT_COUNTER})",
+            f"  while d_tilt > 0.0 or d_silence < {NEWS_TIMEOUT}:",
+            f"    local d_news = read_input_float_register({settings.registers + TILT_COUNTER})",
+            "    if d_news != d_counter:",
+            "      d_counter = d_news",
+            "      d_silence = 0.0",
+            "    else:",
+            "      d_silence = d_silence + d_step",
+            "    end",
+            f"    local d_wanted = read_input_float_register({settings.registers + TILT_SPEED})",
+            f"    if d_silence >= {NEWS_TIMEOUT}:",
+            f"      d_wanted = -{limits.speed:.6f}",
+            "    elif d_silence < 0.0:",
+            "      d_wanted = 0.0",
+            "    end",
+            # the speed from which the arm can still stop within the range
+            f"    local d_up = sqrt({2.0 * limits.acceleration:.6f} * ({end:.6f} - d_tilt))",
+            f"    local d_down = sqrt({2.0 * limits.acceleration:.6f} * d_tilt)",
+            f"    d_wanted = d_clip(d_wanted, -d_clip(d_down, 0.0, {limits.speed:.6f}), "
+            f"d_clip(d_up, 0.0, {limits.speed:.6f}))",
+            f"    local d_change = {limits.acceleration:.6f} * d_step",
+            "    d_speed = d_clip(d_wanted, d_speed - d_change, d_speed + d_change)",
+            f"    d_tilt = d_clip(d_tilt + d_speed * d_step, 0.0, {end:.6f})",
+            "    if d_tilt < 0.0002 and d_wanted <= 0.0:",
+            "      d_tilt = 0.0",
+            "      d_speed = 0.0",
+            "    end",
+            "    d_stop()",
+            f"    write_output_float_register({CLOCK}, d_tilt)",
+            f"    servoj(d_joints(d_tilt), 0, 0, d_step, {LOOKAHEAD}, {GAIN:g})",
+            "  end",
+            "  local d_held = 0.0",
+            f"  while d_held < {SETTLING}:",
+            "    d_held = d_held + d_step",
+            "    d_stop()",
+            f"    servoj(d_joints(0.0), 0, 0, d_step, {LOOKAHEAD}, {GAIN:g})",
+            "  end",
+            f"  stopj({STOP_DECELERATION:g})",
+            f"  write_output_integer_register({STATUS}, {DONE})",
+            "end",
+            "",
+        ]
+    )
+
+
+def _search(points: JointPath, first: int, last: int, indent: str) -> list[str]:
+    """Lines that return the joints at the parameter s, by bisection over the points."""
+    if last - first == 1:
+        start, width = points.times[first], points.times[last] - points.times[first]
+        a, b = points.joints[first], points.joints[last]
+        terms = ", ".join(f"{u:.7f} + f * {v - u:.7f}" for u, v in zip(a, b, strict=True))
+        return [f"{indent}local f = (s - {start:.7f}) / {width:.7f}", f"{indent}return [{terms}]"]
+    middle = (first + last) // 2
+    return [
+        f"{indent}if s < {points.times[middle]:.7f}:",
+        *_search(points, first, middle, indent + "  "),
+        f"{indent}else:",
+        *_search(points, middle, last, indent + "  "),
+        f"{indent}end",
+    ]
+
+
 def _stop_function(number: int, registers: int) -> list[str]:
     return [
         "  def d_stop():",
@@ -157,13 +286,14 @@ def _stop_function(number: int, registers: int) -> list[str]:
     ]
 
 
-def _preparation(settings: MotionSettings, number: int) -> list[str]:
-    """Lines that set tool and payload and report them.
+def _preparation(settings: MotionSettings, number: int, *, heartbeat: bool = True) -> list[str]:
+    """Lines that set tool and payload and report them, and that end the program without a heartbeat.
 
     The number is written last, so that a reader of it sees the rest.
     """
+    watched = f"input_int_register_{settings.registers + HEARTBEAT}"
     return [
-        f'  rtde_set_watchdog("input_int_register_{settings.registers + HEARTBEAT}", {SLOWEST_HEARTBEAT:.1f}, "stop")',
+        *([f'  rtde_set_watchdog("{watched}", {SLOWEST_HEARTBEAT:.1f}, "stop")'] if heartbeat else []),
         f"  set_tcp(p{_list(settings.tool)})",
         f"  set_payload({settings.payload:.4f}, {_list(settings.centre)})",
         "  sync()",

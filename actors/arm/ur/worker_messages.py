@@ -14,11 +14,16 @@ STOP_ORDER, HEARTBEAT, GO = 0, 1, 2
 """Integer inputs, counted from the arm's setting `registers`. An order is the number of its motion, so that an old
 order has no effect."""
 
+TILT_SPEED, TILT_COUNTER = 0, 1
+"""Double inputs of a dose, counted from the same setting: the wanted speed [rad/s]; a number that changes with each
+command."""
+
 NUMBER, STATUS = 12, 13
 """Integer outputs: the number of the motion whose program runs, and its status."""
 
 CLOCK, TOOL = 12, 13
-"""Double outputs: time on the path [s]; from `TOOL` on, the six values of the controller's tool."""
+"""Double outputs: time on the path [s], in a dose the tilt [rad]; from `TOOL` on, the six values of the controller's
+tool."""
 
 READY, RUNNING, DONE, STOPPED = 1, 2, 3, 4
 """Statuses: ready and waiting for `GO`; moving; arrived; stopped by order."""
@@ -159,7 +164,7 @@ class MotionSettings:
     Attributes:
         tool: TCP in the flange's frame [m], [rad].
         payload: [kg]; `centre` [m].
-        registers: first of the three integer inputs that are written.
+        registers: first of the three integer inputs that are written, and of the two double inputs of a dose.
     """
 
     tool: tuple[float, ...]

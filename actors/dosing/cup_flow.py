@@ -1,0 +1,169 @@
+"""The tilting-cup equation of one vessel for arrays of hypotheses: head, flow, and the tilt for a wanted flow.
+
+`CupFlow` tabulates what `sim_engine.hydrostatics` computes for one state, so that a controller can evaluate a hundred
+states in a few microseconds each:
+
+    q = C_d ∫ w(s) √(2g (h − s sin θ)) ds,    h = level(V, θ)
+
+w(s) is the width of the opening at the distance s from the lip's lowest point, taken from the rim of the vessel's
+geometry. A spout of a mesh therefore narrows the flow. In a thick liquid the film of Nusselt limits the flow, too:
+1/q² = 1/q_inertia² + 1/q_viscous² with q_viscous = w g h³ / 3ν.
+
+Limitations: those of `sim_engine.hydrostatics`. Wetting and surface tension at the lip are not modelled; an onset bias
+and a flow factor stand for them (`actors.dosing.dose_estimator`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_engine.hydrostatics import DISCHARGE, GRAVITY, level_table
+from sim_engine.liquids import Liquid
+from sim_engine.model_validity import DRIBBLING_WEBER
+from sim_engine.vessel.vessel import Vessel
+
+Floats = NDArray[np.float64]
+
+LARGEST_TILT = math.radians(125.0)
+"""Largest tabulated tilt [rad]; beyond it a cup is practically empty."""
+
+LARGEST_HEAD = 0.025
+"""Largest tabulated head [m]; a larger one has the flow of this one."""
+
+
+class CupFlow:
+    """Flow out of one vessel; the tilt tips it towards +x.
+
+    Args:
+        vessel: the pourer.
+        liquid: its density, viscosity and surface tension are used, its mass is not.
+    """
+
+    def __init__(self, vessel: Vessel, liquid: Liquid) -> None:
+        self.capacity = vessel.capacity
+        self.density = liquid.density
+        self._viscosity = liquid.kinematic_viscosity
+        self._tension = liquid.surface_tension
+        self._tilt_step = math.radians(1.0)
+        self._tilts = np.arange(0.0, LARGEST_TILT + 1e-9, self._tilt_step)
+        volumes = np.linspace(0.0, vessel.capacity, 129)
+        self._volume_step = float(volumes[1])
+        self._levels = level_table(vessel, self._tilts, volumes)
+        self._head_grid = LARGEST_HEAD * np.linspace(0.0, 1.0, 81) ** 2
+        self._s, self._width = _opening(vessel)
+        self._flows = np.stack([self._flow_of_heads(float(tilt)) for tilt in self._tilts])
+        # Volumes (rows) × heads (columns): the tilt at which a volume stands this high above the lip.
+        self._aim_step = 1e-3
+        aims = self._aim_step * np.arange(26)
+        rising = np.maximum.accumulate(self._levels, axis=0) + 1e-12 * np.arange(len(self._tilts))[:, None]
+        self._aim_tilts = np.stack([np.interp(aims, column, self._tilts) for column in rising.T])
+
+    def head(self, volume: Floats, tilt: Floats) -> Floats:
+        """Free surface above the lip, negative while nothing leaves, elementwise [m].
+
+        Args:
+            volume: [m³].
+            tilt: [rad]; both are clamped to the tables.
+        """
+        return _bilinear(self._levels, tilt / self._tilt_step, volume / self._volume_step)
+
+    def flow(self, head: Floats, tilt: float) -> Floats:
+        """Outflow for a flow factor of 1, elementwise [m³/s].
+
+        Args:
+            head: above the lip [m].
+            tilt: of the vessel [rad].
+        """
+        return np.interp(head, self._head_grid, self._row(tilt))
+
+    def head_for(self, flow: Floats, tilt: float) -> Floats:
+        """Inverse of `flow` [m]."""
+        return np.interp(flow, self._row(tilt), self._head_grid)
+
+    def tilt_for(self, volume: Floats, head: Floats) -> Floats:
+        """Tilt at which a volume stands so high above the lip, elementwise [rad].
+
+        Args:
+            volume: [m³].
+            head: at least 0 [m].
+        """
+        return _bilinear(self._aim_tilts, volume / self._volume_step, head / self._aim_step)
+
+    def volume_per_tilt(self, volume: float, head: float) -> float:
+        """−dV/dθ at a constant head: the flow of a cup that turns with 1 rad/s [m³/rad]."""
+        around = np.clip(volume + np.array([-0.02, 0.02]) * self.capacity, 0.0, self.capacity)
+        low, high = self.tilt_for(around, np.full(2, head))
+        return float(np.diff(around)[0] / max(low - high, 1e-4))
+
+    def clean_flow(self, tilt: float, weber: float = DRIBBLING_WEBER) -> float:
+        """Smallest flow whose film leaves the lip with a Weber number; slower ones dribble [m³/s].
+
+        Args:
+            tilt: [rad].
+            weber: ρU²e/σ of the film at the lip.
+
+        Returns:
+            inf if no tabulated flow reaches it.
+        """
+        depth = np.maximum(self._head_grid[:, None] - self._s * math.sin(tilt), 0.0)
+        step = np.gradient(self._s)
+        area = ((depth > 0.0) * self._width) @ step
+        wide = np.maximum(((depth > 0.0) * self._width).max(axis=1), 1e-6)
+        flow = self._row(tilt)
+        film = np.maximum(DISCHARGE * area / wide, 1e-9)
+        number = self.density * (flow / (wide * film)) ** 2 * film / self._tension
+        reached = np.flatnonzero(number >= weber)
+        return float(flow[reached[0]]) if reached.size else math.inf
+
+    def _row(self, tilt: float) -> Floats:
+        place = min(max(tilt / self._tilt_step, 0.0), len(self._tilts) - 1.001)
+        first = int(place)
+        row: Floats = self._flows[first] + (place - first) * (self._flows[first + 1] - self._flows[first])
+        return row
+
+    def _flow_of_heads(self, tilt: float) -> Floats:
+        """Outflow at the heads of the grid, increasing [m³/s]."""
+        depth = np.maximum(self._head_grid[:, None] - self._s * math.sin(tilt), 0.0)
+        width = ((depth > 0.0) * self._width).max(axis=1)
+        inertia = DISCHARGE * (np.sqrt(2.0 * GRAVITY * depth) * self._width) @ np.gradient(self._s)
+        viscous = width * GRAVITY * self._head_grid**3 / (3.0 * self._viscosity)
+        flow = 1.0 / np.sqrt(1.0 / np.maximum(inertia, 1e-12) ** 2 + 1.0 / np.maximum(viscous, 1e-12) ** 2)
+        flow[0] = 0.0
+        increasing: Floats = np.maximum.accumulate(flow) + 1e-15 * np.arange(len(flow))
+        return increasing
+
+
+def _opening(vessel: Vessel) -> tuple[Floats, Floats]:
+    """Distances from the lip's lowest point along the opening (S,) and the opening's width there (S,) [m]."""
+    crest = vessel.meridians[:, -1, :2]
+    radius = np.hypot(crest[:, 0], crest[:, 1])
+    angle = np.linspace(0.0, math.pi, 361)
+    known = np.linspace(0.0, 2.0 * math.pi, len(radius) + 1)
+    closed = np.append(radius, radius[0])
+    half = [np.interp(a, known, closed) for a in (angle, 2.0 * math.pi - angle)]
+    x = [r * np.cos(angle) for r in half]
+    length = x[0][0] - x[0][-1]
+    s = length * ((np.arange(240) + 0.5) / 240.0) ** 2
+    width = np.zeros_like(s)
+    for r, along in zip(half, x, strict=True):
+        outline = np.minimum.accumulate(along)[::-1] + 1e-12 * np.arange(len(along))
+        width += np.interp(x[0][0] - s, outline, (r * np.sin(angle))[::-1])
+    return s, width
+
+
+def _bilinear(table: Floats, row: Floats, column: Floats) -> Floats:
+    """Values of a table at fractional places, clamped to it, elementwise."""
+    rows, columns = table.shape
+    row = np.minimum(np.maximum(row, 0.0), rows - 1.000001)
+    column = np.minimum(np.maximum(column, 0.0), columns - 1.000001)
+    i, j = row.astype(np.int64), column.astype(np.int64)
+    u, v = row - i, column - j
+    place = i * columns + j
+    flat = table.ravel()
+    low = flat[place] + v * (flat[place + 1] - flat[place])
+    high = flat[place + columns] + v * (flat[place + columns + 1] - flat[place + columns])
+    result: Floats = low + u * (high - low)
+    return result

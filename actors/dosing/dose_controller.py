@@ -1,0 +1,521 @@
+"""Decides the tilt of one dose from the readings of the balance. It has no I/O, no clock and no thread.
+
+`DoseController.step` receives the time, the measured tilt and the readings that arrived, and returns the speed of the
+tilt. The phases are:
+
+1. CHECK: the receiver is on the balance, and the balance rests.
+2. APPROACH: fast to the earliest plausible onset, then slowly until two readings have risen.
+3. POUR: every particle of `actors.dosing.dose_estimator` gives the tilt for the wanted flow; the median is followed.
+   The wanted flow falls with the remaining amount.
+4. RETURN: ordered when the median of the predicted final amount reaches the target, or when more than target + limit
+   is likelier than 1 %.
+5. SETTLE: weigh. If more is missing than the smallest dependable amount, continue with 2.
+
+In doubt the cup is turned back: a tilted cup pours on while it stands still. `DoseResult` has the end of the dose and
+the amount in the receiver, if it is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated
+
+import numpy as np
+
+from actors.dosing.cup_flow import LARGEST_TILT, CupFlow, Floats
+from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading
+from sim_engine.settings.model import Count, Settings
+from sim_engine.settings.quantity import Quantity
+
+TiltSpeed = Annotated[float, Quantity("rad/s", "3 deg/s", 0.0, 3.2, positive=True)]
+TiltAcceleration = Annotated[float, Quantity("rad/s^2", "600 deg/s^2", 0.0, 20.0, positive=True)]
+Amount = Annotated[float, Quantity("kg", "1 g", 0.0, 1.0, positive=True)]
+MassFlow = Annotated[float, Quantity("kg/s", "0.03 kg/s", 0.0, 1.0, positive=True)]
+Duration = Annotated[float, Quantity("s", "0.6 s", 0.0, 600.0, positive=True)]
+
+
+class DosingSettings(Settings):
+    """How doses are poured."""
+
+    approach_speed: TiltSpeed = math.radians(50.0)
+    """Speed of the tilt up to the earliest plausible onset."""
+
+    search_speed: TiltSpeed = math.radians(3.5)
+    """Largest speed until the stream is seen."""
+
+    return_speed: TiltSpeed = math.radians(60.0)
+    """Speed of the return; a fast one cuts the film at the lip."""
+
+    acceleration: TiltAcceleration = math.radians(600.0)
+    """Acceleration of the return."""
+
+    latency: Duration = 0.07
+    """Delay from a decision to the arm's motion, servo lag included."""
+
+    smallest_flow: MassFlow = 0.004
+    """Lower bound of the flow at the end of a dose; it is larger where a slower stream would dribble."""
+
+    largest_fine_flow: MassFlow = 0.008
+    """Upper bound of the flow at the end of a dose."""
+
+    largest_flow: MassFlow = 0.03
+    """Upper bound of the flow at any time."""
+
+    smallest_top_up: Amount = 1.5e-3
+    """Smallest shortage that is poured again; smaller ones cannot be met dependably."""
+
+    most_top_ups: Count = 3
+    """Largest number of top-ups."""
+
+    reading_timeout: Duration = 0.7
+    """Time without a reading after which the connection counts as lost."""
+
+    time_limit: Duration = 60.0
+    """Longest duration of a dose."""
+
+
+@dataclass(frozen=True)
+class DoseOrder:
+    """One wanted dose.
+
+    Attributes:
+        amount: wanted in the receiver [kg].
+        limit: excess that may be exceeded with a probability of 1 % only [kg].
+        receiver_mass: expected reading of the balance before the dose; None if it is not known [kg].
+    """
+
+    amount: float
+    limit: float = 1e-3
+    receiver_mass: float | None = None
+
+
+class DoseEnd(StrEnum):
+    """How a dose ended."""
+
+    REACHED = "reached"
+    SHORT = "short"
+    """Less than the smallest dependable amount is missing, or no further top-up is allowed."""
+    SOURCE_EMPTY = "source empty"
+    STREAM_MISSED = "stream misses the receiver"
+    UNSTABLE = "balance unstable"
+    RECEIVER_MISSING = "receiver missing or different"
+    CONNECTION_LOST = "connection to the balance lost"
+    TIME_LIMIT = "time limit"
+
+
+@dataclass(frozen=True)
+class DoseResult:
+    """The end of a dose.
+
+    Attributes:
+        end: why it ended.
+        amount: weighed in the receiver [kg]; None if it is unknown.
+        estimate: estimated amount past the lip, mean and standard deviation [kg].
+        top_ups: number of times that the cup was tilted again.
+        belief: for the next dose.
+    """
+
+    end: DoseEnd
+    amount: float | None
+    estimate: tuple[float, float]
+    top_ups: int
+    belief: DoseBelief
+
+
+FINE_WEBER = 0.8
+"""Weber number of the film at the lip in the fine flow at the end. Below `DRIBBLING_WEBER` a part may dribble, but only
+for a second or two; a faster flow would add more to the error than it saves in spilled liquid."""
+
+
+def fine_flow(cup: CupFlow, tilt: float, settings: DosingSettings) -> float:
+    """Flow at the end of a dose: slow, but fast enough to leave the lip [kg/s].
+
+    Args:
+        cup: the source vessel.
+        tilt: at which it pours [rad].
+        settings: lower and upper bound.
+    """
+    clean = cup.clean_flow(tilt, FINE_WEBER) * cup.density
+    return min(max(clean, settings.smallest_flow), settings.largest_fine_flow)
+
+
+class DosePhase(StrEnum):
+    """Phase of a dose."""
+
+    CHECK = "check"
+    APPROACH = "approach"
+    POUR = "pour"
+    RETURN = "return"
+    SETTLE = "settle"
+    DONE = "done"
+
+
+PARK = math.radians(18.0)
+"""Tilt by which the cup is turned back from the end of the flow while the balance settles [rad]."""
+
+SEEN = 0.25e-3
+"""Smallest rise of the reading that counts as the stream [kg]."""
+
+ARM_PATIENCE = 0.2
+"""Time without a command after which the arm turns back by itself [s]."""
+
+LATEST_ONSET = math.radians(1.5)
+"""Tilt by which outflow can begin later than expected, even after many doses: the lip may have dried [rad]."""
+
+LONGEST_DOUBT = 1.2
+"""Time with implausible readings after which the cup is turned back [s]."""
+
+LONGEST_SETTLING = 10.0
+"""Time without rest of the balance after which the amount is unknown [s]."""
+
+
+@dataclass(frozen=True)
+class TiltCommand:
+    """A controller's decision.
+
+    Attributes:
+        speed: of the tilt, positive towards the receiver [rad/s].
+        finished: the dose is over; the arm returns upright.
+    """
+
+    speed: float
+    finished: bool = False
+
+
+class DoseController:
+    """The controller of one dose.
+
+    Args:
+        cup: flow of the source vessel.
+        order: the dose.
+        belief: from the doses before it.
+        settings: limits.
+        fall_time: of the stream from the lip into the receiver [s].
+        step: of the balance's display [kg].
+        noise: standard deviation of a reading besides the display's step [kg].
+        seed: of all randomness; the same inputs and seed give the same decisions.
+
+    Attributes:
+        phase: now.
+        result: None until the dose is over.
+    """
+
+    def __init__(
+        self,
+        cup: CupFlow,
+        order: DoseOrder,
+        belief: DoseBelief,
+        settings: DosingSettings,
+        *,
+        fall_time: float = 0.17,
+        step: float = 1e-4,
+        noise: float = 3e-5,
+        seed: int = 0,
+    ) -> None:
+        self._cup, self._order, self._settings = cup, order, settings
+        self._estimator = DoseEstimator(
+            cup, belief, fall_time=fall_time, step=step, noise=noise, rng=np.random.default_rng((seed, 5))
+        )
+        self._belief = belief
+        self._step_size = step
+        self.phase = DosePhase.CHECK
+        self.result: DoseResult | None = None
+        self._begin: float | None = None
+        self._zero: float | None = None
+        self._recent: list[DoseReading] = []
+        self._now, self._tilt, self._speed = 0.0, 0.0, 0.0
+        self._rising = 0
+        self._tick = 0.05
+        self._doubt_since: float | None = None
+        self._since = 0.0
+        self._stop_tilt = 0.0
+        self._expected: float | None = None
+        self._end: DoseEnd | None = None
+        self._top_ups = 0
+        self._factor_before = float(np.median(belief.flow_factor))
+        self._idle_since: float | None = None
+        self._late_volume = float(belief.volume.mean() - 2.0 * belief.volume.std())
+        self._late_onset = float(belief.onset_bias.mean() + max(2.0 * belief.onset_bias.std(), LATEST_ONSET))
+        self._late_factor = 0.7 * self._factor_before
+        self._late_mass, self._late_flow = 0.0, 0.0
+        self.fine_flow = settings.smallest_flow
+
+    # ---- for displays
+
+    @property
+    def amount(self) -> tuple[float, float]:
+        """Estimated amount past the lip, mean and standard deviation [kg]."""
+        return float(self._estimator.mass.mean()), float(self._estimator.mass.std())
+
+    @property
+    def flow(self) -> float:
+        """Estimated flow [kg/s]."""
+        return self._cup.density * float(np.median(self._estimator.flow))
+
+    # ---- decisions
+
+    def step(self, time: float, tilt: float, readings: Sequence[DoseReading]) -> TiltCommand:
+        """Decide the speed of the tilt until the next call.
+
+        Args:
+            time: now, on the clock of the readings [s].
+            tilt: measured now [rad].
+            readings: that arrived since the last call, in order of time.
+        """
+        if self._begin is None:
+            self._begin = self._now = time
+            self._estimator.start(time, tilt)
+        paused = time - self._now > 0.3 and self.phase in (DosePhase.APPROACH, DosePhase.POUR)
+        if paused:
+            self._pass_over(time, tilt)
+            self._recent = [*self._recent, *readings][-12:]
+        else:
+            for reading in readings:
+                self._take(reading, tilt, time)
+        if self.phase is DosePhase.CHECK:
+            self._estimator.start(time, tilt)
+        else:
+            self._estimator.advance(time, tilt)
+        self._note_late_stream(time - self._now, tilt)
+        self._tick += 0.2 * (min(time - self._now, 0.2) - self._tick)
+        self._now, self._tilt = time, tilt
+        if paused and tilt > 0.0:
+            self._turn_back()  # the arm has turned back by itself
+        self._watch()
+        decide = {
+            DosePhase.CHECK: self._check,
+            DosePhase.APPROACH: self._approach,
+            DosePhase.POUR: self._pour,
+            DosePhase.RETURN: self._return,
+            DosePhase.SETTLE: self._settle,
+        }.get(self.phase)
+        speed = 0.0 if decide is None else decide()
+        self._speed = speed
+        return TiltCommand(speed, self.phase is DosePhase.DONE)
+
+    def _check(self) -> float:
+        """Wait for a balance at rest, and take its reading as the zero."""
+        assert self._begin is not None
+        last = self._recent[-4:]
+        if len(last) == 4:
+            spread = max(r.mass for r in last) - min(r.mass for r in last)
+            if spread <= max(3.0 * self._step_size, 1e-4):
+                self._zero = math.fsum(r.mass for r in last) / 4.0
+                expected = self._order.receiver_mass
+                if expected is not None and abs(self._zero - expected) > max(2e-3, 0.03 * expected):
+                    self._finish(DoseEnd.RECEIVER_MISSING, known=True)
+                else:
+                    self._enter(DosePhase.APPROACH)
+                return 0.0
+        if self._now - self._begin > 4.0:
+            self._finish(DoseEnd.UNSTABLE if last else DoseEnd.CONNECTION_LOST, known=True)
+        return 0.0
+
+    def _approach(self) -> float:
+        e = self._estimator
+        early = float(np.quantile(self._cup.tilt_for(e.volume, np.zeros_like(e.volume)) + e.onset_bias, 0.03))
+        ahead = self._tilt + self._speed * self._settings.latency
+        if self._rising >= 2:
+            self._enter(DosePhase.POUR)
+            return self._pour()
+        self.fine_flow = fine_flow(self._cup, max(early, 0.1), self._settings)
+        if self._must_stop():
+            self._turn_back()
+            return -self._settings.return_speed
+        if ahead < early:
+            return self._towards(early + 0.01, self._settings.approach_speed, ahead)
+        aim = float(np.quantile(self._tilts_for(self.fine_flow), 0.35))
+        growth = self._cup.volume_per_tilt(float(np.median(e.volume)), 2e-3) * self._cup.density
+        # the flow at the moment when the stream is seen is about growth × speed × delay / lag of the cup
+        search = min(self._settings.search_speed, max(2.0 * self.fine_flow / growth, math.radians(0.8)))
+        return min(max(3.0 * (aim - ahead), -0.2), search)
+
+    def _pour(self) -> float:
+        if self._must_stop():
+            self._turn_back()
+            return -self._settings.return_speed
+        e = self._estimator
+        wanted = self._wanted_flow()
+        aim = float(np.median(self._tilts_for(wanted)))
+        volume, head = (
+            float(np.median(e.volume)),
+            float(self._cup.head_for(np.array([wanted / self._cup.density]), aim)[0]),
+        )
+        feed = wanted / self._cup.density / self._cup.volume_per_tilt(volume, head)
+        ahead = self._tilt + self._speed * self._settings.latency
+        speed = feed + 4.0 * (aim - ahead)
+        highest = 0.0 if self._doubt_since is not None else math.radians(15.0)
+        if ahead >= LARGEST_TILT - math.radians(5.0):
+            highest = 0.0
+        return min(max(speed, -math.radians(30.0)), highest)
+
+    def _return(self) -> float:
+        if self._tilt <= max(self._stop_tilt - PARK, 0.0) + 0.01:
+            self._enter(DosePhase.SETTLE)
+            return 0.0
+        return self._towards(max(self._stop_tilt - PARK, 0.0), self._settings.return_speed, self._tilt)
+
+    def _settle(self) -> float:
+        waited = self._now - self._since
+        lag = float(np.median(self._estimator.lag))
+        last = [r for r in self._recent if r.time > self._since][-3:]
+        if len(last) == 3 and waited > max(0.5, 3.0 * lag):
+            spread = max(r.mass for r in last) - min(r.mass for r in last)
+            if spread <= max(2.0 * self._step_size, 1e-4) or all(r.stable for r in last):
+                self._weighed(math.fsum(r.mass for r in last) / 3.0)
+                return 0.0
+        if waited > LONGEST_SETTLING:
+            self._finish(self._end or (DoseEnd.UNSTABLE if last else DoseEnd.CONNECTION_LOST), known=False)
+        return 0.0
+
+    def _weighed(self, mass: float) -> None:
+        assert self._zero is not None
+        amount = mass - self._zero
+        missing = self._order.amount - amount
+        if self._end is None and missing > self._settings.smallest_top_up:
+            if self._top_ups < self._settings.most_top_ups:
+                self._top_ups += 1
+                self._rising, self._doubt_since = 0, None
+                self._estimator.update(DoseReading(self._now, amount), sigma=0.05e-3)
+                self._late_mass = amount
+                self._enter(DosePhase.APPROACH)
+                return
+            self._end = DoseEnd.SHORT
+        self._finish(self._end or DoseEnd.REACHED, known=True, amount=amount)
+
+    def _finish(self, end: DoseEnd, *, known: bool, amount: float = 0.0) -> None:
+        self.phase = DosePhase.DONE
+        aim = self._belief.aim
+        if self._expected is not None and known and end is DoseEnd.REACHED:
+            late = min(max(amount - self._expected, -1e-3), 1e-3)
+            aim += max(0.25, 1.0 / (self._belief.doses + 2)) * (late - aim)
+        weighed = amount if known else None
+        self.result = DoseResult(
+            end, weighed, self.amount, self._top_ups, self._estimator.belief(weighed=weighed, aim=aim)
+        )
+
+    # ---- flow
+
+    def _wanted_flow(self) -> float:
+        """Wanted flow [kg/s]: it falls to the fine flow with the remaining amount."""
+        e, order, s = self._estimator, self._order, self._settings
+        after = 0.1 * self.flow
+        left = order.amount - float(np.median(e.mass)) - after
+        horizon = 0.9 + 1.0 * float(np.median(e.lag))
+        bulk = min(max(order.amount / 3.0, self.fine_flow), s.largest_flow)
+        return min(self.fine_flow + max(left - 0.7 * self.fine_flow, 0.0) / horizon, bulk)
+
+    def _tilts_for(self, flow: float) -> Floats:
+        e = self._estimator
+        head = self._cup.head_for(flow / self._cup.density / e.flow_factor, self._tilt)
+        return self._cup.tilt_for(e.volume, head) + e.onset_bias
+
+    def _must_stop(self) -> bool:
+        e, order, s = self._estimator, self._order, self._settings
+        if order.amount - float(e.mass.max()) > 1.5 * self._cup.density * float(e.flow.max()) + 1e-3:
+            return False
+        final = e.final_mass(
+            self._tilt, self._speed, latency=s.latency, back=s.return_speed, acceleration=s.acceleration
+        )
+        middle, deviation = float(np.median(final)) + self._belief.aim, math.hypot(float(final.std()), 0.1e-3)
+        half_tick = 0.5 * self._tick * self.flow
+        if middle + half_tick < order.amount and middle + 2.33 * deviation < order.amount + order.limit:
+            return False
+        self._expected = float(np.median(final))
+        return True
+
+    def _towards(self, tilt: float, speed: float, ahead: float) -> float:
+        """Speed of a turn that ends at a tilt, with a deceleration of a third of the allowed one."""
+        left = tilt - ahead
+        return math.copysign(min(speed, math.sqrt(2.0 * self._settings.acceleration / 3.0 * abs(left))), left)
+
+    # ---- readings and doubts
+
+    def _take(self, reading: DoseReading, tilt: float, now: float) -> None:
+        self._recent.append(reading)
+        del self._recent[:-12]
+        if self._zero is None or self.phase is DosePhase.DONE:
+            return
+        share = 1.0 if now <= self._now else min(max((reading.time - self._now) / (now - self._now), 0.0), 1.0)
+        e = self._estimator
+        e.advance(reading.time, self._tilt + share * (tilt - self._tilt))
+        net = DoseReading(reading.time, reading.mass - self._zero, reading.stable)
+        predicted = e.predicted(reading.time)
+        gate = max(5.0 * math.hypot(float(predicted.std()), e.deviation()), 1.5e-3 + 0.1 * self.flow)
+        if abs(net.mass - float(predicted.mean())) > gate:
+            self._doubt_since = self._doubt_since if self._doubt_since is not None else reading.time
+            if self.phase is not DosePhase.SETTLE:
+                return
+        else:
+            self._doubt_since = None
+        before = self._recent[-2].mass - self._zero if len(self._recent) > 1 else 0.0
+        base = self._late_mass if self._top_ups else 0.0
+        threshold = max(SEEN, 2.5 * self._step_size)
+        self._rising = (
+            self._rising + 1 if net.mass > before + 0.5 * self._step_size and net.mass > base + threshold else 0
+        )
+        e.update(net)
+
+    def _pass_over(self, time: float, tilt: float) -> None:
+        """Move the particles over a pause of the caller, in which the arm has turned back by itself."""
+        highest = self._tilt + self._speed * ARM_PATIENCE
+        turned = self._now + ARM_PATIENCE
+        self._estimator.advance(min(turned, time), highest)
+        self._estimator.advance(min(turned + abs(highest - tilt) / self._settings.return_speed, time), tilt)
+
+    def _note_late_stream(self, seconds: float, tilt: float) -> None:
+        """Integrate the slowest plausible stream; a reading far behind it misses liquid."""
+        if self.phase in (DosePhase.CHECK, DosePhase.DONE) or seconds <= 0.0:
+            return
+        gone = max(self._late_mass, self.amount[0]) / self._cup.density
+        head = self._cup.head(np.array([max(self._late_volume - gone, 0.0)]), np.array([tilt - self._late_onset]))
+        flow = self._late_factor * float(self._cup.flow(head, tilt)[0]) if head[0] > 0.0 else 0.0
+        self._late_flow = flow * self._cup.density
+        self._late_mass += self._late_flow * min(seconds, 0.2)
+
+    def _watch(self) -> None:
+        """Turn back where it is not safe to pour on."""
+        if self.phase not in (DosePhase.APPROACH, DosePhase.POUR) or not self._recent:
+            return
+        assert self._begin is not None
+        e, s = self._estimator, self._settings
+        net = self._recent[-1].mass - (self._zero or 0.0)
+        if self._now - self._recent[-1].time > s.reading_timeout:
+            self._turn_back(DoseEnd.CONNECTION_LOST)
+        elif self._now - self._begin > s.time_limit:
+            self._turn_back(DoseEnd.TIME_LIMIT)
+        elif self._doubt_since is not None and self._now - self._doubt_since > LONGEST_DOUBT:
+            self._turn_back()
+        elif self._nearly_empty():
+            self._turn_back(DoseEnd.SOURCE_EMPTY)
+        elif self._rate() < 0.5 * max(self._late_flow, 1e-3) and (
+            self._late_mass - net - self._late_flow > max(2.5e-3, 0.3 * self._late_mass)
+            or (self.phase is DosePhase.POUR and float(np.median(e.flow_factor)) < 0.3 * self._factor_before)
+        ):
+            left = float(np.median(e.volume))
+            self._turn_back(DoseEnd.SOURCE_EMPTY if left < 0.12 * self._cup.capacity else DoseEnd.STREAM_MISSED)
+
+    def _rate(self) -> float:
+        """Slope of the last readings [kg/s]."""
+        first, last = self._recent[max(len(self._recent) - 7, 0)], self._recent[-1]
+        return (last.mass - first.mass) / (last.time - first.time) if last.time > first.time else math.inf
+
+    def _nearly_empty(self) -> bool:
+        """Whether hardly anything has flowed for a second although the cup is tilted as far as it goes."""
+        empty = self._tilt > LARGEST_TILT - math.radians(12.0) and self.flow < 0.5e-3
+        if not empty:
+            self._idle_since = None
+        elif self._idle_since is None:
+            self._idle_since = self._now
+        return self._idle_since is not None and self._now - self._idle_since > 1.0
+
+    def _turn_back(self, end: DoseEnd | None = None) -> None:
+        self._end = self._end or end
+        self._stop_tilt = self._tilt
+        self._enter(DosePhase.RETURN)
+
+    def _enter(self, phase: DosePhase) -> None:
+        self.phase, self._since = phase, self._now

@@ -1,0 +1,456 @@
+"""A virtual bench for doses: cup, stream, receiver, balance and arm, simulated live and without a clock.
+
+`VirtualDosingBench` is the ground truth for a controller that decides the tilt while liquid flows. It is deliberately
+not the model of `actors.dosing.dose_estimator`:
+
+| part | here |
+|---|---|
+| cup | a straight cylinder with a spout that protrudes beyond the rim, or with a round rim |
+| onset | a dry lip holds the liquid back and gushes; a wet one holds less and dries slowly; grip error |
+| flow | discharge that depends on the head, fluctuations, slosh, a film that drains late, drops |
+| dribble | below a Weber number a part runs down the outside: half of it falls later, half is spilled |
+| stream | falls from a height that changes, with initial speed, spread in time; its impact fluctuates |
+| balance | first order, Butterworth of fourth order, moving average, switching lag; delay, display, noise |
+| arm | commands at 10 or 20 Hz; limits of speed and acceleration, servo lag; back after 0.2 s without news |
+
+`DosingFault` disturbs a dose. Every dose is deterministic for a seed.
+
+Limitations: one dimension; the liquid's surface is a plane plus one slosh mode. Orders of magnitude of dribble, film
+and hold-back are from the literature that `sim_engine.model_validity` cites, not from measurements.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.dosing.dose_controller import TiltCommand
+from actors.dosing.dose_estimator import DoseReading
+from sim_engine.hydrostatics import GRAVITY
+from sim_engine.liquids import Liquid
+
+Floats = NDArray[np.float64]
+
+TIME_STEP = 0.005
+"""[s]"""
+
+WATCHDOG = 0.2
+"""Time without a fresh command after which the arm tilts back by itself [s]."""
+
+LONGEST_DOSE = 90.0
+"""[s]"""
+
+
+class Doser(Protocol):
+    """Anything that decides the tilt of one dose."""
+
+    def step(self, time: float, tilt: float, readings: Sequence[DoseReading]) -> TiltCommand:
+        """Decide.
+
+        Args:
+            time: now [s].
+            tilt: measured now [rad].
+            readings: that arrived since the last call.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class TrueCup:
+    """A straight cylinder with its lip, as the virtual bench has it.
+
+    Attributes:
+        radius, height: of the cavity [m].
+        spout_length: by which the spout protrudes beyond the rim; 0 for a round rim [m].
+        spout_width: where it leaves the rim [m].
+    """
+
+    radius: float
+    height: float
+    spout_length: float = 0.0
+    spout_width: float = 0.012
+
+    @property
+    def capacity(self) -> float:
+        """[m³]"""
+        return math.pi * self.radius**2 * self.height
+
+
+@dataclass(frozen=True)
+class TrueScale:
+    """The balance under the receiver.
+
+    Attributes:
+        kind: of its filter.
+        lag: of the filter, mean of its impulse response [s].
+        interval: between two readings [s].
+        delay: until a reading arrives [s].
+        step: of the display [kg].
+        noise: standard deviation before the display [kg].
+    """
+
+    kind: Literal["first", "fourth", "average", "switching"] = "first"
+    lag: float = 0.33
+    interval: float = 0.1
+    delay: float = 0.05
+    step: float = 1e-4
+    noise: float = 2e-5
+
+
+@dataclass(frozen=True)
+class DosingFault:
+    """A disturbance; `at` is the time after the first flow [s].
+
+    Attributes:
+        kind: 'knock' (5 g for 0.2 s), 'unstable' (the balance never rests), 'line cut' (no reading any more), 'stall'
+            (the controller pauses for 0.7 s), 'killed' (it never comes back), 'miss' (the stream misses the receiver),
+            'receiver missing'.
+    """
+
+    kind: Literal["knock", "unstable", "line cut", "stall", "killed", "miss", "receiver missing"]
+    at: float = 0.5
+
+
+@dataclass(frozen=True)
+class DoseRecord:
+    """What truly happened in one dose.
+
+    Attributes:
+        received: in the receiver at the end [kg].
+        spilled: next to it [kg].
+        duration: from the first command to `finished` [s]; LONGEST_DOSE if it never came.
+        stopped: time of the last outflow [s].
+        upright: time at which the cup had turned back to its rest [s].
+        times, tilts, true_mass, flow: signals (T,): [s], [rad], in the receiver [kg], past the lip [kg/s].
+        readings: as the controller received them.
+    """
+
+    received: float
+    spilled: float
+    duration: float
+    stopped: float
+    upright: float
+    times: Floats
+    tilts: Floats
+    true_mass: Floats
+    flow: Floats
+    readings: tuple[DoseReading, ...]
+
+
+class _Table:
+    """A function of two variables on an even grid, evaluated one value at a time."""
+
+    def __init__(self, values: Floats, row_step: float, column_step: float) -> None:
+        self._rows, self._row_step, self._column_step = values.tolist(), row_step, column_step
+        self._last_row, self._last_column = len(values) - 2, values.shape[1] - 2
+
+    def __call__(self, row: float, column: float) -> float:
+        r, c = max(row / self._row_step, 0.0), max(column / self._column_step, 0.0)
+        i, j = min(int(r), self._last_row), min(int(c), self._last_column)
+        u, v = min(r - i, 1.0), min(c - j, 1.0)
+        a, b = self._rows[i], self._rows[i + 1]
+        low, high = a[j] + v * (a[j + 1] - a[j]), b[j] + v * (b[j + 1] - b[j])
+        return float(low + u * (high - low))
+
+
+_tables: dict[TrueCup, tuple[_Table, _Table]] = {}
+
+
+def _tables_of(cup: TrueCup) -> tuple[_Table, _Table]:
+    """Level above the lip over tilt and volume, and flow / C_d over tilt and the square root of the head."""
+    if cup not in _tables:
+        tilts = np.radians(np.arange(0.0, 126.0, 0.5))
+        x = cup.radius * np.cos((np.arange(80) + 0.5) * math.pi / 80)
+        chord = 2.0 * np.sqrt(cup.radius**2 - x**2) * np.sqrt(cup.radius**2 - x**2) * math.pi / 80
+        z = (np.arange(240) + 0.5) * cup.height / 240
+        xs, zs = np.meshgrid(x, z, indexing="ij")
+        each = np.repeat(chord[:, None], 240, axis=1).ravel() * cup.height / 240
+        each *= cup.capacity / each.sum()
+        volumes = np.linspace(0.0, cup.capacity, 201)
+        levels, flows = [], []
+        heads = np.linspace(0.0, math.sqrt(0.03), 80) ** 2
+        s = 2.0 * cup.radius * ((np.arange(300) + 0.5) / 300) ** 2
+        inside = np.clip(s - cup.spout_length, 0.0, 2.0 * cup.radius)
+        width = 2.0 * np.sqrt(np.maximum(inside * (2.0 * cup.radius - inside), 0.0))
+        if cup.spout_length > 0.0:
+            width = np.maximum(width, cup.spout_width * np.sqrt(np.minimum(s / cup.spout_length, 1.0)))
+        ds = np.gradient(s)
+        for tilt in tilts:
+            heights = (zs * math.cos(tilt) - xs * math.sin(tilt)).ravel()
+            order = np.argsort(heights)
+            surface = np.interp(volumes, np.cumsum(each[order]), heights[order])
+            lip = cup.height * math.cos(tilt) - (cup.radius + cup.spout_length) * math.sin(tilt)
+            levels.append(surface - lip)
+            depth = np.maximum(heads[:, None] - s * math.sin(tilt), 0.0)
+            flows.append(np.sqrt(2.0 * GRAVITY * depth) @ (width * ds))
+        _tables[cup] = (
+            _Table(np.array(levels), math.radians(0.5), float(volumes[1])),
+            _Table(np.array(flows), math.radians(0.5), math.sqrt(0.03) / 79),
+        )
+    return _tables[cup]
+
+
+class _Filter:
+    """The filter of a balance, in steps of `TIME_STEP`."""
+
+    def __init__(self, scale: TrueScale, load: float) -> None:
+        self._kind, self._lag = scale.kind, max(scale.lag, TIME_STEP)
+        self.value = load
+        self._states = [load, 0.0, load, 0.0]
+        self._window: deque[float] = deque([load] * max(round(2.0 * self._lag / TIME_STEP), 1))
+        self._sum = math.fsum(self._window)
+        # delay of a Butterworth filter of fourth order at low frequencies: 2.613/ω
+        self._omega = 2.613 / self._lag
+
+    def step(self, load: float) -> float:
+        """The value after one step with this load [kg]."""
+        if self._kind == "average":
+            self._sum += load - self._window.popleft()
+            self._window.append(load)
+            self.value = self._sum / len(self._window)
+        elif self._kind == "fourth":
+            for k, damping in ((0, 0.92388), (2, 0.38268)):
+                s, w, source = self._states, self._omega, load if k == 0 else self._states[0]
+                s[k + 1] += TIME_STEP * (w * w * (source - s[k]) - 2.0 * damping * w * s[k + 1])
+                s[k] += TIME_STEP * s[k + 1]
+            self.value = self._states[2]
+        else:
+            lag = self._lag
+            if self._kind == "switching":
+                lag *= 1.4 if abs(load - self.value) < 0.6e-3 else 0.8
+            self.value += (load - self.value) * -math.expm1(-TIME_STEP / lag)
+        return self.value
+
+
+class VirtualDosingBench:
+    """One source vessel, one balance and one arm over a series of doses.
+
+    Args:
+        cup: the source vessel.
+        liquid: in it; its mass is the first filling.
+        scale: the balance.
+        seed: of all randomness.
+        receiver_mass: of an empty receiver [kg].
+        command_interval: time between two calls of the controller [s].
+        fall_height: from the lip to the bottom of the receiver [m].
+    """
+
+    def __init__(
+        self,
+        cup: TrueCup,
+        liquid: Liquid,
+        scale: TrueScale,
+        seed: int,
+        *,
+        receiver_mass: float = 0.18,
+        command_interval: float = 0.05,
+        fall_height: float = 0.15,
+    ) -> None:
+        self.cup, self.liquid, self.scale = cup, liquid, scale
+        self.receiver_mass, self.fall_height = receiver_mass, fall_height
+        self._interval = command_interval
+        self._level, self._flow_table = _tables_of(cup)
+        self._rng = np.random.default_rng((seed, 77))
+        rng = self._rng
+        self.volume = liquid.volume
+        # constants of this bench, drawn once
+        wets = 0.5 if liquid.is_thick else 1.0
+        self._grip = math.radians(float(rng.normal(0.0, 0.4)))
+        self._dry_hold = 1e-3 * wets * float(rng.uniform(0.8, 2.0))
+        self._wet_hold = 1e-3 * wets * float(rng.uniform(0.1, 0.5))
+        self._discharge = float(rng.normal(0.60, 0.04))
+        self._wetness = 0.0
+        self._servo_lag = float(rng.uniform(0.03, 0.06))
+        self._network = float(rng.uniform(0.008, 0.025))
+
+    @property
+    def content(self) -> float:
+        """True content of the source [kg]."""
+        return self.volume * self.liquid.density
+
+    def refill(self, mass: float) -> None:
+        """Fill the source to a mass [kg]; the lip dries meanwhile."""
+        self.volume = mass / self.liquid.density
+        self._wetness *= 0.3
+
+    def place_receiver(self) -> tuple[DoseReading, ...]:
+        """Put an empty receiver on the balance: readings of the step, until it rests, with arrival times from 0 [s]."""
+        rng, scale = self._rng, self.scale
+        placed, duration = 1.0 + float(rng.uniform(0.0, 0.3)), float(rng.uniform(0.03, 0.25))
+        cell, end = _Filter(scale, 0.0), 1.5 + 8.0 * scale.lag + 0.5
+        shown, readings, ask = _Display(scale, rng), [], 0.0
+        for k in range(round(end / TIME_STEP)):
+            time = k * TIME_STEP
+            share = min(max((time - placed) / duration, 0.0), 1.0)
+            value = cell.step(self.receiver_mass * share)
+            if time >= ask:
+                ask += scale.interval
+                readings.append(shown.reading(time + scale.delay, value))
+        self._wetness *= 0.85
+        return tuple(readings)
+
+    def dose(self, doser: Doser, fault: DosingFault | None = None) -> DoseRecord:
+        """Run one dose into the empty receiver on the balance."""
+        rng, scale, liquid, cup = self._rng, self.scale, self.liquid, self.cup
+        dt, density = TIME_STEP, liquid.density
+        missing = fault is not None and fault.kind == "receiver missing"
+        base = 0.0 if missing else self.receiver_mass
+        cell, shown = _Filter(scale, base), _Display(scale, rng)
+        thick, nu, tension = liquid.is_thick, liquid.kinematic_viscosity, liquid.surface_tension
+        spouted = cup.spout_length > 0.0
+        critical, clinging = (1.0, 0.25) if spouted else (3.0, 0.08)
+        film_share, film_time = (0.07, 0.7) if thick else (0.03, 0.25)
+        omega = math.sqrt(1.841 * GRAVITY / cup.radius)
+        drops = int(rng.integers(0, 4))
+        landing = [0.0] * 120
+        fluctuation, slosh, slosh_speed, film, late = 0.0, 0.0, 0.0, 0.0, 0.0
+        tilt = target = speed = ordered = 0.0
+        fresh, pending = 0.0, deque[tuple[float, float]]()
+        received = spilled = 0.0
+        first_flow = last_flow = math.inf
+        pending_readings: deque[DoseReading] = deque()
+        next_call, next_reading = 0.0, float(rng.uniform(0.0, scale.interval))
+        finished_at, upright = math.inf, 0.0
+        signals: list[tuple[float, float, float, float]] = []
+        delivered: list[DoseReading] = []
+        normals = rng.standard_normal(int(LONGEST_DOSE / dt) * 2 + 20).tolist()
+        limit, acceleration = math.radians(90.0), math.radians(600.0)
+        k, time, outflow = 0, 0.0, 0.0
+        while time < LONGEST_DOSE and time < finished_at + 2.5:
+            # ---- controller and arm
+            silent = fault is not None and fault.kind in ("stall", "killed") and time > first_flow + fault.at
+            if silent and fault is not None and fault.kind == "stall":
+                silent = time < first_flow + fault.at + 0.7
+            if time >= next_call - 1e-9 and finished_at == math.inf and not silent:
+                next_call = time + self._interval
+                arrived = []
+                while pending_readings and pending_readings[0].time <= time:
+                    arrived.append(pending_readings.popleft())
+                delivered += arrived
+                command = doser.step(time, tilt, arrived)
+                pending.append((time + self._network, command.speed))
+                if command.finished:
+                    finished_at = time
+            while pending and pending[0][0] <= time:
+                _, ordered = pending.popleft()
+                fresh = time
+            lost = time - fresh > WATCHDOG
+            if lost and fault is not None and fault.kind == "killed" and tilt < 1e-4 and first_flow < math.inf:
+                finished_at = min(finished_at, time)
+            wanted = -math.radians(60.0) if lost or finished_at < math.inf else min(max(ordered, -limit), limit)
+            before = speed
+            speed += min(max(wanted - speed, -acceleration * dt), acceleration * dt)
+            target += speed * dt
+            if target < 0.0:
+                target, speed = 0.0, 0.0
+            tilt += (target - tilt) * dt / self._servo_lag
+            if tilt > 0.01:
+                upright = time
+            # ---- cup
+            slosh_speed -= dt * (
+                omega**2 * slosh
+                + 0.08 * omega * slosh_speed
+                + 0.5 * omega**2 * cup.radius * 0.08 * (speed - before) / dt / GRAVITY
+            )
+            slosh += dt * slosh_speed
+            hold = self._dry_hold + (self._wet_hold - self._dry_hold) * self._wetness
+            head = self._level(tilt - self._grip, self.volume) + slosh - hold
+            fluctuation += -fluctuation * dt / 0.3 + 0.04 * math.sqrt(2.0 * dt / 0.3) * normals[2 * k]
+            outflow = 0.0
+            if head > 0.0 and self.volume > 0.0:
+                ideal = self._flow_table(tilt, math.sqrt(head))
+                wide = 2.0 * math.sqrt(2.0 * cup.radius * head)
+                if spouted:
+                    wide = cup.spout_width * math.sqrt(min(head / cup.spout_length, 1.0))
+                wide = max(wide, 1e-4)
+                outflow = (self._discharge + 0.06 * math.tanh(head / 4e-3)) * ideal
+                viscous = 0.8 * wide * GRAVITY * head**3 / (3.0 * nu)
+                outflow = outflow * viscous / (outflow**1.5 + viscous**1.5) ** (1.0 / 1.5)
+                outflow = min(outflow * (1.0 + fluctuation), self.volume / dt)
+                thickness = max(0.6 * head, 1e-5)
+                weber = density * (outflow / (wide * thickness)) ** 2 * thickness / tension
+                clings = clinging * min(max((1.5 * critical - weber) / critical, 0.0), 1.0)
+                self._wetness += (1.0 - self._wetness) * dt / 0.25
+                first_flow = min(first_flow, time)
+            else:
+                clings = 0.0
+                self._wetness -= 0.6 * self._wetness * dt / 40.0
+            self.volume -= outflow * dt
+            mass = density * outflow * dt
+            clinging_mass = clings * mass
+            late += 0.5 * clinging_mass - late * dt / 0.8
+            spilled += 0.5 * clinging_mass
+            film += film_share * mass
+            drained = film * dt / film_time
+            film -= drained
+            leaves = (1.0 - film_share) * mass - clinging_mass + drained + late * dt / 0.8
+            if mass == 0.0 and first_flow < math.inf and time > first_flow + 1.0 and drops and normals[2 * k + 1] > 2.9:
+                drops -= 1
+                drop = min(5e-5, self.volume * density)
+                self.volume -= drop / density
+                leaves += drop
+            if mass > 0.0:
+                last_flow = time
+            # ---- stream
+            height = self.fall_height - received / (density * math.pi * 0.035**2)
+            fall = (math.sqrt(0.01 + 2.0 * GRAVITY * height) - 0.1) / GRAVITY
+            place = k + int(fall / dt) + (k % 3)
+            landing[place % 120] += leaves
+            lands = landing[k % 120]
+            landing[k % 120] = 0.0
+            if fault is not None and fault.kind == "miss" and time > first_flow + fault.at:
+                spilled, lands = spilled + lands, 0.0
+            received += lands
+            impact = lands / dt * math.sqrt(0.01 + 2.0 * GRAVITY * height) / GRAVITY * (1.0 + 0.1 * normals[2 * k + 1])
+            # ---- balance
+            load = base + received + impact
+            if fault is not None:
+                after = time - first_flow - fault.at
+                if fault.kind == "knock" and 0.0 <= after < 0.2:
+                    load += 5e-3
+                if fault.kind == "unstable":
+                    load += 2e-3 * math.sin(8.0 * time) + 1e-3 * normals[2 * k + 1]
+            value = cell.step(load)
+            if time >= next_reading:
+                next_reading += scale.interval + 0.005 * normals[2 * k + 1] * scale.interval / 0.1
+                if not (fault is not None and fault.kind == "line cut" and time > first_flow + fault.at):
+                    pending_readings.append(shown.reading(time + scale.delay, value))
+            if k % 4 == 0:
+                signals.append((time, tilt, received, leaves / dt))
+            k += 1
+            time = k * dt
+        received += late * 0.5 + sum(landing)
+        columns = np.array(signals).T
+        return DoseRecord(
+            received,
+            spilled,
+            min(finished_at, LONGEST_DOSE),
+            0.0 if last_flow == math.inf else last_flow,
+            upright,
+            columns[0],
+            columns[1],
+            columns[2],
+            columns[3],
+            tuple(delivered),
+        )
+
+
+class _Display:
+    """Rounds, and reports when the value rests."""
+
+    def __init__(self, scale: TrueScale, rng: np.random.Generator) -> None:
+        self._scale, self._rng = scale, rng
+        self._last: deque[float] = deque(maxlen=max(round(0.6 / scale.interval), 3))
+
+    def reading(self, arrival: float, value: float) -> DoseReading:
+        step = self._scale.step
+        shown = round((value + self._scale.noise * float(self._rng.standard_normal())) / step) * step
+        self._last.append(shown)
+        full = len(self._last) == self._last.maxlen
+        return DoseReading(arrival, shown, full and max(self._last) - min(self._last) < 1.5 * step)

@@ -1,0 +1,197 @@
+"""Doses of wanted amounts: the flow of the cup, the estimate, and whole doses on the virtual bench."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from actors.dosing.cup_flow import CupFlow
+from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder, DosingSettings
+from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, identify_lag
+from actors.dosing.virtual_dosing_bench import DoseRecord, DosingFault, TrueCup, TrueScale, VirtualDosingBench
+from sim_engine.hydrostatics import level, tilting_cup_outflow
+from sim_engine.liquids import Liquid
+from sim_engine.vessel.shapes import cylinder
+from sim_engine.vessel.vessel import build_vessel
+
+WATER = Liquid(mass=0.3)
+BEAKER = build_vessel(cylinder("beaker", inner_radius=0.04, inner_height=0.10))
+CUP = CupFlow(BEAKER, WATER)
+SPOUTED = TrueCup(0.040, 0.100, 0.007, 0.014)
+
+
+def no_lag_known(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    return identify_lag([], count, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("tilt", [30.0, 55.0, 75.0])
+def test_head_of_many_states_equals_the_level_of_each(tilt: float) -> None:
+    volumes = np.array([1.2e-4, 2.4e-4, 3.9e-4])
+    heads = CUP.head(volumes, np.full(3, math.radians(tilt)))
+    assert heads == pytest.approx([level(BEAKER, v, math.radians(tilt)) for v in volumes], abs=1.5e-4)
+
+
+def test_the_tilt_for_a_flow_gives_that_flow() -> None:
+    volumes, wanted = np.array([1.0e-4, 2.5e-4, 4.0e-4]), 8e-6
+    for volume in volumes:
+        tilt = 1.0
+        for _ in range(20):
+            head = CUP.head_for(np.array([wanted]), tilt)
+            tilt = float(CUP.tilt_for(np.array([volume]), head)[0])
+        flow = CUP.flow(CUP.head(np.array([volume]), np.array([tilt])), tilt)[0]
+        assert flow == pytest.approx(wanted, rel=0.1)
+
+
+def test_a_dose_of_particles_without_uncertainty_follows_the_tilting_cup_equation() -> None:
+    one = np.full(3, 1.0)
+    belief = DoseBelief(0.0 * one, one, 0.3 * one, one, 3e-4 * one)
+    estimator = DoseEstimator(CUP, belief, fall_time=0.17, step=1e-5, noise=0.0, rng=np.random.default_rng(1))
+    times = np.linspace(0.0, 6.0, 241)
+    tilts = np.radians(np.interp(times, [0.0, 2.0, 6.0], [40.0, 56.0, 64.0]))
+    estimator.start(0.0, float(tilts[0]))
+    for time, tilt in zip(times[1:], tilts[1:], strict=True):
+        estimator.advance(float(time), float(tilt))
+    left = WATER.density * tilting_cup_outflow(BEAKER, 3e-4, times, tilts)[-1]
+    assert estimator.mass.mean() == pytest.approx(left, rel=0.05)  # flow and onset wander a little by design
+
+
+def test_readings_correct_a_wrong_onset_and_flow() -> None:
+    """The truth is a particle of the same model; the estimate does not know its onset, flow factor and lag."""
+    rng, single = np.random.default_rng(3), np.full(3, 1.0)
+    truth_belief = DoseBelief(math.radians(1.6) * single, 0.8 * single, 0.25 * single, single, 3e-4 * single)
+    truth = DoseEstimator(CUP, truth_belief, fall_time=0.17, step=1e-5, noise=0.0, rng=np.random.default_rng(4))
+    guess = DoseBelief.prior((3e-4, 1e-6), no_lag_known(100), rng)
+    estimate = DoseEstimator(CUP, guess, fall_time=0.17, step=1e-4, noise=0.0, rng=rng)
+    blind = DoseEstimator(CUP, guess, fall_time=0.17, step=1e-4, noise=0.0, rng=np.random.default_rng(5))
+    for one in (truth, estimate, blind):
+        one.start(0.0, math.radians(45.0))
+    for k in range(1, 141):
+        time, tilt = 0.05 * k, math.radians(min(45.0 + 3.0 * 0.05 * k, 62.0))
+        for one in (truth, estimate, blind):
+            one.advance(time, tilt)
+        if k % 2 == 0:
+            estimate.update(DoseReading(time, float(round(truth.reading[0], 4))))
+    true = float(truth.mass[0])
+    assert abs(float(estimate.mass.mean()) - true) < 0.6e-3 < 5e-3 < abs(float(blind.mass.mean()) - true)
+    assert float(estimate.mass.std()) < 0.6e-3
+
+
+@pytest.mark.parametrize("kind", ["first", "fourth", "average"])
+@pytest.mark.parametrize("lag", [0.2, 0.5, 1.0])
+def test_the_step_of_the_receiver_shows_the_lag(kind: str, lag: float) -> None:
+    scale = TrueScale(kind, lag, delay=0.06)  # type: ignore[arg-type]
+    readings = VirtualDosingBench(SPOUTED, WATER, scale, 2).place_receiver()
+    lags, _ = identify_lag(readings, 100, np.random.default_rng(0))
+    assert float(np.median(lags)) == pytest.approx(lag + 0.06, rel=0.15)
+
+
+def one_dose(
+    amount: float = 0.05,
+    fault: DosingFault | None = None,
+    *,
+    seed: int = 1,
+    mass: float = 0.3,
+    believed: float | None = None,
+    scale: TrueScale | None = None,
+) -> tuple[DoseRecord, DoseController]:
+    liquid = Liquid(mass=mass)
+    bench = VirtualDosingBench(SPOUTED, liquid, scale or TrueScale(lag=0.3), seed)
+    rng = np.random.default_rng(seed)
+    lag = identify_lag(bench.place_receiver(), 80, rng)
+    volume = (believed or mass) / liquid.density
+    controller = DoseController(
+        CUP,
+        DoseOrder(amount, receiver_mass=bench.receiver_mass),
+        DoseBelief.prior((volume, 5e-7), lag, rng),
+        DosingSettings(),
+        seed=seed,
+    )
+    record = bench.dose(controller, fault)
+    return record, controller
+
+
+@pytest.mark.parametrize("amount", [0.01, 0.05, 0.1])
+@pytest.mark.parametrize("kind", ["first", "average", "switching"])
+def test_the_first_dose_meets_its_amount(amount: float, kind: str) -> None:
+    record, controller = one_dose(amount, scale=TrueScale(kind, 0.3))  # type: ignore[arg-type]
+    assert controller.result is not None
+    assert controller.result.end is DoseEnd.REACHED
+    assert record.received == pytest.approx(amount, abs=1.5e-3)
+    assert controller.result.amount == pytest.approx(record.received, abs=0.3e-3)
+
+
+def test_the_same_seed_makes_the_same_dose() -> None:
+    (first, _), (second, _) = one_dose(0.025, seed=7), one_dose(0.025, seed=7)
+    assert first.received == second.received
+    assert np.array_equal(first.tilts, second.tilts)
+
+
+def test_a_dose_passes_on_its_estimates() -> None:
+    record, controller = one_dose(0.1)
+    assert controller.result is not None
+    after = controller.result.belief
+    assert after.doses == 1
+    assert float(after.volume.mean()) * WATER.density == pytest.approx(0.3 - record.received, abs=2e-3)
+    assert float(after.onset_bias.std()) < math.radians(0.8)
+
+
+def test_a_knock_on_the_balance_does_not_end_the_dose_early_or_late() -> None:
+    record, controller = one_dose(0.1, DosingFault("knock", 1.5))
+    assert controller.result is not None
+    assert controller.result.end is DoseEnd.REACHED
+    assert record.received == pytest.approx(0.1, abs=1.5e-3)
+
+
+def test_an_unstable_balance_pours_nothing() -> None:
+    record, controller = one_dose(0.05, DosingFault("unstable"))
+    assert controller.result is not None
+    assert controller.result.end is DoseEnd.UNSTABLE
+    assert record.received == 0.0
+
+
+def test_a_missing_receiver_is_noticed_before_anything_flows() -> None:
+    record, controller = one_dose(0.05, DosingFault("receiver missing"))
+    assert controller.result is not None
+    assert controller.result.end is DoseEnd.RECEIVER_MISSING
+    assert record.received == record.spilled == 0.0
+
+
+def test_a_cut_line_leaves_the_amount_unknown_and_the_cup_turned_back() -> None:
+    record, controller = one_dose(0.1, DosingFault("line cut", 1.5))
+    assert controller.result is not None
+    assert (controller.result.end, controller.result.amount) == (DoseEnd.CONNECTION_LOST, None)
+    assert controller.result.estimate[0] == pytest.approx(record.received, abs=3e-3)
+    assert record.received < 0.1
+
+
+def test_a_stream_beside_the_receiver_is_stopped() -> None:
+    record, controller = one_dose(0.1, DosingFault("miss", 0.0))
+    assert controller.result is not None
+    assert controller.result.end is DoseEnd.STREAM_MISSED
+    assert record.spilled < 0.08  # before the first dose the onset is known to 1.2° only, 8 g per degree
+
+
+def test_an_empty_source_ends_the_dose_short() -> None:
+    record, controller = one_dose(0.1, mass=0.08, believed=0.13)
+    assert controller.result is not None
+    assert controller.result.end is DoseEnd.SOURCE_EMPTY
+    assert controller.result.amount == pytest.approx(record.received, abs=0.5e-3)
+
+
+def test_a_stalled_program_does_not_overfill() -> None:
+    """The arm turns back by itself after 0.2 s; the dose continues when the program is back."""
+    record, controller = one_dose(0.1, DosingFault("stall", 1.0))
+    assert controller.result is not None
+    assert controller.result.end is DoseEnd.REACHED
+    assert record.received == pytest.approx(0.1, abs=1.5e-3)
+
+
+def test_a_killed_program_leaves_the_cup_upright_within_a_second_and_a_half() -> None:
+    record, controller = one_dose(0.1, DosingFault("killed", 1.0))
+    assert controller.result is None
+    flowing = record.times[record.flow > 1e-4]
+    # 0.2 s watchdog, then 60° per second
+    assert record.stopped < float(flowing[0]) + 1.0 + 0.2 + 0.4
+    assert record.upright < float(flowing[0]) + 1.0 + 0.2 + 1.4
