@@ -85,7 +85,7 @@ def test_an_address_that_is_taken_is_told(shared: VirtualController) -> None:
         ({"time_scale": 0.0}, "scale"),
         ({"time_scale": float("nan")}, "scale"),
         ({"frequency": 1.0}, "Hz"),
-        ({"model": "ur5"}, "ur10"),
+        ({"model": "ur6"}, "ur10"),
         ({"joints": [0.0, 1.0]}, "six numbers"),
         ({"joints": [0.0, 0.0, 0.0, 0.0, 0.0, 9.0]}, "joint 6 \\(wrist 3\\)"),
     ],

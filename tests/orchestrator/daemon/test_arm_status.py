@@ -35,7 +35,7 @@ async def arm_of(served: Served, rig: str, state: str) -> dict[str, Any]:
     ("fault", "arguments", "text", "advice"),
     [
         ("protective_stop", {}, "protective stop is in force", "find the cause, then unlock it"),
-        ("reduced", {}, "reduced mode is in force", "end the reduced mode"),
+        ("reduced", {}, "reduced mode is in force", "pours need the normal limits"),
         ("slider", {"fraction": 0.5}, "the speed slider is at 50 %", "set the slider"),
         (
             "remote",

@@ -125,7 +125,7 @@ def test_without_an_answer_nothing_is_called_safe() -> None:
 def test_where_the_action_itself_spills_more_there_is_no_window_and_it_says_so() -> None:
     window = planned(1, 0.01, spill=lambda *pour: 0.05 + 0.9 * two_valleys(*pour)).window
     assert window.axes == {}
-    assert "none; the action itself comes to more than 1.00 %" in window_line(window, loss_unit(Loss()))
+    assert "none; the loss of the action itself exceeds 1.00 %" in window_line(window, loss_unit(Loss()))
 
 
 def test_the_luck_of_few_errors_is_allowed_for() -> None:
