@@ -227,7 +227,7 @@ class DoseController:
         self._zero: float | None = None
         self._recent: list[DoseReading] = []
         self._now, self._tilt, self._speed = 0.0, 0.0, 0.0
-        self._rising, self._poured_before = 0, 0.0
+        self._rising = 0
         self._tick = 0.05
         self._doubt_since: float | None = None
         self._since = 0.0
@@ -380,7 +380,7 @@ class DoseController:
                 self._top_ups += 1
                 self._rising, self._doubt_since = 0, None
                 self._estimator.update(DoseReading(self._now, amount), sigma=0.05e-3)
-                self._late_mass = self._poured_before = amount
+                self._late_mass = amount
                 self._enter(DosePhase.APPROACH)
                 return
             self._end = DoseEnd.SHORT
@@ -452,9 +452,11 @@ class DoseController:
         else:
             self._doubt_since = None
         before = self._recent[-2].mass - self._zero if len(self._recent) > 1 else 0.0
-        threshold = self._poured_before + max(SEEN, 2.5 * self._step_size)
-        rises = net.mass > before + 0.5 * self._step_size and net.mass > threshold
-        self._rising = self._rising + 1 if rises else 0
+        base = self._late_mass if self._top_ups else 0.0
+        threshold = max(SEEN, 2.5 * self._step_size)
+        self._rising = (
+            self._rising + 1 if net.mass > before + 0.5 * self._step_size and net.mass > base + threshold else 0
+        )
         e.update(net)
 
     def _pass_over(self, time: float, tilt: float) -> None:
