@@ -21,6 +21,9 @@ from sim_engine.scene import PoseError
 
 _NORMAL = NormalDist()
 
+WRITTEN_IF_SET = {"written": "if set"}
+"""Metadata of a field that is left out of the journal while it is None."""
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -83,7 +86,7 @@ class Pour:
         number: 1, 2, … within the stage.
         seed: seed of the virtual bench's hidden noise for this pour; a real bench ignores it.
         predicted: the strategy's prediction, for display.
-        dose: wanted amount in the receiver; the action then gives the place and the range of the tilt only.
+        dose: wanted amount in the receiver; its controller then decides the tilt, and the action gives the place only.
     """
 
     scene: str
@@ -92,7 +95,7 @@ class Pour:
     seed: int
     predicted: Prediction | None = None
     purpose: str = "pour"
-    dose: DoseTarget | None = None
+    dose: DoseTarget | None = field(default=None, metadata=WRITTEN_IF_SET)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 from pydantic import BaseModel, ValidationError
 
 from orchestrator.journal.upgrade import upgraded_outcome, upgraded_request, upgraded_result
-from orchestrator.requests import Outcome, Request
+from orchestrator.requests import WRITTEN_IF_SET, Outcome, Request
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.stage_result import StageResult
 
@@ -123,7 +123,9 @@ def to_json(value: Any, hint: Any = Any) -> Any:
     if issubclass(hint, BaseModel):
         return cast(BaseModel, value).model_dump(mode="json")
     if dataclasses.is_dataclass(hint):
-        return {name: to_json(getattr(value, name), h) for name, h in _fields(hint).items()}
+        values = {name: (getattr(value, name), h) for name, h in _fields(hint).items()}
+        absent = {name for name in _written_if_set(hint) if values[name][0] is None}
+        return {name: to_json(one, h) for name, (one, h) in values.items() if name not in absent}
     if dataclasses.is_dataclass(value):  # only a base class is annotated
         return {_TYPE: type(value).__name__, **to_json(value, type(value))}
     raise CodecError(f"no rule to write a {hint.__name__}")
@@ -226,6 +228,11 @@ def _union_from_json(data: Any, arguments: tuple[Any, ...]) -> Any:
 def _fields(cls: Any) -> dict[str, Any]:
     hints = get_type_hints(cls)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
+
+
+@functools.cache
+def _written_if_set(cls: Any) -> frozenset[str]:
+    return frozenset(field.name for field in dataclasses.fields(cls) if field.metadata == WRITTEN_IF_SET)
 
 
 def _element_hints(hint: Any, count: int) -> tuple[Any, ...]:
