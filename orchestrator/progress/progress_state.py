@@ -194,7 +194,8 @@ class ProgressState:
                 if self.pour is not None:
                     weighed = RecordedPour(event.stage, event.id, pour, "weighed", outcome.measurement)
                     self.pour.result = pour_summary(self.plan, weighed).measured
-                if loss is not None and pour.purpose != CONFIRM and not is_calibration(self.plan, pour):
+                minimised = pour.purpose != CONFIRM and pour.dose is None and not is_calibration(self.plan, pour)
+                if loss is not None and minimised:
                     best = self.best.get(pour.scene)
                     if best is None or loss < best.loss:
                         self.best[pour.scene] = Best(loss, pour.number, unit_of_pour(self.plan, pour))

@@ -110,14 +110,22 @@ SPILLAGE = LossUnit("spilled / poured [%]", "%", 100.0)
 """Display unit of a calibration pour's spillage r."""
 
 
+DOSE = LossUnit("|received − wanted| [g]", "g", 1e3)
+"""Display unit of a dose's error."""
+
+
 def is_calibration(plan: CampaignPlan, pour: Pour) -> bool:
     """Whether a pour serves calibration: it is compared with simulations, not minimised."""
+    if pour.dose is not None:
+        return False
     deployed = {scene.name for scene in plan.deployment.scenes} if plan.deployment is not None else set()
     return pour.purpose == "calibration" or pour.scene not in deployed
 
 
 def unit_of_pour(plan: CampaignPlan, pour: Pour) -> LossUnit:
     """Display unit of a pour's loss."""
+    if pour.dose is not None:
+        return DOSE
     if plan.deployment is None or is_calibration(plan, pour):
         return SPILLAGE
     return deployment_unit(plan.deployment)
@@ -125,6 +133,8 @@ def unit_of_pour(plan: CampaignPlan, pour: Pour) -> LossUnit:
 
 def loss_of_pour(plan: CampaignPlan, pour: Pour, measured: PourMeasurement) -> float | None:
     """Measured loss of a pour in its own unit; None if it is undefined (too little poured)."""
+    if pour.dose is not None:
+        return abs(measured.delivered - pour.dose.amount)
     if plan.deployment is None or is_calibration(plan, pour):
         return normalised_spillage(measured.fractions)
     if plan.deployment.objectives is not None:

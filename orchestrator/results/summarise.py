@@ -245,7 +245,7 @@ def pour_summaries(plan: CampaignPlan | None, record: RunRecord, *, live: bool =
     """
     best: dict[str, tuple[float, int]] = {}
     for pour in record.pours:
-        if plan is None or pour.measured is None or is_calibration(plan, pour.request):
+        if plan is None or pour.measured is None or is_calibration(plan, pour.request) or pour.request.dose is not None:
             continue
         loss = loss_of_pour(plan, pour.request, pour.measured)
         if loss is not None:
@@ -268,13 +268,17 @@ def pour_summary(
         loss = None if measured is None else loss_of_pour(plan, request, measured)
     state = "unknown" if pour.state == "under way" and not live else pour.state
     came = "" if measured is None else "too little was poured" if loss is None else unit.text(loss)
+    action = style.display_values({name: values[name] for name in names})
+    if request.dose is not None:
+        action = f"{1e3 * request.dose.amount:g} g wanted"
+        came = "" if measured is None else f"{1e3 * measured.delivered:.1f} g"
     return PourSummary(
         stage=pour.stage,
         number=request.number,
         receiver=request.scene if plan is None else receiver_names(plan).get(request.scene, request.scene),
         state=state,
         calibration=calibrating,
-        action=style.display_values({name: values[name] for name in names}),
+        action=action,
         action_si=values,
         predicted="" if request.predicted is None else unit.prediction(request.predicted),
         measured=pour.reason if state == "failed" else came,

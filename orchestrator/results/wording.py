@@ -31,6 +31,7 @@ from orchestrator.strategies.deployment.deployment_result import ParetoAction, R
 from orchestrator.strategies.deployment.model_monitoring import DOUBT, Believed
 from orchestrator.strategies.deployment.real_pours import PredictionCheck
 from orchestrator.strategies.deployment.safe_window import WindowFound
+from orchestrator.strategies.dispense import Dispensed
 from sim_engine.prediction_band import PredictionInterval
 from sim_engine.scene import Scene
 from sim_engine.search_space import Axis, Space
@@ -622,7 +623,24 @@ def receiver_table(summary: RunSummary) -> ResultTable:
 def pour_tables(summary: RunSummary) -> list[ResultTable]:
     """Every requested pour, one table for each stage."""
     stages = dict.fromkeys(pour.stage for pour in summary.pours_made)
-    return [_pour_table(stage, [pour for pour in summary.pours_made if pour.stage == stage]) for stage in stages]
+    return [
+        _dose_table(stage, doses)
+        if isinstance(doses := summary.results.get(stage), Dispensed)
+        else _pour_table(stage, [pour for pour in summary.pours_made if pour.stage == stage])
+        for stage in stages
+    ]
+
+
+def _dose_table(stage: str, dispensed: Dispensed) -> ResultTable:
+    rows = []
+    for dose in dispensed.doses:
+        error = None if dose.received_g is None else dose.received_g - dose.wanted_g
+        cells = [str(dose.number), f"{dose.wanted_g:g}"]
+        cells += ["—" if grams is None else f"{grams:.2f}" for grams in (dose.received_g, error, dose.spilled_g)]
+        cells += ["—" if dose.duration_s is None else f"{dose.duration_s:.1f}", dose.end]
+        rows.append(ResultRow(cells, "bad" if dose.received_g is None else ""))
+    header = ["dose", "wanted [g]", "received [g]", "difference [g]", "spilled [g]", "time [s]", "end"]
+    return ResultTable(f"{stage}: {len(rows)} wanted amounts", header, rows, frozenset(range(len(header) - 1)))
 
 
 def _pour_table(stage: str, pours: Sequence[PourSummary]) -> ResultTable:
