@@ -233,8 +233,9 @@ def _pour(pour: RecordedPour, plan: Mapping[str, Any], scenes: Mapping[str, Any]
     scene = scenes.get(request.scene, {})
     deployed = any(scene["name"] == request.scene for scene in deployment.get("scenes", ()))
     calibrating = request.purpose == "calibration" or not deployed
+    minimised = not calibrating and request.dose is None
     # The loss of weighted objectives needs the plan: use `decant.open_run(run).pours`.
-    loss = None if calibrating or deployment.get("objectives") is not None else Loss(**deployment["loss"])
+    loss = None if not minimised or deployment.get("objectives") is not None else Loss(**deployment["loss"])
     measured = None
     if loss is not None and pour.measured is not None:
         particles = int((plan.get("parameters") or {}).get("particles", 0))
@@ -248,13 +249,13 @@ def _pour(pour: RecordedPour, plan: Mapping[str, Any], scenes: Mapping[str, Any]
         "stage": pour.stage,
         "id": pour.id,
         "purpose": request.purpose,
-        "strategy": _strategy(plan, "calibration" if calibrating else "deployment"),
+        "strategy": "" if request.dose else _strategy(plan, "calibration" if calibrating else "deployment"),
         "pourer": scene.get("pourer", {}).get("name", ""),
         "receiver": scene.get("receiver", {}).get("name", request.scene),
         "liquid": scene.get("liquid", {}).get("name", ""),
         "outcome": "open" if pour.outcome is None else pour.state,
         "loss": measured,
-        "loss_name": "" if calibrating else "objectives" if loss is None else loss.name,
+        "loss_name": "" if not minimised else "objectives" if loss is None else loss.name,
         "predicted_deviation": None if request.predicted is None else request.predicted.deviation,
         "seconds": pour.seconds,
     }

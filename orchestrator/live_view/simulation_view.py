@@ -159,7 +159,7 @@ class NoSuchPourError(ValueError):
 
 
 def find_pour(run: Path, number: int, stage: str | None = None) -> RecordedPour:
-    """Find a weighed pour of a run.
+    """Find a weighed pour of a run. Doses are not found: their motions were not those of an action.
 
     Args:
         run: folder of the run.
@@ -170,7 +170,7 @@ def find_pour(run: Path, number: int, stage: str | None = None) -> RecordedPour:
         NoSuchPourError: the run has no such pour.
         JournalError: the journal can't be read.
     """
-    weighed = read_record(run).weighed
+    weighed = [pour for pour in read_record(run).weighed if pour.request.dose is None]
     fitting = [pour for pour in weighed if pour.request.number == number and stage in (None, pour.stage)]
     if not fitting:
         stages: dict[str, list[str]] = {}

@@ -47,7 +47,7 @@ class PreviousRun:
 
 
 def read_former_run(directory: Path) -> PreviousRun:
-    """Read the weighed pours of a run, finished or not.
+    """Read the weighed pours of a run, finished or not. Doses are left out: their motions were not those of an action.
 
     Pours made for calibration keep their split if the stage that made them was finished; all others are 'train'.
 
@@ -57,7 +57,11 @@ def read_former_run(directory: Path) -> PreviousRun:
     """
     record = read_record(directory)
     header, splits = record.header.fingerprint, _splits(decode_results(record.results))
-    weighed = [pour for pour in record.pours if pour.measured is not None and is_sound(pour.measured.fractions)]
+    weighed = [
+        pour
+        for pour in record.pours
+        if pour.request.dose is None and pour.measured is not None and is_sound(pour.measured.fractions)
+    ]
     pours = tuple(
         (
             pour.request.scene,
