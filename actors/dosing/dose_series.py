@@ -65,7 +65,7 @@ class DoseForecast:
         longest: duration that 95 % of the doses do not exceed [s].
         enough: probability that the source holds the amount.
         fine_flow: at the end of the dose [kg/s].
-        dribbles: whether the stream may run down the outside at this flow.
+        clean_flow: smallest flow that leaves the lip cleanly; a slower stream may run down the outside [kg/s].
         ends: number of simulated doses by their end.
     """
 
@@ -75,7 +75,7 @@ class DoseForecast:
     longest: float
     enough: float
     fine_flow: float
-    dribbles: bool
+    clean_flow: float
     ends: dict[DoseEnd, int]
 
     def as_json(self) -> dict[str, Any]:
@@ -87,7 +87,7 @@ class DoseForecast:
             "longest": self.longest,
             "enough": self.enough,
             "fine_flow": self.fine_flow,
-            "dribbles": self.dribbles,
+            "clean_flow": self.clean_flow,
             "ends": {str(end): count for end, count in self.ends.items()},
         }
 
@@ -183,7 +183,7 @@ class DoseSeries:
             float(np.quantile(durations, 0.95)),
             self.content.probability_of(order.amount),
             fine,
-            fine < self._cup.density * self._cup.clean_flow(max(tilt, 0.1)),
+            self._cup.density * self._cup.clean_flow(max(tilt, 0.1)),
             dict(ends),
         )
 

@@ -18,7 +18,7 @@ from actors.dosing.virtual_dosing_bench import DoseRecord, TrueCup, TrueScale, V
 from actors.interfaces import DoseTarget, InvalidActionError, UnknownPourError
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
-from sim_engine.vessel.vessel import Vessel, build_vessel
+from sim_engine.vessel.vessel import Vessel, VesselError, build_vessel, check_holds
 
 STRAIGHT = 0.03
 """Largest relative difference between a cup's capacity and that of the cylinder of its opening."""
@@ -39,12 +39,10 @@ def simulated_dose(scene: Scene, dose: DoseTarget, seed: int) -> PourMeasurement
         seed: of the bench and of the controller.
 
     Raises:
-        InvalidActionError: the pourer is no straight cup, or it holds less than the amount.
+        InvalidActionError: see `check_dose`.
         UnknownPourError: the amount in the receiver is not known at the end.
     """
-    if dose.amount >= scene.liquid.mass:
-        held, wanted = 1e3 * scene.liquid.mass, 1e3 * dose.amount
-        raise InvalidActionError(f"the pourer holds {held:.4g} g, and {wanted:.4g} g are wanted; fill more")
+    check_dose(scene, dose)
     series, bench = _set_up(scene, seed)
     loaded = bench.content
     controller = series.controller(DoseOrder(dose.amount, dose.limit, bench.receiver_mass), seed=seed)
@@ -57,9 +55,28 @@ def simulated_dose(scene: Scene, dose: DoseTarget, seed: int) -> PourMeasurement
             f"the dose ended: {result.end}. The amount in the receiver is unknown; estimated are {mean:.1f} g ± "
             f"{2.0 * deviation:.1f} g"
         )
-    return PourMeasurement(
-        loaded=loaded, spilled=record.spilled, retained=bench.content, notes={"dose": _notes(dose, result, record)}
-    )
+    retained = max(loaded - record.spilled - result.amount, 0.0)  # the receiver was weighed, the source was not
+    return PourMeasurement(loaded, record.spilled, retained, {"dose": _notes(dose, result, record)})
+
+
+def check_dose(scene: Scene, dose: DoseTarget) -> None:
+    """Check what is known about a dose before it begins.
+
+    Args:
+        scene: pourer, receiver and liquid.
+        dose: wanted amount.
+
+    Raises:
+        InvalidActionError: the source holds too little, the receiver is too small, or the pourer is no straight cup.
+    """
+    held, wanted = 1e3 * scene.liquid.mass, 1e3 * dose.amount
+    if held <= wanted:
+        raise InvalidActionError(f"the pourer holds {held:.4g} g, and {wanted:.4g} g are wanted; fill more")
+    try:
+        check_holds(build_vessel(scene.receiver), (dose.amount + dose.limit) / scene.liquid.density)
+    except VesselError as error:
+        raise InvalidActionError(f"the receiver is too small: {error}") from error
+    _true_cup(build_vessel(scene.pourer))
 
 
 def forecast(scene: Scene, dose: DoseTarget, seed: int) -> DoseForecast:
@@ -69,8 +86,9 @@ def forecast(scene: Scene, dose: DoseTarget, seed: int) -> DoseForecast:
         scene, dose, seed: see `simulated_dose`.
 
     Raises:
-        InvalidActionError: the pourer is no straight cup.
+        InvalidActionError: see `check_dose`.
     """
+    check_dose(scene, dose)
     series, bench = _set_up(scene, seed)
     return series.forecast(DoseOrder(dose.amount, dose.limit, bench.receiver_mass), seed=seed)
 

@@ -1,16 +1,17 @@
 """The command `decant dose`: pours wanted amounts, or predicts them.
 
-So far only simulated benches pour wanted amounts; every other bench refuses before anything moves.
+Only simulated benches pour wanted amounts; the command refuses every laboratory with an arm before anything starts.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Campaign, InProcess, OtherLaboratory, Quiet, SceneName, Seed
+from orchestrator.cli.command_options import Campaign, InProcess, OtherLaboratory, Quiet, Seed
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_message, print_note
 
 if TYPE_CHECKING:
@@ -30,11 +31,17 @@ def dose(
         list[str], typer.Option(help="Wanted in the receiver, for example '50 g'. Repeatable, one dose each.")
     ],
     tolerance: Annotated[
-        str, typer.Option(help="Largest wanted deviation; more than this above the amount is avoided.")
+        str, typer.Option(help="Excess that a dose may have; more is poured in about one of a hundred doses.")
     ] = "1 g",
-    scene: SceneName = None,
+    receiver: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="Name of one of the campaign's receivers; default: the first.", show_default=False
+        ),
+    ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Predict amount, time and content of the source; pour nothing.")
+        bool,
+        typer.Option("--dry-run", help="Predict amount, time, spill risk and content of the source; pour nothing."),
     ] = False,
     seed: Seed = None,
     laboratory: OtherLaboratory = None,
@@ -43,39 +50,26 @@ def dose(
 ) -> None:
     """Pour wanted amounts: the tilt is decided from the balance while the liquid flows.
 
-    The doses are recorded in a journal, as a small run. The pourer holds the campaign's load before every dose.
+    Works on simulated benches only, which have no arm (configs/laboratories/twin.yaml). Hardware and virtual arms are
+    refused. The pourer is a straight cup, and it holds the campaign's load before every dose.
+
+    The doses are recorded in a journal and weighed, as a small run.
     """
-    plan, chosen, action = _chosen(campaign, laboratory, scene)
     targets = _targets(amount, tolerance)
+    plan, scene, action = _chosen(campaign, laboratory, receiver, targets)
+    plan = dataclasses.replace(plan, seed=plan.seed if seed is None else seed)
     if dry_run:
         for target in targets:
-            _predict(chosen, target, plan.seed if seed is None else seed)
+            _predict(scene, target, plan.seed)
         print_message("nothing was poured")
         return
-    again = f"decant dose {campaign} --amount '{amount[0]}'"
-    _pour(plan, chosen, action, targets, seed=seed, in_process=in_process, again=f"Another dose: {again}")
-
-
-def _chosen(path: Campaign, laboratory: OtherLaboratory, scene_name: str | None) -> tuple[CampaignPlan, Scene, Action]:
-    """The campaign, its scene, and an action in the middle of what is searched.
-
-    Raises:
-        RefusalError: the campaign can't be read, or has no bench that pours wanted amounts (exit code 2).
-    """
-    from orchestrator.cli.foreground_run import read_campaign
-    from orchestrator.cli.simulate_command import scene_to_simulate
-
-    plan = read_campaign(path, laboratory)
-    scene, space = scene_to_simulate(plan, scene_name)
-    if not plan.laboratory.pours:
-        raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
-    if plan.laboratory.arm is not None:
-        raise RefusalError(
-            f"laboratory {plan.laboratory.name}: wanted amounts are poured on simulated benches only so far; add "
-            "--laboratory configs/laboratories/twin.yaml",
-            BAD_INPUT,
-        )
-    return plan, scene, scene.action({axis.name: axis.decode(0.5) for axis in space.axes})
+    options = "".join(
+        f" {name} '{value}'"
+        for name, value in (("--laboratory", laboratory), ("--receiver", receiver))
+        if value is not None
+    )
+    again = f"Another dose: decant dose {campaign}{options} --amount '{amount[0]}'"
+    _pour(plan, scene, action, targets, in_process=in_process, again=again)
 
 
 def _targets(amounts: list[str], tolerance: str) -> list[DoseTarget]:
@@ -91,12 +85,49 @@ def _targets(amounts: list[str], tolerance: str) -> list[DoseTarget]:
     return [DoseTarget(amount, limit) for amount in wanted]
 
 
+def _chosen(
+    path: Path, laboratory: Path | None, receiver: str | None, targets: list[DoseTarget]
+) -> tuple[CampaignPlan, Scene, Action]:
+    """The campaign, its scene, and an action in the middle of what is searched.
+
+    Raises:
+        RefusalError: the campaign can't be read, it has no bench that pours wanted amounts, or a dose is impossible
+            (exit code 2).
+    """
+    from actors.dosing.simulated_dose import check_dose
+    from actors.interfaces import InvalidActionError
+    from orchestrator.cli.foreground_run import read_campaign
+    from orchestrator.config.campaign_checks import check_vessels
+    from orchestrator.runs.stages import named_scenes
+
+    plan = read_campaign(path, laboratory)
+    if not plan.laboratory.pours:
+        raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
+    if plan.laboratory.arm is not None:
+        raise RefusalError(
+            f"laboratory {plan.laboratory.name} has an arm, and wanted amounts are poured on simulated benches only; "
+            "name a laboratory without an arm, for example --laboratory configs/laboratories/twin.yaml",
+            BAD_INPUT,
+        )
+    found = list(named_scenes(plan).values())
+    names = [scene.receiver.name for scene, _ in found]
+    if receiver is not None and receiver not in names:
+        known = ", ".join(dict.fromkeys(names))
+        raise RefusalError(f"--receiver {receiver}: the campaign has no such receiver; there are {known}", BAD_INPUT)
+    scene, space = found[0 if receiver is None else names.index(receiver)]
+    # the receiver has to hold the amount, not the load: see `check_dose`
+    if problems := check_vessels(scene, plan.source, wanted=0.0):
+        raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
+    for target in targets:
+        with Refused(InvalidActionError, at=f"--amount '{1e3 * target.amount:g} g': "):
+            check_dose(scene, target)
+    return plan, scene, scene.action({axis.name: axis.decode(0.5) for axis in space.axes})
+
+
 def _predict(scene: Scene, target: DoseTarget, seed: int) -> None:
     from actors.dosing.simulated_dose import forecast
-    from actors.interfaces import InvalidActionError
 
-    with Refused(InvalidActionError):
-        print(forecast_text(target, forecast(scene, target, seed)))
+    print(forecast_text(target, forecast(scene, target, seed)))
 
 
 def forecast_text(target: DoseTarget, predicted: DoseForecast) -> str:
@@ -107,14 +138,16 @@ def forecast_text(target: DoseTarget, predicted: DoseForecast) -> str:
         predicted: its forecast.
     """
     low, high = (1e3 * value for value in predicted.interval)
+    fine, clean = 1e3 * predicted.fine_flow, 1e3 * predicted.clean_flow
+    risk = f"the last stream has {fine:.1f} g/s and leaves the lip cleanly"
+    if fine < clean:
+        risk = f"the last stream has {fine:.1f} g/s only; a part may run down the outside of the pourer"
     lines = [
         f"{1e3 * target.amount:g} g: {low:.1f} to {high:.1f} g expected (90 %), weighed after "
         f"{predicted.duration:.0f} s, in 95 % of the doses within {predicted.longest:.0f} s",
-        f"  the source holds enough with a probability of {100.0 * predicted.enough:.0f} %",
+        f"  source: holds enough with a probability of {100.0 * predicted.enough:.0f} %",
+        f"  spill risk: {risk}",
     ]
-    if predicted.dribbles:
-        flow = 1e3 * predicted.fine_flow
-        lines.append(f"  at the end {flow:.1f} g/s flow; a part may run down the outside of the pourer")
     for end, count in predicted.ends.items():
         if end != "reached":
             lines.append(f"  {count} of {sum(predicted.ends.values())} predicted doses end otherwise: {end}")
@@ -122,14 +155,7 @@ def forecast_text(target: DoseTarget, predicted: DoseForecast) -> str:
 
 
 def _pour(
-    plan: CampaignPlan,
-    scene: Scene,
-    action: Action,
-    targets: list[DoseTarget],
-    *,
-    seed: int | None,
-    in_process: bool,
-    again: str,
+    plan: CampaignPlan, scene: Scene, action: Action, targets: list[DoseTarget], *, in_process: bool, again: str
 ) -> None:
     """As a small run of its own: journalled and weighed."""
     from orchestrator.cli.campaign_commands import run_directory
@@ -141,10 +167,10 @@ def _pour(
     from orchestrator.strategies.dispense import Dispense, Dispensed
 
     small = dataclasses.replace(
-        plan_of_scene(plan, scene),
+        plan_of_scene(plan, scene, pours=len(targets)),
         name=f"{plan.name}-dose",
-        seed=plan.seed if seed is None else seed,
-        outputs=plan.outputs.model_copy(update={"figures": False}),
+        # the recording shows the motions of an arm, and there is none
+        outputs=plan.outputs.model_copy(update={"figures": False, "recording": False}),
     )
 
     def build(results: object, stage_seed: int) -> Dispense:
@@ -158,7 +184,7 @@ def _pour(
         dataclasses.replace(request, folder=directory),
         resources,
         again=again,
-        not_resumed="these doses are not resumed; their weights",
+        not_resumed="these doses are not resumed; what was weighed of them",
     )
     result: Dispensed = result_of(finished.results, STAGE, Dispensed)
     for one in result.doses:

@@ -270,10 +270,10 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
         print(told(result.weighed))
 
 
-def plan_of_scene(plan: CampaignPlan, scene: Scene) -> CampaignPlan:
-    """The campaign without everything that pours in one of its scenes do not need."""
+def plan_of_scene(plan: CampaignPlan, scene: Scene, pours: int = 1) -> CampaignPlan:
+    """The campaign without everything that these pours in one of its scenes do not need."""
     if plan.deployment is not None and scene in plan.deployment.scenes:
-        deployment = dataclasses.replace(plan.deployment.with_settings(pours=1), scenes=(scene,))
+        deployment = dataclasses.replace(plan.deployment.with_settings(pours=pours), scenes=(scene,))
         return dataclasses.replace(plan, calibration=None, deployment=deployment)
     return dataclasses.replace(plan, deployment=None)
 
