@@ -36,6 +36,11 @@ MANY = (Path(__file__).parent / "actors", Path(__file__).parent / "orchestrator"
 REALTIME = (Path(__file__).parent / "end_to_end", Path(__file__).parent / "reliability")
 """Folders whose tests watch other processes: each is `realtime`."""
 
+WITH_PROCESSES = tuple(
+    Path(__file__).parent / name for name in ("actors", "plugins", "orchestrator/commands", "orchestrator/daemon")
+)
+"""Folders where many tests start processes or threads: a stalled machine may fail one, which is tried once more."""
+
 PART = "DECANT_TESTS_PART"
 """Variable '2/4': of the files with tests that were chosen, each fourth one, from the second on."""
 
@@ -74,7 +79,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.hookimpl(trylast=True)  # after those that were not chosen have gone
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """A starved machine misses deadlines, and no arm should move on then: what is `realtime` is tried thrice.
+    """A starved machine misses deadlines, and no arm should move on then: what is `realtime` is tried up to thrice.
 
     Reruns are counted in the last line. A test that needs one on an idle machine has a fault.
     """
@@ -84,6 +89,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker("realtime")
         if item.get_closest_marker("realtime") is not None:
             item.add_marker(pytest.mark.flaky(reruns=2))
+        elif any(item.path.is_relative_to(folder) for folder in WITH_PROCESSES):
+            item.add_marker(pytest.mark.flaky(reruns=1))
     if part := os.environ.get(PART):
         number, parts = (int(word) for word in part.split("/"))
         files = sorted({item.path for item in items})[number - 1 :: parts]

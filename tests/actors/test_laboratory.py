@@ -93,6 +93,7 @@ def test_optimiser_and_its_twin_propose_the_same_also_after_a_death(ray_running,
         assert ours == pytest.approx(theirs, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.ray
 def test_the_real_simulator_gives_the_same_bits_in_a_pool_a_twin_and_the_hidden_liquid(

@@ -134,7 +134,8 @@ def test_address_that_is_not_one_is_refused_with_what_would_be_right() -> None:
             parsed(wrong)
 
 
-@pytest.mark.parametrize("death", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("death", [signal.SIGKILL, signal.SIGSTOP])
 def test_server_that_dies_or_hangs_costs_the_recording_nothing(tmp_path: Path, death: signal.Signals) -> None:
     plan = example_run.campaign(pours=1)
     with LiveView() as live:

@@ -322,6 +322,7 @@ def test_an_operator_who_leaves_the_balance_as_it_is(open_stage, how):
     assert "weighed, pourer_full:" in tale.stage.said("note")
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_balance_that_was_switched_off_during_the_pour_is_not_believed(open_stage):
     """Its new zero would count the spill as nothing; the operator says that it was off, and the spill is unknown."""

@@ -92,6 +92,7 @@ def test_bash_offers_runs_and_the_vessels_they_used(place: Path, monkeypatch: py
     assert completed(place, "bash", "decant runs list --receiver zzz") == set()
 
 
+@pytest.mark.slow
 def test_bash_offers_campaigns_of_the_daemon_and_nothing_without_one(place: Path) -> None:
     assert completed(place, "bash", "decant queue show ") == set()
     real = Real(place / "state")

@@ -60,9 +60,9 @@ def said(command: str) -> str:
 @pytest.mark.parametrize(
     ("command", "options"),
     [
-        ("run", "--in-process"),
-        ("calibrate", "--in-process"),
-        ("plan", "--in-process --iterations 2 --seeds 2"),
+        pytest.param("run", "--in-process", marks=pytest.mark.slow),
+        pytest.param("calibrate", "--in-process", marks=pytest.mark.slow),
+        pytest.param("plan", "--in-process --iterations 2 --seeds 2", marks=pytest.mark.slow),
         ("simulate", f"{ACTION} --seeds 2"),
         ("simulate", "--from pours.csv --seeds 2"),
         ("pour", f"{ACTION} --in-process"),
@@ -89,6 +89,7 @@ def test_queries_of_the_catalogue_print_what_is_documented(tmp_path: Path, monke
     validated("report", said(f"report {run} --json"))
 
 
+@pytest.mark.slow
 def test_a_study_prints_what_is_documented(tmp_path: Path) -> None:
     plan = study_files.small(tmp_path)
     file = tmp_path / "study.yaml"

@@ -151,6 +151,7 @@ def test_another_mean_than_the_papers_is_none_of_d2_paper(tmp_path: Path) -> Non
         study(tmp_path, deployment={"D2_paper": arm})
 
 
+@pytest.mark.slow
 def test_the_papers_methods_run_and_stand_in_figures_and_tables(tmp_path: Path) -> None:
     plan = study(tmp_path)
     for cell in cells_of(plan):
