@@ -22,7 +22,7 @@ from sim_engine.scene import PoseError
 _NORMAL = NormalDist()
 
 WRITTEN_IF_SET = {"written": "if set"}
-"""Metadata of a field that is left out of the journal while it is None."""
+"""Metadata of a field that journal and events leave out while it is None."""
 
 
 @dataclass(frozen=True)

@@ -119,8 +119,8 @@ _add(
 )
 _add(
     dose_command.dose,
-    "decant dose configs/campaigns/quickstart.yaml --amount '50 g' --dry-run",
-    "decant dose configs/campaigns/quickstart.yaml --amount '50 g' --amount '25 g' --tolerance '1 g'",
+    "decant dose my.yaml --laboratory configs/laboratories/twin.yaml --amount '50 g' --dry-run",
+    "decant dose my.yaml --laboratory configs/laboratories/twin.yaml --amount '50 g' --amount '25 g' --tolerance '1 g'",
 )
 _add(
     report_command.report,

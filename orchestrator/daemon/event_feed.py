@@ -22,7 +22,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from orchestrator.requests import Suggest, Suggested
+from orchestrator.requests import WRITTEN_IF_SET, Suggest, Suggested
 from orchestrator.runs.events import (
     CampaignOpened,
     Event,
@@ -68,7 +68,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, BaseModel):
         return plain(value.model_dump(mode="python"))
     if dataclasses.is_dataclass(value):
-        table = {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        values = {f: getattr(value, f.name) for f in dataclasses.fields(value)}
+        table = {f.name: plain(v) for f, v in values.items() if v is not None or f.metadata != WRITTEN_IF_SET}
         return {"type": type(value).__name__, **table}
     if isinstance(value, Mapping):
         return {str(key): plain(one) for key, one in value.items()}
