@@ -18,7 +18,8 @@ from actors.dosing.virtual_dosing_bench import DoseRecord, TrueCup, TrueScale, V
 from actors.interfaces import DoseTarget, InvalidActionError, UnknownPourError
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
-from sim_engine.vessel.vessel import Vessel, VesselError, build_vessel, check_holds
+from sim_engine.vessel.shapes import VesselError
+from sim_engine.vessel.vessel import Vessel, build_vessel, check_holds
 
 STRAIGHT = 0.03
 """Largest relative difference between a cup's capacity and that of the cylinder of its opening."""
@@ -56,7 +57,7 @@ def simulated_dose(scene: Scene, dose: DoseTarget, seed: int) -> PourMeasurement
             f"{2.0 * deviation:.1f} g"
         )
     retained = max(loaded - record.spilled - result.amount, 0.0)  # the receiver was weighed, the source was not
-    return PourMeasurement(loaded, record.spilled, retained, {"dose": _notes(dose, result, record)})
+    return PourMeasurement(loaded, record.spilled, retained, {"dose": _notes(dose, result, record, bench)})
 
 
 def check_dose(scene: Scene, dose: DoseTarget) -> None:
@@ -122,7 +123,7 @@ def _true_cup(vessel: Vessel) -> TrueCup:
     return cup
 
 
-def _notes(dose: DoseTarget, result: DoseResult, record: DoseRecord) -> dict[str, Any]:
+def _notes(dose: DoseTarget, result: DoseResult, record: DoseRecord, bench: VirtualDosingBench) -> dict[str, Any]:
     every = max(len(record.times) // SIGNALS, 1)
     return {
         "wanted": dose.amount,
@@ -134,5 +135,6 @@ def _notes(dose: DoseTarget, result: DoseResult, record: DoseRecord) -> dict[str
         "times": [round(float(t), 3) for t in record.times[::every]],
         "tilt_deg": [round(math.degrees(float(t)), 2) for t in record.tilts[::every]],
         "in_receiver_g": [round(1e3 * float(m), 3) for m in record.true_mass[::every]],
-        "readings": [[round(r.time, 3), r.mass] for r in record.readings],
+        "read_at": [round(r.time, 3) for r in record.readings],
+        "readings_g": [round(1e3 * (r.mass - bench.receiver_mass), 3) for r in record.readings],
     }

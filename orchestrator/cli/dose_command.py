@@ -31,7 +31,7 @@ def dose(
         list[str], typer.Option(help="Wanted in the receiver, for example '50 g'. Repeatable, one dose each.")
     ],
     tolerance: Annotated[
-        str, typer.Option(help="Excess that a dose may have; more is poured in about one of a hundred doses.")
+        str, typer.Option(help="Excess to avoid: the cup turns back as soon as more has an estimated probability of 1 %.")
     ] = "1 g",
     receiver: Annotated[
         str | None,
@@ -88,7 +88,7 @@ def _targets(amounts: list[str], tolerance: str) -> list[DoseTarget]:
 def _chosen(
     path: Path, laboratory: Path | None, receiver: str | None, targets: list[DoseTarget]
 ) -> tuple[CampaignPlan, Scene, Action]:
-    """The campaign, its scene, and an action in the middle of what is searched.
+    """The campaign, its scene, and an action in the middle of the searched ranges.
 
     Raises:
         RefusalError: the campaign can't be read, it has no bench that pours wanted amounts, or a dose is impossible
@@ -170,7 +170,7 @@ def _pour(
         plan_of_scene(plan, scene, pours=len(targets)),
         name=f"{plan.name}-dose",
         # the recording shows the motions of an arm, and there is none
-        outputs=plan.outputs.model_copy(update={"figures": False, "recording": False}),
+        outputs=plan.outputs.model_copy(update={"recording": False}),
     )
 
     def build(results: object, stage_seed: int) -> Dispense:

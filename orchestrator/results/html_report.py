@@ -60,6 +60,10 @@ _FIGURES: dict[str, tuple[str, str]] = {
         "Loss of every pour (dots), its prediction (bars: nine in ten such pours lie inside), and the best so far "
         "(line).",
     ),
+    "dose ": (
+        "Readings of the balance and tilt of the pourer over the time of a dose.",
+        "Balance (dots), wanted amount (line) and tilt over time.",
+    ),
     "loss map": (
         "Map of the expected loss over the searched actions with the pours as numbered dots and the recommended action "
         "as a star.",

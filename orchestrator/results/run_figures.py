@@ -22,6 +22,7 @@ from orchestrator.results.figure_style import safe_name
 from orchestrator.results.loss_units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit, largest_loss
 from orchestrator.results.stage_views import (
     SPLITS,
+    all_of,
     calibrated_label,
     calibration_of,
     deployments_of,
@@ -40,6 +41,7 @@ from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED, Scores
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.deployment.deployment_result import Deployed
+from orchestrator.strategies.dispense import Dispensed, Dose
 from orchestrator.strategies.stage_result import DisplayedMap
 from sim_engine.prediction_band import LEVEL
 
@@ -98,6 +100,8 @@ def _drawings(plan: CampaignPlan, results: Results) -> dict[str, Callable[[], Fi
     if evaluation is not None and (groups := discrepancy_groups(evaluation)):
         title = f"How far the simulator is from the balance: {plan.name}"
         found["test discrepancy"] = partial(draw_discrepancy, groups, title=title)
+    for dose in (dose for dispensed in all_of(results, Dispensed) for dose in dispensed.doses if dose.signals.times):
+        found[f"dose {dose.number}"] = partial(draw_dose, dose)
     if plan.deployment is None:
         return found
     unit = deployment_unit(plan.deployment)
@@ -283,6 +287,25 @@ def draw_spillage(series: Sequence[PourSeries], *, cost: str, title: str) -> Fig
     axes[0, 0].set_ylim(0.0, TOP * top or 1.0)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+    return figure
+
+
+def draw_dose(dose: Dose) -> Figure:
+    """Readings of the balance and tilt of the pourer over the time of a dose, with the wanted amount.
+
+    Args:
+        dose: with signals.
+    """
+    signals = dose.signals
+    figure, axes = style.new_figure(2, 1, size=(6.4, 4.8), sharex=True)
+    received = "unknown" if dose.received_g is None else f"{dose.received_g:.1f} g received"
+    style.entitle(figure, f"Dose {dose.number}: {dose.wanted_g:g} g wanted, {received}")
+    axes[0].plot(signals.read_at, signals.readings_g, ".", color=style.MEASURED, label="reading")
+    axes[0].axhline(dose.wanted_g, color=style.BEST, linewidth=1.0, label="wanted")
+    axes[0].legend(loc="center left", fontsize=9, frameon=False)
+    axes[1].plot(signals.times, signals.tilt_deg, color=style.POURER)
+    style.dress(axes[0], y="balance [g]")
+    style.dress(axes[1], x="time [s]", y="tilt [deg]")
     return figure
 
 

@@ -21,6 +21,22 @@ DOSE = "dose"
 """Purpose of these pours."""
 
 
+class DoseSignals(ResultPart):
+    """Signals of a dose; empty where the bench reports none."""
+
+    times: tuple[float, ...] = ()
+    """Times of the tilt from the first motion [s]."""
+
+    tilt_deg: tuple[float, ...] = ()
+    """Tilt of the pourer [deg]."""
+
+    read_at: tuple[float, ...] = ()
+    """Times of the readings [s]."""
+
+    readings_g: tuple[float, ...] = ()
+    """Readings of the balance, without the receiver [g]."""
+
+
 class Dose(ResultPart):
     """One dose."""
 
@@ -41,6 +57,9 @@ class Dose(ResultPart):
 
     end: str
     """How the dose ended, or why it failed."""
+
+    signals: DoseSignals = DoseSignals()
+    """Signals over time."""
 
 
 class Dispensed(StageResult):
@@ -110,6 +129,7 @@ class Dispense:
                         spilled_g=1e3 * measured.spilled,
                         duration_s=about.get("duration"),
                         end=str(about.get("end", "")),
+                        signals=DoseSignals(**{name: about.get(name, ()) for name in DoseSignals.model_fields}),
                     )
                 )
             case Failed(kind, reason):
