@@ -31,7 +31,8 @@ def dose(
         list[str], typer.Option(help="Wanted in the receiver, for example '50 g'. Repeatable, one dose each.")
     ],
     tolerance: Annotated[
-        str, typer.Option(help="Excess to avoid: the cup turns back as soon as more has an estimated probability of 1 %.")
+        str,
+        typer.Option(help="Excess to avoid: the cup turns back as soon as more has an estimated probability of 1 %."),
     ] = "1 g",
     receiver: Annotated[
         str | None,

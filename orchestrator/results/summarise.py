@@ -116,7 +116,7 @@ def summarise(
                 plan, record, open_theta, calibrated=found is not None, dropped_events=dropped_events
             )
         ),
-        asked=wording.what_was_asked(plan),
+        asked=wording.what_was_asked(plan, record),
         cost=wording.cost(record, totals.occupancy, _time_scale(plan)),
         settings=_settings(plan, versions or {}, recording, check, figures=bool(figures)),
         theta=recommended_theta_of(results),

@@ -449,8 +449,8 @@ def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
-def what_was_asked(plan: CampaignPlan) -> dict[str, str]:
-    """Names and values: the liquid, the calibration of the simulator, the search for pours."""
+def what_was_asked(plan: CampaignPlan, record: RunRecord) -> dict[str, str]:
+    """Names and values: the liquid, and the calibration of the simulator and the search for pours, or the doses."""
     found: list[tuple[str, str]] = []
     scenes = (list(plan.calibration.poured) if plan.calibration is not None else []) + (
         list(plan.deployment.scenes) if plan.deployment is not None else []
@@ -460,6 +460,9 @@ def what_was_asked(plan: CampaignPlan) -> dict[str, str]:
         volume = liquid.millilitres(liquid.mass)
         found.append(("liquid", f"{1e3 * liquid.mass:g} g of {liquid.name} ({volume:.0f} mL)"))
         found.append(("poured from", _listed(scene.pourer.name for scene in scenes)))
+    if doses := [pour.request.dose for pour in record.pours if pour.request.dose is not None]:
+        found.append(("wanted", ", ".join(f"{1e3 * dose.amount:g} g" for dose in doses)))
+        return dict(found)
     if plan.calibration is not None:
         one = plan.calibration
         pours = f"{one.pour_count} pours, {one.holdout} of them kept for testing"

@@ -53,6 +53,8 @@ def test_doses_are_poured_weighed_and_recorded(campaign: Path) -> None:
     assert [dose.number for dose in recorded.doses] == [1, 2]
     page = (run / "report.html").read_text(encoding="utf-8")
     assert "2 wanted amounts" in page
+    assert "25 g, 40 g" in page
+    assert "minimised" not in page.partition("Settings and versions")[0]
     assert "Dose 2: 40 g wanted" in (run / "figures" / "dose-2.svg").read_text(encoding="utf-8")
     assert f"<td>{recorded.doses[1].received_g:.2f}</td>" in re.sub(r"<td[^>]*>", "<td>", page)
     assert read_former_run(run).pours == ()
