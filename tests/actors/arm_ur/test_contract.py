@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -79,13 +80,22 @@ class ReportsThePlan(UrArm):
 
 
 class WaitsForTheController(UrArm):
-    """Tries again until the controller answers."""
+    """Tries again until the controller answers, or its test is over."""
+
+    closed = False
+
+    def close(self) -> None:
+        self.closed = True
+        super().close()
 
     def execute(self, path: PourPath) -> ExecutedPath:
         while True:
             try:
                 return super().execute(path)
             except ArmLostError:
+                if self.closed:
+                    raise
+                time.sleep(0.1)
                 self.release()
 
 
