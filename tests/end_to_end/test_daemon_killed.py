@@ -184,7 +184,7 @@ def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_see
         laboratory.until(lambda: pour_under_way(laboratory.entries()))
         page.locator(".step").wait_for()
         laboratory.kill()
-        page.get_by_text("To stop the arm, use its own emergency stop").wait_for()
+        page.get_by_text("No connection to the daemon").wait_for()
         (unknown,) = {e.body["id"] for e in laboratory.entries() if e.kind == Kind.POUR_STARTED} - {
             e.body["id"] for e in laboratory.entries() if e.kind == Kind.POUR_FINISHED
         }
@@ -193,7 +193,7 @@ def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_see
         card = page.locator(".question")
         card.get_by_role("heading", name="had begun when the run was interrupted").wait_for()
         assert card.get_by_text("simulated: it has no arm").is_visible()
-        assert page.get_by_text("To stop the arm, use its own emergency stop").is_hidden()
+        assert page.get_by_text("No connection to the daemon").is_hidden()
         card.get_by_label("Spilled").fill("3,2")
         card.get_by_label("Left in the pourer").fill("0.4")
         card.get_by_role("button", name="It was weighed").click()
