@@ -34,7 +34,7 @@ from optimiser_problems import BY_NAME, Floats, Instance, Problem
 from players import AXES, SCENE, interval, simulated, unit
 from skipping_clock import SkippingLoop, run
 
-from actors.interfaces import ProgressCallback
+from actors.interfaces import DoseTarget, ProgressCallback
 from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
@@ -125,7 +125,13 @@ class Bench:
         return SimulatedPour(simulated(cost, task.seed, seconds))
 
     async def pour(
-        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
+        self,
+        scene: Scene,
+        action: Any,
+        *,
+        seed: int,
+        progress: ProgressCallback | None = None,
+        dose: DoseTarget | None = None,
     ) -> PourMeasurement:
         """The arm pours, the operator mops."""
         self.before_first = self.before_first if self.poured else self.simulations

@@ -26,7 +26,7 @@ from machine import describe, pin, say, show
 from skipping_clock import run
 
 from actors.bench.ground_truth import hidden_spill
-from actors.interfaces import InvalidActionError, ProgressCallback
+from actors.interfaces import DoseTarget, InvalidActionError, ProgressCallback
 from orchestrator.journal.run_record import Occupancy
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.strategies.campaign_plan import DeploymentPlan, OutputSettings
@@ -93,7 +93,13 @@ class Fluid(Bench):
         return result
 
     async def pour(
-        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
+        self,
+        scene: Scene,
+        action: Any,
+        *,
+        seed: int,
+        progress: ProgressCallback | None = None,
+        dose: DoseTarget | None = None,
     ) -> PourMeasurement:
         """The arm pours, the operator mops."""
         self.before_first = self.before_first if self.poured else self.simulations
