@@ -7,7 +7,14 @@ from typing import Any
 
 import pytest
 
+from orchestrator.cli import console
 from tests.support.campaign_files import write_good
+
+
+@pytest.fixture(autouse=True)
+def not_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command that runs in this process with --quiet or --json leaves the next test talking."""
+    monkeypatch.setattr(console, "_quiet", False)
 
 
 @pytest.fixture
