@@ -85,6 +85,7 @@ def test_the_downloads_are_reports_that_need_nothing_beside_them() -> None:
     for page in pages:
         assert not re.search(r'(?:src|href)="(?!data:)', page)
         assert "VIRTUAL" in page
+        assert not re.search(r"/(?:home|root|work)/|/tmp/(?!decant-)", page), "a folder of one machine"
 
 
 def test_pages_show_commands_of_both_kinds() -> None:

@@ -25,7 +25,6 @@ from actors.bench.ground_truth import GroundTruth
 from actors.bench.pour_procedure import PourProcedure
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.virtual_bench import BenchEmulators, DeviceEmulators, FollowedBench, VirtualBench
-from actors.dosing.simulated_dose import simulated_dose
 from actors.interfaces import (
     DoseTarget,
     InvalidActionError,
@@ -83,6 +82,8 @@ class PouringBench:
                         "wanted amounts are poured on simulated benches only, such as configs/laboratories/twin.yaml; "
                         "remove the amount, or choose such a laboratory"
                     )
+                from actors.dosing.simulated_dose import simulated_dose
+
                 return await asyncio.to_thread(simulated_dose, scene, dose, seed)
             with contextlib.suppress(LaboratoryError):  # the procedure reports why the arm is not ready
                 self._arm_spec = self._arm_spec.fitted_to(await self.arm.ready())

@@ -27,6 +27,7 @@ import numpy as np
 
 from actors.dosing.cup_flow import LARGEST_TILT, CupFlow, Floats
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading
+from actors.interfaces import DoseTarget
 from sim_engine.settings.model import Count, Settings
 from sim_engine.settings.quantity import Quantity
 
@@ -78,17 +79,13 @@ class DosingSettings(Settings):
 
 
 @dataclass(frozen=True)
-class DoseOrder:
-    """One wanted dose.
+class DoseOrder(DoseTarget):
+    """One wanted dose onto a balance.
 
     Attributes:
-        amount: wanted in the receiver [kg].
-        limit: excess that may be exceeded with a probability of 1 % only [kg].
         receiver_mass: expected reading of the balance before the dose; None if it is not known [kg].
     """
 
-    amount: float
-    limit: float = 1e-3
     receiver_mass: float | None = None
 
 

@@ -13,7 +13,6 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -77,19 +76,6 @@ class DoseForecast:
     fine_flow: float
     clean_flow: float
     ends: dict[DoseEnd, int]
-
-    def as_json(self) -> dict[str, Any]:
-        """JSON-ready mapping, SI units."""
-        return {
-            "amount": self.amount,
-            "interval": list(self.interval),
-            "duration": self.duration,
-            "longest": self.longest,
-            "enough": self.enough,
-            "fine_flow": self.fine_flow,
-            "clean_flow": self.clean_flow,
-            "ends": {str(end): count for end, count in self.ends.items()},
-        }
 
 
 class DoseSeries:

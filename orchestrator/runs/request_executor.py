@@ -317,12 +317,9 @@ class RequestExecutor:
             started()
             try:
                 async with asyncio.timeout(self.deadlines.pour):
-                    if request.dose is None:
-                        measurement = await bench.pour(scene, request.action, seed=request.seed, progress=progress)
-                    else:
-                        measurement = await bench.pour(
-                            scene, request.action, seed=request.seed, progress=progress, dose=request.dose
-                        )
+                    measurement = await bench.pour(
+                        scene, request.action, seed=request.seed, progress=progress, dose=request.dose
+                    )
             except InvalidActionError as error:
                 return Failed("invalid_action", str(error))
             except NotPouredError as error:

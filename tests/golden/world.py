@@ -227,7 +227,7 @@ class Bench:
     mode = "virtual"
 
     async def pour(
-        self, scene: Scene, action: Action, *, seed: int, progress: ProgressCallback | None = None
+        self, scene: Scene, action: Action, *, seed: int, progress: ProgressCallback | None = None, dose: Any = None
     ) -> PourMeasurement:
         """One weighed pour."""
         if progress is not None:

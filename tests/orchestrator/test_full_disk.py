@@ -71,7 +71,7 @@ class WeighingBench(ToyBench):
     remark = ""
 
     async def pour(
-        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
+        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None, dose: Any = None
     ) -> PourMeasurement:
         self.happens()
         for key in ("pourer_full", "pourer_after", "tray_after"):

@@ -95,7 +95,7 @@ class ToyBench:
     fails: Callable[[int], Exception | None] = lambda seed: None
 
     async def pour(
-        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
+        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None, dose: Any = None
     ) -> PourMeasurement:
         self.received.append(seed)
         if progress is not None:

@@ -63,7 +63,7 @@ class HeldBench(ToyBench):
         self.answers: list[str] = []
 
     async def pour(
-        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None
+        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None, dose: Any = None
     ) -> PourMeasurement:
         if progress is not None:
             progress(PourProgress(self.checkpoint, 0.5))

@@ -54,7 +54,9 @@ class _Bench:
     def __init__(self, hidden: SimulationParameters) -> None:
         self._hidden = hidden
 
-    async def pour(self, scene: Scene, action: Action, *, seed: int, progress: Any = None) -> PourMeasurement:
+    async def pour(
+        self, scene: Scene, action: Action, *, seed: int, progress: Any = None, dose: Any = None
+    ) -> PourMeasurement:
         await asyncio.sleep(float(os.environ.get(PAUSE, "0")))
         share = spilled(action, self._hidden, seed)
         return PourMeasurement(scene.liquid.mass, share * scene.liquid.mass, 0.0)
