@@ -116,16 +116,61 @@ ProgressCallback = Callable[[PourProgress], None]
 
 
 @dataclass(frozen=True)
+class DoseKnowledge:
+    """What earlier doses have shown about a source vessel and a balance; see `actors.dosing.dose_estimator`.
+
+    Attributes:
+        onset_flow: means of the onset bias [rad] and of the logarithm of the flow factor.
+        covariance: of these two, (2, 2) by rows.
+        lag: mean and standard deviation of the logarithm of the balance's lag, and of the shape of its filter; None if
+            the lag is to be measured again.
+        aim: mass that arrives after the predicted end of the flow [kg].
+        doses: number of doses.
+    """
+
+    onset_flow: tuple[float, ...]
+    covariance: tuple[float, ...]
+    lag: tuple[float, ...] | None
+    aim: float
+    doses: int
+
+
+@dataclass(frozen=True)
+class DoseSource:
+    """The vessel that a dose is poured from.
+
+    Attributes:
+        name: under which its content is tracked.
+        mass: expected content before the dose [kg].
+        deviation: standard deviation of the content [kg].
+        fill: the operator fills it to this content before the dose.
+        constants: number from which a simulated bench draws what stays the same over a series.
+        knowledge: of earlier doses; None if there are none.
+    """
+
+    name: str
+    mass: float
+    deviation: float
+    fill: bool
+    constants: int
+    knowledge: DoseKnowledge | None = None
+
+
+@dataclass(frozen=True)
 class DoseTarget:
     """A wanted amount in the receiver; the tilt is then decided while the liquid flows.
 
     Attributes:
         amount: [kg].
         limit: excess that may be exceeded with a probability of 1 % only [kg].
+        position: name of the receiver's place, for the operator.
+        source: of the dose; None: a full pourer, about which nothing is known.
     """
 
     amount: float
     limit: float = 1e-3
+    position: str = ""
+    source: DoseSource | None = None
 
 
 class Bench(Protocol):

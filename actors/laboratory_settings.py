@@ -19,6 +19,7 @@ from actors.arm.arm_settings import ARMS, ArmSettings
 from actors.balance.balance_settings import BalanceSettings
 from actors.balance.dialect_registry import kinds
 from actors.balance.scale_model import Drift
+from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import OperatorSettings
 from sim_engine.liquids import RETIRED_PARAMETERS, SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise
@@ -184,6 +185,9 @@ class LaboratorySettings(Settings):
 
     bench: BenchSettings | None = None
     """Ground truth of a virtual bench. Without bench and arm, the laboratory only simulates and plans."""
+
+    dosing: Annotated[DosingSettings, NOT_IN_FINGERPRINT] = DosingSettings()
+    """How wanted amounts are poured."""
 
     accepted_checksum: Annotated[str, SET_BY_PROGRAM] = ""
     """Checksum of the accepted safety settings of the hardware; '' if none are accepted."""

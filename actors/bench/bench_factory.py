@@ -25,6 +25,7 @@ from actors.bench.ground_truth import GroundTruth
 from actors.bench.pour_procedure import PourProcedure
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.virtual_bench import BenchEmulators, DeviceEmulators, FollowedBench, VirtualBench
+from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import (
     DoseTarget,
     InvalidActionError,
@@ -46,10 +47,11 @@ class PouringBench:
 
     Args:
         setup: arm, balance, operator and ground truth of the bench.
+        dosing: how wanted amounts are poured.
     """
 
-    def __init__(self, setup: Setup) -> None:
-        self._setup, self._arm_spec = setup, setup.spec
+    def __init__(self, setup: Setup, dosing: DosingSettings) -> None:
+        self._setup, self._arm_spec, self._dosing = setup, setup.spec, dosing
         self.arm, self.balance, self.ground_truth = setup.arm, setup.balance, setup.ground_truth
         self._known: dict[str, dict[str, PourMasses]] = {}
         self._one_at_a_time = asyncio.Lock()
@@ -84,7 +86,7 @@ class PouringBench:
                     )
                 from actors.dosing.simulated_dose import simulated_dose
 
-                return await asyncio.to_thread(simulated_dose, scene, dose, seed)
+                return await asyncio.to_thread(simulated_dose, scene, dose, seed, self._dosing)
             with contextlib.suppress(LaboratoryError):  # the procedure reports why the arm is not ready
                 self._arm_spec = self._arm_spec.fitted_to(await self.arm.ready())
             path = await asyncio.to_thread(self._checked, scene, action)
@@ -179,7 +181,7 @@ async def open_bench(
         if spec.arm is None:
             assert spec.bench is not None
             assert liquid is not None
-            return _open_simulated(spec.bench, opening, liquid)
+            return _open_simulated(spec.bench, spec.dosing, opening, liquid)
         if spec.balance is None:
             raise LaboratoryError(f"laboratory {spec.name}: an arm that pours needs a balance; add a 'balance' to it")
         if operator is None and spec.needs_person:
@@ -194,7 +196,7 @@ async def open_bench(
         raise
 
 
-def _open_simulated(spec: BenchSettings, opening: _Opening, liquid: SimulatorPool) -> OpenBench:
+def _open_simulated(spec: BenchSettings, dosing: DosingSettings, opening: _Opening, liquid: SimulatorPool) -> OpenBench:
     arm_spec, balance_spec = SimulatedArmSettings(time_scale=spec.time_scale), simulated_balance(spec)
     arm = opening.arm(arm_spec)
     balance = opening.balance(balance_spec, "virtual")
@@ -203,7 +205,7 @@ def _open_simulated(spec: BenchSettings, opening: _Opening, liquid: SimulatorPoo
     setup = Setup(
         "virtual", arm_spec, balance_spec, spec.operator_time, arm, balance, operator, ground_truth, _discard_notice
     )
-    return OpenBench(PouringBench(setup), opening.devices, operator=operator)
+    return OpenBench(PouringBench(setup, dosing), opening.devices, operator=operator)
 
 
 def _discard_notice(notice: Notice) -> None:
@@ -244,4 +246,4 @@ async def _open_devices(
     assert operator is not None
     questions = OperatorQuestions(operator, spec.operator, tell, arm_spec.time_scale)
     setup = Setup(spec.mode, arm_spec, balance_spec, spec.operator.time, arm, balance, questions, ground_truth, tell)
-    return OpenBench(PouringBench(setup), opening.devices, emulators, operator)
+    return OpenBench(PouringBench(setup, spec.dosing), opening.devices, emulators, operator)

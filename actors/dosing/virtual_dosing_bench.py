@@ -239,6 +239,8 @@ class VirtualDosingBench:
         receiver_mass: of an empty receiver [kg].
         command_interval: time between two calls of the controller [s].
         fall_height: from the lip to the bottom of the receiver [m].
+        dose_seed: of all that differs between doses; None: of the whole series, as `seed`.
+        wetness: of the lip at first, 0 … 1.
     """
 
     def __init__(
@@ -251,6 +253,8 @@ class VirtualDosingBench:
         receiver_mass: float = 0.18,
         command_interval: float = 0.05,
         fall_height: float = 0.15,
+        dose_seed: int | None = None,
+        wetness: float = 0.0,
     ) -> None:
         self.cup, self.liquid, self.scale = cup, liquid, scale
         self.receiver_mass, self.fall_height = receiver_mass, fall_height
@@ -265,9 +269,11 @@ class VirtualDosingBench:
         self._dry_hold = 1e-3 * wets * float(rng.uniform(0.8, 2.0))
         self._wet_hold = 1e-3 * wets * float(rng.uniform(0.1, 0.5))
         self._discharge = float(rng.normal(0.60, 0.04))
-        self._wetness = 0.0
+        self._wetness = wetness
         self._servo_lag = float(rng.uniform(0.03, 0.06))
         self._network = float(rng.uniform(0.008, 0.025))
+        if dose_seed is not None:
+            self._rng = np.random.default_rng((seed, 78, dose_seed))
 
     @property
     def content(self) -> float:

@@ -20,12 +20,13 @@ import numpy as np
 
 from actors.arm.arm_settings import ArmSettings
 from actors.bench.pour_feasibility import vessel as built
+from actors.dosing.simulated_dose import check_straight
 from actors.interfaces import InvalidActionError, UnreachablePlaceError
 from orchestrator.config.yaml.file_access import why_not_writable
 from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.config.yaml.yaml_source import Document, Loc
 from orchestrator.strategies.calibration.action_prior import actions_all_over
-from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
+from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan, DispensePlan
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.collision import contact_during, describe_contact
 from sim_engine.hydrostatics import level
@@ -371,6 +372,30 @@ class _Checker:
             return f"{action.display(*actions.names)}: {error}"
         return ""
 
+    def doses(self, plan: DispensePlan, *, simulated: bool) -> None:
+        """Every dose must fit into its receiver and come out of a full source."""
+        for scene in plan.scenes:
+            doses = [one for one in plan.doses if one.receiver == scene.receiver.name]
+            largest = max((one.amount + one.limit for one in doses), default=0.0)
+            role = _Role(f"doses from '{scene.pourer.name}' into '{scene.receiver.name}'", ("dispense",))
+            if self.scene(scene, role, largest / scene.liquid.density) is None:
+                continue
+            if simulated:
+                try:
+                    check_straight(scene)
+                except InvalidActionError as error:
+                    self.add(role.places(("sources",), ("pourer",)), f"{role.text}: {error}")
+            elif problem := self._for_the_arm(scene, scene.action({}), Space(()), set()):
+                self.add(role.places(("motion",)), f"{role.text}: the arm can't make the tilt: {problem}")
+        full = min(scene.liquid.mass for scene in plan.scenes)
+        for i, dose in enumerate(plan.doses):
+            if dose.amount + dose.limit + plan.refill_below >= full:
+                text = (
+                    f"a full source holds {1e3 * full:g} g, and the dose, its tolerance and refill_below need "
+                    f"{1e3 * (dose.amount + dose.limit + plan.refill_below):g} g"
+                )
+                self.add((("dispense", "doses", i, "amount"), ("dispense", "doses")), text)
+
     def recorded(self, scene: Scene, recorded: list[Action], role: _Role, place: Loc) -> None:
         """Recorded pours were possible: if their vessels touch, the description of the scene is wrong."""
         vessels = self.scene(scene, role)
@@ -445,6 +470,8 @@ def check_campaign(
             receiver = (("deployment", "receiver"), ("deployment", "receivers", i), ("receivers", i))
             role = _Role(f"deployment into '{scene.receiver.name}'", ("deployment",), receiver)
             checker.reachable(plan.deployment, scene, role)
+    if plan.dispense is not None:
+        checker.doses(plan.dispense, simulated=plan.laboratory.arm is None)
     return list(dict.fromkeys(checker.problems))
 
 
