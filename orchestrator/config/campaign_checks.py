@@ -252,11 +252,14 @@ class _Checker:
                 self.vessels[spec] = None
         return self.vessels[spec]
 
-    def scene(self, scene: Scene, role: _Role, wanted: float | None = None) -> tuple[Vessel, Vessel] | None:
+    def scene(
+        self, scene: Scene, role: _Role, wanted: float | None = None, *, dosed: bool = False
+    ) -> tuple[Vessel, Vessel] | None:
         """The scene's vessels, if both are valid and hold the liquid.
 
         Args:
             wanted: volume that the receiver has to hold [m³]; the whole load unless given.
+            dosed: a controller ends the pour at this volume.
         """
         places = {"pourer": role.places(("pourer",)), "receiver": (*role.receiver, *role.places(("receiver",)))}
         pourer = self.vessel(scene.pourer, places["pourer"])
@@ -275,7 +278,7 @@ class _Checker:
             except VesselError as error:
                 ok = False
                 self.add(places[name], f"{role.text}: {name} can't hold {what if less else load}: {error}")
-        if ok and less and scene.liquid.volume > receiver.capacity:
+        if ok and less and not dosed and scene.liquid.volume > receiver.capacity:
             text = (
                 f"{role.text}: the receiver holds {1e6 * receiver.capacity:.4g} mL, enough for what is asked for, not "
                 f"for {load}: a pour that misses its target may run over"
@@ -378,15 +381,18 @@ class _Checker:
             doses = [one for one in plan.doses if one.receiver == scene.receiver.name]
             largest = max((one.amount + one.limit for one in doses), default=0.0)
             role = _Role(f"doses from '{scene.pourer.name}' into '{scene.receiver.name}'", ("dispense",))
-            if self.scene(scene, role, largest / scene.liquid.density) is None:
+            if self.scene(scene, role, largest / scene.liquid.density, dosed=True) is None:
                 continue
             if simulated:
                 try:
                     check_straight(scene)
                 except InvalidActionError as error:
                     self.add(role.places(("sources",), ("pourer",)), f"{role.text}: {error}")
-            elif problem := self._for_the_arm(scene, scene.action({}), Space(()), set()):
-                self.add(role.places(("motion",)), f"{role.text}: the arm can't make the tilt: {problem}")
+            elif self.arm is not None:
+                try:
+                    self.arm.plan(scene, scene.action({}))
+                except InvalidActionError as error:
+                    self.add(role.places(("motion",)), f"{role.text}: the arm can't make the tilt: {error}")
         full = min(scene.liquid.mass for scene in plan.scenes)
         for i, dose in enumerate(plan.doses):
             if dose.amount + dose.limit + plan.refill_below >= full:

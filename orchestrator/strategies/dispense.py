@@ -213,6 +213,10 @@ class Dispense:
         )
         return self._source(name, filled, fill=True)
 
+    def assume(self, name: str, content: KnownSource) -> None:
+        """Set the content of a source, for a forecast of the doses after it."""
+        self._sources[name] = content
+
     def _holds(self, known: KnownSource, planned: PlannedDose) -> bool:
         sure = known.mass - ENOUGH * known.deviation
         return sure > planned.amount + planned.limit and known.mass - planned.amount >= self._plan.refill_below
