@@ -88,6 +88,26 @@ class SimulatorPool(Protocol):
 
 
 @dataclass(frozen=True)
+class DoseProgress:
+    """Progress of a wanted amount.
+
+    Attributes:
+        phase: 'check', 'approach', 'pour', 'return', 'settle' or 'done'.
+        target: wanted amount [kg].
+        amount, deviation: estimated amount past the lip, and its standard deviation [kg].
+        flow: estimated [kg/s].
+        reading: of the balance, without the receiver [kg]; None before the first one.
+    """
+
+    phase: str
+    target: float
+    amount: float
+    deviation: float
+    flow: float
+    reading: float | None
+
+
+@dataclass(frozen=True)
 class PourProgress:
     """Progress of a pour on the bench, for display only, never for control.
 
@@ -100,6 +120,7 @@ class PourProgress:
         joints: of the arm as last measured [rad]; empty if the arm does not report them.
         pourer: pose of the pourer in the world (x y z [m], qw qx qy qz), from an arm without joints; else empty.
         liquid: particles of this pour, reported once by a virtual bench. Hidden from the learning algorithms.
+        dose: of a wanted amount; None in other pours.
     """
 
     checkpoint: str
@@ -110,6 +131,7 @@ class PourProgress:
     joints: tuple[float, ...] = ()
     pourer: tuple[float, ...] = ()
     liquid: RecordedFrames | None = None
+    dose: DoseProgress | None = None
 
 
 ProgressCallback = Callable[[PourProgress], None]

@@ -220,6 +220,21 @@ class LaboratorySettings(Settings):
             operator=self.operator.with_values(answers=self.operator.answers or answers),
         )
 
+    def in_real_time(self) -> Self:
+        """The laboratory for wanted amounts: an arm over its wires then moves in real time.
+
+        A virtual operator needs as much time of the clock as before.
+        """
+        scale = 1.0 if self.bench is None else self.bench.time_scale
+        if self.arm is None or self.bench is None or scale == 1.0:
+            return self
+        return self.with_values(
+            bench=self.bench.with_values(time_scale=1.0),
+            arm=self.arm.with_values(time_scale=1.0),
+            balance=None if self.balance is None else self.balance.with_values(time_scale=1.0),
+            operator=self.operator.with_values(time=self.operator.time / scale),
+        )
+
     # ---- rules between the sections
 
     def check_values(self, problems: Problems) -> None:

@@ -21,6 +21,7 @@ from actors.balance.balance_settings import BalanceSettings
 from actors.balance.weighing_plan import PourMasses
 from actors.bench.bench_operators import BenchContents, Hands, OperatorQuestions, PlayedOperator, VirtualOperator
 from actors.bench.consent import Setup
+from actors.bench.dose_procedure import DoseProcedure
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.pour_procedure import PourProcedure
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
@@ -78,18 +79,15 @@ class PouringBench:
             UnknownPourError: the pour began, but did not run as planned.
         """
         async with self._one_at_a_time:
-            if dose is not None:
-                if not isinstance(self.ground_truth, SimulatedBench):
-                    raise InvalidActionError(
-                        "wanted amounts are poured on simulated benches only, such as configs/laboratories/twin.yaml; "
-                        "remove the amount, or choose such a laboratory"
-                    )
+            if dose is not None and isinstance(self.ground_truth, SimulatedBench):
                 from actors.dosing.simulated_dose import simulated_dose
 
                 return await asyncio.to_thread(simulated_dose, scene, dose, seed, self._dosing)
             with contextlib.suppress(LaboratoryError):  # the procedure reports why the arm is not ready
                 self._arm_spec = self._arm_spec.fitted_to(await self.arm.ready())
             path = await asyncio.to_thread(self._checked, scene, action)
+            if dose is not None:
+                return await self._dose(scene, dose, path, seed, progress)
             pour = PourProcedure(
                 self._setup, scene, action, path, seed=seed, known=self._known.get(scene.pourer.name), progress=progress
             )
@@ -97,6 +95,16 @@ class PouringBench:
                 return await pour.run()
             finally:
                 self._known[scene.pourer.name] = pour.lasting
+
+    async def _dose(
+        self, scene: Scene, dose: DoseTarget, path: PlannedPour, seed: int, progress: ProgressCallback | None
+    ) -> PourMeasurement:
+        if not self._arm_spec.doses:
+            raise InvalidActionError(f"an arm of the kind '{self._arm_spec.kind}' can't pour wanted amounts")
+        if self._arm_spec.time_scale != 1.0:
+            raise InvalidActionError("wanted amounts are poured in real time; write 'bench: {time_scale: 1}'")
+        procedure = DoseProcedure(self._setup, scene, dose, path, seed=seed, settings=self._dosing, progress=progress)
+        return await procedure.run()
 
     def _checked(self, scene: Scene, action: Action) -> PlannedPour:
         try:

@@ -39,7 +39,6 @@ LOST = (1e-3, 1e-3)
 films. On the virtual bench it is 0.3 g with a spout, and 2.7 g with a round rim."""
 
 
-
 @dataclass(frozen=True)
 class SourceContent:
     """Content of a source vessel, as far as it is known.

@@ -20,7 +20,7 @@ from actors.dosing.virtual_dosing_bench import DoseRecord, TrueCup, TrueScale, V
 from actors.interfaces import DoseTarget, InvalidActionError, UnknownPourError
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
-from sim_engine.vessel.vessel import Vessel, build_vessel
+from sim_engine.vessel.vessel import build_vessel
 
 STRAIGHT = 0.03
 """Largest relative difference between a cup's capacity and that of the cylinder of its opening."""
@@ -79,7 +79,7 @@ def _set_up(
     )
     wetness = 0.0 if source.knowledge is None else 0.2 if source.fill else 0.7
     bench = VirtualDosingBench(
-        _true_cup(pourer),
+        true_cup(scene),
         liquid,
         scale,
         constants,
@@ -96,20 +96,21 @@ def check_straight(scene: Scene) -> None:
     Raises:
         InvalidActionError: the pourer is no straight cup.
     """
-    _true_cup(build_vessel(scene.pourer))
+    true_cup(scene)
 
 
-def _true_cup(vessel: Vessel) -> TrueCup:
-    """The virtual bench's own cup of the same size.
+def true_cup(scene: Scene) -> TrueCup:
+    """The virtual bench's own cup of the size of the scene's pourer.
 
     Raises:
         InvalidActionError: the vessel is no straight cup.
     """
+    vessel = build_vessel(scene.pourer)
     height = vessel.rim_height - vessel.inner_floor
     cup = TrueCup(vessel.opening_radius, height)
     if not math.isclose(cup.capacity, vessel.capacity, rel_tol=STRAIGHT):
         raise InvalidActionError(
-            f"{vessel.name} is no straight cup; a simulated bench pours wanted amounts out of straight cups only"
+            f"{vessel.name} is no straight cup; virtual benches pour wanted amounts out of straight cups only"
         )
     return cup
 

@@ -367,7 +367,7 @@ class VirtualDosingBench:
             if tilt > 0.01:
                 upright = time
             missed = fault is not None and fault.kind == "miss" and time > pour.first_flow + fault.at
-            load = base + pour.step(tilt, (speed - before) / dt, missed=missed)
+            load = base + pour.step(tilt, speed - before, missed=missed)
             # ---- balance
             if fault is not None:
                 after = time - pour.first_flow - fault.at
@@ -426,12 +426,12 @@ class LivePour:
         self.received = self.spilled = self.flow = 0.0
         self.first_flow = self.last_flow = math.inf
 
-    def step(self, tilt: float, acceleration: float, *, missed: bool = False) -> float:
+    def step(self, tilt: float, turned: float, *, missed: bool = False) -> float:
         """Pour for one step.
 
         Args:
             tilt: of the cup [rad].
-            acceleration: of the tilt [rad/s²].
+            turned: change of the tilt's speed in this step [rad/s].
             missed: the stream misses the receiver.
 
         Returns:
@@ -449,7 +449,7 @@ class LivePour:
         self._slosh_speed -= dt * (
             omega**2 * self._slosh
             + 0.08 * omega * self._slosh_speed
-            + 0.5 * omega**2 * cup.radius * 0.08 * acceleration / GRAVITY
+            + 0.5 * omega**2 * cup.radius * 0.08 * turned / dt / GRAVITY
         )
         self._slosh += dt * self._slosh_speed
         head = bench.head(tilt, self._slosh)

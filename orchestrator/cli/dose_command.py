@@ -33,8 +33,8 @@ def dose(
     amount: Annotated[
         list[str] | None,
         typer.Option(
-            help="Wanted in the receiver, for example '50 g'. Repeatable, one dose each. With --dry-run, by default the "
-            "campaign's own series.",
+            help="Wanted in the receiver, for example '50 g'. Repeatable, one dose each. With --dry-run, by default "
+            "the campaign's own series.",
             show_default=False,
         ),
     ] = None,

@@ -389,6 +389,9 @@ class _Checker:
                 except InvalidActionError as error:
                     self.add(role.places(("sources",), ("pourer",)), f"{role.text}: {error}")
             elif self.arm is not None:
+                if not self.arm.doses:
+                    self.add(role.places(), f"an arm of the kind '{self.arm.kind}' can't pour wanted amounts")
+                    continue
                 try:
                     self.arm.plan(scene, scene.action({}))
                 except InvalidActionError as error:
@@ -477,6 +480,13 @@ def check_campaign(
             role = _Role(f"deployment into '{scene.receiver.name}'", ("deployment",), receiver)
             checker.reachable(plan.deployment, scene, role)
     if plan.dispense is not None:
+        balance = plan.laboratory.balance
+        if plan.laboratory.arm is not None and (balance is None or balance.placement not in ("receiver", "everything")):
+            text = (
+                f"laboratory '{plan.laboratory.name}': wanted amounts need a connected balance under the receiver; "
+                "write 'balance: {placement: receiver}' and set it up so"
+            )
+            checker.add((("dispense",), ("laboratory",)), text)
         checker.doses(plan.dispense, simulated=plan.laboratory.arm is None)
     return list(dict.fromkeys(checker.problems))
 

@@ -367,7 +367,7 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         name=file.name,
         seed=file.seed,
         source=root.document.path,
-        laboratory=laboratory,
+        laboratory=laboratory if dispense is None else laboratory.in_real_time(),
         parameters=SimulationParameters.from_values(in_force),
         calibration=calibration,
         deployment=deployment,
