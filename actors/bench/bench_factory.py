@@ -43,6 +43,10 @@ from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 
 
+FASTEST_DOSE = 2.0
+"""Largest time scale of a dose, whose commands and readings follow each other in tenths of a second."""
+
+
 class PouringBench:
     """The `Bench` interface for every kind of bench. The arm moves only after all checks, weighings and confirmations.
 
@@ -101,7 +105,7 @@ class PouringBench:
     ) -> PourMeasurement:
         if not self._arm_spec.doses:
             raise InvalidActionError(f"an arm of the kind '{self._arm_spec.kind}' can't pour wanted amounts")
-        if self._arm_spec.time_scale != 1.0:
+        if self._arm_spec.time_scale > FASTEST_DOSE:
             raise InvalidActionError("wanted amounts are poured in real time; write 'bench: {time_scale: 1}'")
         procedure = DoseProcedure(self._setup, scene, dose, path, seed=seed, settings=self._dosing, progress=progress)
         return await procedure.run()

@@ -74,6 +74,7 @@ class BalanceReadings:
     def __init__(self, setup: Setup, report: PourReport) -> None:
         assert setup.balance is not None
         self._balance, self._report = setup.balance, report
+        self._scale = setup.spec.time_scale
         self._kept: list[DoseReading] = []
         self._taken = 0
         self.step = 0.0
@@ -95,7 +96,7 @@ class BalanceReadings:
 
     @property
     def all(self) -> tuple[DoseReading, ...]:
-        """All readings so far."""
+        """All readings so far; their times are `time.monotonic` in bench time."""
         return tuple(self._kept)
 
     async def _read(self) -> None:
@@ -108,7 +109,7 @@ class BalanceReadings:
                     # the driver's clock is this one, unless it runs on another machine
                     moment = weight.time if 0.0 <= now - weight.time < 1.0 else now
                     self.step = weight.step or self.step
-                    self._kept.append(DoseReading(moment, weight.mass, weight.stable))
+                    self._kept.append(DoseReading(self._scale * moment, weight.mass, weight.stable))
                     self._report.show(weight.mass, weight.stable)
             await asyncio.sleep(0.01)
 
@@ -234,7 +235,7 @@ class DoseProcedure:
         place = f" {dose.position}" if dose.position else ""
         problem = ""
         while True:
-            await asyncio.sleep(BEFORE_PLACING)
+            await self._sleep(BEFORE_PLACING)
             before = self._readings.all[-3:]
             await self._consent.ask(
                 OperatorQuestion(
@@ -245,7 +246,7 @@ class DoseProcedure:
                     about="dose_receiver",
                 )
             )
-            await asyncio.sleep(AFTER_PLACING)
+            await self._sleep(AFTER_PLACING)
             after = self._readings.all[-3:]
             if not before or not after:
                 raise BalanceError("the balance sends no weight; look at its cable and its display")
@@ -313,27 +314,34 @@ class DoseProcedure:
                     await motion
                 await asyncio.sleep(0.01)
             self._readings.fresh()
-            begin = self._at = time.monotonic()
+            begin = self._at = self._now()
             state = await arm.drive(0.0)
             upright = state.tilt or 0.0
             while controller.result is None and not motion.done():
-                now = time.monotonic()
+                now = self._now()
                 tilt = (state.tilt or 0.0) - upright
                 self._tilts.append((now - begin, tilt))
                 command = controller.step(now, tilt, self._readings.fresh())
                 state = await arm.drive(command.speed)
                 self._show(controller, state, tilt)
-                await asyncio.sleep(max(now + TICK - time.monotonic(), 0.0))
+                await self._sleep(max(now + TICK - self._now(), 0.0))
             self._executed = await motion  # without commands the cup turns back, and the program ends
         finally:
             if not motion.done():
                 await asyncio.gather(asyncio.wait_for(motion, 1.0), return_exceptions=True)
-        self._tilts.append((time.monotonic() - begin, 0.0))
-        self._duration = time.monotonic() - begin
+        self._duration = self._now() - begin
+        self._tilts.append((self._duration, 0.0))
         if controller.result is None:
             raise LaboratoryError("the dose's program ended on the controller before the dose was over")
         self._series.finish(controller.result)
         return controller.result
+
+    def _now(self) -> float:
+        """The clock in bench time [s]."""
+        return self._setup.spec.time_scale * time.monotonic()
+
+    async def _sleep(self, seconds: float) -> None:
+        await asyncio.sleep(seconds / self._setup.spec.time_scale)
 
     # ---- results
 
@@ -366,7 +374,7 @@ class DoseProcedure:
             "readings_g": [round(1e3 * (one.mass - self._zero), 3) for one in during],
             **truth,
         }
-        notes = {"mode": self._setup.mode, "dose": about, "operator": self._setup.questions.take_log()}
+        notes: dict[str, Any] = {"mode": self._setup.mode, "dose": about, "operator": self._setup.questions.take_log()}
         if self._executed is not None and len(self._executed.times) > 1:
             motion = SampledMotion(self._executed.times, self._executed.poses)
             notes["largest_tilt_deg"] = math.degrees(float(motion.tilt(self._executed.times).max()))

@@ -70,9 +70,20 @@ class FlowEnd:
 class JointHistory(Protocol):
     """Joint motion of an arm's emulator; see `actors.bench.virtual_bench.History`."""
 
-    times: tuple[float, ...]
-    joints: tuple[tuple[float, ...], ...]
-    now: float
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Controller times [s], increasing."""
+        ...
+
+    @property
+    def joints(self) -> tuple[tuple[float, ...], ...]:
+        """Six joint angles at each time [rad]."""
+        ...
+
+    @property
+    def now(self) -> float:
+        """Controller time of the request [s]."""
+        ...
 
 
 class FlowingLiquid:
@@ -139,16 +150,15 @@ class FlowingLiquid:
 
     def _follow(self) -> None:
         """Pour along the motion since the last call."""
-        from actors.arm.planning.kinematics import pourer_motion
+        from actors.arm.planning.kinematics import pourer_transforms
 
         found = self._history(self._since)
         fresh = [(t, q) for t, q in zip(found.times, found.joints, strict=True) if self._since < t <= found.now]
         if not fresh:
             return
         times = np.array([t for t, _ in fresh])
-        joints = np.array([q for _, q in fresh])
-        motion = pourer_motion(joints, times, self._arm)
-        tilts = motion.tilt(times)
+        turned = pourer_transforms(np.array([q for _, q in fresh]), self._arm).rotation
+        tilts = np.arccos(np.clip(turned[..., 2, 2], -1.0, 1.0))
         load = 0.0
         for moment, tilt in zip(times, tilts, strict=True):
             load = self._advance(float(moment), float(tilt), load)

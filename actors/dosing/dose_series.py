@@ -250,7 +250,7 @@ def predict_dose(scene: Scene, dose: DoseTarget, seed: int, settings: DosingSett
     """
     check_dose(scene, dose)
     series = series_of(scene, dose, settings, (), np.random.default_rng((seed, 32)))
-    return series.forecast(DoseOrder(dose.amount, dose.limit, 0.2), seed=seed, count=count)
+    return series.forecast(DoseOrder(dose.amount, dose.limit, receiver_mass=0.2), seed=seed, count=count)
 
 
 def series_of(

@@ -49,7 +49,7 @@ def simulated_dose(scene: Scene, dose: DoseTarget, seed: int, settings: DosingSe
     check_straight(scene)
     series, bench = _set_up(scene, dose, seed, settings)
     loaded = bench.content
-    controller = series.controller(DoseOrder(dose.amount, dose.limit, bench.receiver_mass), seed=seed)
+    controller = series.controller(DoseOrder(dose.amount, dose.limit, receiver_mass=bench.receiver_mass), seed=seed)
     record = bench.dose(controller)
     result = controller.result
     assert result is not None, "a dose ends within LONGEST_DOSE"

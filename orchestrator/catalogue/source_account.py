@@ -121,7 +121,10 @@ class SourceAccount:
             rows = connection.execute(
                 f"select source, time, kind, mass, deviation, knowledge from entries {condition}", values
             ).fetchall()
-        return [SourceEntry(*row[:5], None if row[5] is None else json.loads(row[5])) for row in rows]
+        return [
+            SourceEntry(source, moment, kind, mass, deviation, None if text is None else json.loads(text))
+            for source, moment, kind, mass, deviation, text in rows
+        ]
 
     def known(self, plan: DispensePlan) -> dict[str, KnownSource]:
         """Content and knowledge of a series' sources, by the names of the vessels.

@@ -431,7 +431,7 @@ class DoseOutput(_Output):
     run: str
     """Folder of the run."""
 
-    doses: list[create_model("DoseOut", __base__=_Output, __doc__="One dose.", **_part(Dose, _DOSE))]  # type: ignore[misc, valid-type]
+    doses: list[create_model("DoseOut", __base__=_Output, __doc__="One dose.", **_part(Dose, _DOSE))]  # type: ignore[valid-type]
     """Completed doses, in the order made."""
 
 
