@@ -174,7 +174,7 @@ def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
     assert plan.dispense is not None
     series, known = plan.dispense, _known(plan.dispense)
     strategy, seeds = Dispense(series, plan.seed, known), SeedStream(plan.seed, "predict doses")
-    count = 20 if len(series.doses) <= 3 else 8
+    count = 20 if len(series.doses) == 1 else 8
     rows: list[dict[str, Any]] = []
     total, filled = 0.0, 0
     for number, planned in enumerate(series.doses, start=1):
