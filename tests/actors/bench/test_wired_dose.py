@@ -116,7 +116,9 @@ def test_a_dose_over_other_balances(open_stage: OpenStage, dialect: str) -> None
     asyncio.run(scenario())
 
 
-def when_flowing(stage: Stage, strike: Callable[[], Awaitable[Any]]) -> tuple[Callable[[PourProgress], None], list[Any]]:
+def when_flowing(
+    stage: Stage, strike: Callable[[], Awaitable[Any]]
+) -> tuple[Callable[[PourProgress], None], list[Any]]:
     """A progress callback that does something once 5 g have flowed; the second list holds its task."""
     tasks: list[Any] = []
 
@@ -128,7 +130,7 @@ def when_flowing(stage: Stage, strike: Callable[[], Awaitable[Any]]) -> tuple[Ca
 
 
 async def broken_off(stage: Stage, strike: Callable[[], Awaitable[Any]]) -> str:
-    progress, tasks = when_flowing(stage, strike)
+    progress, tasks = when_flowing(strike)
     with pytest.raises(UnknownPourError) as raised:
         await dosed(stage, 150, progress=progress)
     await tasks[0]
