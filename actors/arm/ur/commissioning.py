@@ -23,16 +23,13 @@ from actors.arm.ur.controller_readout import (
     read_status,
 )
 from actors.arm.ur.primary_interface import RobotState
-from actors.arm.ur.robot_comparison import robot_checks
+from actors.arm.ur.robot_comparison import payload_check, robot_checks
 from actors.arm.ur.robot_models import same_robot
 from actors.arm.ur.worker_messages import SAFETY_MODES, safety_mode, why_not_ready
 from actors.interfaces import DeviceCheck, State
 
 TOOL_TOLERANCE, TURN_TOLERANCE = 1e-3, math.radians(0.5)
 """Largest difference between the controller's TCP and the file's [m], [rad]."""
-
-PAYLOAD_TOLERANCE, CENTRE_TOLERANCE = 0.1, 0.02
-"""Largest differences of payload [kg] and payload centre [m]."""
 
 MOUNT_TOLERANCE, GRAVITY = math.radians(15.0), 9.81
 """Largest angle between the measured and the configured vertical [rad], because the tool's accelerometer is not a
@@ -79,23 +76,6 @@ def mount_check(spec: UrArmSettings, state: RobotState, exchange: Exchange) -> D
         f"the tool feels up {math.degrees(away):.0f} deg away from where the file has it: tilt {tilt:.0f} deg, turn "
         f"{turn:.0f} deg would agree with it",
         "correct 'mount' in the file and the mounting in the installation on the teach pendant: pours would go astray",
-    )
-
-
-def payload_check(spec: UrArmSettings, exchange: Exchange) -> DeviceCheck:
-    """Compare the controller's payload with the file's."""
-    if exchange.payload is None or exchange.payload_centre is None:
-        return DeviceCheck("payload", "warn", "not told", "compare payload and centre with the teach pendant yourself")
-    away = math.dist(exchange.payload_centre, spec.payload_centre.vector)
-    text = f"{exchange.payload:.2f} kg"
-    if abs(exchange.payload - spec.payload) <= PAYLOAD_TOLERANCE and away <= CENTRE_TOLERANCE:
-        return DeviceCheck("payload", "ok", text)
-    return DeviceCheck(
-        "payload",
-        "fail",
-        f"{text} on the controller, {spec.payload:.2f} kg in the file; centres {1e3 * away:.0f} mm apart",
-        "set payload and centre in the installation on the teach pendant, or correct them in the file: a wrong payload "
-        "ends in protective stops",
     )
 
 
@@ -209,7 +189,9 @@ def judge(
     if found.state is not None and found.exchange is not None:
         checks.append(mount_check(spec, found.state, found.exchange))
     if found.exchange is not None:
-        checks += [payload_check(spec, found.exchange), *_motion(found.exchange), _network(found.exchange)]
+        exchange = found.exchange
+        payload = payload_check(spec, exchange.payload, exchange.payload_centre)
+        checks += [payload, *_motion(exchange), _network(exchange)]
     return checks
 
 
@@ -392,7 +374,8 @@ def _motion(exchange: Exchange) -> list[DeviceCheck]:
     if any(value is None for value in values):
         return [DeviceCheck("motion", "warn", "not told", "look at the teach pendant whether the arm is ready")]
     robot, safety, runtime, slider = (value[0] for value in values if value is not None)
-    why = why_not_ready(int(robot), int(safety), int(runtime), slider)
+    (status,) = exchange.values.get("robot_status_bits", (0,))
+    why = why_not_ready(int(robot), int(safety), int(runtime), slider, int(status))
     if not why:
         return [DeviceCheck("motion", "ok", "the arm is ready to move")]
     return [DeviceCheck("motion", "fail", why, "mend that first: no motion begins before")]

@@ -50,7 +50,7 @@ QUESTIONS = (
 """Queries on the dashboard; none of them changes anything."""
 
 SLIDER = "target_speed_fraction"
-STATUS = ("robot_mode", "safety_mode", "runtime_state", SLIDER)
+STATUS = ("robot_mode", "safety_mode", "runtime_state", "robot_status_bits", SLIDER)
 """RTDE values that determine whether the arm can move."""
 
 ROUND_TRIPS = 20

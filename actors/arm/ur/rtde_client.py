@@ -67,6 +67,8 @@ _VARIABLES = [
     *(f"output_int_register_{n}" for n in (NUMBER, STATUS)),
     *(f"output_double_register_{n}" for n in (CLOCK, *range(TOOL, TOOL + 6))),
 ]
+_FORCE, _WRIST = "actual_TCP_force", "ft_raw_wrench"
+"""Read from controllers that have them; the second one since 5.9, from robots with a sensor in the wrist."""
 
 
 class RtdeClient:
@@ -91,8 +93,9 @@ class RtdeClient:
 
         for attempt in range(1, ATTEMPTS + 1):
             try:
+                self._forces = _offered(address, (_FORCE, _WRIST))
                 with _bounded(CONSTRUCTION_TIME):
-                    self._receive: Any = RTDEReceiveInterface(address, rate, _VARIABLES)
+                    self._receive: Any = RTDEReceiveInterface(address, rate, [*_VARIABLES, *self._forces])
                 self._inputs = InputWriter(address, registers)
                 break
             except (RuntimeError, ValueError, TroubleError) as error:
@@ -145,6 +148,9 @@ class RtdeClient:
                 status=r.getOutputIntRegister(STATUS),
                 clock=r.getOutputDoubleRegister(CLOCK),
                 tool=tuple(r.getOutputDoubleRegister(TOOL + k) for k in range(6)),
+                status_bits=r.getRobotStatus(),
+                force=tuple(r.getActualTCPForce()) if _FORCE in self._forces else (),
+                wrist=tuple(r.getFtRawWrench()) if _WRIST in self._forces else (),
             )
             if r.getTimestamp() == time_before:
                 self._last, self._same_readings = reading, 0
@@ -237,6 +243,18 @@ class InputWriter:
                 self._socket.recv(4096)  # messages of the controller, which nothing reads; usually there are none
         finally:
             self._writing.release()
+
+
+def _offered(address: str, names: tuple[str, ...]) -> list[str]:
+    """Which values the controller has. It refuses a recipe that names another one."""
+    try:
+        with socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME) as connection:
+            requests = rtde.Requests(connection)
+            requests.ask(rtde.REQUEST_PROTOCOL_VERSION, b"\0\2")
+            answer = requests.ask(rtde.SETUP_OUTPUTS, struct.pack(">d", 1.0) + ",".join(names).encode("ascii"))
+    except (OSError, rtde.PackageError) as error:
+        raise TroubleError("lost", f"{address}: its RTDE does not answer as it should: {error}") from None
+    return [name for name, kind in zip(names, rtde.names(answer[1:]), strict=False) if kind in rtde.FORMATS]
 
 
 def _probe(address: str, port: int, name: str) -> None:

@@ -33,6 +33,7 @@ from actors.arm.planning.kinematics import cell_transforms, forward
 from actors.arm.planning.path_checks import recheck
 from actors.arm.ur.dashboard import DashboardError, stop_program
 from actors.arm.ur.executed_motion import Stops, StopTimes, executed_path
+from actors.arm.ur.robot_comparison import payload_check
 from actors.arm.ur.motion_segments import MotionSegment, jog_path, upright_way, way_home
 from actors.arm.ur.ur_session import ANSWER_TIME, Session, UrFacts
 from actors.arm.ur.urscript_writer import path_program
@@ -348,7 +349,12 @@ class UrArm:
     def _evaluate(self, outcome: MotionOutcome, segment: MotionSegment) -> ExecutedPath:
         self._stops.came_to(outcome)
         executed = executed_path(
-            outcome.samples, segment.path, self._spec, completed=outcome.kind == "completed", slider=outcome.slider
+            outcome.samples,
+            segment.path,
+            self._spec,
+            completed=outcome.kind == "completed",
+            slider=outcome.slider,
+            forces=outcome.forces,
         )
         if outcome.kind == "completed":
             return executed
@@ -381,8 +387,14 @@ class AcceptedArm(UrArm):
 
         Raises:
             NotAcceptedError: the safety settings differ from the accepted ones; the arm is disconnected.
+            ArmRefusedError: the payload that is set on the controller differs from the settings'; likewise.
         """
-        return self._compared(super().connect())
+        facts = self._compared(super().connect())
+        payload = payload_check(self._spec, facts.payload, facts.payload_centre)
+        if payload.state == "fail":
+            self.close()
+            raise ArmRefusedError(f"arm at {self._address}: payload {payload.found}: {payload.advice}")
+        return facts
 
     def facts(self) -> UrFacts:
         """See `UrArm.facts`; raises as `connect`."""

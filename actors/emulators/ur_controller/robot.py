@@ -60,6 +60,7 @@ class Robot:
         lag: time constant with which the joints follow their targets [s].
         payload: [kg]; `cog` [m], `inertia` [kg m²].
         gravity: direction in the base's frame [m/s²].
+        external_force: on the tool, in the base's frame [N], [N m]; it moves nothing.
         recent: measured positions of the last cycles.
         history: (time, q) as executed, without noise, at `HISTORY_RATE`.
     """
@@ -74,6 +75,7 @@ class Robot:
         self.cog: Vector = (0.0, 0.0, 0.0)
         self.inertia: Pose = (0.0,) * 6
         self.gravity: Vector = (0.0, 0.0, 9.82)
+        self.external_force: Pose = (0.0,) * 6
         self.noise = 0.0
         self.lag = TRACKING_LAG
         self._random = random.Random(0)
