@@ -8,7 +8,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from actors.arm.arm_geometry import JOINT_NAMES, Pose
 from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord, UrArmSettings
@@ -19,8 +21,10 @@ from actors.arm.ur.controller_readout import (
     Exchange,
     Findings,
     ReadoutError,
+    findings_of,
     look_at,
     read_status,
+    recorded_findings,
 )
 from actors.arm.ur.primary_interface import RobotState
 from actors.arm.ur.robot_comparison import payload_check, robot_checks
@@ -134,7 +138,20 @@ class UrDiagnostics(ArmDiagnostics):
     @classmethod
     def at(cls, spec: UrArmSettings) -> UrDiagnostics:
         """Read everything from the controller."""
-        found = look_at(spec.address)
+        return cls._of(spec, look_at(spec.address))
+
+    @classmethod
+    def of_record(cls, spec: UrArmSettings, recorded: Mapping[str, Any]) -> UrDiagnostics:
+        """From `recorded`."""
+        found = findings_of(recorded)
+        return cls._of(spec.with_values(address=found.address), found)
+
+    def recorded(self) -> dict[str, Any]:
+        """See `ArmDiagnostics.recorded`."""
+        return {} if self.found is None else recorded_findings(self.found)
+
+    @classmethod
+    def _of(cls, spec: UrArmSettings, found: Findings) -> UrDiagnostics:
         return cls(
             checksum="" if found.state is None else found.state.checksum,
             serial=found.serial,

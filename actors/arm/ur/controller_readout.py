@@ -4,7 +4,8 @@ It sends queries to the dashboard, reads the robot's state from the primary port
 move the arm or change a setting. They also work in states in which a driver cannot connect, so that the user can find
 the cause.
 
-`look_at` returns `Findings`; `actors.arm.ur.commissioning` evaluates them.
+`look_at` returns `Findings`; `actors.arm.ur.commissioning` evaluates them. `recorded_findings` and `findings_of` write
+and read them as JSON.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ import statistics
 import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from typing import Any
 
 from actors.arm.ur import dashboard as dashboard_port
 from actors.arm.ur import primary_interface as primary
@@ -209,14 +212,20 @@ class Findings:
         address: to which the name resolves; '' if it does not.
         ports: why each cannot be reached; None if it can.
         dashboard: responses by query.
+        parts: of the robot's state, as bytes by type.
     """
 
     address: str
     ports: dict[int, str | None] = field(default_factory=dict)
     dashboard: dict[str, str] | None = None
-    state: RobotState | None = None
+    parts: dict[int, bytes] | None = None
     exchange: Exchange | None = None
     problems: tuple[str, ...] = ()
+
+    @cached_property
+    def state(self) -> RobotState | None:
+        """The robot's state."""
+        return None if self.parts is None else primary.robot_state(self.parts)
 
     @property
     def software(self) -> tuple[int, ...]:
@@ -279,21 +288,59 @@ def look_at(host: str) -> Findings:
     except OSError as error:
         return Findings("", problems=(str(error),))
     ports = {port: port_problem(address, port) for port in PORTS}
-    dashboard = state = exchange = None
+    dashboard = parts = exchange = None
     problems: list[str] = []
     if ports[dashboard_port.PORT] is None:
         with _noting(problems):
             dashboard = ask_dashboard(address)
     if ports[primary.PORT] is None:
         with _noting(problems):
-            state = primary.read_state(address)
+            parts = primary.read_parts(address)
     if ports[RTDE] is None:
         with _noting(problems):
             exchange = read_exchange(address)
             # a gap may be caused by this computer, so measure twice and keep the better result
             if exchange.gap > PATIENT_GAP:
                 exchange = min(exchange, read_exchange(address), key=lambda e: e.gap)
-    return Findings(address, ports, dashboard, state, exchange, tuple(problems))
+    return Findings(address, ports, dashboard, parts, exchange, tuple(problems))
+
+
+def recorded_findings(found: Findings) -> dict[str, Any]:
+    """JSON-ready values, from which `findings_of` makes the same findings."""
+    return {
+        "address": found.address,
+        "ports": {str(port): problem for port, problem in found.ports.items()},
+        "dashboard": found.dashboard,
+        "primary": None if found.parts is None else {str(kind): body.hex() for kind, body in found.parts.items()},
+        "exchange": None if found.exchange is None else asdict(found.exchange),
+        "problems": list(found.problems),
+    }
+
+
+def findings_of(recorded: Mapping[str, Any]) -> Findings:
+    """The findings that were recorded.
+
+    Raises:
+        ValueError: these are not recorded findings.
+    """
+    try:
+        primary_parts, values = recorded["primary"], recorded["exchange"]
+        exchange = None
+        if values is not None:
+            lists = {name: tuple(values[name]) for name in ("version",)}
+            centre = None if values["payload_centre"] is None else tuple(values["payload_centre"])
+            numbers = {name: tuple(value) for name, value in values["values"].items()}
+            exchange = Exchange(**{**values, **lists, "payload_centre": centre, "values": numbers})
+        return Findings(
+            recorded["address"],
+            {int(port): problem for port, problem in recorded["ports"].items()},
+            recorded["dashboard"],
+            None if primary_parts is None else {int(kind): bytes.fromhex(body) for kind, body in primary_parts.items()},
+            exchange,
+            tuple(recorded["problems"]),
+        )
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"not a readout of a controller: {error!r}") from error
 
 
 @contextlib.contextmanager

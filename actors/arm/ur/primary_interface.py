@@ -125,7 +125,12 @@ def _calibration(data: bytes) -> Calibration | None:
 
 
 def read_state(address: str, patience: float = 3.0) -> RobotState:
-    """The robot's state, once all its parts have arrived.
+    """The robot's state; see `read_parts`."""
+    return robot_state(read_parts(address, patience))
+
+
+def read_parts(address: str, patience: float = 3.0) -> dict[int, bytes]:
+    """The parts of the robot's state by type, once all have arrived.
 
     Args:
         address: of the controller.
@@ -153,7 +158,7 @@ def read_state(address: str, patience: float = 3.0) -> RobotState:
         raise PrimaryError(f"the primary port at {address} can't be read: {error}") from error
     if not needed <= parts.keys():
         raise PrimaryError(f"the primary port at {address} sent no robot state within {patience:g} s")
-    return robot_state(parts)
+    return parts
 
 
 class Primary:
