@@ -122,6 +122,9 @@ GOOD_ROUND_TRIP, GOOD_GAP, LONGEST_GAP = 10e-3, 60e-3, 0.2
 KNOWN_SOFTWARE: dict[int, tuple[int, int]] = {3: (14, 15), 5: (6, 17)}
 """Minor versions, by major version, with which the authors of the client library have tested it."""
 
+POLYSCOPE_X, FIRST_X = 10, 14
+"""Major version of PolyScope X, and the first minor one whose Robot API reports model and serial number."""
+
 
 @dataclass(frozen=True)
 class UrDiagnostics(ArmDiagnostics):
@@ -282,12 +285,20 @@ def _ports(found: Findings) -> list[DeviceCheck]:
 def _software(found: Findings) -> DeviceCheck:
     version = ".".join(str(part) for part in found.software[:3])
     major, minor = found.software[:2]
+    if major == POLYSCOPE_X and minor >= FIRST_X:
+        return DeviceCheck(
+            "software",
+            "warn",
+            f"PolyScope X {version}",
+            "Decant's support of PolyScope X follows public documents and was tried on none; go slowly through the "
+            "commissioning page",
+        )
     if major not in KNOWN_SOFTWARE:
         return DeviceCheck(
             "software",
             "fail",
             f"PolyScope {version}",
-            "Decant needs PolyScope 3 (CB3) or 5 (e-Series); PolyScope X has no dashboard server",
+            f"Decant needs PolyScope 3 (CB3), 5 (e-Series), or PolyScope X from {POLYSCOPE_X}.{FIRST_X}",
         )
     low, high = KNOWN_SOFTWARE[major]
     if low <= minor <= high:

@@ -25,7 +25,7 @@ from typing import Any
 
 from actors.arm.ur import dashboard as dashboard_port
 from actors.arm.ur import primary_interface as primary
-from actors.arm.ur import rtde
+from actors.arm.ur import robot_api, rtde
 from actors.arm.ur.dashboard import Dashboard, DashboardError
 from actors.arm.ur.primary_interface import RobotState
 from actors.arm.ur.robot_models import model_named
@@ -35,6 +35,7 @@ from actors.interfaces import LaboratoryError
 SCRIPTS, RTDE = 30003, rtde.PORT
 PORTS: dict[int, str] = {
     dashboard_port.PORT: "dashboard",
+    **dict.fromkeys(robot_api.PORTS, "Robot API of PolyScope X"),
     primary.PORT: "primary interface",
     SCRIPTS: "programs",
     RTDE: "real-time data exchange",
@@ -259,16 +260,24 @@ def read_status(host: str) -> Findings:
         address = _resolved(host)
     except OSError as error:
         return Findings("", problems=(str(error),))
-    ports = {port: port_problem(address, port) for port in (dashboard_port.PORT, RTDE)}
+    control = _control_port(address)
+    ports = {port: port_problem(address, port) for port in (control, RTDE)}
     dashboard = exchange = None
     problems: list[str] = []
-    if ports[dashboard_port.PORT] is None:
+    if ports[control] is None:
         with _noting(problems):
             dashboard = ask_dashboard(address)
     if ports[RTDE] is None:
         with _noting(problems):
             exchange = read_exchange(address, rate=10.0, seconds=0.0)
     return Findings(address, ports, dashboard, None, exchange, tuple(problems))
+
+
+def _control_port(address: str) -> int:
+    """The dashboard's port; on PolyScope X that of the Robot API."""
+    with contextlib.suppress(dashboard_port.DashboardError), Dashboard(address, patience=2.0) as dashboard:
+        return dashboard.port
+    return dashboard_port.PORT
 
 
 def _resolved(host: str) -> str:
@@ -287,10 +296,11 @@ def look_at(host: str) -> Findings:
         address = _resolved(host)
     except OSError as error:
         return Findings("", problems=(str(error),))
-    ports = {port: port_problem(address, port) for port in PORTS}
+    control = _control_port(address)
+    ports = {port: port_problem(address, port) for port in (control, primary.PORT, SCRIPTS, RTDE)}
     dashboard = parts = exchange = None
     problems: list[str] = []
-    if ports[dashboard_port.PORT] is None:
+    if ports[control] is None:
         with _noting(problems):
             dashboard = ask_dashboard(address)
     if ports[primary.PORT] is None:

@@ -22,6 +22,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from actors.arm.ur import rtde
+from actors.arm.ur.dashboard import Dashboard, DashboardError
 from actors.arm.ur.worker_messages import (
     CLOCK,
     GO,
@@ -45,7 +46,7 @@ def client_missing() -> str | None:
     )
 
 
-PORTS = {rtde.PORT: "RTDE", 29999: "dashboard", 30001: "primary interface"}
+PORTS = {rtde.PORT: "RTDE", 30001: "primary interface"}
 PROBE_TIME = 2.0
 CONSTRUCTION_TIME = 5.0
 """Time after which a blocked constructor ends the process [s], because it holds the interpreter lock."""
@@ -87,6 +88,11 @@ class RtdeClient:
     def __init__(self, address: str, rate: float, silence: float, registers: int) -> None:
         for port, name in PORTS.items():
             _probe(address, port, name)
+        try:
+            with Dashboard(address, PROBE_TIME):
+                pass
+        except DashboardError as error:
+            raise TroubleError("lost", f"no robot at {address}: {error}. {_ENABLED}") from None
         if (missing := client_missing()) is not None:
             raise TroubleError("refused", missing)
         from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
@@ -264,9 +270,11 @@ def _probe(address: str, port: int, name: str) -> None:
     except OSError as error:
         raise TroubleError(
             "lost",
-            f"no robot at {address}: its {name} (port {port}) does not answer: {error}. "
-            "Is the controller on, on this network, and are its services enabled?",
+            f"no robot at {address}: its {name} (port {port}) does not answer: {error}. {_ENABLED}",
         ) from None
+
+
+_ENABLED = "Is the controller on, on this network, and are its services enabled?"
 
 
 @contextlib.contextmanager
