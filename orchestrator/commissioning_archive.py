@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
 import tempfile
 import time
@@ -123,7 +122,7 @@ class CommissioningArchive:
             ArchiveError: one is no recording, or its name is in the archive already.
             OSError: the archive cannot be written.
         """
-        added = []
+        added: list[ArchivedRecording] = []
         for path in paths:
             if path.name in {one.name for one in (*self.recordings, *added)}:
                 raise ArchiveError(f"{path.name} is in the archive already; give the new recording another name")
@@ -143,14 +142,14 @@ class CommissioningArchive:
             self.recordings += added
             entries = [dataclasses.asdict(one) for one in self.recordings]
             archive.writestr(INDEX, json.dumps({"decant_archive": FORMAT, "recordings": entries}, indent=1))
-        os.replace(fresh, self.path)
+        fresh.replace(self.path)
         return added
 
     def replay(self) -> Iterator[DeviceCheck]:
         """Read every recording again, and compare the results with those of the day: one line for each."""
         with tempfile.TemporaryDirectory() as folder:
             with zipfile.ZipFile(self.path) as archive:
-                archive.extractall(folder)  # noqa: S202 (zipfile keeps names inside the folder)
+                archive.extractall(folder)
             for one in self.recordings:
                 try:
                     _, _, read = read_recording(Path(folder) / one.name)

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from decant.plugins import InvalidActionError, RobotCell, plan_pour
 from decant.plugins.testing import ArmBench, ArmContract
-from tests.plugins.decant_example.seven_joints import HOME, SevenJointArm, SevenJointPour, SevenJointSettings, SimulatedRobot
+from tests.plugins.decant_example.seven_joints import (
+    HOME,
+    SevenJointArm,
+    SevenJointPour,
+    SevenJointSettings,
+    SimulatedRobot,
+)
 from tests.plugins.test_stand import ACTION, SCENE
 
 SCALE = 2.0
@@ -76,7 +82,7 @@ def test_its_plan_is_the_pour_that_was_asked_for(path: SevenJointPour) -> None:
 
 def test_a_pour_beyond_its_reach_is_refused_with_the_cure() -> None:
     far = RobotCell(receiver={"x": "1300 mm", "y": "0 mm", "z": "150 mm"}, direction="90 deg")  # type: ignore[arg-type]
-    with pytest.raises(InvalidActionError, match="does not reach x = .*; move the receiver nearer"):
+    with pytest.raises(InvalidActionError, match=r"does not reach x = .*; move the receiver nearer"):
         SETTINGS.in_laboratory(far, SCALE).plan(SCENE, ACTION)
 
 

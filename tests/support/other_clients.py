@@ -16,7 +16,10 @@ Cycle = Callable[[int], bool]
 
 
 def ur_rtde(address: str) -> Cycle:
-    """The interfaces of ur_rtde for inputs, outputs and states. It claims registers 18 to 23, all outputs, the slider."""
+    """The interfaces of ur_rtde for inputs, outputs and states.
+
+    It claims registers 18 to 23, all outputs and the slider.
+    """
     from rtde_io import RTDEIOInterface  # type: ignore[import-not-found]
     from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
 

@@ -85,8 +85,9 @@ class RobotApi:
             path, key, text = _READS[query]
             status, answer = self._request("GET", path)
             if status != 200 or key not in answer:
+                shown = _shown(status, answer)
                 raise RobotApiError(
-                    f"Robot API: {path} was answered with {_shown(status, answer)}; PolyScope X 10.14 or later is needed"
+                    f"Robot API: {path} was answered with {shown}; PolyScope X 10.14 or later is needed"
                 )
             value = str(answer[key])
             return str(value == "REMOTE").lower() if query == "is in remote control" else text.format(value)

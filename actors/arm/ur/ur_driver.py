@@ -33,8 +33,8 @@ from actors.arm.planning.kinematics import cell_transforms, forward
 from actors.arm.planning.path_checks import recheck
 from actors.arm.ur.dashboard import DashboardError, stop_program
 from actors.arm.ur.executed_motion import Stops, StopTimes, executed_path
-from actors.arm.ur.robot_comparison import payload_check
 from actors.arm.ur.motion_segments import MotionSegment, jog_path, upright_way, way_home
+from actors.arm.ur.robot_comparison import payload_check
 from actors.arm.ur.ur_session import ANSWER_TIME, Session, UrFacts
 from actors.arm.ur.urscript_writer import path_program
 from actors.arm.ur.worker_messages import REDUCED, DataPackage, MotionOrder, MotionOutcome, MotionSettings

@@ -15,7 +15,6 @@ import pytest
 from actors.arm.arm_interface import ArmRefusedError
 from actors.arm.ur import rtde
 from actors.emulators.ur_controller.rtde_fields import INPUT_KINDS
-
 from actors.runtime.child_process import child_environment
 from tests.support.waiting import PATIENCE
 

@@ -69,7 +69,9 @@ def test_the_check_reads_the_robot_api_and_says_that_it_was_never_tried(rig: Rig
     assert port.state == "ok"
     assert "port 29999" not in checks
     assert (checks["software"].state, checks["software"].found) == ("warn", "PolyScope X 10.14.0")
-    assert [name for name in ("model", "remote control", "arm", "safety", "program") if checks[name].state != "ok"] == []
+    assert [
+        name for name in ("model", "remote control", "arm", "safety", "program") if checks[name].state != "ok"
+    ] == []
     rig.fault("protective_stop")
     again = {check.name: check for check in UrDiagnostics.at(rig.arm._spec).checks(None, accept="", virtual=True)}
     assert again["safety"].state == "fail"

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from actors.arm.arm_interface import ArmNotReleasedError, ArmRefusedError, ArmStoppedError
-from actors.arm.ur.worker_messages import may_move, safety_mode
 from actors.arm.ur.ur_driver import AcceptedArm
+from actors.arm.ur.worker_messages import may_move, safety_mode
 from tests.support.ur_pours import HOME, START, pour_path
 
 from .conftest import Call, Rig

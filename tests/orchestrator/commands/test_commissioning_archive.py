@@ -62,7 +62,7 @@ def test_a_recording_that_is_read_differently_fails_with_its_place(day: Path, tm
         fresh.writestr("index.json", index)
     done = archive(tmp_path / "kept.zip")
     assert done.exit_code == 1
-    assert "state was \"ok\", is \"fail\"" in done.stdout or "found was" in done.stdout
+    assert 'state was "ok", is "fail"' in done.stdout or "found was" in done.stdout
 
 
 @pytest.mark.parametrize(

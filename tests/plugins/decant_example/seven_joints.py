@@ -91,7 +91,7 @@ def frames(q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     axes, origins = np.empty((7, 3)), np.empty((8, 3))
     for k in range(7):
         axes[k], origins[k] = rotation @ AXES[k], place
-        c, s, (x, y, z) = math.cos(q[k]), math.sin(q[k]), AXES[k]
+        c, s, (_, y, z) = math.cos(q[k]), math.sin(q[k]), AXES[k]
         # every axis is ±y or z
         turn = np.array([[c, -s * z, s * y], [s * z, c if z else 1.0, 0.0], [-s * y, 0.0, 1.0 if z else c]])
         rotation = rotation @ turn
@@ -285,7 +285,7 @@ class SevenJointSettings(ArmSettings):
     def plan(self, scene: Scene, action: Action) -> SevenJointPour:
         """See `ArmSettings.plan`."""
         motion = plan_pour(scene, action)
-        count = max(int(math.ceil(motion.duration / 0.02)), 2) + 1
+        count = max(math.ceil(motion.duration / 0.02), 2) + 1
         times = np.linspace(0.0, motion.duration, count)
         poses = motion.sample(times)
         rotations, places = self._flanges(poses)
@@ -511,7 +511,9 @@ class SevenJointArm:
         _, joints, _ = self._read()
         _, origins, rotation = frames(joints)
         place = origins[7] + rotation @ GRIP[1]
-        return ArmPose(Pose.of(*place, *Rotation.from_matrix(rotation).as_rotvec()), tuple(joints.tolist()), tuple(HOME.tolist()))
+        return ArmPose(
+            Pose.of(*place, *Rotation.from_matrix(rotation).as_rotvec()), tuple(joints.tolist()), tuple(HOME.tolist())
+        )
 
     def close(self) -> None:
         self.stop()
