@@ -26,7 +26,7 @@ import uvicorn
 from pythonjsonlogger.json import JsonFormatter
 
 from orchestrator.catalogue.run_registry import make_state_directory, use_state_directory
-from orchestrator.daemon.access_control import Tokens
+from orchestrator.daemon.access_tokens import Tokens
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.daemon.http_api import serve_app
 from orchestrator.daemon.notifications import OCCASIONS, Notifier, NotifyError, pass_on
