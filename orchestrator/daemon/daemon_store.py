@@ -79,6 +79,10 @@ create table vessel (
     id text primary key, code text unique, shape text not null check (json_valid(shape)), capacity real not null,
     position text unique, liquid text, created real not null
 ) strict;
+create table node_action (
+    id text primary key, name text not null, args text not null check (json_valid(args)), created real not null,
+    started real, campaign text, error text, json_result text
+) strict;
 create table account (
     id integer primary key, t real not null, vessel text not null, kind text not null, change real, deviation real,
     liquid text, pour text, by text not null, note text not null

@@ -11,19 +11,22 @@ import contextlib
 import os
 import signal
 import socket
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import uvicorn
 
 from orchestrator.daemon import ordering, rig_worker
-from orchestrator.daemon.daemon_settings import DaemonSettings
+from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
 from orchestrator.daemon.http_api import serve_app
+from orchestrator.daemon.madsci_node import create_node
+from orchestrator.daemon.materials import Materials
 from orchestrator.daemon.pour_orders import OrderBook
 from orchestrator.daemon.supervisor import Supervisor
-from tests.support.station import rigs_in
+from tests.support.station import BEAKER, VIAL, rigs_in
 from tests.support.toy_daemon import HeldBench, HeldLaboratory
 
 STAGES = ("checked", "queued", "leased", "pouring", "poured", "in the account", "weighed")
@@ -53,8 +56,6 @@ def die_at(stage: str) -> None:
         case "poured":
             rig_worker.settle = die
         case "in the account":
-            from orchestrator.daemon.materials import Materials
-
             Materials.enter_pour = after(Materials.enter_pour)  # type: ignore[method-assign]
         case "weighed":
             OrderBook.settle = after(OrderBook.settle)  # type: ignore[method-assign]
@@ -105,8 +106,32 @@ async def serve(folder: Path, stage: str) -> None:
     listening = socket.socket()
     listening.bind(("127.0.0.1", 0))
     await daemon.start()
+    if stage == "node":
+        app = create_node(daemon, app.state.ordering, MadsciSettings(allow=["127.0.0.1"]))
+        server.config = uvicorn.Config(app, log_config=None, lifespan="off", access_log=False)
+        materials = Materials(daemon.store)
+        materials.add_liquid("water", "", {})
+        for vessel, shape in (("beaker", BEAKER), ("vial-1", VIAL)):
+            materials.add_vessel(vessel, "", shape, "", "test")
+        materials.weigh("beaker", 0.1, 1e-4, "water", "test")
     print(f"http://127.0.0.1:{listening.getsockname()[1]}", flush=True)
     await server.serve([listening])
+
+
+@contextlib.contextmanager
+def node_process(folder: Path) -> Iterator[str]:
+    """Run the daemon as a MADSci node with a filled beaker; yields its URL."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", __name__, str(folder), "node"], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None
+        yield process.stdout.readline().strip()
+    finally:
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
 
 
 if __name__ == "__main__":
