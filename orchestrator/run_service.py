@@ -81,6 +81,7 @@ class RunRequest:
         folder: of the run; None: a new one, which is entered in the catalogue.
         resume: continue the run in `folder`; 'if begun': only if a run was begun there.
         as_written: the vessels are those of the campaign's file.
+        problems: finds what prevents these pours; None: the checks of the campaign do.
     """
 
     campaign: CampaignPlan
@@ -88,6 +89,7 @@ class RunRequest:
     folder: Path | None = None
     resume: Literal["no", "yes", "if begun"] = "no"
     as_written: bool = True
+    problems: Callable[[], Sequence[str]] | None = None
 
     @property
     def pours(self) -> bool:
@@ -167,6 +169,8 @@ class RunService:
         """
         from orchestrator.config.campaign_checks import check_campaign
 
+        if request.problems is not None:
+            return CheckReport(tuple(request.problems()), ())
         warned: list[Problem] = []
         found = check_campaign(request.campaign, as_written=request.as_written, warn=warned.append, doing=doing)
         problems = [str(one) for one in found]

@@ -42,7 +42,6 @@ from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 
-
 FASTEST_DOSE = 2.0
 """Largest time scale of a dose, whose commands and readings follow each other in tenths of a second."""
 

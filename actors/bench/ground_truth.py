@@ -228,7 +228,7 @@ class GroundTruth:
         """Called when the arm is about to tilt for a dose: from now on the liquid follows its motion."""
 
     async def flowed(self) -> dict[str, Any]:
-        """Called after a dose, also after an aborted one. Returns the true amount of a virtual bench, for its record."""
+        """Called after a dose, also after an aborted one. Returns the true amount of a virtual bench."""
         return {}
 
     async def lasting(self, doing: Awaitable[T], seconds: float) -> T:

@@ -227,7 +227,7 @@ class RemoteCatalogueClient:
 
     def pours(self, conditions: Mapping[str, Any]) -> list[Row]:
         """See `CatalogueClient`."""
-        return list(self._client.get("/pours", **conditions))
+        return list(self._client.get("/runs/pours", **conditions))
 
     def run(self, name: str) -> Row:
         """See `CatalogueClient`."""
