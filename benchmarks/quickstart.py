@@ -437,7 +437,7 @@ def main() -> None:
             print(f"{arm}\n\n{table(poured)}\n")
         if asked.write and arm == "shipped":
             seeds = f"--seeds {asked.seeds} --first {asked.first}"
-            bench = "quickstart.yaml on a bench of numbers with the ground truth of virtual.yaml"
+            bench = "quickstart.yaml on a simulated bench with the ground truth of virtual.yaml"
             command = f"python benchmarks/quickstart.py {seeds}"
             write("quickstart-calibration", calibration_table(chosen), f"{command} --calibration-only", bench)
             if poured:

@@ -99,8 +99,8 @@ def predictions(plan: CampaignPlan, seed: int, draws: int, label: str) -> dict[s
             row = {"split": one.pour.split, "recorded": one.pour.spillage, "predicted": fmean(values)}
             rows.append({**row, "low": interval.low, "high": interval.high})
     answers.close()
-    theta = {name: found.theta.model_dump()[name] for name in found.searched}
-    return {"theta": theta, "pours": rows, "cpu_s": round(time.process_time() - begun, 1)}
+    best = {name: found.theta.model_dump()[name] for name in found.searched}
+    return {"theta": best, "pours": rows, "cpu_s": round(time.process_time() - begun, 1)}
 
 
 def error(found: dict[str, Any], split: str) -> float:
