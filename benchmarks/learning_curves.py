@@ -1,7 +1,7 @@
 """Loss against pours on the virtual bench: D1, D2, D3, and what they compete with, on the same benches and seeds.
 
-    python benchmarks/learning_curves.py --tables             # simulate the pours of the tables (two CPU minutes)
-    python benchmarks/learning_curves.py [--arms D3 ...] [--seeds 20] [--first 4000] [--pours 15] [--rival PYTHON]
+python benchmarks/learning_curves.py --tables             # simulate the pours of the tables (two CPU minutes)
+python benchmarks/learning_curves.py [--arms D3 ...] [--seeds 20] [--first 4000] [--pours 15] [--rival PYTHON]
 """
 
 from __future__ import annotations

@@ -79,9 +79,13 @@ CONTRARY, CONTRARY_SHARE, CONTRARY_REST = 128, 0.2, 0.15
 where the simulation has none is evidence for them, but a displaced valley explains it, too."""
 SURPRISE = 0.99
 """Probability of the prediction intervals; an observation outside makes a change of the bench possible."""
-CHANGE, MISHAP, NOTICED = 0.02, 0.005, 0.9
-"""Prior probabilities of a change before each observation, and that the latest one is an outlier with any cost;
-posterior probability of a change from which it is reported, with two observations since then at least."""
+CHANGE, MISHAP, NOTICED = 0.02, 0.001, 0.9
+"""Prior probabilities of a change before each observation, and that the latest one is an outlier; posterior probability
+of a change from which it is reported, with two observations since then at least."""
+ALL_BY_MISHAP = 0.5
+"""Probability that everything is lost by an outlier; otherwise any cost is equally likely."""
+NEAR_CHANGED = 0.1
+"""Factor on the prior weight of the hypotheses by which the simulator is nearly right, after a change of the bench."""
 TOTAL, RESOLUTION, LEAST_CHANCE = 0.95, 0.01, 1e-12
 """Cost above which everything is lost, whatever the exact cost: it says nothing about the place of the valley. Other
 costs count with this resolution, so that no hypothesis gains by being more certain than it needs to be. And the least
@@ -110,6 +114,7 @@ class Hypotheses:
         lengths: (J,), ℓ.
         noises: (J,), n.
         growths: (J,), m.
+        near: (J,), whether by the hypothesis the simulator is nearly right.
         contrary: (J,), whether the hypothesis reverses the simulator.
         centre: (dimension,), the simulated best.
     """
@@ -122,6 +127,7 @@ class Hypotheses:
     lengths: Array
     noises: Array
     growths: Array
+    near: NDArray[np.bool_]
     contrary: NDArray[np.bool_]
     centre: Array
 
@@ -158,13 +164,14 @@ class Hypotheses:
             _evenly(LENGTHS, length),
             _evenly(NOISES, noise),
             _evenly(NOISE_GROWTHS, growth),
+            near & ~contrary,
             contrary,
             centre,
         )
 
     def only(self, kept: NDArray[np.int_]) -> Hypotheses:
         """Return a subset."""
-        names = "scales", "shifts", "widths", "gains", "rests", "lengths", "noises", "growths", "contrary"
+        names = "scales", "shifts", "widths", "gains", "rests", "lengths", "noises", "growths", "near", "contrary"
         return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
     def moved(self, points: Array) -> Array:
@@ -231,7 +238,7 @@ class ModelAveragedProcess:
         self._all = Hypotheses.of(discrepancy, centre, latent, contrary)
         numbers = HYPOTHESES, CONTRARY, len(UNINFORMATIVE_LENGTHS)
         shares = 1.0 - distrust, CONTRARY_SHARE * distrust, (1.0 - CONTRARY_SHARE) * distrust
-        segments = self._segments(np.log(np.repeat(np.divide(shares, numbers), numbers)))
+        segments = self._segments(np.log(np.repeat(np.divide(shares, numbers), numbers)))  # prior weights
         self.since, weights = segments.since, segments.weights
         informed, uninformative = weights[:, :J], weights[:, J:]
         self._trusting = np.where(self._all.contrary, 0.0, informed.sum(axis=0))
@@ -308,11 +315,14 @@ class ModelAveragedProcess:
         return make(latent)
 
     def _likelihood(self, hypotheses: Hypotheses, counting: NDArray[np.bool_]) -> Array:
-        """Log-likelihoods (k,) of the observations that count for each hypothesis, (k, n)."""
+        """Log-likelihoods (k,) of the observations that count for each hypothesis, (k, n), and the weights after a
+        change.
+        """
         at_data = self._informed(hypotheses, self.points)
         at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
         chances = self._sequential(at_data, hypotheses.lengths, np.arange(len(self.points)))[0]
-        return np.asarray(np.where(counting, chances, 0.0).sum(axis=1))
+        unlikely = np.where(hypotheses.near & ~counting[:, 0], np.log(NEAR_CHANGED), 0.0)
+        return np.asarray(np.where(counting, chances, 0.0).sum(axis=1) + unlikely)
 
     def _segments(self, prior: Array) -> _Segments:
         """Weigh the starts of the present segment together with the hypotheses, of log prior weights (J,).
@@ -334,7 +344,12 @@ class ModelAveragedProcess:
         n, m = len(self.points), len(self.points) - begin
         order = np.arange(begin, n)
         chances, residuals = self._sequential(at_data, lengths, order)
-        before = prior[:, None] + np.concatenate([np.zeros((len(prior), 1)), np.cumsum(chances, axis=1)], axis=1)
+        changed = prior + np.log(
+            np.append(np.where(self._all.near, NEAR_CHANGED, 1.0), np.ones(len(UNINFORMATIVE_LENGTHS)))
+        )
+        changed -= _log_sum(changed)
+        first = changed if begin else prior
+        before = first[:, None] + np.concatenate([np.zeros((len(prior), 1)), np.cumsum(chances, axis=1)], axis=1)
         so_far = np.exp(before[:, :-1] - before[:, :-1].max(axis=0, initial=-np.inf))
         below = (so_far * ndtr(residuals)).sum(axis=0) / so_far.sum(axis=0)  # of each observation, given those before
         surprising = np.abs(below - 0.5) > 0.5 * SURPRISE
@@ -343,10 +358,12 @@ class ModelAveragedProcess:
             after = np.cumsum(self._sequential(at_data, lengths, order[::-1])[0], axis=1)[:, ::-1]
             for start in range(1, m):
                 counting.append(np.arange(n) >= begin + start)
-                logs.append(prior + after[:, start] + _log_sum(before[:, start]) + np.log(CHANGE))
+                logs.append(changed + after[:, start] + _log_sum(before[:, start]) + np.log(CHANGE))
             if surprising[-1]:
                 counting.append(counting[0] & (np.arange(n) < n - 1))
-                logs.append(before[:, m - 1] + np.log(MISHAP))
+                logs.append(
+                    before[:, m - 1] + np.log(MISHAP * (ALL_BY_MISHAP if self._costs[-1] > TOTAL else RESOLUTION))
+                )
         weights = np.exp(np.array(logs) - np.max(logs))
         weights /= weights.sum()
         starts = weights[1:m].sum(axis=1)
@@ -364,7 +381,9 @@ class ModelAveragedProcess:
         residuals = np.linalg.solve(L, (costs - prior.means)[:, :, None])[:, :, 0]
         deviations = np.diagonal(L, axis1=1, axis2=2)
         high = np.where(costs > TOTAL, np.inf, residuals + 0.5 * RESOLUTION / deviations)
-        low = np.where(costs > TOTAL, residuals - (costs - TOTAL) / deviations, residuals - 0.5 * RESOLUTION / deviations)
+        low = np.where(
+            costs > TOTAL, residuals - (costs - TOTAL) / deviations, residuals - 0.5 * RESOLUTION / deviations
+        )
         low = np.where(costs < 0.5 * RESOLUTION, -np.inf, low)
         chances = np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))
         return np.log(np.maximum(chances, LEAST_CHANCE)), np.asarray(residuals)
@@ -388,7 +407,7 @@ class ModelAveragedProcess:
         return means, np.sqrt(np.maximum(variances, 1e-10)), self._noises(means)
 
     def _projected(self, points: Array) -> tuple[_Prior, Array]:
-        """Prior moments at points (m, dimension), and V (components, n, m): Vᵀ V is the covariance that the observations
+        """Prior moments at points (m, dimension), and V (components, n, m): Vᵀ V is the covariance that observations
         explain. The latest results are kept, because one decision needs the same points several times.
         """
         key = points.tobytes()
@@ -484,12 +503,19 @@ def latent_size(dimension: int) -> int:
 def clipped_moments(means: Array, deviations: Array) -> tuple[Array, Array]:
     """E clip(f, 0, 1) and E clip(f, 0, 1)² of normal f."""
     low, high = -means / deviations, (1.0 - means) / deviations
-    inside = ndtr(high) - ndtr(low)
-    p, q = _density(low), _density(high)
-    above = ndtr(-high)
-    first = means * inside + deviations * (p - q) + above
-    second = (means**2 + deviations**2) * inside + deviations * (means * p - (means + 1.0) * q) + above
+    below, under = ndtr(low), ndtr(high)
+    p, q, above = _density(low), _density(high), 1.0 - under
+    first = means * (under - below) + deviations * (p - q) + above
+    second = (means**2 + deviations**2) * (under - below) + deviations * (means * p - (means + 1.0) * q) + above
     return np.clip(first, 0.0, 1.0), np.clip(second, 0.0, 1.0)
+
+
+def clipped_mean(means: Array, deviations: Array) -> Array:
+    """E clip(f, 0, 1) of normal f."""
+    low, high = -means / deviations, (1.0 - means) / deviations
+    under = ndtr(high)
+    first = means * (under - ndtr(low)) + deviations * (_density(low) - _density(high)) + 1.0 - under
+    return np.asarray(np.clip(first, 0.0, 1.0))
 
 
 def shortfall(level: Array | float, means: Array, deviations: Array) -> Array:
