@@ -81,6 +81,7 @@ class RunRequest:
         folder: of the run; None: a new one, which is entered in the catalogue.
         resume: continue the run in `folder`; 'if begun': only if a run was begun there.
         as_written: the vessels are those of the campaign's file.
+        problems: finds what prevents these pours; None: the checks of the campaign do.
     """
 
     campaign: CampaignPlan
@@ -88,6 +89,7 @@ class RunRequest:
     folder: Path | None = None
     resume: Literal["no", "yes", "if begun"] = "no"
     as_written: bool = True
+    problems: Callable[[], Sequence[str]] | None = None
 
     @property
     def pours(self) -> bool:
@@ -167,6 +169,8 @@ class RunService:
         """
         from orchestrator.config.campaign_checks import check_campaign
 
+        if request.problems is not None:
+            return CheckReport(tuple(request.problems()), ())
         warned: list[Problem] = []
         found = check_campaign(request.campaign, as_written=request.as_written, warn=warned.append, doing=doing)
         problems = [str(one) for one in found]
@@ -427,7 +431,8 @@ class GivenTheta:
 
     Attributes:
         theta: the θ itself.
-        draws: of its posterior; empty where none is known, or the campaign's risk bears none.
+        draws: of its posterior, which the simulations use in turn; empty if it has none, or if the file recommends the
+            uncalibrated θ.
         left_over: shift that the calibration left (`sim_engine.prediction_band`); None where it is not known.
     """
 
@@ -441,14 +446,20 @@ def read_theta(path: Path, plan: CampaignPlan) -> GivenTheta:
 
     Args:
         path: of the file.
-        plan: whose θ has what the file does not name; if its risk bears draws of a posterior, the file needs them.
+        plan: whose θ has what the file does not name; if its risk needs draws of a posterior, the file needs them.
 
     Raises:
         ConfigError: anything is wrong with the file.
     """
-    from orchestrator.config.file_loading import load_discrepancy, load_parameters, load_posterior
+    from orchestrator.config.file_loading import (
+        load_discrepancy,
+        load_parameters,
+        load_posterior,
+        predicts_with_posterior,
+    )
 
     needed = plan.deployment is not None and plan.deployment.settings.needs_posterior
+    needed = needed or predicts_with_posterior(path)
     draws = load_posterior(path, POSTERIOR_DRAWS, plan.parameters) if needed else ()
     return GivenTheta(load_parameters(path, plan.parameters), draws, load_discrepancy(path))
 

@@ -15,6 +15,7 @@ import ipaddress
 import math
 import re
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pkgutil import resolve_name
@@ -89,6 +90,10 @@ class ArmDiagnostics:
             advice = "" if accepted else f"read the arm's safety settings, then: {accept}"
             checks.append(DeviceCheck("safety checksum", "ok" if accepted else "fail", found, advice))
         return checks
+
+    def recorded(self) -> dict[str, Any]:
+        """The values that were read, JSON-ready, for `ArmSettings.diagnostics_of`; empty if they are not kept."""
+        return {}
 
     def at_home(self) -> DeviceCheck:
         """Whether the arm stands at its home pose."""
@@ -208,6 +213,14 @@ class ArmSettings(Settings):
         finally:
             arm.close()
         return ArmDiagnostics(facts.checksum, facts.serial, facts.model, facts.version, facts.problem)
+
+    def diagnostics_of(self, recorded: Mapping[str, Any]) -> ArmDiagnostics:
+        """The diagnostics of values that were recorded before (`ArmDiagnostics.recorded`); nothing is connected.
+
+        Raises:
+            ValueError: the values cannot be read.
+        """
+        raise ValueError("this kind of arm has no recorded readouts")
 
     def readiness(self) -> DeviceCheck | None:
         """Read whether a motion could begin now, for a display while no run uses the arm.
@@ -396,6 +409,11 @@ class UrArmSettings(ArmSettings):
     def diagnostics(self) -> ArmDiagnostics:
         """See `ArmSettings.diagnostics`."""
         found: ArmDiagnostics = resolve_name("actors.arm.ur.commissioning:UrDiagnostics").at(self)
+        return found
+
+    def diagnostics_of(self, recorded: Mapping[str, Any]) -> ArmDiagnostics:
+        """See `ArmSettings.diagnostics_of`."""
+        found: ArmDiagnostics = resolve_name("actors.arm.ur.commissioning:UrDiagnostics").of_record(self, recorded)
         return found
 
     def readiness(self) -> DeviceCheck | None:

@@ -311,6 +311,16 @@ class BalanceCheckOutput(_Output):
     checks: list[DeviceCheck]
 
 
+class ArchiveOutput(_Output):
+    """Replay of the recordings of a commissioning day."""
+
+    archive: str
+    ready: bool
+    """Whether all recordings are read as on the day."""
+
+    checks: list[DeviceCheck]
+
+
 class ValidateSolverOutput(_Output):
     """Results of the solver's validation cases."""
 
@@ -495,6 +505,7 @@ OUTPUTS: dict[str, Any] = {
     "study run": StudyOutput | StudyCostOutput,
     "study report": StudyOutput,
     "robot check": CheckOutput,
+    "robot archive": ArchiveOutput,
     "balance check": BalanceCheckOutput,
     "queue submit": CampaignOut,
     "queue list": QueueOutput,

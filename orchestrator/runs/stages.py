@@ -58,7 +58,7 @@ SOURCES, DOSES = "sources", "doses"
 """Names of the stages of a series of doses."""
 
 POSTERIOR_DRAWS = 64
-"""Number of draws from the posterior of θ that a deployment under risk uses."""
+"""Number of draws from the posterior of θ that a deployment's simulations use."""
 
 
 @dataclass(frozen=True)
@@ -269,16 +269,27 @@ def prediction_stages(
 
 
 def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPlan:
-    """The deployment with the posterior draws of θ that its settings need, from the preceding calibration.
+    """The deployment with posterior draws of θ from the preceding calibration; its simulations use them in turn.
+
+    There are none if the calibration has no posterior, or if the weighed pours do not justify θ*. A strategy that
+    learns the bench's offsets from its pours receives what calibration knows of them separately (`with_bench`): if
+    offsets were searched, its simulations use θ*.
 
     Raises:
-        RunError: the calibration has no posterior.
+        RunError: the settings need a posterior, and the calibration has none.
     """
-    if not deployment.settings.needs_posterior or deployment.thetas:
+    if deployment.thetas:
         return deployment
     found = calibrated_theta(results) if CALIBRATION in results else None
-    if found is None or found.posterior is None or not found.posterior.thetas:
-        raise RunError("deployment.risk: theta: posterior, but no calibration of this campaign tells one; C4 does")
+    posterior = () if found is None or found.posterior is None else found.posterior.thetas
+    if deployment.settings.needs_posterior:
+        if not posterior:
+            raise RunError("deployment.risk: theta: posterior, but no calibration of this campaign tells one; C4 does")
+    elif found is None or not posterior or deployed_theta(results) != found.theta:
+        return deployment
+    elif deployment.settings.learns_of_benches and set(SimulationParameters.nuisances()).intersection(found.searched):
+        return deployment
+    assert found is not None
     return replace(deployment, thetas=posterior_draws(found, POSTERIOR_DRAWS))
 
 

@@ -414,8 +414,8 @@ class DeploymentPlan(StagePlan):
         objectives: objectives to minimise instead of the loss.
         constraints: constraints on actions in addition to the bounds of their space.
         confirm: number of repetitions of the recommended action in each scene after the strategy has ended.
-        thetas: equally likely draws of a posterior, for settings that need them. They are given if no calibration of
-            the same campaign provides them.
+        thetas: equally likely draws of a posterior, which simulations use in turn. They are given if no calibration of
+            the same campaign provides them; without any, all simulations use θ*.
         bench: equally likely offsets of the bench from the simulator; empty if nothing is known about it.
         left_over: residual shift of a calibration (`sim_engine.prediction_band`), given in the same case as `thetas`;
             None if unknown.

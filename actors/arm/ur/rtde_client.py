@@ -22,6 +22,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 from actors.arm.ur import rtde
+from actors.arm.ur.dashboard import Dashboard, DashboardError
 from actors.arm.ur.worker_messages import (
     CLOCK,
     GO,
@@ -47,7 +48,7 @@ def client_missing() -> str | None:
     )
 
 
-PORTS = {rtde.PORT: "RTDE", 29999: "dashboard", 30001: "primary interface"}
+PORTS = {rtde.PORT: "RTDE", 30001: "primary interface"}
 PROBE_TIME = 2.0
 CONSTRUCTION_TIME = 5.0
 """Time after which a blocked constructor ends the process [s], because it holds the interpreter lock."""
@@ -75,6 +76,8 @@ _VARIABLES = [
     *(f"output_int_register_{n}" for n in (NUMBER, STATUS)),
     *(f"output_double_register_{n}" for n in (CLOCK, *range(TOOL, TOOL + 6))),
 ]
+_FORCE, _WRIST = "actual_TCP_force", "ft_raw_wrench"
+"""Read from controllers that have them; the second one since 5.9, from robots with a sensor in the wrist."""
 
 
 class RtdeClient:
@@ -93,14 +96,20 @@ class RtdeClient:
     def __init__(self, address: str, rate: float, silence: float, registers: int) -> None:
         for port, name in PORTS.items():
             _probe(address, port, name)
+        try:
+            with Dashboard(address, PROBE_TIME):
+                pass
+        except DashboardError as error:
+            raise TroubleError("lost", f"no robot at {address}: {error}. {_ENABLED}") from None
         if (missing := client_missing()) is not None:
             raise TroubleError("refused", missing)
         from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
 
         for attempt in range(1, ATTEMPTS + 1):
             try:
+                self._forces = _offered(address, (_FORCE, _WRIST))
                 with _bounded(CONSTRUCTION_TIME):
-                    self._receive: Any = RTDEReceiveInterface(address, rate, _VARIABLES)
+                    self._receive: Any = RTDEReceiveInterface(address, rate, [*_VARIABLES, *self._forces])
                 self._inputs = InputWriter(address, registers)
                 self._tilt: InputWriter | None = None
                 break
@@ -156,6 +165,9 @@ class RtdeClient:
                 status=r.getOutputIntRegister(STATUS),
                 clock=r.getOutputDoubleRegister(CLOCK),
                 tool=tuple(r.getOutputDoubleRegister(TOOL + k) for k in range(6)),
+                status_bits=r.getRobotStatus(),
+                force=tuple(r.getActualTCPForce()) if _FORCE in self._forces else (),
+                wrist=tuple(r.getFtRawWrench()) if _WRIST in self._forces else (),
             )
             if r.getTimestamp() == time_before:
                 self._last, self._same_readings = reading, 0
@@ -277,6 +289,18 @@ class InputWriter:
             self._writing.release()
 
 
+def _offered(address: str, names: tuple[str, ...]) -> list[str]:
+    """Which values the controller has. It refuses a recipe that names another one."""
+    try:
+        with socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME) as connection:
+            requests = rtde.Requests(connection)
+            requests.ask(rtde.REQUEST_PROTOCOL_VERSION, b"\0\2")
+            answer = requests.ask(rtde.SETUP_OUTPUTS, struct.pack(">d", 1.0) + ",".join(names).encode("ascii"))
+    except (OSError, rtde.PackageError) as error:
+        raise TroubleError("lost", f"{address}: its RTDE does not answer as it should: {error}") from None
+    return [name for name, kind in zip(names, rtde.names(answer[1:]), strict=False) if kind in rtde.FORMATS]
+
+
 def _probe(address: str, port: int, name: str) -> None:
     try:
         with socket.create_connection((address, port), timeout=PROBE_TIME):
@@ -284,9 +308,11 @@ def _probe(address: str, port: int, name: str) -> None:
     except OSError as error:
         raise TroubleError(
             "lost",
-            f"no robot at {address}: its {name} (port {port}) does not answer: {error}. "
-            "Is the controller on, on this network, and are its services enabled?",
+            f"no robot at {address}: its {name} (port {port}) does not answer: {error}. {_ENABLED}",
         ) from None
+
+
+_ENABLED = "Is the controller on, on this network, and are its services enabled?"
 
 
 @contextlib.contextmanager

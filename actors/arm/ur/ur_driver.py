@@ -36,6 +36,7 @@ from actors.arm.planning.path_checks import recheck
 from actors.arm.ur.dashboard import DashboardError, stop_program
 from actors.arm.ur.executed_motion import Stops, StopTimes, executed_dose, executed_path
 from actors.arm.ur.motion_segments import MotionSegment, jog_path, upright_way, way_home
+from actors.arm.ur.robot_comparison import payload_check
 from actors.arm.ur.ur_session import ANSWER_TIME, Session, UrFacts
 from actors.arm.ur.urscript_writer import TiltLimits, path_program, tilt_program
 from actors.arm.ur.worker_messages import REDUCED, DataPackage, MotionOrder, MotionOutcome, MotionSettings
@@ -426,7 +427,14 @@ class UrArm:
                     executed,
                 )
             return executed
-        executed = executed_path(outcome.samples, segment.path, self._spec, completed=completed, slider=outcome.slider)
+        executed = executed_path(
+            outcome.samples,
+            segment.path,
+            self._spec,
+            completed=completed,
+            slider=outcome.slider,
+            forces=outcome.forces,
+        )
         if completed:
             return executed
         self._tilt, self._stopped = segment.tilt_left(outcome), True
@@ -458,8 +466,14 @@ class AcceptedArm(UrArm):
 
         Raises:
             NotAcceptedError: the safety settings differ from the accepted ones; the arm is disconnected.
+            ArmRefusedError: the payload that is set on the controller differs from the settings'; likewise.
         """
-        return self._compared(super().connect())
+        facts = self._compared(super().connect())
+        payload = payload_check(self._spec, facts.payload, facts.payload_centre)
+        if payload.state == "fail":
+            self.close()
+            raise ArmRefusedError(f"arm at {self._address}: payload {payload.found}: {payload.advice}")
+        return facts
 
     def facts(self) -> UrFacts:
         """See `UrArm.facts`; raises as `connect`."""

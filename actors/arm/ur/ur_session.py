@@ -82,7 +82,7 @@ def facts_of(worker_facts: Facts) -> UrFacts:
         model=worker_facts.model,
         serial=worker_facts.serial,
         version=".".join(map(str, worker_facts.version)),
-        problem=why_not_ready(r.robot_mode, r.safety_mode, r.runtime, r.slider),
+        problem=why_not_ready(r.robot_mode, r.safety_mode, r.runtime, r.slider, r.status_bits),
         robot_mode=ROBOT_MODES.get(r.robot_mode, str(r.robot_mode)),
         safety_mode=safety_mode(r.safety_mode).text,
         remote=worker_facts.remote,

@@ -36,6 +36,8 @@ class ControllerFaults:
         self._controller = host.controller
         self._names: dict[str, Callable[..., dict[str, Any] | None]] = {
             "protective_stop": self.protective_stop,
+            "freedrive": self.freedrive,
+            "force": self.force,
             "emergency_stop": self.emergency_stop,
             "release_emergency_stop": self.release_emergency_stop,
             "safeguard": self.safeguard,
@@ -109,9 +111,26 @@ class ControllerFaults:
 
     # ---- safety
 
-    def protective_stop(self, reason: str = "fault port", **when: Any) -> None:
-        """Trigger a protective stop."""
-        self._when(lambda: self._controller.protective_stop(str(reason)), **when)
+    def protective_stop(self, reason: str = "fault port", code: int = 157, **when: Any) -> None:
+        """Trigger a protective stop, with the code of an error; 157 is a collision."""
+        self._when(lambda: self._controller.protective_stop(str(reason), int(code)), **when)
+
+    def freedrive(self, active: bool = True, **when: Any) -> None:
+        """Press the freedrive button, or let it go; nothing is moved by hand."""
+
+        def apply() -> None:
+            self._controller.freedrive = bool(active)
+
+        self._when(apply, **when)
+
+    def force(self, wrench: list[float], **when: Any) -> None:
+        """Push the tool: force and torque in the base's frame [N], [N m]. Only the reported values change."""
+        x, y, z, rx, ry, rz = map(_finite, wrench)
+
+        def apply() -> None:
+            self._controller.robot.external_force = (x, y, z, rx, ry, rz)
+
+        self._when(apply, **when)
 
     def emergency_stop(self, system: bool = False, **when: Any) -> None:
         """Press the emergency stop button."""
