@@ -20,7 +20,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from actors.dosing.simulated_dose import check_dose, forecast
+from actors.dosing.dose_series import check_dose, predict_dose
+from actors.dosing.simulated_dose import check_straight
 from actors.interfaces import DoseTarget, InvalidActionError, SimulatorPool
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.action_assignments import AssignmentError, assigned_action, set_action
@@ -33,7 +34,7 @@ from orchestrator.run_errors import RunError
 from orchestrator.run_service import RunRequest
 from orchestrator.runs.stages import StageDefinition
 from orchestrator.shipped import shipped
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.dispense import DOSE, Dispense
 from orchestrator.strategies.single_action import OnePour, RepeatedSimulation
@@ -255,7 +256,9 @@ class PlannedOrder:
         """Build the strategy."""
         if self.target is None:
             return OnePour(self.scene, self.action, seed)
-        return Dispense(self.scene, self.action, [self.target], seed)
+        dose = PlannedDose(self.target.amount, self.target.limit, self.scene.receiver.name)
+        scene = replace(self.scene, fixed=self.action.values())
+        return Dispense(DispensePlan((scene,), (dose,), 0.0, False, self.plan.laboratory.name), seed)
 
     def problems(self) -> list[str]:
         """Return what prevents this pour; nothing moves."""
@@ -272,6 +275,7 @@ class PlannedOrder:
                         "order an action, or name a rig without an arm"
                     ]
                 check_dose(self.scene, target)
+                check_straight(self.scene)
                 return []
             vessels = build_vessel(self.scene.pourer), build_vessel(self.scene.receiver)
             contact = touch(self.scene, self.action, *vessels)
@@ -313,8 +317,8 @@ class PlannedOrder:
 
     def _forecast(self) -> dict[str, Any]:
         assert self.target is not None
-        found, wanted = forecast(self.scene, self.target, self.order.seed), self.target.amount
-        bench = self.plan.laboratory.bench
+        laboratory, wanted = self.plan.laboratory, self.target.amount
+        found, bench = predict_dose(self.scene, self.target, self.order.seed, laboratory.dosing), laboratory.bench
         low, high = (1e3 * value for value in found.interval)
         return {
             "amount_g": 1e3 * found.amount,
