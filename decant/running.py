@@ -261,7 +261,7 @@ def plan(
         campaign: with a deployment: it says which actions may be planned, and what is minimised.
         receiver: another vessel than the campaign's, or its file.
         theta: parameters to plan with; the campaign's unless given. A run that has calibrated, or its `theta.json`,
-            also gives what a campaign with `risk: {theta: posterior}` needs, the draws of the posterior.
+            also gives the draws of the posterior, if the weighed pours justify θ*; the simulations use them in turn.
         iterations: actions that are tried, 1 or more; as the campaign says unless given.
         seeds: number of new seeds, 1 or more, that the recommended action is simulated with.
         watch: see `run`.
@@ -295,9 +295,10 @@ def _given(theta: SimulationParameters | Run | Path | str | None, campaign: Camp
     if found is None or recommended is None:
         raise InvalidArgumentError(f"theta: run {theta.directory} has found no θ*; give one that has calibrated")
     scores = evaluation_of(theta.results)
+    needed = campaign.deployment is not None and campaign.deployment.settings.needs_posterior
     return GivenTheta(
         recommended,
-        posterior_draws(found, POSTERIOR_DRAWS),
+        posterior_draws(found, POSTERIOR_DRAWS) if needed or recommended == found.theta else (),
         None if scores is None else shift_left_over(scores, len(found.searched)),
     )
 

@@ -333,6 +333,13 @@ def liquids() -> str:
 SHOWN_SHARES = (20.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0)
 
 
+MEASURED = (
+    *("recorded", "rounding", "recorded-2k", "recorded-run", "bands", "quickstart-calibration", "quickstart"),
+    *("cliffs", "risk", "optimizers"),
+)
+"""Tables of docs/data/results.json that a page shows."""
+
+
 def measured(name: str) -> str:
     """A table of docs/data/results.json, with how it was measured."""
     found = json.loads((FOLDER / "data" / "results.json").read_text(encoding="utf-8"))[name]
@@ -516,10 +523,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "objectives": partial(variants, OBJECTIVES.all, Objective),
     "compared-calibration": partial(variants, _arms(study.CalibrationsSettings), Settings),
     "compared-deployment": partial(variants, _arms(study.DeploymentsSettings), Settings),
-    **{
-        f"result-{name}": partial(measured, name)
-        for name in ("recorded", "recorded-run", "bands", "cliffs", "risk", "optimizers")
-    },
+    **{f"result-{name}": partial(measured, name) for name in MEASURED},
     **{name: partial(dosing, group) for name, group in DOSING.items()},
     "command-line": command_line,
     "output": json_output,

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
 from actors.laboratory_settings import LaboratorySettings
+from orchestrator.catalogue.source_account import SourceAccount
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import check_journal, has_begun
 from orchestrator.journal.run_record import CampaignResult, read_result
@@ -280,6 +281,8 @@ class RunHandle:
         self._subscribers: list[Subscriber] = [*resources.subscribers, self._note]
         if recorder is not None:
             self._subscribers.append(recorder)
+        if request.campaign.dispense is not None:
+            self._subscribers.append(SourceAccount.open().follow(request.campaign.dispense))
         self._pausing = self._aborting = self._abandoning = False
         self._winding_down = asyncio.Event()
         self._result: CampaignResult | None = None
@@ -428,7 +431,8 @@ class GivenTheta:
 
     Attributes:
         theta: the θ itself.
-        draws: of its posterior; empty where none is known, or the campaign's risk bears none.
+        draws: of its posterior, which the simulations use in turn; empty if it has none, or if the file recommends the
+            uncalibrated θ.
         left_over: shift that the calibration left (`sim_engine.prediction_band`); None where it is not known.
     """
 
@@ -442,14 +446,20 @@ def read_theta(path: Path, plan: CampaignPlan) -> GivenTheta:
 
     Args:
         path: of the file.
-        plan: whose θ has what the file does not name; if its risk bears draws of a posterior, the file needs them.
+        plan: whose θ has what the file does not name; if its risk needs draws of a posterior, the file needs them.
 
     Raises:
         ConfigError: anything is wrong with the file.
     """
-    from orchestrator.config.file_loading import load_discrepancy, load_parameters, load_posterior
+    from orchestrator.config.file_loading import (
+        load_discrepancy,
+        load_parameters,
+        load_posterior,
+        predicts_with_posterior,
+    )
 
     needed = plan.deployment is not None and plan.deployment.settings.needs_posterior
+    needed = needed or predicts_with_posterior(path)
     draws = load_posterior(path, POSTERIOR_DRAWS, plan.parameters) if needed else ()
     return GivenTheta(load_parameters(path, plan.parameters), draws, load_discrepancy(path))
 

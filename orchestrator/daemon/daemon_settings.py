@@ -23,12 +23,12 @@ from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
+from orchestrator.daemon import PORT
 from orchestrator.daemon.notifications import NotifySettings, problem_of
 from sim_engine.settings.model import Count, FilePath, Name, PositiveCount, Settings, Switch, Text
 from sim_engine.settings.quantity import Quantity
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
-PORT = 8377
 ANY_RIG = "virtual"
 """The rig of a daemon whose settings name none: each campaign's own laboratory, which must be virtual."""
 

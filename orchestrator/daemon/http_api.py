@@ -14,7 +14,8 @@ from typing import Any
 from fastapi import FastAPI, Response
 
 from orchestrator.daemon import archive_routes, command_routes, query_routes, station_routes
-from orchestrator.daemon.access_control import Daemon, RequestGuard, Tokens
+from orchestrator.daemon.access_control import Daemon, RequestGuard
+from orchestrator.daemon.access_tokens import Tokens
 from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.page import page_router
 from orchestrator.daemon.schemas import HealthOut, ProblemOut

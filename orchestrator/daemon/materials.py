@@ -195,7 +195,9 @@ class Materials:
         if mass > 0.0 and liquid != MIXTURE:
             volume = mass / self.liquid(liquid).density
             if volume > found.capacity:
-                raise MaterialError(f"{found.id}: holds {1e6 * found.capacity:.0f} ml, and {1e6 * volume:.0f} ml are stated")
+                raise MaterialError(
+                    f"{found.id}: holds {1e6 * found.capacity:.0f} ml, and {1e6 * volume:.0f} ml are stated"
+                )
         self._enter(found.id, "weighed", mass, deviation, liquid if mass > 0.0 else "", None, by, note)
 
     def enter_pour(self, pour: str, source: str, receiver: str, moved: Transfer, by: str) -> None:
@@ -243,7 +245,9 @@ class Materials:
                 mass = None
             elif mass is not None:
                 mass, variance = mass + entry["change"], variance + entry["deviation"] ** 2
-        return VesselContent(mass if mass is None else max(mass, 0.0), math.sqrt(variance), liquid, since, pour, weighed)
+        return VesselContent(
+            mass if mass is None else max(mass, 0.0), math.sqrt(variance), liquid, since, pour, weighed
+        )
 
     def account(self, vessel: str | None = None) -> list[dict[str, Any]]:
         """Return the entries of one vessel or of all, oldest first. Masses in kg."""
@@ -345,7 +349,9 @@ class Materials:
             return f"{source.id}: is source and receiver at once"
         for vessel in (source, receiver):
             if other := self._open_pour(vessel.id, pour):
-                return f"{vessel.id}: pour {other} has begun and has no outcome; answer its question, resume or cancel it"
+                return (
+                    f"{vessel.id}: pour {other} has begun and has no outcome; answer its question, resume or cancel it"
+                )
         held, there = self.content(source.id), self.content(receiver.id)
         for vessel, content in ((source, held), (receiver, there)):
             if content.mass is None:

@@ -365,4 +365,3 @@ def _ids(prepared: Sequence[Prepared]) -> set[str]:
 
 def _grams(mass: float | None) -> float | None:
     return None if mass is None else 1e3 * mass
-

@@ -286,7 +286,9 @@ class PlannedOrder:
         laboratory = self.plan.laboratory
         if laboratory.arm is not None:
             return laboratory.arm.plan(self.scene, self.action).report.duration + laboratory.operator.time
-        motion = plan_motion(self.scene, self.action, build_vessel(self.scene.pourer), build_vessel(self.scene.receiver))
+        motion = plan_motion(
+            self.scene, self.action, build_vessel(self.scene.pourer), build_vessel(self.scene.receiver)
+        )
         bench = laboratory.bench
         return motion.duration + (0.0 if bench is None else bench.operator_time + bench.balance.settling_time)
 
@@ -468,12 +470,12 @@ class OrderBook:
     def list(self, limit: int, source: str = "") -> list[dict[str, Any]]:
         """Return orders, newest first."""
         where, arguments = ("where source = ?", [source]) if source else ("", [])
-        rows = self._store.rows(
-            f"select * from pour_order {where} order by rowid desc limit ?", *arguments, limit
-        )
+        rows = self._store.rows(f"select * from pour_order {where} order by rowid desc limit ?", *arguments, limit)
         return [_decoded(row) for row in rows]
 
-    def add(self, order: PourOrder, campaign: str, body: Mapping[str, Any], predicted: Mapping[str, Any] | None) -> None:
+    def add(
+        self, order: PourOrder, campaign: str, body: Mapping[str, Any], predicted: Mapping[str, Any] | None
+    ) -> None:
         """Store an order; call it together with `Store.add` of its campaign."""
         self._store.write(
             "insert into pour_order (id, campaign, body, source, receiver, amount, predicted) "

@@ -27,7 +27,7 @@ from fastapi import FastAPI
 from pythonjsonlogger.json import JsonFormatter
 
 from orchestrator.catalogue.run_registry import make_state_directory, use_state_directory
-from orchestrator.daemon.access_control import Tokens
+from orchestrator.daemon.access_tokens import Tokens
 from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
 from orchestrator.daemon.http_api import serve_app
 from orchestrator.daemon.madsci_node import create_node

@@ -34,7 +34,13 @@ class PourIn(_In):
         use_attribute_docstrings=True,
         json_schema_extra={
             "examples": [
-                {"id": "plan-17:step-4", "source": "beaker-1", "receiver": "vial-7", "amount": "30 g", "tolerance": "1 g"},
+                {
+                    "id": "plan-17:step-4",
+                    "source": "beaker-1",
+                    "receiver": "vial-7",
+                    "amount": "30 g",
+                    "tolerance": "1 g",
+                },
                 {
                     "id": "plan-17:step-5",
                     "source": "beaker-1",

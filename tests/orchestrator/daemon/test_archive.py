@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from orchestrator.catalogue.run_registry import VARIABLE, use_state_directory
 from orchestrator.cli.app import app
-from orchestrator.daemon.access_control import Role
+from orchestrator.daemon.access_tokens import Role
 from tests.orchestrator.test_catalogue import made
 from tests.support.daemon_thread import Real
 from tests.support.toy_daemon import Served, run, serving

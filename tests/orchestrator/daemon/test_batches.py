@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.daemon.access_control import Role
+from orchestrator.daemon.access_tokens import Role
 from orchestrator.daemon.submissions import pack
 from tests.support.station import order, rigs_in, set_up, until_pour
 from tests.support.toy_daemon import run, serving
@@ -19,7 +19,9 @@ def test_a_batch_is_taken_as_a_whole_or_not_at_all_and_reports_each_item(tmp_pat
             await served.post("/queue/pause")
             first = order("a", amount="40 g", receiver="vial-1")
             second = order("b", amount="80 g", receiver="vial-2")
-            told = await served.post("/batches", {"id": "plate", "items": [{"pour": first}, {"pour": second}]}, status=409)
+            told = await served.post(
+                "/batches", {"id": "plate", "items": [{"pour": first}, {"pour": second}]}, status=409
+            )
             assert told["detail"].startswith("b: beaker: holds 100")
             assert await served.get("/campaigns") == []
             assert not list((tmp_path / "state/campaigns").iterdir())

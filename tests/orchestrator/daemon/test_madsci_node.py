@@ -13,7 +13,7 @@ from typing import Any
 import httpx
 import pytest
 
-from orchestrator.daemon.access_control import Role
+from orchestrator.daemon.access_tokens import Role
 from orchestrator.daemon.daemon_settings import MadsciSettings
 from orchestrator.daemon.madsci_node import create_node, new_ulid
 from orchestrator.daemon.ordering import Ordering

@@ -189,6 +189,6 @@ async def _pours(served: Served, body: dict[str, object]) -> bool:
 
 
 def _admin() -> object:
-    from orchestrator.daemon.access_control import Role
+    from orchestrator.daemon.access_tokens import Role
 
     return Role.ADMIN

@@ -15,7 +15,7 @@ from urllib.parse import urlparse
 
 import pytest
 
-from orchestrator.daemon.access_control import Role, token_of
+from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from tests.support.station import order, setting_up
 from tests.support.station_process import STAGES
