@@ -23,6 +23,7 @@ from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document
 from orchestrator.daemon.daemon_store import ENDED, Store
 from orchestrator.run_errors import RunError
+from orchestrator.strategies.dispense import ENOUGH
 from sim_engine.liquids import Liquid
 from sim_engine.settings.quantity import QuantityError, parse_quantity
 from sim_engine.vessel.shapes import VesselError
@@ -31,7 +32,7 @@ from sim_engine.vessel.vessel import build_vessel
 MIXTURE = "mixture"
 """Liquid of a vessel that several liquids were poured into."""
 
-SURE = 2.0
+SURE = ENOUGH
 """Number of standard deviations by which a content may be smaller than its estimate, and larger."""
 
 
@@ -367,7 +368,7 @@ class Materials:
         promised = self.promised(source.id, pour)
         sure = held.mass - SURE * held.deviation - promised
         wanted = 0.0 if amount is None else amount
-        if sure <= wanted:
+        if sure <= (0.0 if amount is None else amount + more):
             spoken = f", {1e3 * promised:.4g} g of it are promised to other pours" if promised else ""
             return (
                 f"{source.id}: holds {1e3 * held.mass:.4g} ± {1e3 * SURE * held.deviation:.2g} g{spoken}, and "
