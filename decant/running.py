@@ -176,9 +176,7 @@ class RunningCampaign:
         return f"<b>{html.escape(self._campaign.name)}</b>: {html.escape(str(self))}"
 
 
-async def start(
-    campaign: CampaignPlan, *, watch: Sequence[Watch] = (), in_process: bool = True
-) -> RunningCampaign:
+async def start(campaign: CampaignPlan, *, watch: Sequence[Watch] = (), in_process: bool = True) -> RunningCampaign:
     """Start a campaign in the running event loop and return at once, so that its progress can be shown.
 
     Args:

@@ -104,7 +104,9 @@ class StationPour:
 
     def _repr_html_(self) -> str:
         """The pour as a table, in notebooks."""
-        shown = {name: value for name, value in {**self.row(), "reason": self.reason}.items() if value not in (None, "")}
+        shown = {
+            name: value for name, value in {**self.row(), "reason": self.reason}.items() if value not in (None, "")
+        }
         rows = "".join(
             f"<tr><th>{html.escape(name)}</th><td>"
             f"{html.escape(f'{value:.2f}' if isinstance(value, float) else str(value))}</td></tr>"

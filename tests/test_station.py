@@ -56,7 +56,7 @@ def test_a_campaign_is_checked_without_running_and_started_with_progress(
         assert not running.done
         return await running
 
-    with pytest.warns(UserWarning):
+    with pytest.warns(UserWarning, match=".+"):
         found = asyncio.run(work())
     assert found.result.state == "finished"
     assert len(found.pours) == 5

@@ -36,7 +36,9 @@ def order(
     for text in assignments or []:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals:
-            raise RefusalError(f"--set: {text!r} should be name=value, for example angular_velocity='60 deg/s'", BAD_INPUT)
+            raise RefusalError(
+                f"--set: {text!r} should be name=value, for example angular_velocity='60 deg/s'", BAD_INPUT
+            )
         action[name] = value
     body = {
         **{"id": key, "source": source, "receiver": receiver, "amount": amount, "tolerance": tolerance},
@@ -136,7 +138,11 @@ def materials(url: Url = None, state: State = None, as_json: Json = False) -> No
         print_message("no vessel is registered; see docs/laboratory/station.md")
     for one in found["vessels"]:
         content = one["content"]
-        mass = "unknown: weigh it" if content["mass_g"] is None else f"{content['mass_g']:.1f} ± {content['deviation_g']:.1f} g"
+        mass = (
+            "unknown: weigh it"
+            if content["mass_g"] is None
+            else f"{content['mass_g']:.1f} ± {content['deviation_g']:.1f} g"
+        )
         print(f"{one['id']:20s} {content['liquid'] or '-':12s} {mass:24s} {one['position']}".rstrip())
 
 
@@ -181,4 +187,6 @@ def restore(
         found = state_backup.restore(file, state or state_directory())
     then = time.strftime("%Y-%m-%d %H:%M", time.localtime(found["time"]))
     print(f"restored the state of {then}: {found['campaigns']:.0f} campaigns, {found['runs']:.0f} runs")
-    print_message("the queue is paused. Pours made since then are not in it: weigh the vessels, then decant queue resume")
+    print_message(
+        "the queue is paused. Pours made since then are not in it: weigh the vessels, then decant queue resume"
+    )

@@ -1,7 +1,7 @@
 """Materials of a station: liquids, vessels, positions, and the account of what is in which vessel.
 
-`Materials` reads and writes its tables in the daemon's `Store`. The account is append-only: an entry sets the content of
-a vessel (a weighing) or changes it (a pour). `Materials.content` adds the entries up, with their uncertainty.
+`Materials` reads and writes its tables in the daemon's `Store`. The account is append-only: an entry sets the content
+of a vessel (a weighing) or changes it (a pour). `Materials.content` adds the entries up, with their uncertainty.
 `Materials.refusal` is the reason why vessels can't serve a pour; it is checked before anything moves.
 
 Limitations: liquids that were poured together become a mixture, which is no source any more. Evaporation is not

@@ -1,7 +1,7 @@
 """A pour that another program orders: its request, its run, its prediction and its result.
 
-An order becomes a queued campaign with the task 'pour' and one pour, so that rigs, journal, questions and stops treat it
-as any other campaign. The id of its caller makes it unique: the same order again is the same pour.
+An order becomes a queued campaign with the task 'pour' and one pour, so that rigs, journal, questions and stops treat
+it as any other campaign. The id of its caller makes it unique: the same order again is the same pour.
 
 - `PourOrder` is the order; `order_bundle` is the campaign of it, `order_request` its run.
 - `predict` predicts it; nothing moves.

@@ -59,9 +59,10 @@ def back_up(state: Path, target: Path) -> dict[str, int]:
     campaigns = sorted(path for path in (state / "campaigns").glob("*") if path.is_dir())
     try:
         # The content includes tokens.
-        with os.fdopen(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as file, zipfile.ZipFile(
-            file, "w", zipfile.ZIP_DEFLATED
-        ) as archive:
+        with (
+            os.fdopen(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as file,
+            zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
+        ):
             # The store is first: a run that is further than the store continues from its journal.
             archive.writestr(STORE, whole_copy(state / STORE))
             if (state / "tokens").is_file():
@@ -143,7 +144,9 @@ def restore(source: Path, state: Path) -> dict[str, float]:
         for item in store.items(limit=1_000_000):
             if item.state not in (*ENDED, "queued"):
                 store.change(item.id, desired_state=str(DesiredState.PAUSE))
-        store.note("restore", "restore backup", detail=time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(about["time"])))
+        store.note(
+            "restore", "restore backup", detail=time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(about["time"]))
+        )
     finally:
         store.close()
     return about

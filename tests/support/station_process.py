@@ -122,9 +122,7 @@ async def serve(folder: Path, stage: str) -> None:
 @contextlib.contextmanager
 def node_process(folder: Path, served: str = "node") -> Iterator[str]:
     """Run the daemon with a filled beaker; yields the URL of its 'node' for MADSci, or of the 'station'."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", __name__, str(folder), served], stdout=subprocess.PIPE, text=True
-    )
+    process = subprocess.Popen([sys.executable, "-m", __name__, str(folder), served], stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
         yield process.stdout.readline().strip()
