@@ -10,11 +10,13 @@ estimated. Campaigns other than ordered pours are not in the account: an operato
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -254,6 +256,20 @@ class Materials:
         """Return the entries of one vessel or of all, oldest first. Masses in kg."""
         where, arguments = ("", []) if vessel is None else ("where vessel = ?", [vessel])
         return self._store.rows(f"select * from account {where} order by id", *arguments)
+
+    def table(self) -> str:
+        """Return the account as CSV, for the export of runs: masses in g, and the run of each ordered pour."""
+        rows = self._store.rows(
+            "select t, vessel, kind, 1e3 * change as change_g, 1e3 * deviation as deviation_g, liquid, pour, run, "
+            "account.by, note from account left join pour_order on pour_order.id = pour "
+            "left join campaign on campaign.id = campaign order by account.id"
+        )
+        text = StringIO()
+        columns = ("t", "vessel", "kind", "change_g", "deviation_g", "liquid", "pour", "run", "by", "note")
+        writer = csv.DictWriter(text, columns)
+        writer.writeheader()
+        writer.writerows(rows)
+        return text.getvalue()
 
     # ---- look-up
 

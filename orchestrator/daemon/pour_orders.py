@@ -406,7 +406,9 @@ def weighing_deviation(laboratory: LaboratorySettings) -> float:
     balance = laboratory.balance
     if balance is None:
         return 0.0
-    return math.hypot(balance.repeatability or 0.0, (balance.step or 0.0) / math.sqrt(12.0))
+    # settings of a plug-in's balance need not have them
+    repeatability, step = (getattr(balance, name, None) or 0.0 for name in ("repeatability", "step"))
+    return math.hypot(repeatability, step / math.sqrt(12.0))
 
 
 def weighed_result(order: PourOrder, measured: PourMeasurement, deviation: float) -> dict[str, Any]:
