@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
 from actors.laboratory_settings import LaboratorySettings
+from orchestrator.catalogue.source_account import SourceAccount
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import check_journal, has_begun
 from orchestrator.journal.run_record import CampaignResult, read_result
@@ -80,6 +81,7 @@ class RunRequest:
         folder: of the run; None: a new one, which is entered in the catalogue.
         resume: continue the run in `folder`; 'if begun': only if a run was begun there.
         as_written: the vessels are those of the campaign's file.
+        problems: finds what prevents these pours; None: the checks of the campaign do.
     """
 
     campaign: CampaignPlan
@@ -87,6 +89,7 @@ class RunRequest:
     folder: Path | None = None
     resume: Literal["no", "yes", "if begun"] = "no"
     as_written: bool = True
+    problems: Callable[[], Sequence[str]] | None = None
 
     @property
     def pours(self) -> bool:
@@ -166,6 +169,8 @@ class RunService:
         """
         from orchestrator.config.campaign_checks import check_campaign
 
+        if request.problems is not None:
+            return CheckReport(tuple(request.problems()), ())
         warned: list[Problem] = []
         found = check_campaign(request.campaign, as_written=request.as_written, warn=warned.append, doing=doing)
         problems = [str(one) for one in found]
@@ -276,6 +281,8 @@ class RunHandle:
         self._subscribers: list[Subscriber] = [*resources.subscribers, self._note]
         if recorder is not None:
             self._subscribers.append(recorder)
+        if request.campaign.dispense is not None:
+            self._subscribers.append(SourceAccount.open().follow(request.campaign.dispense))
         self._pausing = self._aborting = self._abandoning = False
         self._winding_down = asyncio.Event()
         self._result: CampaignResult | None = None

@@ -173,6 +173,12 @@ _add(
     to=_robot,
 )
 _add(
+    robot_commands.archive,
+    "decant robot archive day-one.zip day-one-robot.json day-one-balance.jsonl runs/first-pour-20300131-1",
+    "decant robot archive day-one.zip   # replay it without the rig",
+    to=_robot,
+)
+_add(
     robot_commands.jog,
     "decant robot jog configs/laboratories/virtual.yaml         # practise without a robot",
     "decant robot jog configs/laboratories/ur10-kern.yaml --enable-motion",

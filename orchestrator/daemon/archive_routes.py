@@ -128,7 +128,7 @@ async def runs(daemon: Daemon, person: Viewer, asked: RunsAsked) -> Any:
     return await _in_catalogue(daemon, lambda catalogue: catalogue.runs(asked))
 
 
-@router.get("/pours", operation_id="pours", response_model=_several(PreviousPour))
+@router.get("/runs/pours", operation_id="run_pours", response_model=_several(PreviousPour))
 async def pours(daemon: Daemon, person: Viewer, asked: PoursAsked) -> Any:
     """List the pours of all runs, oldest first: the action, the measured spillage and the prediction."""
     return await _in_catalogue(daemon, lambda catalogue: catalogue.pours(asked))

@@ -15,16 +15,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import httpx
 
 from orchestrator.catalogue.run_registry import state_directory
-from orchestrator.daemon.access_control import Role, token_of
-from orchestrator.daemon.daemon_settings import PORT
-from orchestrator.journal.run_record import Row
+from orchestrator.daemon import PORT
+from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.run_errors import RunError
+
+if TYPE_CHECKING:  # a command that only asks the daemon reads no run
+    from orchestrator.journal.run_record import Row
 
 V1 = "/api/v1"
 TIMEOUT = httpx.Timeout(60.0, connect=5.0)
@@ -225,7 +227,7 @@ class RemoteCatalogueClient:
 
     def pours(self, conditions: Mapping[str, Any]) -> list[Row]:
         """See `CatalogueClient`."""
-        return list(self._client.get("/pours", **conditions))
+        return list(self._client.get("/runs/pours", **conditions))
 
     def run(self, name: str) -> Row:
         """See `CatalogueClient`."""

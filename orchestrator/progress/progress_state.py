@@ -253,7 +253,9 @@ class ProgressState:
         if pour is None:
             return None
         total = None
-        if pour.calibrating:
+        if self.plan.dispense is not None:
+            total = len(self.plan.dispense.doses)
+        elif pour.calibrating:
             total = self.plan.calibration.pour_count if self.plan.calibration is not None else None
         elif self.plan.deployment is not None:
             total = self.plan.deployment.confirm if pour.confirming else self.plan.deployment.pours

@@ -70,10 +70,10 @@ from sim_engine.fluid.kernels import SIGMA, decayed, dot, length, slope, square,
 from sim_engine.fluid.state import SUPPORT, VESSELS
 from sim_engine.fluid.walls import to_vessel
 
-LAYERED = 1.14
+LAYERED = 1.0
 """The sum over pairs is that of the continuum among disordered particles, and 0.76 of it among layers that slide over
 each other, as next to walls. The factor lies between the corrections for the two."""
-PAIRS = LAYERED * 200.0 * SIGMA / SUPPORT**5
+PAIRS = LAYERED * 80.0 * SIGMA / SUPPORT**5
 """Coefficient of a pair: 10 V (σ/h⁵) 20 in units of 1/d²."""
 NEAREST = 0.25
 """Least distance of a particle from a wall, in spacings."""
@@ -95,6 +95,8 @@ BESIDE = 0.386
 ABOVE = 0.16
 """… and the part of a layer above, times its height in spacings."""
 THINNEST = 0.15
+LEAST_INERTIA = 0.02
+ROUNDS = 2
 """Least thickness of films, in spacings."""
 
 
@@ -189,12 +191,61 @@ def rub(f: ti.template(), s, dt, v: ti.template(), out: ti.template()):
         for k in range(f.first[i], f.first[i] + f.count[i]):
             j = f.neighbour[k]
             r = xi - f.x[j]
-            r2 = square(r) + 1e-12
-            u = ti.max(1.0 - ti.sqrt(r2) * inv_h, 0.0)
-            pair = (scale * (nu + f.dp[j]) * u * u * u * dot(vi - v[j], r) / r2) * r
+            u = ti.max(1.0 - length(r) * inv_h, 0.0)
+            pair = (scale * (nu + f.dp[j]) * u * u * u) * (vi - v[j])
             total += pair
             out[j] = out[j] - pair
         out[i] = out[i] + total
+
+
+@ti.func
+def cross(a, b):
+    """a × b."""
+    return ti.Vector([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@ti.func
+def turn_along(f: ti.template(), s, dt):
+    """Add to the residual (dv) what the rotation of v − v_copy contributes."""
+    d = f.spacing[s]
+    inv_h = 1.0 / (SUPPORT * d)
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        f.sums[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
+        f.place[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
+        f.move[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        change = f.v[i] - f.v_copy[i]
+        for k in range(f.first[i], f.first[i] + f.count[i]):
+            j = f.neighbour[k]
+            r = inv_h * (f.x[i] - f.x[j])
+            u = ti.max(1.0 - length(r), 0.0)
+            w = u * u * u
+            m = w * ti.Vector([r[0] * r[0], r[0] * r[1], r[0] * r[2], r[1] * r[1]])
+            spin = cross(r, change - f.v[j] + f.v_copy[j])
+            n = w * ti.Vector([spin[0], spin[1], spin[2], r[1] * r[2]])
+            zz = w * r[2] * r[2]
+            f.sums[i] = f.sums[i] + m
+            f.sums[j] = f.sums[j] + m
+            f.move[i] = f.move[i] + n
+            f.move[j] = f.move[j] + n
+            f.place[i][0] = f.place[i][0] + zz
+            f.place[j][0] = f.place[j][0] + zz
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        xx, xy, xz, yy = f.sums[i][0], f.sums[i][1], f.sums[i][2], f.sums[i][3]
+        yz, zz = f.move[i][3], f.place[i][0]
+        low = LEAST_INERTIA * (xx + yy + zz) + 1e-9
+        inertia = ti.Matrix([[yy + zz + low, -xy, -xz], [-xy, xx + zz + low, -yz], [-xz, -yz, xx + yy + low]])
+        f.gradient[i] = inv_h * (inertia.inverse() @ ti.Vector([f.move[i][0], f.move[i][1], f.move[i][2]]))
+    scale = dt * PAIRS / (d * d) * 0.25
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        nu = f.dp[i]
+        for k in range(f.first[i], f.first[i] + f.count[i]):
+            j = f.neighbour[k]
+            r = f.x[i] - f.x[j]
+            u = ti.max(1.0 - length(r) * inv_h, 0.0)
+            pair = (scale * (nu + f.dp[j]) * u * u * u) * cross(f.gradient[i] + f.gradient[j], r)
+            f.dv[i] = f.dv[i] + pair
+            f.dv[j] = f.dv[j] - pair
 
 
 @ti.func
@@ -202,7 +253,7 @@ def diagonal(f: ti.template(), s, dt):
     """Mean of the diagonal of 1 + dt L at every particle (squares), by which conjugate gradients divide."""
     d = f.spacing[s]
     inv_h = 1.0 / (SUPPORT * d)
-    scale = dt * PAIRS / (d * d) * 0.5 / 3.0
+    scale = dt * PAIRS / (d * d) * 0.5
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         f.squares[i] = 1.0 + f.push[i][0] + f.push[i][1]
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
@@ -228,10 +279,10 @@ def flow(f: ti.template(), s, dt):
         v = f.v[i]
         v[2] -= fall
         f.v[i] = v
+        f.v_copy[i] = ti.Vector([0.0, 0.0, 0.0])
         size += square(v)
-    # The residual of the equation, as a velocity, and the search direction.
+    # The residual of the equation, as a velocity, without the part of the rotation.
     rub(f, s, dt, f.v, f.dx)
-    lasting = ti.cast(0.0, ti.f32)
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         rest = -f.dx[i]
         for b in ti.static(range(VESSELS)):
@@ -241,37 +292,44 @@ def flow(f: ti.template(), s, dt):
                 carried = (turned(f.turn[s, b], y) + f.origin[s, b] - f.x[i]) / dt
                 rest += k * carried
         f.dv[i] = rest
-        f.gradient[i] = rest / f.squares[i]
-        lasting += square(rest) / f.squares[i]
     count = ti.cast(f.moving[s], ti.f32)
     limit = count * (ACCURACY * fall) ** 2
     if f.gravity[s] < 1e-3:
         limit = COARSELY**2 * size
     limit = ti.max(limit, count * 1e-14)
-    left = 2.0 * limit
-    n = 0
-    while left > limit and n < MOST_PASSES:
-        rub(f, s, dt, f.gradient, f.dx)
-        along = ti.cast(0.0, ti.f32)
+    for _ in range(ROUNDS):
+        turn_along(f, s, dt)
+        lasting = ti.cast(0.0, ti.f32)
+        left = ti.cast(0.0, ti.f32)
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-            p = f.gradient[i]
-            along += dot(p, p + f.dx[i])
-        stride = lasting / ti.max(along, 1e-20)
-        left = 0.0
-        before = lasting
-        lasting = 0.0
-        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-            p = f.gradient[i]
-            f.v[i] = f.v[i] + stride * p
-            rest = f.dv[i] - stride * (p + f.dx[i])
-            f.dv[i] = rest
+            rest = f.dv[i]
+            f.v_copy[i] = f.v[i]
+            f.gradient[i] = rest / f.squares[i]
             left += square(rest)
             lasting += square(rest) / f.squares[i]
-        turn = lasting / ti.max(before, 1e-20)
-        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-            f.gradient[i] = f.dv[i] / f.squares[i] + turn * f.gradient[i]
-        n += 1
-    f.passes[s] = f.passes[s] + n
+        n = 0
+        while left > limit and n < MOST_PASSES:
+            rub(f, s, dt, f.gradient, f.dx)
+            along = ti.cast(0.0, ti.f32)
+            for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+                p = f.gradient[i]
+                along += dot(p, p + f.dx[i])
+            stride = lasting / ti.max(along, 1e-20)
+            left = 0.0
+            before = lasting
+            lasting = 0.0
+            for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+                p = f.gradient[i]
+                f.v[i] = f.v[i] + stride * p
+                rest = f.dv[i] - stride * (p + f.dx[i])
+                f.dv[i] = rest
+                left += square(rest)
+                lasting += square(rest) / f.squares[i]
+            turn = lasting / ti.max(before, 1e-20)
+            for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+                f.gradient[i] = f.dv[i] / f.squares[i] + turn * f.gradient[i]
+            n += 1
+        f.passes[s] = f.passes[s] + n
 
 
 @ti.func
