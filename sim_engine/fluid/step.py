@@ -400,7 +400,10 @@ class Stepper:
         dt = f.dt[s]
         if f.time[s] < f.start[s]:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-                f.v[i] = f.v[i] * TREACLE
+                if ti.static(thick):
+                    f.v[i] = ti.Vector([0.0, 0.0, 0.0])
+                else:
+                    f.v[i] = f.v[i] * TREACLE
         elif f.time[s] - dt < f.start[s]:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 f.v[i] = f.v[i] + f.drift[s]

@@ -86,7 +86,7 @@ squares) …
 COARSELY = 1e-4
 """… or this fraction of the velocities themselves, if there is no gravity."""
 MOST_PASSES = 80
-STIFFEST = 0.4
+STIFFEST = 0.2
 """Longest step in units of d²/ν: pressure acts after viscosity, and in a longer step each would hide the other."""
 ALONE = SIGMA / SUPPORT**3
 """Kernel sum of a single particle, W(0) d³ …"""
