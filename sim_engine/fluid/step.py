@@ -56,7 +56,8 @@ WARM = 0.3
 """Fraction of the last step's multipliers with which a step starts. From one half on, oscillations grow in deep liquid,
 because the multipliers respond to the previous state (docs/notes/solver.md has the analysis)."""
 TREACLE = 0.7
-"""Factor by which velocities shrink in every step before the start, so that a lattice settles without splashing."""
+"""Factor by which velocities shrink in every step before the start, so that a lattice settles without splashing. Those
+of thick liquids are zero: velocities of an expanding lattice would throw films off walls."""
 
 FACTS = ("time", "fault", "steps", "iterations", "compression")
 """Names of the fields that `Stepper.look` returns for a scene in addition to its particles."""
