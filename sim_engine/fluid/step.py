@@ -57,7 +57,7 @@ WARM = 0.3
 because the multipliers respond to the previous state (docs/notes/solver.md has the analysis)."""
 TREACLE = 0.7
 """Factor by which velocities shrink in every step before the start, so that a lattice settles without splashing. Those
-of thick liquids are zero: velocities of an expanding lattice would throw films off walls."""
+of thick liquids become zero: an expanding lattice would throw films off walls."""
 
 FACTS = ("time", "fault", "steps", "iterations", "compression")
 """Names of the fields that `Stepper.look` returns for a scene in addition to its particles."""

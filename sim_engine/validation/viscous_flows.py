@@ -33,8 +33,8 @@ WALL = 0.005
 """Thickness of the tubes' walls [m]."""
 
 SETTLING = 0.02
-"""Time in which a lattice loses its excess density without gaining velocity [s]. A lattice that expands in flight throws
-films off their walls."""
+"""Time in which a lattice loses its excess density without gaining velocity [s]: a lattice that expands in flight
+throws films off their walls."""
 
 
 def tube(radius: float, top: float, bottom: float, spacing: float) -> Container:
