@@ -9,8 +9,8 @@ from the simulator's best action x̂, with a scaled cost, plus a discrepancy δ 
 
 f̂_s and s_s are posterior mean and deviation of a GP of the simulations, with costs in units of the largest one. h
 makes the valley wider or narrower than simulated, as deviating walls and lips do. Each hypothesis has a factor on the
-deviations of these errors: by some the simulator is nearly right, by others it is far off. n and m, the scatter of pours
-of one action and its growth with the cost, belong to the hypothesis, too: a few pours close together determine them.
+deviations of these errors: by some the simulator is nearly right, by others it is far off. n and m, the scatter of
+pours of one action and its growth with the cost, belong to the hypothesis, too: a few pours close together determine them.
 
 Two further groups of hypotheses do not rely on the simulator. In the contrary group it predicts
 the opposite, μ_j = clip(e^{g_j} (1 − f̂_s(z_j(x))), 0, 1). In the uninformative group it contains no information about
