@@ -102,6 +102,7 @@ SECTIONS: dict[str, type[Settings]] = {
     "listen": daemon.ListenSettings,
     "tls": daemon.TlsSettings,
     "live": daemon.LiveSettings,
+    "madsci": daemon.MadsciSettings,
     "recordings": daemon.RecordingsSettings,
     "notify": NotifySettings,
 }
