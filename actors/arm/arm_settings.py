@@ -110,6 +110,9 @@ class ArmSettings(Settings):
     default_tag: ClassVar[str] = "ur"
     retired: ClassVar[dict[str, str]] = {"kind: numbers": "kind: simulated"}
 
+    doses: ClassVar[bool] = False
+    """Whether the driver pours wanted amounts, see `actors.arm.arm_interface.DosingArm`."""
+
     emulator: ClassVar[str] = ""
     """'module:callable' that makes, from these settings, the emulator of the arm on a virtual bench. See
     `actors.bench.virtual_bench.ArmEmulator`; '' for a driver that only simulates."""
@@ -253,6 +256,7 @@ class UrArmSettings(ArmSettings):
         "untilt_speed": "upright_speed",
         "announcement": "warning_time",
     }
+    doses: ClassVar[bool] = True
     emulator: ClassVar[str] = "actors.emulators.ur_controller.arm_emulator:UrEmulator"
 
     kind: Literal["ur"] = "ur"

@@ -90,6 +90,14 @@ class PourPath:
         """Duration [s]."""
         return self.retreat.duration
 
+    @property
+    def tilt_part(self) -> tuple[FloatArray, FloatArray]:
+        """Increasing tilts of the first phase, (T,) [rad], and the joints at them, (T, 6) [rad]."""
+        during = self.pour.times <= self.phases[0][2] + 1e-9
+        tilts, joints = self.tilts[during], self.pour.joints[during]
+        rising = np.concatenate([[True], tilts[1:] > np.maximum.accumulate(tilts)[:-1] + 1e-5])
+        return tilts[rising], joints[rising]
+
     def slowed(self, factor: float) -> PourPath:
         """The same path with all its times divided by a factor in (0, 1]."""
         if factor == 1.0:

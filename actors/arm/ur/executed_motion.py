@@ -70,6 +70,22 @@ def _forces(readings: Sequence[ForceSample]) -> FloatArray:
     return np.array(rows).reshape(-1, 13)
 
 
+def executed_dose(samples: list[Sample], spec: UrArmSettings, *, completed: bool) -> ExecutedPath:
+    """The readings of a dose on the controller's clock; there is no planned motion to compare them with.
+
+    Args:
+        samples: in the order of their times.
+        spec: of the arm.
+        completed: False if it was stopped before its end.
+    """
+    if len(samples) < 2:
+        return ExecutedPath(np.zeros(0), np.zeros((0, 6)), False, {})
+    times = np.array([t for t, _, _ in samples])
+    joints = np.array([q for _, q, _ in samples])
+    times = times - times[0]
+    return ExecutedPath(times, joints, completed, {}, pourer_motion(joints, times, spec).poses)
+
+
 def best_lag(times: FloatArray, joints: FloatArray, path: JointPath) -> float:
     """The delay of the path that fits the readings best [s]."""
     low, high = 0.0, LONGEST_LAG

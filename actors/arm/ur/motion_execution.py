@@ -42,6 +42,9 @@ from actors.arm.ur.worker_messages import (
 AT_START = 0.01
 """Largest distance of the joints from a path's first point [rad]; the program first removes it slowly."""
 
+UPRIGHT = 1e-3
+"""Tilt below which the cup of a dose counts as upright [rad]."""
+
 AT_END = 0.01
 """Largest distance of the joints from a path's last point [rad] for the path to count as completed."""
 
@@ -96,9 +99,20 @@ class MotionMonitor:
         self._answered: float | None = None
 
     def order_stop(self) -> None:
-        """Order a stop; may be called from any thread."""
+        """Order a stop; may be called from any thread.
+
+        In a dose the first order ends the commands: the program turns the cup back upright and ends. A second order
+        stops the arm where it is.
+        """
+        again = self._ordered.is_set()
         self._ordered.set()
-        self._client.order_stop(self._motion.number)
+        if not self._motion.tilts or again or not self._went:
+            self._client.order_stop(self._motion.number)
+
+    def tilt(self, speed: float) -> None:
+        """Pass on a wanted speed of the tilt [rad/s]; may be called from any thread."""
+        if self._motion.tilts and self._went and not self._ordered.is_set():
+            self._client.tilt(speed)
 
     def run(self) -> MotionOutcome:
         """Execute the whole motion.
@@ -193,7 +207,10 @@ class MotionMonitor:
             reading = self._look()
             if reading.status == STOPPED and reading.number == motion.number:
                 self._answered = time.monotonic()
-                return self._broken_off("operator", "stopped by the operator")
+                upright = "; the cup was turned back upright" if motion.tilts and reading.clock < UPRIGHT else ""
+                return self._broken_off("operator", "stopped by the operator" + upright)
+            if motion.tilts and self._ordered.is_set() and reading.clock < UPRIGHT and reading.stands:
+                self._client.order_stop(motion.number)
             if self._is_stopped(reading):
                 return self._stopped_by_safety(reading, primary)
             if reading.status_bits & FREEDRIVE:
@@ -203,6 +220,8 @@ class MotionMonitor:
                 if reading.runtime == STOPPED_PROGRAM and reading.stands:
                     if _near(reading.joints, motion.end, AT_END):
                         self._standing = time.monotonic()
+                        if motion.tilts and self._ordered.is_set():
+                            return self._outcome("operator", "stopped by the operator; the cup was turned back upright")
                         return self._outcome("completed", "")
                     return self._outcome(
                         "program ended", f"the path was run through, but {_elsewhere(reading.joints, motion.end)}"
@@ -213,7 +232,7 @@ class MotionMonitor:
                 return self._stopped_by_program(primary)
             if reading.time - self._began > motion.duration + OVERTIME + STANDING_TIME:
                 return self._broken_off("program ended", "the motion takes far longer than planned")
-            if time.monotonic() - self._owner_seen() > OWNER_SILENCE:
+            if time.monotonic() - self._owner_seen() > OWNER_SILENCE and not motion.tilts:
                 self.order_stop()
             time.sleep(LOOK_INTERVAL)
 

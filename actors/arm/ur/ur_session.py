@@ -165,6 +165,10 @@ class WorkerProcess:
         """Order a stop of any motion; does not wait."""
         self._send(("stop", stops))
 
+    def tilt(self, speed: float) -> None:
+        """Send the wanted speed of the tilt in a dose [rad/s]; does not wait."""
+        self._send(("tilt", speed))
+
     def kill(self) -> None:
         """End the process; its watchdog ends a running motion."""
         self._child.kill()
@@ -283,6 +287,11 @@ class Session:
         """Order a stop; does not wait."""
         if self._worker is not None:
             self._worker.stop(stops)
+
+    def tilt(self, speed: float) -> None:
+        """Send the wanted speed of the tilt in a dose [rad/s]; does not wait."""
+        if self._worker is not None:
+            self._worker.tilt(speed)
 
     def kill(self) -> None:
         """End the worker; its watchdog ends a running motion."""

@@ -193,6 +193,8 @@ class MotionOrder:
         settings: read back before the start.
         stops: number of stops when the motion was requested; if there is another one, it does not start.
         pours: it carries or pours liquid, so it needs the normal limits and the full speed.
+        tilts: it is a dose, whose speed comes over registers. Without news it ends by itself, upright; the first order
+            to stop ends it in this way.
     """
 
     program: str
@@ -203,6 +205,7 @@ class MotionOrder:
     settings: MotionSettings
     stops: int
     pours: bool
+    tilts: bool = False
 
 
 @dataclass(frozen=True)

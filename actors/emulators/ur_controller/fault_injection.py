@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import math
 from collections.abc import Callable
@@ -321,7 +322,8 @@ class ControllerFaults:
     def history(self, since: float = 0.0) -> dict[str, Any]:
         """Return the executed joint positions since a controller time, without noise."""
         start = _finite(since)
-        kept = [(t, q) for t, q in self._controller.robot.history if t >= start]
+        newest = itertools.takewhile(lambda one: one[0] >= start, reversed(self._controller.robot.history))
+        kept = list(newest)[::-1]
         return {"times": [t for t, _ in kept], "joints": [list(q) for _, q in kept]}
 
     def clear(self) -> None:

@@ -26,7 +26,7 @@ from tests.support.toy_daemon import Served, held, run, serving
 
 LOOKING = (
     *("/status", "/campaigns", "/campaigns/x", "/questions", "/rigs", "/events", "/metrics", "/campaigns/x/report"),
-    *("/runs", "/pours", "/runs/compare?run=a&run=b", "/runs/export", "/runs/x", "/runs/x/report"),
+    *("/runs", "/pours", "/runs/pours", "/runs/compare?run=a&run=b", "/runs/export", "/runs/x", "/runs/x/report"),
 )
 DOING = (
     "/campaigns",

@@ -41,7 +41,7 @@ def test_runs_and_pours_of_the_daemon_are_found_and_tagged_by_operators_only(tmp
             (found,) = await served.get("/runs", receiver="NARR*", strategy="D2")
             assert (found["run"], found["pours"], found["mode"]) == (name, 3, "virtual")
             assert await served.get("/runs", since="2031") == []
-            pours = await served.get("/pours", run=name)
+            pours = await served.get("/runs/pours", run=name)
             assert [pour["number"] for pour in pours] == [1, 2, 3]
             assert all(60 <= pour["angular_velocity_deg_s"] <= 180 for pour in pours)
 
