@@ -1,4 +1,4 @@
-"""Materials of a station: liquids, vessels, positions, and the account of what is in which vessel.
+"""Materials of a station: liquids, vessels, positions, and the account of the contents.
 
 `Materials` reads and writes its tables in the daemon's `Store`. The account is append-only: an entry sets the content
 of a vessel (a weighing) or changes it (a pour). `Materials.content` adds the entries up, with their uncertainty.
@@ -86,7 +86,7 @@ class RegisteredVessel:
 
 @dataclass(frozen=True)
 class Transfer:
-    """What a pour has moved [kg], each with its standard deviation; None: unknown."""
+    """Masses that a pour has moved [kg], each with its standard deviation; None: unknown."""
 
     taken: tuple[float, float] | None
     received: tuple[float, float] | None
