@@ -154,7 +154,7 @@ async def compare(
 async def export(daemon: Daemon, person: Viewer, asked: ExportAsked) -> Response:
     """Export runs and pours as files with a data dictionary, in one zip archive.
 
-    `account.csv` is the account of the materials, with the run of each ordered pour.
+    If vessels are registered, `account.csv` is the account of the materials, with the run of each ordered pour.
     """
     formats = dict.fromkeys(asked.pop("format"))
     account = Materials(daemon.store).table()
@@ -165,7 +165,8 @@ async def export(daemon: Daemon, person: Viewer, asked: ExportAsked) -> Response
             found = catalogue.export(Path(folder), asked, list(formats))
             for path in map(Path, found.pop("files")):
                 packed.write(path, path.name)
-            packed.writestr("account.csv", account)
+            if account:
+                packed.writestr("account.csv", account)
             packed.comment = json.dumps(found).encode()
         return archive.getvalue()
 

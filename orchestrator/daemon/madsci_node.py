@@ -3,7 +3,7 @@
 `create_node` makes the application, which the daemon serves at an address of its own. The routes, status words and
 schemas are those of madsci.client 0.8.1; its packages are not needed. Actions: `pour`, `predict_pour`, `run_campaign`.
 
-- MADSci's client repeats every POST and sends no authorization. Hence an action is started once by its id, and only
+- MADSci's client repeats every POST and sends no authorization. Therefore an action is started once by its id, and only
   addresses of the settings' list may call.
 - Enabling the motion of hardware stays an operator's act: the action is 'paused' until then. An emergency stop is
   cleared by an administrator, not by `reset`.

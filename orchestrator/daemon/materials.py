@@ -1,4 +1,4 @@
-"""Materials of a station: liquids, vessels, positions, and the account of what is in which vessel.
+"""Materials of a station: liquids, vessels, positions, and the account of the contents.
 
 `Materials` reads and writes its tables in the daemon's `Store`. The account is append-only: an entry sets the content
 of a vessel (a weighing) or changes it (a pour). `Materials.content` adds the entries up, with their uncertainty.
@@ -86,7 +86,7 @@ class RegisteredVessel:
 
 @dataclass(frozen=True)
 class Transfer:
-    """What a pour has moved [kg], each with its standard deviation; None: unknown."""
+    """Masses that a pour has moved [kg], each with its standard deviation; None: unknown."""
 
     taken: tuple[float, float] | None
     received: tuple[float, float] | None
@@ -258,12 +258,14 @@ class Materials:
         return self._store.rows(f"select * from account {where} order by id", *arguments)
 
     def table(self) -> str:
-        """Return the account as CSV, for the export of runs: masses in g, and the run of each ordered pour."""
+        """Return the account as CSV, for the export of runs: masses in g, and the run of each pour; '' if empty."""
         rows = self._store.rows(
             "select t, vessel, kind, 1e3 * change as change_g, 1e3 * deviation as deviation_g, liquid, pour, run, "
             "account.by, note from account left join pour_order on pour_order.id = pour "
             "left join campaign on campaign.id = campaign order by account.id"
         )
+        if not rows:
+            return ""
         text = StringIO()
         columns = ("t", "vessel", "kind", "change_g", "deviation_g", "liquid", "pour", "run", "by", "note")
         writer = csv.DictWriter(text, columns)

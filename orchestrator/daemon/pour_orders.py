@@ -221,7 +221,7 @@ def order_request(plan: CampaignPlan, order: PourOrder) -> RunRequest:
 
     Args:
         plan: loaded from its bundle, with the laboratory of its rig.
-        order: what is poured.
+        order: of the pour.
 
     Raises:
         OrderError: there is no place for the pourer.
@@ -415,8 +415,8 @@ def weighed_result(order: PourOrder, measured: PourMeasurement, deviation: float
     """Return the result of a weighed pour, ready for JSON.
 
     Args:
-        order: what was ordered.
-        measured: what was weighed.
+        order: of the pour.
+        measured: its weights.
         deviation: of one weighing [kg]; a mass is the difference of two.
     """
     about: dict[str, Any] = measured.notes.get(DOSE, {})

@@ -85,7 +85,8 @@ class Supervisor:
         for item in self.store.items():
             if item.state not in AT_REST:
                 found = f"found {item.state} after the daemon had ended without a word"
-                self.store.change(item.id, state="paused", reason=found)
+                # without a run nothing has begun: it is in the queue again
+                self.store.change(item.id, state="paused" if item.run is not None else "queued", reason=found)
                 self.feed.publish("CampaignFound", {"state": item.state, "text": found}, item.id)
         for item in self.store.items(limit=1_000_000):
             if item.task == POUR and item.state not in (*ENDED, "queued"):
