@@ -166,8 +166,9 @@ def main() -> None:
         results["learning"] = results["cliffs"] | {
             "head": head,
             "rows": table,
-            "command": "python benchmarks/learning_curves.py --write",
-            "settings": f"{LEVEL}; mean loss without scatter, 95 % bootstrap intervals over {asked.seeds} benches",
+            "command": f"python benchmarks/learning_curves.py --seeds {asked.seeds} --write",
+            "settings": f"'{LEVEL}'; mean loss without scatter, 95 % bootstrap intervals over {asked.seeds} benches; seeds "
+            f"from {asked.first}, not used for tuning",
             "date": machine["date"][:10],
         }
         RESULTS.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
