@@ -518,7 +518,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "compared-deployment": partial(variants, _arms(study.DeploymentsSettings), Settings),
     **{
         f"result-{name}": partial(measured, name)
-        for name in ("recorded", "recorded-run", "bands", "cliffs", "risk", "optimizers")
+        for name in ("recorded", "recorded-run", "bands", "cliffs", "intervals", "learning", "risk", "optimizers")
     },
     **{name: partial(dosing, group) for name, group in DOSING.items()},
     "command-line": command_line,
