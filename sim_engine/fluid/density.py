@@ -19,9 +19,10 @@ integral: after Bender et al. 2019 (volume maps), see `sim_engine/vessel/wall_co
 
 import taichi as ti
 
-from sim_engine.fluid.kernels import SIGMA, slope, square, wall_density, wall_slope, weight
+from sim_engine.fluid.kernels import SIGMA, dot, length, slope, square, turned, wall_density, wall_slope, weight
 from sim_engine.fluid.neighbours import measure_pairs
 from sim_engine.fluid.state import SUPPORT, VESSELS
+from sim_engine.fluid.walls import to_vessel
 
 PACKING = 1.012
 """Kernel sum of bulk liquid of spacing d over its continuum value, measured on a cup at rest. With it the density there
@@ -105,7 +106,7 @@ def compression(f: ti.template(), s, i, volume, inv_h):
 
 
 @ti.func
-def multiply_first(f: ti.template(), s, rate):
+def multiply_first(f: ti.template(), s, rate, thick: ti.template()):
     """All multipliers after a step's first iteration; they begin with the kept part of the last step's.
 
     Returns:
@@ -119,18 +120,21 @@ def multiply_first(f: ti.template(), s, rate):
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         rho = compression(f, s, i, volume, inv_h)
         f.density[i] = rho
+        excess = rho - 1.0
+        if ti.static(thick):
+            excess -= f.allowed[i]
         if rho > 0.95:
             inside += 1.0
-            compressed += ti.max(rho - 1.0, 0.0)
+            compressed += ti.max(excess, 0.0)
         # C is dimensionless, its gradients 1/m: multipliers are m².
-        after = ti.max(f.pressure[i] + rate * (rho - 1.0) / f.squares[i], 0.0)
+        after = ti.max(f.pressure[i] + rate * excess / f.squares[i], 0.0)
         f.pressure[i] = after
         f.dp[i] = after
     return compressed / ti.max(inside, 1.0)
 
 
 @ti.func
-def multiply(f: ti.template(), s, rate, momentum):
+def multiply(f: ti.template(), s, rate, momentum, thick: ti.template()):
     """Change of all multipliers in a later iteration: by the density, plus a part of their last change.
 
     Returns:
@@ -144,14 +148,48 @@ def multiply(f: ti.template(), s, rate, momentum):
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         rho = compression(f, s, i, volume, inv_h)
         f.density[i] = rho
+        excess = rho - 1.0
+        if ti.static(thick):
+            excess -= f.allowed[i]
         if rho > 0.95:
             inside += 1.0
-            compressed += ti.max(rho - 1.0, 0.0)
+            compressed += ti.max(excess, 0.0)
         before = f.pressure[i]
-        after = ti.max(before + rate * (rho - 1.0) / f.squares[i] + momentum * f.dp[i], 0.0)
+        after = ti.max(before + rate * excess / f.squares[i] + momentum * f.dp[i], 0.0)
         f.pressure[i] = after
         f.dp[i] = after - before
     return compressed / ti.max(inside, 1.0)
+
+
+@ti.func
+def measure_before(f: ti.template(), s):
+    """Compression of all particles at the step's beginning, max(ρ/ρ₀ − 1, 0), to `allowed`."""
+    d = f.spacing[s]
+    inv_h = 1.0 / (SUPPORT * d)
+    volume = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        f.density[i] = 1.0
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        xi = f.x0[i]
+        rho = ti.cast(0.0, ti.f32)
+        for k in range(f.first[i], f.first[i] + f.count[i]):
+            j = f.neighbour[k]
+            w = weight(ti.max(1.0 - length(xi - f.x0[j]) * inv_h, 0.0))
+            rho += w
+            f.density[j] = f.density[j] + w
+        f.density[i] = f.density[i] + rho
+    for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+        rho = f.density[i] * volume
+        for b in ti.static(range(VESSELS)):
+            n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
+            back = f.x0[i] - f.x[i]
+            if f.swing[s, b] > 0.0:
+                y = to_vessel(f, s, b, f.x0[i], True)
+                back += turned(f.turn[s, b], y) + f.origin[s, b] - f.x0[i]
+            q = (f.phi[i][b] + dot(n, back)) * inv_h - f.wall_shift[s]
+            if q < 1.0:
+                rho += wall_density(q)
+        f.allowed[i] = ti.max(rho - 1.0, 0.0)
 
 
 @ti.func

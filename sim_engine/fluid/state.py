@@ -158,6 +158,7 @@ class FluidState:
         self.x, self.x0, self.v, self.dx, self.dv, self.x_listed = (vectors() for _ in range(6))
         self.x_copy, self.v_copy = vectors(), vectors()
         self.pressure, self.dp, self.density, self.pressure_copy = (scalars() for _ in range(4))
+        self.allowed = scalars()
         self.phi = ti.Vector.field(VESSELS, ti.f32, shape=pool)
         self.sag, self.sag_copy = (ti.Vector.field(VESSELS, ti.f32, shape=pool) for _ in range(2))
         self.push = ti.Vector.field(VESSELS, ti.f32, shape=pool)

@@ -12,7 +12,7 @@ Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 
 import taichi as ti
 
-from sim_engine.fluid.density import displace, measure, measure_first, multiply, multiply_first
+from sim_engine.fluid.density import displace, measure, measure_before, measure_first, multiply, multiply_first
 from sim_engine.fluid.kernels import dot, length, square, turned, turned_back
 from sim_engine.fluid.neighbours import rebuild
 from sim_engine.fluid.state import VESSELS, FluidState
@@ -56,7 +56,8 @@ WARM = 0.3
 """Fraction of the last step's multipliers with which a step starts. From one half on, oscillations grow in deep liquid,
 because the multipliers respond to the previous state (docs/notes/solver.md has the analysis)."""
 TREACLE = 0.7
-"""Factor by which velocities shrink in every step before the start, so that a lattice settles without splashing."""
+"""Factor by which velocities shrink in every step before the start, so that a lattice settles without splashing. Those
+of thick liquids become zero: an expanding lattice would throw films off walls."""
 
 FACTS = ("time", "fault", "steps", "iterations", "compression")
 """Names of the fields that `Stepper.look` returns for a scene in addition to its particles."""
@@ -175,14 +176,17 @@ class Stepper:
             f.x[i] = x
 
     @ti.func
-    def solve_density(self, s, ratio):
+    def solve_density(self, s, ratio, thick: ti.template()):
         """Chebyshev-accelerated Jacobi iteration, which starts from a fraction of the last step's multipliers.
 
         This fraction causes no displacement by itself; the first iteration's displacements include it.
 
+        In thick liquids only compression beyond that of the step's beginning is resolved here; see `decompress`.
+
         Args:
             s: scene.
             ratio: this step's dt² over the last one's, which scales the multipliers.
+            thick: whether the viscosity is in SI.
         """
         f = self.state
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
@@ -198,21 +202,56 @@ class Stepper:
         while n < ITERATIONS or (compressed > TOLERANCE and n < MOST_ITERATIONS):
             if n == 0:
                 measure_first(f, s)
-                compressed = multiply_first(f, s, rate)
+                compressed = multiply_first(f, s, rate, thick)
             else:
                 following = 1.0 / (2.0 * centre / half - sigma)
                 momentum = sigma * following
                 rate = 2.0 * following / half
                 sigma = following
                 measure(f, s)
-                compressed = multiply(f, s, rate, momentum)
+                compressed = multiply(f, s, rate, momentum, thick)
             displace(f, s)
             self.apply(s)
             n += 1
         f.iterations[s] = f.iterations[s] + n
 
     @ti.func
-    def finish(self, s, dt, grids: ti.template()):
+    def decompress(self, s):
+        """Remove the compression that is left from earlier steps: the displacements change no velocity.
+
+        Otherwise each correction would be a velocity of its size over dt, which throws films off walls.
+        """
+        f = self.state
+        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            f.pressure_copy[i] = f.pressure[i]
+            f.pressure[i] = 0.0
+            f.allowed[i] = 0.0
+            f.dv[i] = f.x[i]
+        n = 0
+        compressed = ti.cast(1.0, ti.f32)
+        centre = ti.cast(0.5 * (ROUGHEST + SMOOTHEST), ti.f32)
+        half = ti.cast(0.5 * (ROUGHEST - SMOOTHEST), ti.f32)
+        sigma = half / centre
+        rate = 1.0 / centre
+        momentum = ti.cast(0.0, ti.f32)
+        while n < ITERATIONS or (compressed > TOLERANCE and n < MOST_ITERATIONS):
+            if n > 0:
+                following = 1.0 / (2.0 * centre / half - sigma)
+                momentum = sigma * following
+                rate = 2.0 * following / half
+                sigma = following
+            measure(f, s)
+            compressed = multiply(f, s, rate, momentum, True)
+            displace(f, s)
+            self.apply(s)
+            n += 1
+        f.iterations[s] = f.iterations[s] + n
+        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            f.pressure[i] = f.pressure_copy[i]
+            f.dv[i] = f.x[i] - f.dv[i]
+
+    @ti.func
+    def finish(self, s, dt, grids: ti.template(), thick: ti.template()):
         """Final look-up of the walls, friction, velocities."""
         f = self.state
         d = f.spacing[s]
@@ -260,6 +299,8 @@ class Stepper:
                             f.stale[s] = 1
             f.x[i] = x
             v = (x - x0) / dt
+            if ti.static(thick):
+                v -= f.dv[i] / dt
             f.v[i] = v
             if not (ti.abs(v[0]) + ti.abs(v[1]) + ti.abs(v[2]) < 1e3):
                 f.fault[s] = 2
@@ -337,8 +378,12 @@ class Stepper:
         if f.stale[s] == 1:
             rebuild(f, s, SKIN)
         self.look_at_walls(s, planes)
-        self.solve_density(s, ratio)
-        self.finish(s, dt, grids)
+        if ti.static(thick):
+            measure_before(f, s)
+        self.solve_density(s, ratio, thick)
+        if ti.static(thick):
+            self.decompress(s)
+        self.finish(s, dt, grids, thick)
         if ti.static(thick):
             yield_to_shear(f, s, dt)
         else:
@@ -356,7 +401,10 @@ class Stepper:
         dt = f.dt[s]
         if f.time[s] < f.start[s]:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-                f.v[i] = f.v[i] * TREACLE
+                if ti.static(thick):
+                    f.v[i] = ti.Vector([0.0, 0.0, 0.0])
+                else:
+                    f.v[i] = f.v[i] * TREACLE
         elif f.time[s] - dt < f.start[s]:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 f.v[i] = f.v[i] + f.drift[s]
