@@ -30,16 +30,18 @@ from typing import Any
 
 import numpy as np
 from machine import describe, say, single_threaded
-from mismatch import campaign, numbers
+from mismatch import campaign
 from mismatch_worlds import Valley
 from optimiser_problems import Floats
 from optimisers import RIVALS_FILE, environment
-from players import SCENE, interval, play
+from players import SCENE, interval, unit
 from scipy.stats import qmc
 from threadpoolctl import threadpool_limits
 
 from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.d1 import D1Settings
+from orchestrator.strategy_harness import StrategyHarness
+from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 
@@ -73,11 +75,19 @@ def asked_by(arm: str, valley: Valley, seed: int, rival: Ask | None) -> list[flo
 
 def planned(valley: Valley, seed: int) -> list[float]:
     """D1: the same action every time."""
-    settings = D1Settings()
-    plan, parameters = DeploymentPlan(settings, (SCENE,), valley.space, Loss()), SimulationParameters()
-    world = numbers(valley)
-    play(settings.build(plan, SCENE, parameters, seed), world.answer)
-    return world.poured * 15
+    poured: list[float] = []
+
+    def simulated(action: Action, theta: SimulationParameters, rng: np.random.Generator) -> float:
+        lost = valley.simulated(unit(valley.space, action)) + valley.scatter * float(rng.standard_normal())
+        return float(np.clip(lost, 0.0, 1.0))
+
+    def real(action: Action, theta: SimulationParameters, rng: np.random.Generator) -> float:
+        poured.append(valley.true(unit(valley.space, action)))
+        return poured[-1]
+
+    plan = DeploymentPlan(D1Settings(), (SCENE,), valley.space, Loss())
+    StrategyHarness(simulated, real).run(plan.settings.build(plan, SCENE, SimulationParameters(), seed))
+    return poured[:1] * 15
 
 
 @contextmanager
@@ -166,8 +176,9 @@ def main() -> None:
         results["learning"] = results["cliffs"] | {
             "head": head,
             "rows": table,
-            "command": "python benchmarks/learning_curves.py --write",
-            "settings": f"{LEVEL}; mean loss without scatter, 95 % bootstrap intervals over {asked.seeds} benches",
+            "command": f"python benchmarks/learning_curves.py --seeds {asked.seeds} --write",
+            "settings": f"'{LEVEL}'; mean loss without scatter, 95 % bootstrap intervals over {asked.seeds} benches; "
+            f"seeds from {asked.first}, not used for tuning",
             "date": machine["date"][:10],
         }
         RESULTS.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")

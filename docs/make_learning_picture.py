@@ -28,10 +28,11 @@ def main() -> None:
     runs = json.loads((DOCS / "data" / "learning-curves.json").read_text(encoding="utf-8"))["runs"]
     figure, axes = style.new_figure(size=(7.0, 3.6))
     rng = np.random.default_rng(0)
+    benches = sorted(set.intersection(*(set(runs[name]) for name in SHOWN if name in runs)))
     for name, colour in SHOWN.items():
         if name not in runs:
             continue
-        losses = np.array(list(runs[name].values()))
+        losses = np.array([runs[name][bench] for bench in benches])
         pours = np.arange(1, losses.shape[1] + 1)
         means = losses[rng.integers(0, len(losses), (RESAMPLES, len(losses)))].mean(axis=1)
         low, high = np.percentile(means, (2.5, 97.5), axis=0)
@@ -39,7 +40,7 @@ def main() -> None:
         axes.plot(pours, losses.mean(axis=0), color=colour, label=name)
     axes.set_ylim(0.0, 1.0)
     axes.legend(frameon=False, ncols=2)
-    style.dress(axes, title="Loss against pours, 20 benches", x="pour", y="mean loss of the pour")
+    style.dress(axes, title=f"Loss against pours, {len(benches)} benches", x="pour", y="mean loss of the pour")
     style.save(figure, DOCS / "images" / "learning-curves.png")
 
 

@@ -10,7 +10,8 @@ from the simulator's best action x̂, with a scaled cost, plus a discrepancy δ 
 f̂_s and s_s are posterior mean and deviation of a GP of the simulations, with costs in units of the largest one. h
 makes the valley wider or narrower than simulated, as deviating walls and lips do. Each hypothesis has a factor on the
 deviations of these errors: by some the simulator is nearly right, by others it is far off. n and m, the scatter of
-pours of one action and its growth with the cost, belong to the hypothesis, too: a few pours close together determine them.
+pours of one action and its growth with the cost, belong to the hypothesis, too: a few pours close together determine
+them.
 
 Two further groups of hypotheses do not rely on the simulator. In the contrary group it predicts
 the opposite, μ_j = clip(e^{g_j} (1 − f̂_s(z_j(x))), 0, 1). In the uninformative group it contains no information about
@@ -18,11 +19,11 @@ this bench, and f is a GP around 0.6, more towards corners.
 
 The posterior weights are prior times marginal likelihood of the observations. No hypothesis is removed: the weight of a
 failing one decreases. The weight of the two further groups measures how unreliable the simulator is. An observation
-counts with a finite resolution, and one of nearly everything lost only as such: otherwise a hypothesis that is certain of
-a total loss would gain from each failed pour over one that is less certain.
+counts with a finite resolution, and one of nearly everything lost only as such: otherwise a hypothesis that is certain
+of a total loss would gain from each failed pour over one that is less certain.
 
-The prior draws are coarse: with steep walls, a few pours leave a handful of 2,048. The ones that are used for predictions
-are therefore moved by Markov chains that keep the posterior.
+The prior draws are coarse: with steep walls, a few pours leave a handful of 2,048. The ones that are used for
+predictions are therefore moved by Markov chains that keep the posterior.
 
 **A bench that changes.** Once an observation lies outside its 99 % prediction interval, the hypotheses are weighed
 together with the start of the present segment: the observations before it were made on another bench, and say nothing
