@@ -131,7 +131,7 @@ class PourProgress:
     joints: tuple[float, ...] = ()
     pourer: tuple[float, ...] = ()
     liquid: RecordedFrames | None = None
-    dose: DoseProgress | None = None
+    dose: DoseProgress | None = field(default=None, metadata={"written": "if set"})
 
 
 ProgressCallback = Callable[[PourProgress], None]

@@ -2,7 +2,7 @@
 
     python benchmarks/mismatch.py [--levels none small ...] [--arms D2 paper adaptive] [--seeds 24] [--first 1000]
                                   [--pours 15] [--simulations 37] [--settled 0.005] [--out FILE]
-                                  [--receivers] [--write]
+                                  [--receivers] [--write] [--write-steep]
 
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
 the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are kept in FILE, so that an
@@ -40,6 +40,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from machine import describe
 from mismatch_worlds import CHANGED_AFTER, CLIFFS, LEVELS, Valley
 from optimiser_problems import Floats
 from players import SCENE, Numbers, interval, play
@@ -210,6 +211,87 @@ def table(runs: list[dict[str, Any]], fewest: int = 1) -> str:
     return "\n".join(lines)
 
 
+BEFORE = {
+    "none": ("0.118", "0.022", "0.000"),
+    "small": ("0.143", "0.023", "0.000"),
+    "moderate": ("0.776", "0.215", "0.048"),
+    "large": ("0.900", "0.227", "0.047"),
+    "changed": ("0.143", "0.218", "0.417"),
+}
+"""First pour, mean of 15 pours, and pours 9 to 15, of seeds 2000 to 2008 before the draws were moved."""
+
+
+def steep_rows(runs: list[dict[str, Any]]) -> list[list[str]]:
+    """A row for each level with steep walls: figures before (other seeds) and now, with standard errors."""
+    found = []
+    for level, earlier in BEFORE.items():
+        poured = np.array([run["poured"] for run in runs if run["level"] == f"cliff, {level}"])
+        if level == "small":  # the pours before the change, if one of them settled it
+            before = [run["poured"][:CHANGED_AFTER] for run in runs if run["level"] == "cliff, changed"]
+            poured = np.array([[*one, *[float(np.mean(one[-3:]))] * (15 - CHANGED_AFTER)] for one in before])
+        if len(poured):
+            now = []
+            for values in (poured[:, 0], poured.mean(axis=1), poured[:, CHANGED_AFTER:].mean(axis=1)):
+                error = float(values.std(ddof=1)) / len(values) ** 0.5
+                now.append(f"{values.mean():.3f} ± {error:.3f}")
+            pairs = zip(earlier, now, strict=True)
+            found.append([level, str(len(poured)), *(cell for pair in pairs for cell in pair)])
+    return found
+
+
+def interval_rows(runs: list[dict[str, Any]]) -> list[list[str]]:
+    """A row for first pours and for all others: how many lie in their intervals, and the mean interval score.
+
+    Source: interval score, Gneiting & Raftery, JASA 2007.
+    """
+    found = []
+    for name, part in (("first pours", slice(0, 1)), ("all others", slice(1, None))):
+        shown = [pour for run in runs for pour in run["intervals"][part]]
+        cells = []
+        for i, share in enumerate(SHARES):
+            low, high = np.array([pour[i] for pour in shown]).T
+            lost = np.array([pour[-1] for pour in shown])
+            inside = float(np.mean((low <= lost) & (lost <= high)))
+            missed = np.maximum(low - lost, 0.0) + np.maximum(lost - high, 0.0)
+            score = float(np.mean(high - low + 2.0 / (1.0 - share) * missed))
+            cells.append(f"{100 * inside:.0f} % ({score:.3f})")
+        found.append([name, str(len(shown)), *cells])
+    return found
+
+
+def write_steep(runs: list[dict[str, Any]]) -> None:
+    """Keep the runs in docs/data/steep-walls.json, and their tables in docs/data/results.json."""
+    data, machine = PAGE.parents[1] / "data", describe()
+    (data / "steep-walls.json").write_text(json.dumps({"machine": machine, "runs": rounded(runs)}) + "\n")
+    results = json.loads((data / "results.json").read_text(encoding="utf-8"))
+    about = results["cliffs"] | {
+        "command": "python benchmarks/mismatch.py --levels 'cliff, none' … --arms adaptive --first 3000 --seeds 20 "
+        "--settled 0.005 --out FILE --write-steep",
+        "date": machine["date"][:10],
+    }
+    sought = ["first pour", "mean of 15 pours", "pours 9 to 15"]
+    head = ["simulator", "seeds", *(cell for one in sought for cell in (f"{one}, before", "now ± standard error"))]
+    settings = (
+        "37 simulations, 15 pours, two simulations next to each; loss without scatter; a campaign ends after three "
+        "pours below 0.5 %; before: seeds 2000 to 2008, now: seeds from 3000, each used once"
+    )
+    results["cliffs"] = about | {"head": head, "rows": steep_rows(runs), "settings": settings}
+    head = ["pours", "number", *(f"in {100 * share:.0f} % (interval score)" for share in SHARES)]
+    text = "all pours of the table above, as observed"
+    results["intervals"] = about | {"head": head, "rows": interval_rows(runs), "settings": text}
+    text = json.dumps(results, indent=1, ensure_ascii=False)
+    (data / "results.json").write_text(text + "\n", encoding="utf-8")
+
+
+def rounded(value: Any) -> Any:
+    """Numbers with five decimals."""
+    if isinstance(value, list):
+        return [rounded(one) for one in value]
+    if isinstance(value, dict):
+        return {key: rounded(one) for key, one in value.items()}
+    return round(value, 5) if isinstance(value, float) else value
+
+
 def write(text: str) -> None:
     """Put a table into the page; rows that it lacks stay as they are there."""
     begin, end = "<!-- measured: mismatch -->\n", "<!-- end of measured -->"
@@ -237,6 +319,7 @@ def main() -> None:
     parser.add_argument("--settled", type=float, default=0.0, help="ends after three pours in a row below this loss")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--write", action="store_true", help="write the table of FILE into docs/evidence/results.md")
+    parser.add_argument("--write-steep", action="store_true", help="write the tables of the levels with steep walls")
     parser.add_argument("--receivers", action="store_true", help="three receivers one after the other on one bench")
     asked = parser.parse_args()
     if asked.receivers:
@@ -247,6 +330,10 @@ def main() -> None:
     if asked.out is not None and asked.out.exists():
         runs = [json.loads(line) for line in asked.out.read_text().splitlines()]
     known = {(run["arm"], run["level"], run["seed"]) for run in runs}
+    if asked.write_steep:
+        seeds = range(asked.first, asked.first + asked.seeds)
+        write_steep([run for run in runs if run["level"] in CLIFFS and run["seed"] in seeds])
+        return
     for level in () if asked.write else asked.levels:
         for arm in asked.arms:
             for seed in range(asked.first, asked.first + asked.seeds):

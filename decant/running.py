@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import asyncio
 import csv
+import html
 import json
 import tempfile
+import time
 import warnings
-from collections.abc import Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Coroutine, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
@@ -24,14 +26,18 @@ from orchestrator.config.file_loading import campaign_from, load_campaign, load_
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document
 from orchestrator.live_view.live_server import recorder_of
+from orchestrator.progress.progress_state import ProgressState
 from orchestrator.results.publishing import not_simulated
 from orchestrator.results.stage_views import evaluation_of
 from orchestrator.run_service import (
     PREDICTION_SEEDS,
+    CheckReport,
     GivenTheta,
+    RunHandle,
     RunRequest,
     RunResources,
     RunService,
+    Task,
     read_theta,
     task_request,
 )
@@ -107,6 +113,84 @@ def run(
     if resume is not None:
         request = replace(request, folder=Path(resume).expanduser(), resume="yes")
     return _run(request, resources)
+
+
+def check(campaign: CampaignPlan, task: Task = "run") -> CheckReport:
+    """Check a campaign as `decant validate` does, without running it.
+
+    Args:
+        campaign: what to check.
+        task: 'run', 'calibrate' or 'plan'.
+
+    Returns:
+        Problems, each of which prevents the run, and warnings.
+
+    Raises:
+        ValueError: the campaign has no section for the task.
+    """
+    return RunService().check(task_request(campaign, task))
+
+
+class RunningCampaign:
+    """A campaign that runs in the event loop of a notebook or program. `await` returns its `Run`.
+
+    Attributes:
+        directory: of the run.
+    """
+
+    def __init__(self, campaign: CampaignPlan, handle: RunHandle, progress: ProgressState) -> None:
+        self._campaign, self._handle, self._progress = campaign, handle, progress
+        self.directory = handle.folder
+        self._task = asyncio.ensure_future(self._finished())
+
+    async def _finished(self) -> Run:
+        try:
+            result = await self._handle.wait()
+        finally:
+            self._handle.close()
+        return Run(self._campaign, result, await asyncio.to_thread(self._handle.publish))
+
+    def __await__(self) -> Generator[Any, None, Run]:
+        return self._task.__await__()
+
+    @property
+    def done(self) -> bool:
+        """Whether it has ended."""
+        return self._task.done()
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Expected time until it ends [s]; None if unknown."""
+        return self._progress.forecast.left(time.time())
+
+    def __str__(self) -> str:
+        """Progress in one line."""
+        return self._progress.counts_line() or "starting"
+
+    def pause(self) -> None:
+        """Pause at the next safe point; `run(..., resume=directory)` continues. `await` then raises CancelledError."""
+        self._handle.pause()
+
+    def _repr_html_(self) -> str:
+        """Progress, in notebooks."""
+        return f"<b>{html.escape(self._campaign.name)}</b>: {html.escape(str(self))}"
+
+
+async def start(campaign: CampaignPlan, *, watch: Sequence[Watch] = (), in_process: bool = True) -> RunningCampaign:
+    """Start a campaign in the running event loop and return at once, so that its progress can be shown.
+
+    Args:
+        campaign: what to do.
+        watch: see `run`.
+        in_process: see `run`.
+
+    Raises:
+        ValueError, LaboratoryError, RunError: see `run`.
+    """
+    progress = ProgressState(campaign)
+    request = task_request(campaign)
+    resources = await asyncio.to_thread(_checked, request, (*watch, progress), in_process)
+    return RunningCampaign(campaign, RunService().start(request, resources), progress)
 
 
 def calibrate(

@@ -25,6 +25,7 @@ from actors import laboratory_settings as laboratory
 from actors.arm.arm_geometry import ArmLimits, RobotCell
 from actors.arm.arm_settings import ARMS, UrArmSettings
 from actors.balance.balance_settings import SerialBalanceSettings
+from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import OperatorSettings
 from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.cli.physics_command import kept_records
@@ -74,6 +75,9 @@ SECTIONS: dict[str, type[Settings]] = {
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
     "data": campaign.DataSettings,
+    "dispense": campaign.DispenseSettings,
+    "dose": campaign.DoseSettings,
+    "dosing": DosingSettings,
     "loss": Loss,
     "objective": Objective,
     "outputs": OutputSettings,
@@ -98,6 +102,7 @@ SECTIONS: dict[str, type[Settings]] = {
     "listen": daemon.ListenSettings,
     "tls": daemon.TlsSettings,
     "live": daemon.LiveSettings,
+    "madsci": daemon.MadsciSettings,
     "recordings": daemon.RecordingsSettings,
     "notify": NotifySettings,
 }
@@ -132,6 +137,9 @@ OF_SECTIONS = {
     "RiskLimitSettings": "[risk limit](#risk-limit)",
     "StopSettings": "[stop](#stop)",
     "DataSettings": "[data](#data)",
+    "DispenseSettings": "[dispense](#dispense)",
+    "DoseSettings": "[dose](#dose)",
+    "DosingSettings": "[dosing](#dosing)",
     "ProfileShape": "[profile](#profile)",
     "Motion": "[motion](#motion-and-actions)",
     "Actions": "[actions](#motion-and-actions)",

@@ -170,6 +170,8 @@ def read_recording(path: Path) -> tuple[str, str, Any]:
     Raises:
         ArchiveError: it is none, or cannot be read.
     """
+    if not path.exists():
+        raise ArchiveError(f"{path}: there is no such file")
     try:
         if path.is_dir():
             return _read_run(path)

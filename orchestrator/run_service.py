@@ -55,7 +55,7 @@ PREDICTION_SEEDS = 5
 PLANNED = "-plan"
 """Suffix of the name of a campaign that is only planned."""
 
-MOVING = ("approach", "tilt", "hold", "return")
+MOVING = ("approach", "tilt", "hold", "return", "dose")
 """Checkpoints of a pour during which the arm moves."""
 
 BETWEEN_CANCELS = 1.0

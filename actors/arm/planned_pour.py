@@ -135,7 +135,8 @@ class ExecutedPath:
             [m], the 'lag' [s] that was removed from them, and the 'longest_gap' between two readings [s].
         poses: of the pourer in the world, (T, 7); empty if the cell is unknown, as after `unpack`.
         forces: rows of time [s], external force and torque at the TCP (6) [N], [N m], and of the wrist's sensor (6)
-            likewise, which shift by an unknown constant with each motion. NaN if the robot does not report them.
+            likewise, in its own frame, shifted by an unknown constant with each motion. NaN if the robot does not
+            report them.
     """
 
     times: FloatArray

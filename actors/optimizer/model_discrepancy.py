@@ -5,19 +5,24 @@ from the simulator's best action x̂, with a scaled cost, plus a discrepancy δ 
 
     f(x) = μ_j(x) + δ(x),    μ_j(x) = clip(e^{g_j} f̂_s(z_j(x)), 0, 1),    δ ~ GP(0, v_j(x) v_j(x′) M_{ℓ_j}(x, x′))
     z_j(x) = x̂ + e^{h_j} (A_j x + s_j − x̂),    v_j² = σ_j² + e^{2 g_j} s_s²(z_j(x))
-    y = f(x) + ε,    ε ~ N(0, (n_j + 0.15 μ_j(x))²)
+    y = f(x) + ε,    ε ~ N(0, (n_j + m_j μ_j(x))²)
 
 f̂_s and s_s are posterior mean and deviation of a GP of the simulations, with costs in units of the largest one. h
 makes the valley wider or narrower than simulated, as deviating walls and lips do. Each hypothesis has a factor on the
-deviations of these errors: by some the simulator is nearly right, by others it is far off. n, the scatter of pours of
-one action, belongs to the hypothesis, too: a few pours close together determine it.
+deviations of these errors: by some the simulator is nearly right, by others it is far off. n and m, the scatter of
+pours of one action and its growth with the cost, belong to the hypothesis, too: a few pours close together determine them.
 
-Two further groups of hypotheses, of equal prior weight, do not rely on the simulator. In the contrary group it predicts
+Two further groups of hypotheses do not rely on the simulator. In the contrary group it predicts
 the opposite, μ_j = clip(e^{g_j} (1 − f̂_s(z_j(x))), 0, 1). In the uninformative group it contains no information about
 this bench, and f is a GP around 0.6, more towards corners.
 
 The posterior weights are prior times marginal likelihood of the observations. No hypothesis is removed: the weight of a
-failing one decreases. The weight of the two further groups measures how unreliable the simulator is.
+failing one decreases. The weight of the two further groups measures how unreliable the simulator is. An observation
+counts with a finite resolution, and one of nearly everything lost only as such: otherwise a hypothesis that is certain of
+a total loss would gain from each failed pour over one that is less certain.
+
+The prior draws are coarse: with steep walls, a few pours leave a handful of 2,048. The ones that are used for predictions
+are therefore moved by Markov chains that keep the posterior.
 
 **A bench that changes.** Once an observation lies outside its 99 % prediction interval, the hypotheses are weighed
 together with the start of the present segment: the observations before it were made on another bench, and say nothing
@@ -25,8 +30,10 @@ of this one. Two Cholesky factors of every hypothesis, in both orders, give the 
 and ends. Alternatively the latest observation is an outlier.
 
 Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001;
-changes, Adams & MacKay, Bayesian online changepoint detection, 2007, and binary segmentation, Scott & Knott 1974.
-Limitations: the set of hypotheses is fixed; predictions use at most 32 draws of them, and the uninformative group.
+changes, Adams & MacKay, Bayesian online changepoint detection, 2007, and binary segmentation, Scott & Knott 1974;
+moves after resampling, Gilks & Berzuini 2001.
+Limitations: the weights of the groups, and of the starts of a segment, come from the prior draws; predictions use 48
+moved draws, and the uninformative group.
 """
 
 from __future__ import annotations
@@ -48,7 +55,7 @@ Remake = Callable[[Array], "Hypotheses"]
 
 HYPOTHESES = 2048
 KEPT = 48
-"""Number of draws from the posterior weights for predictions, evenly by weight: at most as many hypotheses."""
+"""Number of draws from the posterior weights for predictions, evenly by weight."""
 GAIN = 0.3
 """Standard deviation of g."""
 WIDTH = 0.25

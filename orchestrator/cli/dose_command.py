@@ -174,7 +174,7 @@ def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
     assert plan.dispense is not None
     series, known = plan.dispense, _known(plan.dispense)
     strategy, seeds = Dispense(series, plan.seed, known), SeedStream(plan.seed, "predict doses")
-    count = 20 if len(series.doses) <= 3 else 8
+    count = 20 if len(series.doses) == 1 else 8
     rows: list[dict[str, Any]] = []
     total, filled = 0.0, 0
     for number, planned in enumerate(series.doses, start=1):
@@ -252,8 +252,16 @@ def _pour(plan: CampaignPlan, *, in_process: bool, as_json: bool, again: str) ->
         check_somebody_is_there,
         run_in_front_of_people,
     )
+    from orchestrator.cli.motion_control import confirm
     from orchestrator.journal.codec import result_of
     from orchestrator.run_service import RunRequest, RunResources
+    from orchestrator.runs.motion_approval import (
+        SafetyRecordError,
+        campaign_pours,
+        envelope,
+        envelope_lines,
+        required_checksum,
+    )
     from orchestrator.runs.stages import DOSES, dispense_stages
     from orchestrator.strategies.dispense import Dispensed
 
@@ -262,7 +270,14 @@ def _pour(plan: CampaignPlan, *, in_process: bool, as_json: bool, again: str) ->
         plan = dataclasses.replace(plan, outputs=plan.outputs.model_copy(update={"recording": False}))
     assert plan.dispense is not None
     request = RunRequest(plan, dispense_stages(plan.dispense))
-    resources = RunResources(in_process=in_process)
+    checksum = ""
+    if plan.laboratory.mode == "hardware":
+        assert plan.laboratory.arm is not None
+        with Refused(SafetyRecordError):
+            checksum = required_checksum(plan)
+        found = envelope(plan.laboratory.arm, campaign_pours(plan, request.stages))
+        confirm(plan.laboratory, [f"doses          {len(plan.dispense.doses)}", *envelope_lines(found)])
+    resources = RunResources(in_process=in_process, approved_checksum=checksum)
     check_somebody_is_there(plan.laboratory)
     check_laboratory_answers(request, resources)
     directory = run_directory(plan, resume=False, run_id=None)

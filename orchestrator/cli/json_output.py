@@ -15,6 +15,7 @@ from actors.arm.arm_interface import PathReport
 from actors.interfaces import DeviceCheck
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail, RunComparison
 from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, StatusOut
+from orchestrator.daemon.station_schemas import BatchOut, MaterialsOut, PourOut
 from orchestrator.results.run_summary import ReceiverSummary, RunSummary, UntitledSchema
 from orchestrator.strategies.dispense import Dose
 from orchestrator.strategies.single_action import WeighedPour
@@ -511,6 +512,10 @@ OUTPUTS: dict[str, Any] = {
     "queue list": QueueOutput,
     "queue show": CampaignDetailOut,
     "queue logs": EventOutput,
+    "queue pour": PourOut,
+    "queue batch": BatchOut,
+    "queue batch-status": BatchOut,
+    "queue materials": MaterialsOut,
 }
 """Models of the output, by command."""
 

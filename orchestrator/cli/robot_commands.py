@@ -117,9 +117,7 @@ def archive(
     ],
     recordings: Annotated[
         list[Path] | None,
-        typer.Argument(
-            help="Recordings to add: files of '--record', and run folders.", exists=True, show_default=False
-        ),
+        typer.Argument(help="Recordings to add: files of '--record', and run folders.", show_default=False),
     ] = None,
     as_json: Json = False,
 ) -> None:

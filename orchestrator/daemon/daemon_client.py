@@ -33,11 +33,15 @@ TIMEOUT = httpx.Timeout(60.0, connect=5.0)
 
 
 class DaemonError(RunError):
-    """The daemon can't be reached, or it refuses; the message is the daemon's own if there is one."""
+    """The daemon can't be reached, or it refuses; the message is the daemon's own if there is one.
 
-    def __init__(self, text: str, exit_code: int = 1) -> None:
+    Attributes:
+        unreachable: the connection failed, so the call may or may not have been executed.
+    """
+
+    def __init__(self, text: str, exit_code: int = 1, *, unreachable: bool = False) -> None:
         super().__init__(text)
-        self.exit_code = exit_code
+        self.exit_code, self.unreachable = exit_code, unreachable
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,8 @@ class Client:
             )
         return DaemonError(
             f"no daemon answers at {self.url} ({error}); start one with 'decant server start', or say where it is: "
-            "--url, --state"
+            "--url, --state",
+            unreachable=True,
         )
 
     def events(

@@ -428,12 +428,6 @@ class Store:
         """
         return self._write(statement, *arguments)
 
-    def copy_to(self, path: Path) -> None:
-        """Write a consistent copy of the file, also while the daemon works."""
-        with sqlite3.connect(path) as target:
-            self._db.backup(target)
-        target.close()
-
     def _write(self, statement: str, *arguments: Any) -> int:
         try:
             return int(self._db.execute(statement, arguments).lastrowid or 0)

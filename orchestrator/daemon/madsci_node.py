@@ -5,8 +5,8 @@ schemas are those of madsci.client 0.8.1; its packages are not needed. Actions: 
 
 - MADSci's client repeats every POST and sends no authorization. Hence an action is started once by its id, and only
   addresses of the settings' list may call.
-- Enabling the motion of hardware stays an operator's act: the action is 'paused' until then. An emergency stop is cleared
-  by an administrator, not by `reset`.
+- Enabling the motion of hardware stays an operator's act: the action is 'paused' until then. An emergency stop is
+  cleared by an administrator, not by `reset`.
 - Actions and the node's lock are stored, so they outlive a restart.
 """
 

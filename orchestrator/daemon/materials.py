@@ -1,7 +1,7 @@
 """Materials of a station: liquids, vessels, positions, and the account of what is in which vessel.
 
-`Materials` reads and writes its tables in the daemon's `Store`. The account is append-only: an entry sets the content of
-a vessel (a weighing) or changes it (a pour). `Materials.content` adds the entries up, with their uncertainty.
+`Materials` reads and writes its tables in the daemon's `Store`. The account is append-only: an entry sets the content
+of a vessel (a weighing) or changes it (a pour). `Materials.content` adds the entries up, with their uncertainty.
 `Materials.refusal` is the reason why vessels can't serve a pour; it is checked before anything moves.
 
 Limitations: liquids that were poured together become a mixture, which is no source any more. Evaporation is not
@@ -10,11 +10,13 @@ estimated. Campaigns other than ordered pours are not in the account: an operato
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document
 from orchestrator.daemon.daemon_store import ENDED, Store
 from orchestrator.run_errors import RunError
+from orchestrator.strategies.dispense import ENOUGH
 from sim_engine.liquids import Liquid
 from sim_engine.settings.quantity import QuantityError, parse_quantity
 from sim_engine.vessel.shapes import VesselError
@@ -31,7 +34,7 @@ from sim_engine.vessel.vessel import build_vessel
 MIXTURE = "mixture"
 """Liquid of a vessel that several liquids were poured into."""
 
-SURE = 2.0
+SURE = ENOUGH
 """Number of standard deviations by which a content may be smaller than its estimate, and larger."""
 
 
@@ -254,6 +257,20 @@ class Materials:
         where, arguments = ("", []) if vessel is None else ("where vessel = ?", [vessel])
         return self._store.rows(f"select * from account {where} order by id", *arguments)
 
+    def table(self) -> str:
+        """Return the account as CSV, for the export of runs: masses in g, and the run of each ordered pour."""
+        rows = self._store.rows(
+            "select t, vessel, kind, 1e3 * change as change_g, 1e3 * deviation as deviation_g, liquid, pour, run, "
+            "account.by, note from account left join pour_order on pour_order.id = pour "
+            "left join campaign on campaign.id = campaign order by account.id"
+        )
+        text = StringIO()
+        columns = ("t", "vessel", "kind", "change_g", "deviation_g", "liquid", "pour", "run", "by", "note")
+        writer = csv.DictWriter(text, columns)
+        writer.writeheader()
+        writer.writerows(rows)
+        return text.getvalue()
+
     # ---- look-up
 
     def vessel(self, key: str) -> RegisteredVessel:
@@ -367,7 +384,7 @@ class Materials:
         promised = self.promised(source.id, pour)
         sure = held.mass - SURE * held.deviation - promised
         wanted = 0.0 if amount is None else amount
-        if sure <= wanted:
+        if sure <= (0.0 if amount is None else amount + more):
             spoken = f", {1e3 * promised:.4g} g of it are promised to other pours" if promised else ""
             return (
                 f"{source.id}: holds {1e3 * held.mass:.4g} ± {1e3 * SURE * held.deviation:.2g} g{spoken}, and "

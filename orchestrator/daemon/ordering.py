@@ -1,8 +1,8 @@
 """Takes orders of other programs: pours and batches, once each, whatever happens to the connection.
 
-`Ordering.pour` places an order and returns it; the same order again returns the pour that exists. `Ordering.batch` takes
-a list of pours and campaigns, or none of them. `Ordering.pour_out` is the state of a pour with its result. An order is
-placed in a task of its own, so a caller that disconnects does not interrupt it.
+`Ordering.pour` places an order and returns it; the same order again returns the pour that exists. `Ordering.batch`
+takes a list of pours and campaigns, or none of them. `Ordering.pour_out` is the state of a pour with its result. An order
+is placed in a task of its own, so a caller that disconnects does not interrupt it.
 """
 
 from __future__ import annotations

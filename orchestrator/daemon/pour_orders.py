@@ -1,7 +1,7 @@
 """A pour that another program orders: its request, its run, its prediction and its result.
 
-An order becomes a queued campaign with the task 'pour' and one pour, so that rigs, journal, questions and stops treat it
-as any other campaign. The id of its caller makes it unique: the same order again is the same pour.
+An order becomes a queued campaign with the task 'pour' and one pour, so that rigs, journal, questions and stops treat
+it as any other campaign. The id of its caller makes it unique: the same order again is the same pour.
 
 - `PourOrder` is the order; `order_bundle` is the campaign of it, `order_request` its run.
 - `predict` predicts it; nothing moves.
@@ -20,8 +20,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from actors.dosing.simulated_dose import check_dose, forecast
-from actors.interfaces import DoseTarget, InvalidActionError, SimulatorPool
+from actors.dosing.dose_series import check_dose, predict_dose
+from actors.dosing.simulated_dose import check_straight
+from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, SimulatorPool
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.action_assignments import AssignmentError, assigned_action, set_action
 from orchestrator.config.campaign_checks import check_vessels, touch
@@ -33,9 +34,9 @@ from orchestrator.run_errors import RunError
 from orchestrator.run_service import RunRequest
 from orchestrator.runs.stages import StageDefinition
 from orchestrator.shipped import shipped
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.strategies.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
 from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.dispense import DOSE, Dispense
+from orchestrator.strategies.dispense import DOSE, Dispense, KnownSource
 from orchestrator.strategies.single_action import OnePour, RepeatedSimulation
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.motion import plan_motion
@@ -80,6 +81,7 @@ class PourOrder:
         amount: wanted in the receiver; None: the action is poured.
         tolerance: of the amount; the excess that the pour avoids.
         action: values by dimension, such as {'angular_velocity': '60 deg/s'}; for an amount, the place of the pourer.
+        deviation: standard deviation of the content of the source, when the pour begins.
     """
 
     id: str
@@ -89,6 +91,7 @@ class PourOrder:
     amount: float | None = None
     tolerance: float = 1e-3
     action: dict[str, str] = field(default_factory=dict)
+    deviation: float = 1e-4
 
     @property
     def seed(self) -> int:
@@ -197,13 +200,15 @@ def _grams(mass: float) -> str:
     return f"{1e3 * mass:.6f} g"
 
 
-def renew_load(campaign: Path, mass: float) -> None:
-    """Set the load in the campaign of an order that has not begun: other pours may have changed its source.
+def renew_load(campaign: Path, mass: float, deviation: float) -> None:
+    """Set the load in the snapshot of an order that has not begun: other pours may have changed its source.
 
     Args:
         campaign: its file.
         mass: present content of the source [kg].
+        deviation: its standard deviation [kg].
     """
+    replace(PourOrder.read(campaign.parent), deviation=deviation).write(campaign.parent)
     content = json.loads(campaign.read_text(encoding="utf-8"))
     content["liquid"]["mass"] = _grams(mass)
     fresh = campaign.with_suffix(".new")
@@ -238,24 +243,40 @@ class PlannedOrder:
 
     @classmethod
     def of(cls, plan: CampaignPlan, order: PourOrder) -> PlannedOrder:
-        """Plan an order; see `order_request`."""
+        """Plan an order; see `order_request`. The plan of its run may be given, too."""
+        if plan.dispense is not None:
+            scene = plan.dispense.scenes[0]
+            return cls(plan, order, scene, scene.action({}))
         assert plan.deployment is not None
         scene = plan.deployment.scenes[0]
         if "x_offset" not in order.action:
             scene = _placed(scene, order)
             plan = replace(plan, deployment=replace(plan.deployment, scenes=(scene,)))
-        return cls(plan, order, scene, _action(scene, order))
+        action = _action(scene, order)
+        if order.amount is not None:
+            scene = replace(scene, fixed=action.values())
+            dose = PlannedDose(order.amount, order.tolerance, scene.receiver.name)
+            series = DispensePlan((scene,), (dose,), 0.0, False, plan.laboratory.name)
+            plan = replace(plan, deployment=None, dispense=series)
+        return cls(plan, order, scene, action)
 
     @property
     def target(self) -> DoseTarget | None:
         """The wanted amount; None for an action."""
-        return None if self.order.amount is None else DoseTarget(self.order.amount, self.order.tolerance)
+        if self.order.amount is None:
+            return None
+        source = DoseSource(
+            self.scene.pourer.name, self.scene.liquid.mass, self.order.deviation, fill=False, constants=0
+        )
+        return DoseTarget(self.order.amount, self.order.tolerance, source=source)
 
     def strategy(self, results: object, seed: int) -> Dispense | OnePour:
         """Build the strategy."""
         if self.target is None:
             return OnePour(self.scene, self.action, seed)
-        return Dispense(self.scene, self.action, [self.target], seed)
+        assert self.plan.dispense is not None
+        content = KnownSource(mass=self.scene.liquid.mass, deviation=self.order.deviation)
+        return Dispense(self.plan.dispense, seed, {self.scene.pourer.name: content})
 
     def problems(self) -> list[str]:
         """Return what prevents this pour; nothing moves."""
@@ -266,12 +287,9 @@ class PlannedOrder:
             return [one.message for one in found]
         try:
             if target is not None:
-                if laboratory.arm is not None:
-                    return [
-                        f"laboratory {laboratory.name} has an arm, and amounts are poured on simulated benches only; "
-                        "order an action, or name a rig without an arm"
-                    ]
                 check_dose(self.scene, target)
+                if laboratory.arm is None:
+                    check_straight(self.scene)
                 return []
             vessels = build_vessel(self.scene.pourer), build_vessel(self.scene.receiver)
             contact = touch(self.scene, self.action, *vessels)
@@ -313,7 +331,8 @@ class PlannedOrder:
 
     def _forecast(self) -> dict[str, Any]:
         assert self.target is not None
-        found, wanted = forecast(self.scene, self.target, self.order.seed), self.target.amount
+        found = predict_dose(self.scene, self.target, self.order.seed, self.plan.laboratory.dosing)
+        wanted = self.target.amount
         bench = self.plan.laboratory.bench
         low, high = (1e3 * value for value in found.interval)
         return {
@@ -387,7 +406,9 @@ def weighing_deviation(laboratory: LaboratorySettings) -> float:
     balance = laboratory.balance
     if balance is None:
         return 0.0
-    return math.hypot(balance.repeatability or 0.0, (balance.step or 0.0) / math.sqrt(12.0))
+    # settings of a plug-in's balance need not have them
+    repeatability, step = (getattr(balance, name, None) or 0.0 for name in ("repeatability", "step"))
+    return math.hypot(repeatability, step / math.sqrt(12.0))
 
 
 def weighed_result(order: PourOrder, measured: PourMeasurement, deviation: float) -> dict[str, Any]:

@@ -135,7 +135,8 @@ class Running:
         more = order.tolerance
         if reason := materials.refusal(order.source, order.receiver, order.liquid, order.amount, more, pour=order.id):
             raise OrderError(f"{reason}. Nothing was poured")
-        await asyncio.to_thread(renew_load, folder / CAMPAIGN, materials.content(order.source).mass or 0.0)
+        content = materials.content(order.source)
+        await asyncio.to_thread(renew_load, folder / CAMPAIGN, content.mass or 0.0, content.deviation)
 
     def _resources(self, request: RunRequest, checksum: str) -> RunResources:
         asking, key, rig = self._shared.asking, self.item.id, self._rig.name

@@ -39,6 +39,7 @@ CHECKPOINT_WORDS = {
     "tilt": "tilting",
     "hold": "holding",
     "return": "returning upright",
+    "dose": "dosing",
     "settle": "settling",
     "weigh": "weighing",
     "record": "recording",

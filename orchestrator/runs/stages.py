@@ -285,9 +285,14 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     if deployment.settings.needs_posterior:
         if not posterior:
             raise RunError("deployment.risk: theta: posterior, but no calibration of this campaign tells one; C4 does")
-    elif found is None or not posterior or deployed_theta(results) != found.theta:
-        return deployment
-    elif deployment.settings.learns_of_benches and set(SimulationParameters.nuisances()).intersection(found.searched):
+    elif (
+        found is None
+        or not posterior
+        or deployed_theta(results) != found.theta
+        or (
+            deployment.settings.learns_of_benches and set(SimulationParameters.nuisances()).intersection(found.searched)
+        )
+    ):
         return deployment
     assert found is not None
     return replace(deployment, thetas=posterior_draws(found, POSTERIOR_DRAWS))

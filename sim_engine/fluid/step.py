@@ -56,7 +56,8 @@ WARM = 0.3
 """Fraction of the last step's multipliers with which a step starts. From one half on, oscillations grow in deep liquid,
 because the multipliers respond to the previous state (docs/notes/solver.md has the analysis)."""
 TREACLE = 0.7
-"""Factor by which velocities shrink in every step before the start, so that a lattice settles without splashing."""
+"""Factor by which velocities shrink in every step before the start, so that a lattice settles without splashing. Those
+of thick liquids become zero: an expanding lattice would throw films off walls."""
 
 FACTS = ("time", "fault", "steps", "iterations", "compression")
 """Names of the fields that `Stepper.look` returns for a scene in addition to its particles."""
@@ -400,7 +401,10 @@ class Stepper:
         dt = f.dt[s]
         if f.time[s] < f.start[s]:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-                f.v[i] = f.v[i] * TREACLE
+                if ti.static(thick):
+                    f.v[i] = ti.Vector([0.0, 0.0, 0.0])
+                else:
+                    f.v[i] = f.v[i] * TREACLE
         elif f.time[s] - dt < f.start[s]:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 f.v[i] = f.v[i] + f.drift[s]

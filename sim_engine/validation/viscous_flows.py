@@ -32,6 +32,10 @@ Floats = NDArray[np.float64]
 WALL = 0.005
 """Thickness of the tubes' walls [m]."""
 
+SETTLING = 0.02
+"""Time in which a lattice loses its excess density without gaining velocity [s]: a lattice that expands in flight
+throws films off their walls."""
+
 
 def tube(radius: float, top: float, bottom: float, spacing: float) -> Container:
     """A straight tube along z, open at both ends.
@@ -104,7 +108,7 @@ def down_a_tube(
     start = ring(0.0, radius, 0.0, length, d)
     pipe = tube(radius, length + 0.05, -1.5 * mean * float(times[-1]) - 0.05, 0.4 * d)
     places, speeds = [], []
-    for _ in run(start, d, pipe, parameters, times, viscosity=viscosity):
+    for _ in run(start, d, pipe, parameters, times, viscosity=viscosity, settling=SETTLING):
         x, v = engine().particles()[0].astype(float), engine().velocities().astype(float)
         middle = np.abs(x[:, 2] - np.median(x[:, 2])) < radius
         places.append(np.hypot(x[middle, 0], x[middle, 1]))
@@ -161,7 +165,7 @@ def down_an_incline(
     poses = still_pose(float(times[-1]))
     poses[:, 3], poses[:, 5] = math.cos(INCLINE / 2.0), math.sin(INCLINE / 2.0)
     heights, speeds, deep = [], [], []
-    for _ in run(local @ turn.T, d, channel, parameters, times, poses=poses, viscosity=viscosity):
+    for _ in run(local @ turn.T, d, channel, parameters, times, poses=poses, viscosity=viscosity, settling=SETTLING):
         x = engine().particles()[0].astype(float) @ turn
         v = engine().velocities().astype(float) @ turn
         middle = (np.abs(x[:, 0] - np.median(x[:, 0])) < 2.0 * thickness) & (np.abs(x[:, 1]) < width / 4.0)
@@ -209,7 +213,7 @@ def left_on_a_wall(
     start = ring(radius - first, radius, 0.0, height, d)
     pipe = tube(radius, height + 0.01, 0.0, 0.4 * d)
     left = []
-    for _ in run(start, d, pipe, parameters, times, viscosity=viscosity, spill_level=-0.02):
+    for _ in run(start, d, pipe, parameters, times, viscosity=viscosity, spill_level=-0.02, settling=SETTLING):
         x = engine().particles()[0].astype(float)
         left.append(float(np.mean(x[:, 2] > 0.0)))
     wanted = [jeffreys(float(t), first, height, radius, viscosity) for t in times]

@@ -88,7 +88,7 @@ class CountingBench(HeldBench):
 
 async def serve(folder: Path, stage: str) -> None:
     import actors.laboratory
-    from orchestrator.daemon.access_tokens import Tokens
+    from orchestrator.daemon.access_control import Tokens
     from tests.support.toy_campaign import ToyOptimizer, ToySimulators
 
     def open_laboratory(spec: Any, **arguments: Any) -> HeldLaboratory:
@@ -107,8 +107,9 @@ async def serve(folder: Path, stage: str) -> None:
     listening.bind(("127.0.0.1", 0))
     await daemon.start()
     if stage == "node":
-        app = create_node(daemon, app.state.ordering, MadsciSettings(allow=["127.0.0.1"]))
-        server.config = uvicorn.Config(app, log_config=None, lifespan="off", access_log=False)
+        node = create_node(daemon, app.state.ordering, MadsciSettings(allow=["127.0.0.1"]))
+        server.config = uvicorn.Config(node, log_config=None, lifespan="off", access_log=False)
+    if stage in ("node", "station"):
         materials = Materials(daemon.store)
         materials.add_liquid("water", "", {})
         for vessel, shape in (("beaker", BEAKER), ("vial-1", VIAL)):
@@ -119,9 +120,9 @@ async def serve(folder: Path, stage: str) -> None:
 
 
 @contextlib.contextmanager
-def node_process(folder: Path) -> Iterator[str]:
-    """Run the daemon as a MADSci node with a filled beaker; yields its URL."""
-    process = subprocess.Popen([sys.executable, "-m", __name__, str(folder), "node"], stdout=subprocess.PIPE, text=True)
+def node_process(folder: Path, served: str = "node") -> Iterator[str]:
+    """Run the daemon with a filled beaker; yields the URL of its 'node' for MADSci, or of the 'station'."""
+    process = subprocess.Popen([sys.executable, "-m", __name__, str(folder), served], stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
         yield process.stdout.readline().strip()

@@ -42,6 +42,9 @@ from actors.arm.ur.worker_messages import (
 AT_START = 0.01
 """Largest distance of the joints from a path's first point [rad]; the program first removes it slowly."""
 
+UPRIGHT = 1e-3
+"""Tilt below which the cup of a dose counts as upright [rad]."""
+
 AT_END = 0.01
 """Largest distance of the joints from a path's last point [rad] for the path to count as completed."""
 
@@ -204,7 +207,10 @@ class MotionMonitor:
             reading = self._look()
             if reading.status == STOPPED and reading.number == motion.number:
                 self._answered = time.monotonic()
-                return self._broken_off("operator", "stopped by the operator")
+                upright = "; the cup was turned back upright" if motion.tilts and reading.clock < UPRIGHT else ""
+                return self._broken_off("operator", "stopped by the operator" + upright)
+            if motion.tilts and self._ordered.is_set() and reading.clock < UPRIGHT and reading.stands:
+                self._client.order_stop(motion.number)
             if self._is_stopped(reading):
                 return self._stopped_by_safety(reading, primary)
             if reading.status_bits & FREEDRIVE:

@@ -222,7 +222,8 @@ class DataPackage:
         number, status, clock, tool: of the program, see the registers.
         status_bits: `robot_status_bits`.
         force: external force and torque at the TCP, in the base's frame [N], [N m], as the controller estimates them.
-        wrist: raw values of the sensor in the wrist, likewise; empty if the robot has none.
+        wrist: raw force and torque of the sensor in the wrist, in a frame that no document names; empty if the robot
+            has none.
     """
 
     time: float

@@ -242,7 +242,7 @@ class _Slow:
         return tuple(t / 10.0 for t in self.torques())
 
     def wrench(self) -> tuple[float, ...]:
-        """The external force and the payload's weight, in the base's frame."""
+        """The external force and the payload's weight. The base's frame is an assumption: no document names one."""
         robot = self._controller.robot
         x, y, z, *torque = robot.external_force
         gx, gy, gz = (-robot.payload * g for g in robot.gravity)

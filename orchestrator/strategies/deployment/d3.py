@@ -173,7 +173,8 @@ loss that a simulated action must keep below, relative to the largest one: other
 class Hybrid(Deployment[D3Settings]):
     """D3: as D2, but the surrogate's prior mean comes from m2 simulations, and from further ones between pours.
 
-    First, Bayesian optimisation in simulation chooses m2 actions. Their surrogate becomes the prior of the real
+    First, Bayesian optimisation in simulation chooses m2 actions; with 'adaptive', the last third of them are chosen for
+    the decision about the first pour, once a good action was simulated. Their surrogate becomes the prior of the real
     cost, f_r(a) = f_s(a) + δ(a): its posterior mean is the prior mean, its posterior covariance adds to δ's. The first
     pour is the minimiser of the prior mean; every further one minimises m(a) − κ s(a) given the weighed pours.
 

@@ -71,8 +71,8 @@ class Deployment(ABC, Generic[S]):
     refusal does not count against a budget; at most `MAX_REFUSED` are free. A pour that failed after something had
     moved counts, and enters the data with the worst cost (`on_failed_pour: penalise`) or not at all (`ignore`).
 
-    If the plan has posterior draws of θ, the simulations use them in turn, so that the expected loss over all θ that fit
-    the weighed pours is minimised. Where many θ fit equally well, θ* is one of them that rounding may decide; the mean
+    If the plan has posterior draws of θ, the simulations use them in turn, so that the expected loss over all θ that
+    fit the weighed pours is minimised. Where many θ fit equally well, θ* is one of them that rounding may decide; the mean
     over the draws is stable.
     """
 

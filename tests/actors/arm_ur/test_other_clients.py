@@ -102,6 +102,7 @@ def test_a_client_of_other_makers_exchanges_values_while_the_arm_pours(unconnect
     assert taken == "taken"
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_client_that_speaks_no_protocol_does_not_disturb_a_pour(unconnected: Rig) -> None:
     rig = unconnected

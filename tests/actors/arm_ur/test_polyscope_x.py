@@ -44,6 +44,7 @@ def test_an_arm_pours_is_stopped_and_recovers_without_a_dashboard(rig: Rig) -> N
     assert rig.joints == pytest.approx(HOME, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_power_and_brakes_are_switched_over_the_robot_api(rig: Rig) -> None:
     rig.fault("emergency_stop")
     rig.arm.release()
@@ -55,6 +56,7 @@ def test_power_and_brakes_are_switched_over_the_robot_api(rig: Rig) -> None:
     rig.arm.hands_in()
 
 
+@pytest.mark.slow
 def test_local_control_is_named(rig: Rig) -> None:
     rig.fault("remote", active=False)
     rig.arm.release()

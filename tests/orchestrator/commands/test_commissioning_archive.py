@@ -74,6 +74,9 @@ def test_what_is_no_recording_is_refused_and_leaves_the_archive_as_it_is(tmp_pat
     assert done.exit_code == 2
     assert f"{name}: not a recording" in done.stderr
     assert not (tmp_path / "kept.zip").exists()
+    absent = archive(tmp_path / "kept.zip", tmp_path / "absent.json")
+    assert absent.exit_code == 2
+    assert "absent.json: there is no such file" in absent.stderr
     missing = archive(tmp_path / "kept.zip")
     assert missing.exit_code == 2
     assert "there is no such archive" in missing.stderr
