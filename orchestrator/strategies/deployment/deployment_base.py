@@ -72,8 +72,8 @@ class Deployment(ABC, Generic[S]):
     moved counts, and enters the data with the worst cost (`on_failed_pour: penalise`) or not at all (`ignore`).
 
     If the plan has posterior draws of θ, the simulations use them in turn, so that the expected loss over all θ that
-    fit the weighed pours is minimised. Where many θ fit equally well, θ* is one of them that rounding may decide; the mean
-    over the draws is stable.
+    fit the weighed pours is minimised. Where many θ fit equally well, θ* is one of them that rounding may decide; the
+    mean over the draws is stable.
     """
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
