@@ -88,6 +88,26 @@ class SimulatorPool(Protocol):
 
 
 @dataclass(frozen=True)
+class DoseProgress:
+    """Progress of a wanted amount.
+
+    Attributes:
+        phase: 'check', 'approach', 'pour', 'return', 'settle' or 'done'.
+        target: wanted amount [kg].
+        amount, deviation: estimated amount past the lip, and its standard deviation [kg].
+        flow: estimated [kg/s].
+        reading: of the balance, without the receiver [kg]; None before the first one.
+    """
+
+    phase: str
+    target: float
+    amount: float
+    deviation: float
+    flow: float
+    reading: float | None
+
+
+@dataclass(frozen=True)
 class PourProgress:
     """Progress of a pour on the bench, for display only, never for control.
 
@@ -100,6 +120,7 @@ class PourProgress:
         joints: of the arm as last measured [rad]; empty if the arm does not report them.
         pourer: pose of the pourer in the world (x y z [m], qw qx qy qz), from an arm without joints; else empty.
         liquid: particles of this pour, reported once by a virtual bench. Hidden from the learning algorithms.
+        dose: of a wanted amount; None in other pours.
     """
 
     checkpoint: str
@@ -110,9 +131,51 @@ class PourProgress:
     joints: tuple[float, ...] = ()
     pourer: tuple[float, ...] = ()
     liquid: RecordedFrames | None = None
+    dose: DoseProgress | None = field(default=None, metadata={"written": "if set"})
 
 
 ProgressCallback = Callable[[PourProgress], None]
+
+
+@dataclass(frozen=True)
+class DoseKnowledge:
+    """What earlier doses have shown about a source vessel and a balance; see `actors.dosing.dose_estimator`.
+
+    Attributes:
+        onset_flow: means of the onset bias [rad] and of the logarithm of the flow factor.
+        covariance: of these two, (2, 2) by rows.
+        lag: mean and standard deviation of the logarithm of the balance's lag, and of the shape of its filter; None if
+            the lag is to be measured again.
+        aim: mass that arrives after the predicted end of the flow [kg].
+        doses: number of doses.
+    """
+
+    onset_flow: tuple[float, ...]
+    covariance: tuple[float, ...]
+    lag: tuple[float, ...] | None
+    aim: float
+    doses: int
+
+
+@dataclass(frozen=True)
+class DoseSource:
+    """The vessel that a dose is poured from.
+
+    Attributes:
+        name: under which its content is tracked.
+        mass: expected content before the dose [kg].
+        deviation: standard deviation of the content [kg].
+        fill: the operator fills it to this content before the dose.
+        constants: number from which a simulated bench draws what stays the same over a series.
+        knowledge: of earlier doses; None if there are none.
+    """
+
+    name: str
+    mass: float
+    deviation: float
+    fill: bool
+    constants: int
+    knowledge: DoseKnowledge | None = None
 
 
 @dataclass(frozen=True)
@@ -122,10 +185,14 @@ class DoseTarget:
     Attributes:
         amount: [kg].
         limit: excess that may be exceeded with a probability of 1 % only [kg].
+        position: name of the receiver's place, for the operator.
+        source: of the dose; None: a full pourer, about which nothing is known.
     """
 
     amount: float
     limit: float = 1e-3
+    position: str = ""
+    source: DoseSource | None = None
 
 
 class Bench(Protocol):

@@ -19,6 +19,7 @@ from actors.arm.arm_settings import ARMS, ArmSettings
 from actors.balance.balance_settings import BalanceSettings
 from actors.balance.dialect_registry import kinds
 from actors.balance.scale_model import Drift
+from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import OperatorSettings
 from sim_engine.liquids import RETIRED_PARAMETERS, SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise
@@ -185,6 +186,9 @@ class LaboratorySettings(Settings):
     bench: BenchSettings | None = None
     """Ground truth of a virtual bench. Without bench and arm, the laboratory only simulates and plans."""
 
+    dosing: Annotated[DosingSettings, NOT_IN_FINGERPRINT] = DosingSettings()
+    """How wanted amounts are poured."""
+
     accepted_checksum: Annotated[str, SET_BY_PROGRAM] = ""
     """Checksum of the accepted safety settings of the hardware; '' if none are accepted."""
 
@@ -214,6 +218,21 @@ class LaboratorySettings(Settings):
             arm=None if self.arm is None else self.arm.in_laboratory(self.cell, scale),
             balance=None if self.balance is None else self.balance.with_values(time_scale=scale),
             operator=self.operator.with_values(answers=self.operator.answers or answers),
+        )
+
+    def in_real_time(self) -> Self:
+        """The laboratory for wanted amounts: an arm over its wires then moves in real time.
+
+        A virtual operator needs as much time of the clock as before.
+        """
+        scale = 1.0 if self.bench is None else self.bench.time_scale
+        if self.arm is None or self.bench is None or scale == 1.0:
+            return self
+        return self.with_values(
+            bench=self.bench.with_values(time_scale=1.0),
+            arm=self.arm.with_values(time_scale=1.0),
+            balance=None if self.balance is None else self.balance.with_values(time_scale=1.0),
+            operator=self.operator.with_values(time=self.operator.time / scale),
         )
 
     # ---- rules between the sections

@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 
 from actors.dosing.cup_flow import CupFlow
-from actors.dosing.dose_controller import DoseOrder, DosingSettings, fine_flow
+from actors.dosing.dose_controller import DoseOrder, fine_flow
 from actors.dosing.dose_series import DoseSeries, SourceContent
+from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
 from sim_engine.liquids import Liquid
 from sim_engine.vessel import profile

@@ -1,8 +1,8 @@
 """What a wrong simulator costs: D2, D3 as in the paper, and D3 that averages over mistakes.
 
     python benchmarks/mismatch.py [--levels none small ...] [--arms D2 paper adaptive] [--seeds 24] [--first 1000]
-                                  [--pours 15] [--simulations 37] [--out FILE]
-                                  [--receivers] [--write]
+                                  [--pours 15] [--simulations 37] [--settled 0.005] [--out FILE]
+                                  [--receivers] [--write] [--write-steep]
 
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
 the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are kept in FILE, so that an
@@ -19,6 +19,13 @@ Primary questions, written before any of it was run. Seeds below 1000 are for tu
    0.4?
 5. (`--receivers`, six pours each.) With what was learnt of the bench before: fewer pours into receiver 3 until one
    loses less than 1 % than afresh?
+
+Questions on the levels `cliff, …`, written before seeds 3000 to 3019 were used, which is done once (`--settled 0.005`;
+seeds 1000 to 1031 are for tuning). `small` is `changed` before its change: the same world and the same decisions.
+
+6. First pour at no mismatch: at most 0.05? Mean of 15 pours at none, small, moderate, large and contrary: at most 0.02,
+   0.03, 0.06, 0.12, 0.15? Mean of pours 9 to 15 of `changed`: at most 0.30?
+7. Share of the pours inside their intervals of 50, 90 and 99 %: within 45 to 60, 85 to 95, and above 97?
 """
 
 from __future__ import annotations
@@ -27,13 +34,19 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
-from mismatch_worlds import CLIFFS, LEVELS, Valley
+from machine import describe
+from mismatch_worlds import CHANGED_AFTER, CLIFFS, LEVELS, Valley
+from optimiser_problems import Floats
 from players import SCENE, Numbers, interval, play
 
+from actors.optimizer.model_discrepancy import ModelAveragedProcess
+from orchestrator.requests import Outcome, Request
 from orchestrator.runs.stages import DEPLOYMENT, with_bench
 from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.d2 import D2Settings
@@ -54,6 +67,8 @@ NAMES = {
     "adaptive": "D3, `adaptive`",
 }
 GOOD, BAD = 0.01, 0.10
+SHARES = (0.5, 0.9, 0.99)
+"""Probabilities of the intervals that are compared with the pours."""
 PAGE = Path(__file__).parents[1] / "docs" / "evidence" / "results.md"
 FEWEST = 20
 """Seeds of a row on the page."""
@@ -66,18 +81,53 @@ def numbers(valley: Valley) -> Numbers:
     return world
 
 
-def campaign(arm: str, level: str, seed: int, pours: int, simulations: int) -> dict[str, Any]:
-    """One campaign; losses without scatter."""
+class _SettledError(Exception):
+    """Three pours in a row lost almost nothing."""
+
+
+def campaign(arm: str, level: str, seed: int, pours: int, simulations: int, settled: float = 0.0) -> dict[str, Any]:
+    """One campaign; losses without scatter.
+
+    After three pours in a row that lost less than `settled`, it ends, and the other pours count as their mean. On a
+    bench that changes, the three must be after the change.
+    """
     valley = Valley(level, seed)
     settings = ARMS[arm](pours, simulations)
     plan = DeploymentPlan(settings, (SCENE,), valley.space, Loss())
     strategy, world = settings.build(plan, SCENE, SimulationParameters(), seed), numbers(valley)
-    play(strategy, world.answer)
-    best = strategy.best_values
-    reported = 1.0 if best is None else world.true(valley.space.encode(best))
-    weighed = strategy.result().weighed
-    shown = [[*pour.predicted_interval, pour.loss] for pour in weighed if pour.predicted_interval is not None]
-    return {"arm": arm, "level": level, "seed": seed, "poured": world.poured, "reported": reported, "bands": shown}
+    since = CHANGED_AFTER if valley.changes else 0
+    intervals: list[list[list[float]]] = []
+
+    def answer(request: Request) -> Outcome:
+        outcome = world.answer(request)
+        if len(world.poured) >= since + 3 and max(world.poured[-3:]) < settled:
+            raise _SettledError
+        return outcome
+
+    def bands(process: ModelAveragedProcess, points: Floats, level: float) -> Floats:
+        intervals.append([of_surrogate(process, points[:1], share)[0].tolist() for share in SHARES])
+        return of_surrogate(process, points, level)
+
+    of_surrogate = ModelAveragedProcess.bands
+    with patch.object(ModelAveragedProcess, "bands", bands), suppress(_SettledError):
+        play(strategy, answer)
+    best, made = strategy.best_values, len(world.poured)
+    reported = 1.0 if best is None else valley.true(valley.space.encode(best), made - 1)
+    if made < pours:
+        reported = world.poured[-1]
+    poured = world.poured + [float(np.mean(world.poured[-3:]))] * (pours - made)
+    observed = [valley.observe(place, index) for index, place in enumerate(world.places)]
+    pairs = list(zip(intervals[-made:], observed, strict=True)) if intervals else []
+    return {
+        "arm": arm,
+        "level": level,
+        "seed": seed,
+        "poured": poured,
+        "made": made,
+        "reported": reported,
+        "bands": [[*ends[1], lost] for ends, lost in pairs],
+        "intervals": [[*ends, lost] for ends, lost in pairs],
+    }
 
 
 def receivers(level: str, bench: int, carried: bool, pours: int, simulations: int) -> list[dict[str, float]]:
@@ -161,6 +211,87 @@ def table(runs: list[dict[str, Any]], fewest: int = 1) -> str:
     return "\n".join(lines)
 
 
+BEFORE = {
+    "none": ("0.118", "0.022", "0.000"),
+    "small": ("0.143", "0.023", "0.000"),
+    "moderate": ("0.776", "0.215", "0.048"),
+    "large": ("0.900", "0.227", "0.047"),
+    "changed": ("0.143", "0.218", "0.417"),
+}
+"""First pour, mean of 15 pours, and pours 9 to 15, of seeds 2000 to 2008 before the draws were moved."""
+
+
+def steep_rows(runs: list[dict[str, Any]]) -> list[list[str]]:
+    """A row for each level with steep walls: figures before (other seeds) and now, with standard errors."""
+    found = []
+    for level, earlier in BEFORE.items():
+        poured = np.array([run["poured"] for run in runs if run["level"] == f"cliff, {level}"])
+        if level == "small":  # the pours before the change, if one of them settled it
+            before = [run["poured"][:CHANGED_AFTER] for run in runs if run["level"] == "cliff, changed"]
+            poured = np.array([[*one, *[float(np.mean(one[-3:]))] * (15 - CHANGED_AFTER)] for one in before])
+        if len(poured):
+            now = []
+            for values in (poured[:, 0], poured.mean(axis=1), poured[:, CHANGED_AFTER:].mean(axis=1)):
+                error = float(values.std(ddof=1)) / len(values) ** 0.5
+                now.append(f"{values.mean():.3f} ± {error:.3f}")
+            pairs = zip(earlier, now, strict=True)
+            found.append([level, str(len(poured)), *(cell for pair in pairs for cell in pair)])
+    return found
+
+
+def interval_rows(runs: list[dict[str, Any]]) -> list[list[str]]:
+    """A row for first pours and for all others: how many lie in their intervals, and the mean interval score.
+
+    Source: interval score, Gneiting & Raftery, JASA 2007.
+    """
+    found = []
+    for name, part in (("first pours", slice(0, 1)), ("all others", slice(1, None))):
+        shown = [pour for run in runs for pour in run["intervals"][part]]
+        cells = []
+        for i, share in enumerate(SHARES):
+            low, high = np.array([pour[i] for pour in shown]).T
+            lost = np.array([pour[-1] for pour in shown])
+            inside = float(np.mean((low <= lost) & (lost <= high)))
+            missed = np.maximum(low - lost, 0.0) + np.maximum(lost - high, 0.0)
+            score = float(np.mean(high - low + 2.0 / (1.0 - share) * missed))
+            cells.append(f"{100 * inside:.0f} % ({score:.3f})")
+        found.append([name, str(len(shown)), *cells])
+    return found
+
+
+def write_steep(runs: list[dict[str, Any]]) -> None:
+    """Keep the runs in docs/data/steep-walls.json, and their tables in docs/data/results.json."""
+    data, machine = PAGE.parents[1] / "data", describe()
+    (data / "steep-walls.json").write_text(json.dumps({"machine": machine, "runs": rounded(runs)}) + "\n")
+    results = json.loads((data / "results.json").read_text(encoding="utf-8"))
+    about = results["cliffs"] | {
+        "command": "python benchmarks/mismatch.py --levels 'cliff, none' … --arms adaptive --first 3000 --seeds 20 "
+        "--settled 0.005 --out FILE --write-steep",
+        "date": machine["date"][:10],
+    }
+    sought = ["first pour", "mean of 15 pours", "pours 9 to 15"]
+    head = ["simulator", "seeds", *(cell for one in sought for cell in (f"{one}, before", "now ± standard error"))]
+    settings = (
+        "37 simulations, 15 pours, two simulations next to each; loss without scatter; a campaign ends after three "
+        "pours below 0.5 %; before: seeds 2000 to 2008, now: seeds from 3000, each used once"
+    )
+    results["cliffs"] = about | {"head": head, "rows": steep_rows(runs), "settings": settings}
+    head = ["pours", "number", *(f"in {100 * share:.0f} % (interval score)" for share in SHARES)]
+    text = "all pours of the table above, as observed"
+    results["intervals"] = about | {"head": head, "rows": interval_rows(runs), "settings": text}
+    text = json.dumps(results, indent=1, ensure_ascii=False)
+    (data / "results.json").write_text(text + "\n", encoding="utf-8")
+
+
+def rounded(value: Any) -> Any:
+    """Numbers with five decimals."""
+    if isinstance(value, list):
+        return [rounded(one) for one in value]
+    if isinstance(value, dict):
+        return {key: rounded(one) for key, one in value.items()}
+    return round(value, 5) if isinstance(value, float) else value
+
+
 def write(text: str) -> None:
     """Put a table into the page; rows that it lacks stay as they are there."""
     begin, end = "<!-- measured: mismatch -->\n", "<!-- end of measured -->"
@@ -185,8 +316,10 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1000)
     parser.add_argument("--pours", type=int, default=15)
     parser.add_argument("--simulations", type=int, default=37)
+    parser.add_argument("--settled", type=float, default=0.0, help="ends after three pours in a row below this loss")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--write", action="store_true", help="write the table of FILE into docs/evidence/results.md")
+    parser.add_argument("--write-steep", action="store_true", help="write the tables of the levels with steep walls")
     parser.add_argument("--receivers", action="store_true", help="three receivers one after the other on one bench")
     asked = parser.parse_args()
     if asked.receivers:
@@ -197,12 +330,16 @@ def main() -> None:
     if asked.out is not None and asked.out.exists():
         runs = [json.loads(line) for line in asked.out.read_text().splitlines()]
     known = {(run["arm"], run["level"], run["seed"]) for run in runs}
+    if asked.write_steep:
+        seeds = range(asked.first, asked.first + asked.seeds)
+        write_steep([run for run in runs if run["level"] in CLIFFS and run["seed"] in seeds])
+        return
     for level in () if asked.write else asked.levels:
         for arm in asked.arms:
             for seed in range(asked.first, asked.first + asked.seeds):
                 if (arm, level, seed) in known:
                     continue
-                runs.append(campaign(arm, level, seed, asked.pours, asked.simulations))
+                runs.append(campaign(arm, level, seed, asked.pours, asked.simulations, asked.settled))
                 if asked.out is not None:
                     with asked.out.open("a") as file:
                         file.write(json.dumps(runs[-1]) + "\n")

@@ -2,7 +2,8 @@
 
     python optimiser_rivals.py OPTIMISER < jobs.jsonl
 
-Each line of the input is {"problem": name, "seed": number}; each line of the output a result.
+Each line of the input is {"problem": name, "seed": number}; each line of the output a result. With {"points": [...],
+"costs": [...], "seed": number} one of BoTorch's answers with a point.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -162,6 +164,12 @@ def main() -> None:
     name = sys.argv[1]
     for line in sys.stdin:
         job = json.loads(line)
+        if "points" in job:  # one proposal instead of a whole optimisation
+            points = [np.array(point) for point in job["points"]]
+            about = SimpleNamespace(seed=job["seed"], problem=SimpleNamespace(dimension=len(points[0])))
+            proposed = RIVALS[name](about)[0](points, job["costs"])  # type: ignore[arg-type]
+            print(json.dumps({"point": proposed.tolist()}), flush=True)
+            continue
         world = Instance(BY_NAME[job["problem"]], job["seed"])
         started = time.process_time()
         result = play(world, *RIVALS[name](world))

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from optimiser_problems import Floats
 
+from actors.optimizer.questions import SpaceFillingQuery
 from actors.optimizer.suggest import propose
 from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.strategy import Strategy
@@ -50,7 +51,13 @@ def play(strategy: Strategy, answer: Callable[[Request], Outcome], *, pours_last
         if pours_last:
             waiting.sort(key=lambda one: isinstance(one, Pour))
         request = waiting.pop(0)
-        outcome = Suggested(propose(request.query)) if isinstance(request, Suggest) else answer(request)
+        if isinstance(request, Suggest):
+            query = request.query
+            if not isinstance(query, SpaceFillingQuery):
+                query = replace(query, map_resolution=0)  # maps are for pictures, and decide nothing
+            outcome: Outcome = Suggested(propose(query))
+        else:
+            outcome = answer(request)
         strategy.tell(request, outcome)
 
 
@@ -75,6 +82,7 @@ class Numbers:
         simulated: what the simulator says in the mean.
         scatter: its scatter from seed to seed.
         poured: what the pours have lost, without scatter.
+        places: where they were.
     """
 
     space: Space
@@ -83,6 +91,7 @@ class Numbers:
     simulated: Callable[[Floats], float]
     scatter: float
     poured: list[float] = field(default_factory=list)
+    places: list[Floats] = field(default_factory=list)
 
     def answer(self, request: Request) -> Outcome:
         """What comes of a simulation or a pour."""
@@ -91,6 +100,7 @@ class Numbers:
         if isinstance(request, Pour):
             spilled = self.observed(at, len(self.poured))
             self.poured.append(self.true(at))
+            self.places.append(at)
             return Poured(PourMeasurement(0.2, 0.2 * spilled, 0.0))
         chance = self.scatter * float(np.random.default_rng(request.seed).standard_normal())
         return Simulated(simulated(self.simulated(at) + chance, request.seed))

@@ -1,18 +1,25 @@
-"""What the quickstart loses on its way, and after how many pours it stops, on the bench of numbers, seed after seed.
+"""What the quickstart's calibration is worth, what it loses on its way, and after how many pours it stops.
 
-    python benchmarks/quickstart.py [--seeds 20] [--first 101] [--arms shipped ...] [--laboratory FILE]
-                                    [--into build/quickstart] [--write]
+    python benchmarks/quickstart.py [--seeds 10] [--first 301] [--arms shipped ...] [--calibration-only] [--random 64]
+                                    [--plans 4] [--laboratory FILE] [--into build/quickstart] [--write]
 
-The shipped campaign as it is; only random θ are not scored, which the deployment does not depend on. A seed is
-a process of its own that ends with this one. Every simulated pour of a seed is kept under `--into`, by what was asked
-and the solver that answered, so that the arms of a seed share their calibration and whatever else they both ask for,
-pour for pour the same; finished runs are kept there, too, and an interrupted comparison goes on. `--write` makes no
-runs, and puts the table of those that are there into docs/evidence/results.md.
+The shipped campaign as it is, on a bench of numbers with the ground truth of its own laboratory; only random θ are not
+scored, which the deployment does not depend on. A seed is a process of its own that ends with this one. Every simulated
+pour of a seed is kept under `--into`, by what was asked and the solver that answered, so that the arms of a seed share
+their calibration and whatever else they both ask for, pour for pour the same; finished runs are kept there, too, and an
+interrupted comparison goes on. `--calibration-only` leaves the deployment out, and scores the test pours alone.
+`--random` pours so many random actions of the deployment on the bench, `--plans` so many plans of the uncalibrated
+simulator. `--write` makes no runs, and writes the tables of those that are there into docs/data/results.json, for
+docs/make_tables.py.
 
 The other arms change the program, for this benchmark only: there are no such settings.
 
-Questions, written before it was run: no pour above 10 % after the first below 1 %? Four pours or fewer until it stops,
-in the median? Seeds below 100 are for tuning, those from 101 on for answers.
+Questions, written before it was run on seeds from 301 on; seeds below 300 are for tuning or were used before:
+
+1. Do fewer than 10 % of random actions lose less than 1 %?
+2. Does the action that the uncalibrated simulator plans lose more than 5 % on the bench?
+3. Does calibration halve the mean error on the test pours, on at least 9 of 10 seeds?
+4. No pour above 10 % after the first below 1 %? Four pours or fewer until it stops, in the median?
 """
 
 from __future__ import annotations
@@ -26,26 +33,47 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from machine import ROOT, run_self, say
+import numpy as np
+from machine import ROOT, describe, run_self, say
 from players import interval
 
+from actors.bench.ground_truth import draw_pose_error
 from actors.optimizer.questions import ModelDiscrepancy
 from actors.simulators.job_runner import Simulator, pour_simulator
 from actors.simulators.local_worker import ThreadWorker
 from actors.simulators.pool import WorkerPool
 from orchestrator.journal.codec import digest, from_json, to_json
+from orchestrator.runs.stages import (
+    EVALUATION,
+    StageDefinition,
+    calibrated_theta,
+    calibration_stages,
+    measured_pours,
+)
+from orchestrator.strategies.calibration.action_prior import Contexts
+from orchestrator.strategies.calibration.calibration_scores import CalibrationEvaluation
+from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan
 from orchestrator.strategies.deployment import d3
+from sim_engine.action import Action
+from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourOutcome, SimulatedPour
 from sim_engine.scene import PourTask
 
 GOOD, BAD = 0.01, 0.10
-PAGE = ROOT / "docs" / "evidence" / "results.md"
-BEGIN, END = "<!-- measured: quickstart -->\n", "<!-- end of measured -->"
+DATA = ROOT / "docs" / "data" / "results.json"
+TRUTH = ("liquid", "pose_error", "pose_noise")
+"""Settings of a bench that the simulator does not know."""
+
+PLANNED = 12
+"""Simulated actions of the uncalibrated plan."""
+
 CAMPAIGN = ROOT / "configs" / "campaigns" / "quickstart.yaml"
 
 
@@ -85,52 +113,139 @@ class KeptPours(WorkerPool):
         return SimulatedPour(from_json(self._known[key], PourOutcome))
 
 
-def one(seed: int, arm: str, laboratory: Path, into: Path) -> dict[str, Any]:
-    """One campaign: every pour with what was expected of it, what it recommends, and why it ended."""
-    from decant.running import build_campaign, load_campaign
-    from orchestrator.results.stage_views import deployments_of
-    from orchestrator.run_service import RunResources, RunService, task_request
-    from sim_engine.solver_fingerprint import solver_fingerprint
+def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: bool = False) -> dict[str, Any]:
+    """One campaign: the error of its calibration on the test pours, and every pour with its prediction."""
+    from decant.running import build_campaign
+    from orchestrator.results.stage_views import deployments_of, evaluation_of, theta_of
+    from orchestrator.run_service import RunRequest, RunResources, RunService, task_request
 
     ARMS[arm]()
-    shipped = load_campaign(CAMPAIGN, laboratory)
-    pool = KeptPours(into / f"pours-{solver_fingerprint()}-{seed}.jsonl")
+    pool = kept_pours(seed, into)
     with tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder:
-        content: dict[str, Any] = {
-            **shipped.resolved,
-            "seed": seed,
-            "outputs": {"directory": folder, "recording": False},
-        }
-        content["laboratory"]["bench"]["time_scale"] = 3000  # nobody watches; the numbers are the same
-        content["calibration"]["random_baseline"] = 0
-        campaign = build_campaign(content, folder)
-        handle = RunService().start(task_request(campaign), RunResources(in_process=True, simulators=pool))
-        result = asyncio.run(handle.wait())
+        campaign = build_campaign(on_numbers(seed, laboratory, folder), folder)
+        assert campaign.deployment is not None
+        assert campaign.calibration is not None
+        request = task_request(campaign)
+        if calibration_only:
+            request = RunRequest(replace(campaign, deployment=None), calibration_and_test(campaign.calibration))
+        handle = RunService().start(request, RunResources(in_process=True, simulators=pool))
+        results = asyncio.run(handle.wait()).results
         asyncio.run(pool.close())
-    (found,) = deployments_of(result.results).values()
-    assert campaign.deployment is not None
-    pours = [
-        {
-            "at": [round(u, 4) for u in campaign.deployment.actions.encode(pour.action_si)],
-            "loss": pour.loss,
-            "predicted": pour.predicted,
-            "band": pour.predicted_interval,
-        }
-        for pour in found.pours
-        if pour.status == "weighed" and pour.loss is not None
-    ]
-    known = found.recommended
-    recommended = None if known is None else [round(u, 4) for u in campaign.deployment.actions.encode(known.action_si)]
-    cpu = time.process_time()
-    return {
+    scores, theta = evaluation_of(results), theta_of(results)
+    assert scores is not None
+    assert theta is not None
+    run: dict[str, Any] = {
         "seed": seed,
         "arm": arm,
-        "pours": pours,
-        "recommended": recommended,
-        "ended": found.ended,
-        "cpu_s": round(cpu, 1),
-        "simulated": pool.simulated,
+        "test": {name: scores.discrepancy[name]["test"] for name in ("theta", "uncalibrated")},
+        "theta": {name: theta.theta.model_dump()[name] for name in theta.searched},
     }
+    actions = campaign.deployment.actions
+    for found in deployments_of(results).values():
+        known = found.recommended
+        run |= {
+            "pours": [
+                {
+                    "at": [round(u, 4) for u in actions.encode(pour.action_si)],
+                    "loss": pour.loss,
+                    "predicted": pour.predicted,
+                    "band": pour.predicted_interval,
+                }
+                for pour in found.pours
+                if pour.status == "weighed" and pour.loss is not None
+            ],
+            "recommended": None if known is None else [round(u, 4) for u in actions.encode(known.action_si)],
+            "ended": found.ended,
+        }
+    return {**run, "cpu_s": round(time.process_time(), 1), "simulated": pool.simulated}
+
+
+def calibration_and_test(plan: CalibrationPlan) -> tuple[StageDefinition, ...]:
+    """The calibration's stages, with an evaluation on the test pours alone."""
+    *stages, _ = calibration_stages(plan)
+
+    def evaluation(results: Any, seed: int) -> CalibrationEvaluation:
+        test = [scored for scored in measured_pours(plan, results) if scored.pour.split == "test"]
+        plain = SimulationParameters.from_values(plan.fixed_parameters)
+        theta = calibrated_theta(results).theta
+        return CalibrationEvaluation(theta, {}, test, Contexts.of(plan), seed, uncalibrated=plain)
+
+    return (*stages, StageDefinition(EVALUATION, evaluation))
+
+
+def uncalibrated_plan(seed: int, laboratory: Path, into: Path) -> dict[str, float]:
+    """What the plan of the uncalibrated simulator is expected to lose, and its loss on the bench."""
+    from decant.running import build_campaign
+    from orchestrator.results.stage_views import deployments_of
+    from orchestrator.run_service import RunResources, RunService, task_request
+
+    pool = kept_pours(f"plan-{seed}", into)
+    with tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder:
+        campaign = build_campaign(on_numbers(seed, laboratory, folder), folder)
+        request = task_request(campaign, "plan", iterations=PLANNED, seeds=1)
+        handle = RunService().start(request, RunResources(in_process=True, simulators=pool))
+        (plan,) = deployments_of(asyncio.run(handle.wait()).results).values()
+        assert campaign.deployment is not None
+        assert plan.recommended is not None
+        action = campaign.deployment.scenes[0].action(dict(plan.recommended.action_si))
+        loss = asyncio.run(lost(campaign, action, seed, pool))
+        asyncio.run(pool.close())
+    return {"seed": seed, "expected": plan.recommended.predicted_loss, "loss": loss}
+
+
+def kept_pours(seed: int | str, into: Path) -> KeptPours:
+    """The pool of a seed."""
+    from sim_engine.solver_fingerprint import solver_fingerprint
+
+    return KeptPours(into / f"pours-{solver_fingerprint()}-{seed}.jsonl")
+
+
+def on_numbers(seed: int, laboratory: Path, folder: str) -> dict[str, Any]:
+    """The shipped campaign on a laboratory of numbers, with the ground truth of the campaign's own laboratory."""
+    from decant.running import load_campaign
+
+    truth = load_campaign(CAMPAIGN).resolved["laboratory"]["bench"]
+    content: dict[str, Any] = {
+        **load_campaign(CAMPAIGN, laboratory).resolved,
+        "seed": seed,
+        "outputs": {"directory": folder, "recording": False, "figures": False},
+    }
+    bench = {key: value for key, value in content["laboratory"]["bench"].items() if key not in TRUTH}
+    bench |= {key: truth[key] for key in TRUTH if key in truth}
+    content["laboratory"]["bench"] = bench | {"time_scale": 3000}  # nobody watches; the numbers are the same
+    content["calibration"]["random_baseline"] = 0
+    return content
+
+
+async def lost(campaign: CampaignPlan, action: Action, seed: int, pool: KeptPours) -> float:
+    """The true loss of an action on the bench; 1 if the cups touch."""
+    assert campaign.deployment is not None
+    scene, bench = campaign.deployment.scenes[0], campaign.laboratory.bench
+    assert bench is not None
+    error = draw_pose_error(bench, seed)
+    outcome = (await pool.simulate(PourTask(scene, action, bench.theta, seed, pose_error=error))).outcome
+    loss = campaign.deployment.loss(outcome.fractions, loaded_mass=scene.liquid.mass, particles=bench.theta.particles)
+    return 1.0 if loss is None else loss
+
+
+def random_losses(count: int, laboratory: Path, into: Path) -> list[float]:
+    """True losses of random actions of the deployment on the bench, from a scrambled Sobol sequence."""
+    from scipy.stats import qmc
+
+    from decant.running import build_campaign
+
+    with tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder:
+        campaign = build_campaign(on_numbers(0, laboratory, folder), folder)
+    assert campaign.deployment is not None
+    scene, actions, pool = campaign.deployment.scenes[0], campaign.deployment.actions, kept_pours("random", into)
+
+    async def all_of_them() -> list[float]:
+        places = qmc.Sobol(actions.dimension, scramble=True, rng=np.random.default_rng(0)).random(count)
+        found = [await lost(campaign, scene.action(actions.decode(tuple(u))), k, pool) for k, u in enumerate(places)]
+        await pool.close()
+        return found
+
+    return asyncio.run(all_of_them())
 
 
 def figures(run: dict[str, Any]) -> dict[str, float]:
@@ -163,10 +278,14 @@ def held(pour: dict[str, Any]) -> bool:
 
 def table(runs: list[dict[str, Any]]) -> str:
     """Markdown: a row for every seed, and what was asked."""
-    lines = [
-        "| seed | lost, pour by pour | pours | first below 1 % | worst after it | best | recommended | why it ended |",
-        "|---:|---|---:|---:|---:|---:|---:|---|",
-    ]
+    shown = pours_table(runs)
+    lines = [shown["head"], ["---"] * len(shown["head"]), *shown["rows"]]
+    return "\n".join([*(f"| {' | '.join(cells)} |" for cells in lines), "", summary(runs)])
+
+
+def pours_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Head and rows: a row for every seed."""
+    rows = []
     found = [figures(run) for run in runs]
     for run, one in zip(runs, found, strict=True):
         shown = ", ".join(f"{100 * pour['loss']:.1f}" for pour in run["pours"])
@@ -174,8 +293,9 @@ def table(runs: list[dict[str, Any]]) -> str:
         why = "all pours made" if run["ended"] is None else run["ended"].split(":")[0]
         cells = [str(run["seed"]), f"{shown} %", f"{one['pours']:g}", good]
         cells += ["" if math.isnan(one[key]) else f"{100 * one[key]:.1f} %" for key in ("after", "best", "final")]
-        lines.append(f"| {' | '.join([*cells, why])} |")
-    return "\n".join([*lines, "", summary(runs)])
+        rows.append([*cells, why])
+    head = ["seed", "lost, pour by pour", "pours", "first below 1 %", "worst after it", "best", "recommended"]
+    return {"head": [*head, "why it ended"], "rows": rows}
 
 
 def summary(runs: list[dict[str, Any]]) -> str:
@@ -202,10 +322,39 @@ def summary(runs: list[dict[str, Any]]) -> str:
     )
 
 
-def write(text: str) -> None:
-    """Put the table into the page."""
-    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    PAGE.write_text(f"{before}{BEGIN}{text}\n{END}{rest.split(END, 1)[1]}", encoding="utf-8")
+def calibration_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Head and rows: errors on the test pours, and the parameters found."""
+    rows = []
+    for run in runs:
+        calibrated, plain, theta = run["test"]["theta"], run["test"]["uncalibrated"], run["theta"]
+        rows.append(
+            [
+                str(run["seed"]),
+                f"{100 * plain:.1f}",
+                f"{100 * calibrated:.1f}",
+                "yes" if calibrated <= 0.5 * plain else "no",
+                f"{theta['friction']:.2f}",
+                f"{1e3 * theta['receiver_x']:.1f} mm",
+            ]
+        )
+    head = ["seed", "uncalibrated, error on the test pours [points]", "θ\\*", "halved", "friction found"]
+    return {"head": [*head, "receiver found at"], "rows": rows}
+
+
+def write(name: str, content: dict[str, Any], command: str, settings: str) -> None:
+    """Put a table into the data of the evidence pages."""
+    machine = describe()
+    data = json.loads(DATA.read_text(encoding="utf-8"))
+    where = f"{machine['processor'].split(' (')[0]}, {machine['cores']} shared cores, {machine['system']}"
+    data[name] = {
+        **content,
+        "command": command,
+        "settings": settings,
+        "date": machine["date"].split()[0],
+        "version": version("decant-pouring"),
+        "machine": f"{where}, Python {'.'.join(machine['python'].split('.')[:2])}",
+    }
+    DATA.write_text(json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _end_with_parent() -> None:
@@ -220,45 +369,79 @@ def _end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
+def _run_missing(asked: argparse.Namespace, runs: list[dict[str, Any]], file: Path) -> None:
+    """Make the runs that are not there yet, one process each."""
+    places = [f"--{name}={path.resolve()}" for name, path in vars(asked).items() if isinstance(path, Path)]
+    places += ["--calibration-only"] if asked.calibration_only else []
+    for seed in range(asked.first, asked.first + asked.seeds):
+        for arm in asked.arms:
+            known = [run for run in runs if (run["seed"], run["arm"]) == (seed, arm)]
+            if any("pours" in run or asked.calibration_only for run in known):
+                continue
+            run = run_self(__file__, f"--one={seed}", "--arms", arm, *places)
+            runs[:] = [run, *(other for other in runs if other not in known)]
+            with file.open("a", encoding="utf-8") as kept:
+                kept.write(json.dumps(run) + "\n")
+            test = run["test"]
+            losses = ", ".join(
+                f"{100 * pour['loss']:.2f} % ({100 * pour['band'][0]:.1f} … {100 * pour['band'][1]:.1f})"
+                for pour in run.get("pours", ())
+            )
+            say(
+                f"seed {seed}, {arm}: test {test['theta']:.4f} with θ*, {test['uncalibrated']:.4f} uncalibrated; pours "
+                f"{losses or 'not made'} "
+                f"({run['cpu_s']:.0f} CPU s, {run['simulated']} simulated)"
+            )
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--first", type=int, default=101)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first", type=int, default=301)
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=["shipped"])
+    parser.add_argument("--calibration-only", action="store_true", help="leave the deployment out")
+    parser.add_argument("--random", type=int, default=0, help="number of random actions to pour on the bench")
+    parser.add_argument("--plans", type=int, default=0, help="number of uncalibrated plans to pour on the bench")
     parser.add_argument("--laboratory", type=Path, default=ROOT / "configs" / "laboratories" / "twin.yaml")
     parser.add_argument("--into", type=Path, default=ROOT / "build" / "quickstart")
-    parser.add_argument("--write", action="store_true", help="write the table into docs/evidence/results.md")
+    parser.add_argument("--write", action="store_true", help="write the tables into docs/data/results.json")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # this is a process that makes one seed
     asked = parser.parse_args()
+    asked.into.mkdir(parents=True, exist_ok=True)
     if asked.one is not None:
         _end_with_parent()
-        print(json.dumps(one(asked.one, asked.arms[0], asked.laboratory, asked.into)))
+        only = asked.calibration_only
+        print(json.dumps(one(asked.one, asked.arms[0], asked.laboratory, asked.into, calibration_only=only)))
         return
-    asked.into.mkdir(parents=True, exist_ok=True)
+    if asked.random:
+        losses = random_losses(asked.random, asked.laboratory, asked.into)
+        good, bad = sum(loss < GOOD for loss in losses), sum(loss > BAD for loss in losses)
+        print(f"{good} of {asked.random} random actions lose less than 1 %, {bad} more than 10 %")
+    for seed in range(asked.first, asked.first + asked.plans):
+        plan = uncalibrated_plan(seed, asked.laboratory, asked.into)
+        print(f"seed {seed}: the uncalibrated plan expects {plan['expected']:.3f} and loses {plan['loss']:.3f}")
     file = asked.into / "runs.jsonl"
-    runs = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
+    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+    latest = {(run["seed"], run["arm"]): run for run in map(json.loads, lines)}
+    runs = list(latest.values())
+    if not asked.write:
+        _run_missing(asked, runs, file)
     wanted = range(asked.first, asked.first + asked.seeds)
-    for seed in () if asked.write else wanted:
-        for arm in asked.arms:
-            if any((run["seed"], run["arm"]) == (seed, arm) for run in runs):
-                continue
-            places = [f"--{name}={path.resolve()}" for name, path in vars(asked).items() if isinstance(path, Path)]
-            runs.append(run_self(__file__, f"--one={seed}", "--arms", arm, *places))
-            with file.open("a", encoding="utf-8") as kept:
-                kept.write(json.dumps(runs[-1]) + "\n")
-            losses = ", ".join(
-                f"{100 * pour['loss']:.2f} % ({100 * pour['band'][0]:.1f} … {100 * pour['band'][1]:.1f})"
-                for pour in runs[-1]["pours"]
-            )
-            say(f"seed {seed}, {arm}: {losses} ({runs[-1]['cpu_s']:.0f} CPU s, {runs[-1]['simulated']} simulated)")
     for arm in asked.arms:
-        chosen = [run for run in runs if run["seed"] in wanted and run["arm"] == arm]
-        if chosen:
-            text = table(sorted(chosen, key=lambda run: int(run["seed"])))
-            print(f"{arm}\n\n{text}\n")
-            if asked.write and arm == "shipped":
-                write(text)
+        chosen = sorted(
+            (run for run in runs if run["seed"] in wanted and run["arm"] == arm), key=lambda run: run["seed"]
+        )
+        poured = [run for run in chosen if "pours" in run]
+        if poured:
+            print(f"{arm}\n\n{table(poured)}\n")
+        if asked.write and arm == "shipped":
+            seeds = f"--seeds {asked.seeds} --first {asked.first}"
+            bench = "quickstart.yaml on a simulated bench with the ground truth of virtual.yaml"
+            command = f"python benchmarks/quickstart.py {seeds}"
+            write("quickstart-calibration", calibration_table(chosen), f"{command} --calibration-only", bench)
+            if poured:
+                write("quickstart", pours_table(poured), command, f"{bench}. {summary(poured)}")
 
 
 if __name__ == "__main__":

@@ -13,12 +13,26 @@ if TYPE_CHECKING:
     from actors.interfaces import LaboratoryError
     from decant.catalogue_tables import find_pours, find_runs
     from decant.run_results import Run, open_run, publish
-    from decant.running import build_campaign, calibrate, load_campaign, load_vessel, plan, run, shipped, starting_set
+    from decant.running import (
+        RunningCampaign,
+        build_campaign,
+        calibrate,
+        check,
+        load_campaign,
+        load_vessel,
+        plan,
+        run,
+        shipped,
+        start,
+        starting_set,
+    )
     from decant.simulation import Simulation, simulate
+    from decant.station import Station, StationPour
     from orchestrator.config.action_assignments import AssignmentError
     from orchestrator.config.yaml.yaml_errors import ConfigError
     from orchestrator.results.publishing import Published
     from orchestrator.run_errors import RunError
+    from orchestrator.run_service import CheckReport
     from orchestrator.runs import events
     from orchestrator.runs.events import Event
     from orchestrator.strategies.campaign_plan import CampaignPlan
@@ -30,6 +44,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AssignmentError",
     "CampaignPlan",
+    "CheckReport",
     "ConfigError",
     "DecantError",
     "Event",
@@ -39,11 +54,15 @@ __all__ = [
     "Published",
     "Run",
     "RunError",
+    "RunningCampaign",
     "Simulation",
     "SimulationParameters",
+    "Station",
+    "StationPour",
     "VesselSpec",
     "build_campaign",
     "calibrate",
+    "check",
     "events",
     "find_pours",
     "find_runs",
@@ -55,6 +74,7 @@ __all__ = [
     "run",
     "shipped",
     "simulate",
+    "start",
     "starting_set",
 ]
 
@@ -62,14 +82,16 @@ _HOMES = {
     "decant.catalogue_tables": ("find_pours", "find_runs"),
     "decant.running": (
         *("build_campaign", "load_campaign", "load_vessel", "shipped", "starting_set"),
-        *("calibrate", "plan", "run"),
+        *("calibrate", "check", "plan", "run", "start", "RunningCampaign"),
     ),
     "decant.run_results": ("Run", "open_run", "publish"),
     "decant.simulation": ("Simulation", "simulate"),
+    "decant.station": ("Station", "StationPour"),
     "actors.interfaces": ("LaboratoryError",),
     "orchestrator.config.action_assignments": ("AssignmentError",),
     "orchestrator.config.yaml.yaml_errors": ("ConfigError",),
     "orchestrator.run_errors": ("RunError",),
+    "orchestrator.run_service": ("CheckReport",),
     "orchestrator.runs.events": ("Event",),
     "orchestrator.strategies.campaign_plan": ("CampaignPlan",),
     "orchestrator.results.publishing": ("Published",),

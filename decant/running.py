@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import asyncio
 import csv
+import html
 import json
 import tempfile
+import time
 import warnings
-from collections.abc import Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Coroutine, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
@@ -24,14 +26,18 @@ from orchestrator.config.file_loading import campaign_from, load_campaign, load_
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document
 from orchestrator.live_view.live_server import recorder_of
+from orchestrator.progress.progress_state import ProgressState
 from orchestrator.results.publishing import not_simulated
 from orchestrator.results.stage_views import evaluation_of
 from orchestrator.run_service import (
     PREDICTION_SEEDS,
+    CheckReport,
     GivenTheta,
+    RunHandle,
     RunRequest,
     RunResources,
     RunService,
+    Task,
     read_theta,
     task_request,
 )
@@ -109,6 +115,84 @@ def run(
     return _run(request, resources)
 
 
+def check(campaign: CampaignPlan, task: Task = "run") -> CheckReport:
+    """Check a campaign as `decant validate` does, without running it.
+
+    Args:
+        campaign: what to check.
+        task: 'run', 'calibrate' or 'plan'.
+
+    Returns:
+        Problems, each of which prevents the run, and warnings.
+
+    Raises:
+        ValueError: the campaign has no section for the task.
+    """
+    return RunService().check(task_request(campaign, task))
+
+
+class RunningCampaign:
+    """A campaign that runs in the event loop of a notebook or program. `await` returns its `Run`.
+
+    Attributes:
+        directory: of the run.
+    """
+
+    def __init__(self, campaign: CampaignPlan, handle: RunHandle, progress: ProgressState) -> None:
+        self._campaign, self._handle, self._progress = campaign, handle, progress
+        self.directory = handle.folder
+        self._task = asyncio.ensure_future(self._finished())
+
+    async def _finished(self) -> Run:
+        try:
+            result = await self._handle.wait()
+        finally:
+            self._handle.close()
+        return Run(self._campaign, result, await asyncio.to_thread(self._handle.publish))
+
+    def __await__(self) -> Generator[Any, None, Run]:
+        return self._task.__await__()
+
+    @property
+    def done(self) -> bool:
+        """Whether it has ended."""
+        return self._task.done()
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Expected time until it ends [s]; None if unknown."""
+        return self._progress.forecast.left(time.time())
+
+    def __str__(self) -> str:
+        """Progress in one line."""
+        return self._progress.counts_line() or "starting"
+
+    def pause(self) -> None:
+        """Pause at the next safe point; `run(..., resume=directory)` continues. `await` then raises CancelledError."""
+        self._handle.pause()
+
+    def _repr_html_(self) -> str:
+        """Progress, in notebooks."""
+        return f"<b>{html.escape(self._campaign.name)}</b>: {html.escape(str(self))}"
+
+
+async def start(campaign: CampaignPlan, *, watch: Sequence[Watch] = (), in_process: bool = True) -> RunningCampaign:
+    """Start a campaign in the running event loop and return at once, so that its progress can be shown.
+
+    Args:
+        campaign: what to do.
+        watch: see `run`.
+        in_process: see `run`.
+
+    Raises:
+        ValueError, LaboratoryError, RunError: see `run`.
+    """
+    progress = ProgressState(campaign)
+    request = task_request(campaign)
+    resources = await asyncio.to_thread(_checked, request, (*watch, progress), in_process)
+    return RunningCampaign(campaign, RunService().start(request, resources), progress)
+
+
 def calibrate(
     campaign: CampaignPlan,
     pours: Any,
@@ -175,7 +259,7 @@ def plan(
         campaign: with a deployment: it says which actions may be planned, and what is minimised.
         receiver: another vessel than the campaign's, or its file.
         theta: parameters to plan with; the campaign's unless given. A run that has calibrated, or its `theta.json`,
-            also gives what a campaign with `risk: {theta: posterior}` needs, the draws of the posterior.
+            also gives the draws of the posterior, if the weighed pours justify θ*; the simulations use them in turn.
         iterations: actions that are tried, 1 or more; as the campaign says unless given.
         seeds: number of new seeds, 1 or more, that the recommended action is simulated with.
         watch: see `run`.
@@ -209,9 +293,10 @@ def _given(theta: SimulationParameters | Run | Path | str | None, campaign: Camp
     if found is None or recommended is None:
         raise InvalidArgumentError(f"theta: run {theta.directory} has found no θ*; give one that has calibrated")
     scores = evaluation_of(theta.results)
+    needed = campaign.deployment is not None and campaign.deployment.settings.needs_posterior
     return GivenTheta(
         recommended,
-        posterior_draws(found, POSTERIOR_DRAWS),
+        posterior_draws(found, POSTERIOR_DRAWS) if needed or recommended == found.theta else (),
         None if scores is None else shift_left_over(scores, len(found.searched)),
     )
 

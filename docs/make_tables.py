@@ -25,6 +25,7 @@ from actors import laboratory_settings as laboratory
 from actors.arm.arm_geometry import ArmLimits, RobotCell
 from actors.arm.arm_settings import ARMS, UrArmSettings
 from actors.balance.balance_settings import SerialBalanceSettings
+from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import OperatorSettings
 from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.cli.physics_command import kept_records
@@ -74,6 +75,9 @@ SECTIONS: dict[str, type[Settings]] = {
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
     "data": campaign.DataSettings,
+    "dispense": campaign.DispenseSettings,
+    "dose": campaign.DoseSettings,
+    "dosing": DosingSettings,
     "loss": Loss,
     "objective": Objective,
     "outputs": OutputSettings,
@@ -98,6 +102,7 @@ SECTIONS: dict[str, type[Settings]] = {
     "listen": daemon.ListenSettings,
     "tls": daemon.TlsSettings,
     "live": daemon.LiveSettings,
+    "madsci": daemon.MadsciSettings,
     "recordings": daemon.RecordingsSettings,
     "notify": NotifySettings,
 }
@@ -132,6 +137,9 @@ OF_SECTIONS = {
     "RiskLimitSettings": "[risk limit](#risk-limit)",
     "StopSettings": "[stop](#stop)",
     "DataSettings": "[data](#data)",
+    "DispenseSettings": "[dispense](#dispense)",
+    "DoseSettings": "[dose](#dose)",
+    "DosingSettings": "[dosing](#dosing)",
     "ProfileShape": "[profile](#profile)",
     "Motion": "[motion](#motion-and-actions)",
     "Actions": "[actions](#motion-and-actions)",
@@ -333,6 +341,13 @@ def liquids() -> str:
 SHOWN_SHARES = (20.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0)
 
 
+MEASURED = (
+    *("recorded", "rounding", "recorded-2k", "recorded-run", "bands", "quickstart-calibration", "quickstart"),
+    *("cliffs", "risk", "optimizers"),
+)
+"""Tables of docs/data/results.json that a page shows."""
+
+
 def measured(name: str) -> str:
     """A table of docs/data/results.json, with how it was measured."""
     found = json.loads((FOLDER / "data" / "results.json").read_text(encoding="utf-8"))[name]
@@ -516,10 +531,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "objectives": partial(variants, OBJECTIVES.all, Objective),
     "compared-calibration": partial(variants, _arms(study.CalibrationsSettings), Settings),
     "compared-deployment": partial(variants, _arms(study.DeploymentsSettings), Settings),
-    **{
-        f"result-{name}": partial(measured, name)
-        for name in ("recorded", "recorded-run", "bands", "cliffs", "risk", "optimizers")
-    },
+    **{f"result-{name}": partial(measured, name) for name in MEASURED},
     **{name: partial(dosing, group) for name, group in DOSING.items()},
     "command-line": command_line,
     "output": json_output,

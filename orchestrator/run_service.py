@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
 from actors.laboratory_settings import LaboratorySettings
+from orchestrator.catalogue.source_account import SourceAccount
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import check_journal, has_begun
 from orchestrator.journal.run_record import CampaignResult, read_result
@@ -54,7 +55,7 @@ PREDICTION_SEEDS = 5
 PLANNED = "-plan"
 """Suffix of the name of a campaign that is only planned."""
 
-MOVING = ("approach", "tilt", "hold", "return")
+MOVING = ("approach", "tilt", "hold", "return", "dose")
 """Checkpoints of a pour during which the arm moves."""
 
 BETWEEN_CANCELS = 1.0
@@ -80,6 +81,7 @@ class RunRequest:
         folder: of the run; None: a new one, which is entered in the catalogue.
         resume: continue the run in `folder`; 'if begun': only if a run was begun there.
         as_written: the vessels are those of the campaign's file.
+        problems: finds what prevents these pours; None: the checks of the campaign do.
     """
 
     campaign: CampaignPlan
@@ -87,6 +89,7 @@ class RunRequest:
     folder: Path | None = None
     resume: Literal["no", "yes", "if begun"] = "no"
     as_written: bool = True
+    problems: Callable[[], Sequence[str]] | None = None
 
     @property
     def pours(self) -> bool:
@@ -166,6 +169,8 @@ class RunService:
         """
         from orchestrator.config.campaign_checks import check_campaign
 
+        if request.problems is not None:
+            return CheckReport(tuple(request.problems()), ())
         warned: list[Problem] = []
         found = check_campaign(request.campaign, as_written=request.as_written, warn=warned.append, doing=doing)
         problems = [str(one) for one in found]
@@ -276,6 +281,8 @@ class RunHandle:
         self._subscribers: list[Subscriber] = [*resources.subscribers, self._note]
         if recorder is not None:
             self._subscribers.append(recorder)
+        if request.campaign.dispense is not None:
+            self._subscribers.append(SourceAccount.open().follow(request.campaign.dispense))
         self._pausing = self._aborting = self._abandoning = False
         self._winding_down = asyncio.Event()
         self._result: CampaignResult | None = None
@@ -424,7 +431,8 @@ class GivenTheta:
 
     Attributes:
         theta: the θ itself.
-        draws: of its posterior; empty where none is known, or the campaign's risk bears none.
+        draws: of its posterior, which the simulations use in turn; empty if it has none, or if the file recommends the
+            uncalibrated θ.
         left_over: shift that the calibration left (`sim_engine.prediction_band`); None where it is not known.
     """
 
@@ -438,14 +446,20 @@ def read_theta(path: Path, plan: CampaignPlan) -> GivenTheta:
 
     Args:
         path: of the file.
-        plan: whose θ has what the file does not name; if its risk bears draws of a posterior, the file needs them.
+        plan: whose θ has what the file does not name; if its risk needs draws of a posterior, the file needs them.
 
     Raises:
         ConfigError: anything is wrong with the file.
     """
-    from orchestrator.config.file_loading import load_discrepancy, load_parameters, load_posterior
+    from orchestrator.config.file_loading import (
+        load_discrepancy,
+        load_parameters,
+        load_posterior,
+        predicts_with_posterior,
+    )
 
     needed = plan.deployment is not None and plan.deployment.settings.needs_posterior
+    needed = needed or predicts_with_posterior(path)
     draws = load_posterior(path, POSTERIOR_DRAWS, plan.parameters) if needed else ()
     return GivenTheta(load_parameters(path, plan.parameters), draws, load_discrepancy(path))
 

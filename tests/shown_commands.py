@@ -100,7 +100,7 @@ def write_scratch(folder: Path) -> str:
     _change(folder / "configs/laboratories/planning.yaml", lambda lab: lab.update(in_process=True))
     _change(folder / "configs/campaigns/quickstart.yaml", _small_quickstart)
     _change(folder / "configs/campaigns/recorded.yaml", _small_recorded)
-    for table in (folder / "configs/data/recorded-pours").glob("*.csv"):
+    for table in (folder / "configs/data").glob("*/*.csv"):
         _shorten(table)
     for name in ("quick", "paper"):
         _change(folder / f"configs/studies/{name}.yaml", _small_study)

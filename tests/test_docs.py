@@ -191,8 +191,8 @@ def test_quickstart_is_what_the_tutorial_says() -> None:
     assert calibration is not None
     assert deployment is not None
     page = " ".join(text_of(ROOT / "docs" / "tutorials" / "first-pour.md").split())
-    assert (calibration.pour_count, deployment.pours) == (10, 6)
-    assert "weighs ten pours into a tumbler" in page
+    assert (calibration.pour_count, deployment.pours) == (12, 6)
+    assert "weighs twelve pours into a tumbler" in page
     assert f"with {calibration.simulations} simulations" in page
     assert f"{deployment.settings.simulations_before} simulations first, then at most six pours" in page
 

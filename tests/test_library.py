@@ -222,7 +222,7 @@ def test_an_argument_that_can_not_be_used_is_one_clear_error_and_leaves_no_run(
 
 
 def test_a_refused_table_leaves_no_run_and_names_the_place_of_its_error(tmp_path: Path) -> None:
-    row = {"angular_velocity_deg_s": 20, "max_angle_deg": 110, "poured_g": 198, "retained_g": 2, "split": "train"}
+    row = {"angular_velocity_deg_s": 60, "x_offset_mm": 110, "poured_g": 198, "retained_g": 2, "split": "train"}
     rows = [{**row, "spilled_g": 1.2}, {**row, "spilled_g": "much"}]
     with pytest.raises(decant.ConfigError, match=r"pours\.csv:3:\d+") as refused:
         decant.calibrate(small(tmp_path), rows)

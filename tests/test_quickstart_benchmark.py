@@ -63,3 +63,30 @@ def test_the_table_says_what_was_asked(quickstart: ModuleType) -> None:
     assert "below 1 % in 1 of them, in the median at pour 2" in text
     assert "5 of 5 pours (100 %) lie in their 90 % bands" in text
     assert "3 of 4 pours (75 %)" in quickstart.summary([run_of(0.02, 0.04, 0.03, 0.005, recommended=0)])
+
+
+def test_a_seed_counts_as_halved_by_its_error_on_the_test_pours(quickstart: ModuleType) -> None:
+    theta = {"friction": 0.3, "receiver_x": 0.0132}
+    runs = [
+        {"seed": 201, "test": {"theta": 0.04, "uncalibrated": 0.12}, "theta": theta},
+        {"seed": 202, "test": {"theta": 0.07, "uncalibrated": 0.12}, "theta": theta},
+    ]
+    rows = quickstart.calibration_table(runs)["rows"]
+    assert rows == [
+        ["201", "12.0", "4.0", "yes", "0.30", "13.2 mm"],
+        ["202", "12.0", "7.0", "no", "0.30", "13.2 mm"],
+    ]
+
+
+def test_the_benchmark_s_bench_has_the_ground_truth_of_the_campaign_s_own_laboratory(
+    quickstart: ModuleType, tmp_path: Path
+) -> None:
+    from decant.running import build_campaign, load_campaign
+
+    twin = quickstart.ROOT / "configs" / "laboratories" / "twin.yaml"
+    campaign = build_campaign(quickstart.on_numbers(3, twin, str(tmp_path)), tmp_path)
+    bench, shipped = campaign.laboratory.bench, load_campaign(quickstart.CAMPAIGN).laboratory.bench
+    assert bench is not None
+    assert shipped is not None
+    assert (campaign.laboratory.name, campaign.seed) == ("twin", 3)
+    assert (bench.theta, bench.pose_error, bench.pose_noise) == (shipped.theta, shipped.pose_error, shipped.pose_noise)

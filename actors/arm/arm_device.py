@@ -17,6 +17,9 @@ from actors.runtime.remote_object import Device
 PATIENCE = 60.0
 """Longest wait for a call that moves nothing [s], such as a process start or controller queries."""
 
+DRIVE_PATIENCE = 10.0
+"""Longest wait for a command of a dose [s]; without it the arm turns back by itself long before."""
+
 POWER_TIME = 180.0
 """Longest wait for power and brakes after an emergency stop [s of controller time]."""
 
@@ -74,6 +77,16 @@ class DeviceArm:
             deadline = self._deadline(path.pour_time)
             executed: Executed = await self.device.call("execute", path, deadline=deadline)
             return executed
+
+    async def dose(self, path: PlannedPour, longest: float) -> Executed:
+        """Tilt as `drive` says; see `actors.arm.arm_interface.DosingArm`."""
+        executed: Executed = await self.device.call("dose", path, longest, deadline=self._deadline(longest))
+        return executed
+
+    async def drive(self, speed: float) -> ArmState:
+        """Set the speed of the tilt in a running dose [rad/s]. Returns the state."""
+        state: ArmState = await self.device.call("drive", speed, deadline=DRIVE_PATIENCE, urgent=True)
+        return state
 
     async def retreat(self, path: PlannedPour, follow: Follow = _ignore) -> None:
         """Move home from any upright pose on the way to or from the pour; `follow` as in `move_to_start`."""

@@ -291,6 +291,28 @@ class Arm(Protocol):
         ...
 
 
+class DosingArm(Protocol):
+    """An `Arm` that also pours wanted amounts: its tilt is driven while the liquid flows."""
+
+    def dose(self, path: Any, longest: float) -> Executed:
+        """Tilt as `drive` says, within the tilt of a checked path; ends upright, without commands for 0.2 s.
+
+        An order to stop turns the cup back upright first; a second one stops the arm where it is.
+
+        Args:
+            path: a `PlannedPour`; the arm stands at its start.
+            longest: duration [s of controller time].
+
+        Raises:
+            ArmError: as `Arm.execute`.
+        """
+        ...
+
+    def drive(self, speed: float) -> ArmState:
+        """Set the speed of the tilt [rad/s] in a running dose, ten to twenty times a second. Returns the state."""
+        ...
+
+
 @dataclass(frozen=True)
 class Bar:
     """One link.

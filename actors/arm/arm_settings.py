@@ -15,6 +15,7 @@ import ipaddress
 import math
 import re
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pkgutil import resolve_name
@@ -90,6 +91,10 @@ class ArmDiagnostics:
             checks.append(DeviceCheck("safety checksum", "ok" if accepted else "fail", found, advice))
         return checks
 
+    def recorded(self) -> dict[str, Any]:
+        """The values that were read, JSON-ready, for `ArmSettings.diagnostics_of`; empty if they are not kept."""
+        return {}
+
     def at_home(self) -> DeviceCheck:
         """Whether the arm stands at its home pose."""
         return DeviceCheck("position", "ok", "at home, as far as the driver tells")
@@ -104,6 +109,9 @@ class ArmSettings(Settings):
     tag: ClassVar[str] = "kind"
     default_tag: ClassVar[str] = "ur"
     retired: ClassVar[dict[str, str]] = {"kind: numbers": "kind: simulated"}
+
+    doses: ClassVar[bool] = False
+    """Whether the driver pours wanted amounts, see `actors.arm.arm_interface.DosingArm`."""
 
     emulator: ClassVar[str] = ""
     """'module:callable' that makes, from these settings, the emulator of the arm on a virtual bench. See
@@ -206,6 +214,14 @@ class ArmSettings(Settings):
             arm.close()
         return ArmDiagnostics(facts.checksum, facts.serial, facts.model, facts.version, facts.problem)
 
+    def diagnostics_of(self, recorded: Mapping[str, Any]) -> ArmDiagnostics:
+        """The diagnostics of values that were recorded before (`ArmDiagnostics.recorded`); nothing is connected.
+
+        Raises:
+            ValueError: the values cannot be read.
+        """
+        raise ValueError("this kind of arm has no recorded readouts")
+
     def readiness(self) -> DeviceCheck | None:
         """Read whether a motion could begin now, for a display while no run uses the arm.
 
@@ -240,6 +256,7 @@ class UrArmSettings(ArmSettings):
         "untilt_speed": "upright_speed",
         "announcement": "warning_time",
     }
+    doses: ClassVar[bool] = True
     emulator: ClassVar[str] = "actors.emulators.ur_controller.arm_emulator:UrEmulator"
 
     kind: Literal["ur"] = "ur"
@@ -392,6 +409,11 @@ class UrArmSettings(ArmSettings):
     def diagnostics(self) -> ArmDiagnostics:
         """See `ArmSettings.diagnostics`."""
         found: ArmDiagnostics = resolve_name("actors.arm.ur.commissioning:UrDiagnostics").at(self)
+        return found
+
+    def diagnostics_of(self, recorded: Mapping[str, Any]) -> ArmDiagnostics:
+        """See `ArmSettings.diagnostics_of`."""
+        found: ArmDiagnostics = resolve_name("actors.arm.ur.commissioning:UrDiagnostics").of_record(self, recorded)
         return found
 
     def readiness(self) -> DeviceCheck | None:

@@ -90,6 +90,14 @@ class PourPath:
         """Duration [s]."""
         return self.retreat.duration
 
+    @property
+    def tilt_part(self) -> tuple[FloatArray, FloatArray]:
+        """Increasing tilts of the first phase, (T,) [rad], and the joints at them, (T, 6) [rad]."""
+        during = self.pour.times <= self.phases[0][2] + 1e-9
+        tilts, joints = self.tilts[during], self.pour.joints[during]
+        rising = np.concatenate([[True], tilts[1:] > np.maximum.accumulate(tilts)[:-1] + 1e-5])
+        return tilts[rising], joints[rising]
+
     def slowed(self, factor: float) -> PourPath:
         """The same path with all its times divided by a factor in (0, 1]."""
         if factor == 1.0:
@@ -126,6 +134,9 @@ class ExecutedPath:
         tracking: errors in following the path: 'rms_angle', 'max_angle' [rad] of the joints, 'rms_tool', 'max_tool'
             [m], the 'lag' [s] that was removed from them, and the 'longest_gap' between two readings [s].
         poses: of the pourer in the world, (T, 7); empty if the cell is unknown, as after `unpack`.
+        forces: rows of time [s], external force and torque at the TCP (6) [N], [N m], and of the wrist's sensor (6)
+            likewise, in its own frame, shifted by an unknown constant with each motion. NaN if the robot does not
+            report them.
     """
 
     times: FloatArray
@@ -133,6 +144,7 @@ class ExecutedPath:
     completed: bool
     tracking: dict[str, float] = field(default_factory=dict)
     poses: FloatArray = field(default_factory=lambda: np.zeros((0, 7)))
+    forces: FloatArray = field(default_factory=lambda: np.zeros((0, 13)))
 
     def record(self) -> dict[str, Any]:
         """See `actors.arm.arm_interface.Executed`."""
@@ -153,7 +165,15 @@ def pack(executed: ExecutedPath) -> dict[str, Any]:
         "completed": executed.completed,
         "tracking": dict(executed.tracking),
         "packed": base64.b85encode(zlib.compress(data, 9)).decode("ascii"),
+        **_forces(executed.forces),
     }
+
+
+def _forces(forces: FloatArray) -> dict[str, Any]:
+    """Forces in hundredths, each kind only if it was reported."""
+    kinds = {"external_force": forces[:, 1:7], "wrist_force": forces[:, 7:]}
+    known = {name: np.round(rows, 2).tolist() for name, rows in kinds.items() if np.isfinite(rows).any()}
+    return {"forces": {"times": np.round(forces[:, 0], 2).tolist(), **known}} if known else {}
 
 
 def unpack(data: dict[str, Any]) -> ExecutedPath:

@@ -98,6 +98,12 @@ class EmulatedScale:
         self._offset = float(self._rng.normal(0.0, self.settings.noise))
         self._resting = 0.0
 
+    def change(self, mass: float) -> None:
+        """Change the mass on the tray [kg] while liquid flows: the same load goes on, with the same error."""
+        if mass != self.truth:
+            self._load, self._loaded_at = Load((0.0,), (mass,)), self.time
+            self._resting = 0.0
+
     def advance(self, seconds: float) -> None:
         """Let bench time pass [s]."""
         end = self.time + seconds

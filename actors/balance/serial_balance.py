@@ -247,6 +247,11 @@ LOSSES = 3
 """Number of lost connections allowed during one weighing."""
 
 
+OFF_TIME = 3.0
+"""Silence after which a balance may have been switched off, although its port stayed open [s of the clock]: a serial
+server or a USB adapter does not notice that. Longer than a busy balance or a stalled computer needs."""
+
+
 class SerialBalance:
     """Driver of a serial balance; see the module docstring.
 
@@ -265,6 +270,7 @@ class SerialBalance:
         self._display = BalanceDisplay(spec.step)
         self._tared = self._reference_lost = False
         self._losses = self._strange_units = 0
+        self._silent_since: float | None = None
 
     @property
     def found(self) -> Detected | None:
@@ -463,7 +469,7 @@ class SerialBalance:
             with self._exclusive():
                 self._conversation.open()
                 reading, moment = self._conversation.ask()
-                self._display.note(reading, moment)
+                self._note(reading, moment)
                 return reading, moment
         except NoConnectionError as error:
             self._wait_for_return(error)
@@ -478,7 +484,16 @@ class SerialBalance:
         except NoConnectionError:
             self._note_loss()
         else:
-            self._display.note(reading, moment)
+            self._note(reading, moment)
+
+    def _note(self, reading: Reading, moment: float) -> None:
+        if reading.status is not ReadingStatus.SILENT:
+            self._silent_since = None
+        elif self._silent_since is None:
+            self._silent_since = moment - self._spec.answer_time
+        elif moment - self._silent_since >= OFF_TIME:
+            self._reference_lost = self._reference_lost or self._tared
+        self._display.note(reading, moment)
 
     def _note_loss(self) -> None:
         self._reference_lost = self._reference_lost or self._tared

@@ -21,10 +21,12 @@ from actors.balance.balance_settings import BalanceSettings
 from actors.balance.weighing_plan import PourMasses
 from actors.bench.bench_operators import BenchContents, Hands, OperatorQuestions, PlayedOperator, VirtualOperator
 from actors.bench.consent import Setup
+from actors.bench.dose_procedure import DoseProcedure
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.pour_procedure import PourProcedure
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.virtual_bench import BenchEmulators, DeviceEmulators, FollowedBench, VirtualBench
+from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import (
     DoseTarget,
     InvalidActionError,
@@ -40,16 +42,20 @@ from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 
+FASTEST_DOSE = 2.0
+"""Largest time scale of a dose, whose commands and readings follow each other in tenths of a second."""
+
 
 class PouringBench:
     """The `Bench` interface for every kind of bench. The arm moves only after all checks, weighings and confirmations.
 
     Args:
         setup: arm, balance, operator and ground truth of the bench.
+        dosing: how wanted amounts are poured.
     """
 
-    def __init__(self, setup: Setup) -> None:
-        self._setup, self._arm_spec = setup, setup.spec
+    def __init__(self, setup: Setup, dosing: DosingSettings) -> None:
+        self._setup, self._arm_spec, self._dosing = setup, setup.spec, dosing
         self.arm, self.balance, self.ground_truth = setup.arm, setup.balance, setup.ground_truth
         self._known: dict[str, dict[str, PourMasses]] = {}
         self._one_at_a_time = asyncio.Lock()
@@ -76,18 +82,15 @@ class PouringBench:
             UnknownPourError: the pour began, but did not run as planned.
         """
         async with self._one_at_a_time:
-            if dose is not None:
-                if not isinstance(self.ground_truth, SimulatedBench):
-                    raise InvalidActionError(
-                        "wanted amounts are poured on simulated benches only, such as configs/laboratories/twin.yaml; "
-                        "remove the amount, or choose such a laboratory"
-                    )
+            if dose is not None and isinstance(self.ground_truth, SimulatedBench):
                 from actors.dosing.simulated_dose import simulated_dose
 
-                return await asyncio.to_thread(simulated_dose, scene, dose, seed)
+                return await asyncio.to_thread(simulated_dose, scene, dose, seed, self._dosing)
             with contextlib.suppress(LaboratoryError):  # the procedure reports why the arm is not ready
                 self._arm_spec = self._arm_spec.fitted_to(await self.arm.ready())
             path = await asyncio.to_thread(self._checked, scene, action)
+            if dose is not None:
+                return await self._dose(scene, dose, path, seed, progress)
             pour = PourProcedure(
                 self._setup, scene, action, path, seed=seed, known=self._known.get(scene.pourer.name), progress=progress
             )
@@ -95,6 +98,16 @@ class PouringBench:
                 return await pour.run()
             finally:
                 self._known[scene.pourer.name] = pour.lasting
+
+    async def _dose(
+        self, scene: Scene, dose: DoseTarget, path: PlannedPour, seed: int, progress: ProgressCallback | None
+    ) -> PourMeasurement:
+        if not self._arm_spec.doses:
+            raise InvalidActionError(f"an arm of the kind '{self._arm_spec.kind}' can't pour wanted amounts")
+        if self._arm_spec.time_scale > FASTEST_DOSE:
+            raise InvalidActionError("wanted amounts are poured in real time; write 'bench: {time_scale: 1}'")
+        procedure = DoseProcedure(self._setup, scene, dose, path, seed=seed, settings=self._dosing, progress=progress)
+        return await procedure.run()
 
     def _checked(self, scene: Scene, action: Action) -> PlannedPour:
         try:
@@ -179,7 +192,7 @@ async def open_bench(
         if spec.arm is None:
             assert spec.bench is not None
             assert liquid is not None
-            return _open_simulated(spec.bench, opening, liquid)
+            return _open_simulated(spec.bench, spec.dosing, opening, liquid)
         if spec.balance is None:
             raise LaboratoryError(f"laboratory {spec.name}: an arm that pours needs a balance; add a 'balance' to it")
         if operator is None and spec.needs_person:
@@ -194,7 +207,7 @@ async def open_bench(
         raise
 
 
-def _open_simulated(spec: BenchSettings, opening: _Opening, liquid: SimulatorPool) -> OpenBench:
+def _open_simulated(spec: BenchSettings, dosing: DosingSettings, opening: _Opening, liquid: SimulatorPool) -> OpenBench:
     arm_spec, balance_spec = SimulatedArmSettings(time_scale=spec.time_scale), simulated_balance(spec)
     arm = opening.arm(arm_spec)
     balance = opening.balance(balance_spec, "virtual")
@@ -203,7 +216,7 @@ def _open_simulated(spec: BenchSettings, opening: _Opening, liquid: SimulatorPoo
     setup = Setup(
         "virtual", arm_spec, balance_spec, spec.operator_time, arm, balance, operator, ground_truth, _discard_notice
     )
-    return OpenBench(PouringBench(setup), opening.devices, operator=operator)
+    return OpenBench(PouringBench(setup, dosing), opening.devices, operator=operator)
 
 
 def _discard_notice(notice: Notice) -> None:
@@ -244,4 +257,4 @@ async def _open_devices(
     assert operator is not None
     questions = OperatorQuestions(operator, spec.operator, tell, arm_spec.time_scale)
     setup = Setup(spec.mode, arm_spec, balance_spec, spec.operator.time, arm, balance, questions, ground_truth, tell)
-    return OpenBench(PouringBench(setup), opening.devices, emulators, operator)
+    return OpenBench(PouringBench(setup, spec.dosing), opening.devices, emulators, operator)

@@ -176,6 +176,12 @@ class BenchContents:
                 self.in_pourer, self.on_balance = fill, under | {"pourer"}
             case "receiver_empty":
                 self.in_receiver, self.on_balance = 0.0, under | {"receiver"}
+            case "dose_source":
+                self.in_pourer, self.on_balance = fill, under
+            case "dose_cleared":
+                self.on_balance = under
+            case "dose_receiver":
+                self.in_receiver, self.on_balance = 0.0, under | {"receiver"}
             case "set_up":
                 self.in_receiver, self.on_tray = 0.0, 0.0
                 self.on_balance = {"tray"} if alone else under | {"receiver"}
@@ -214,6 +220,8 @@ SHARES = {
     "cleared_after": 1.0,
     "receiver_gone": 1.0,
     "tray_after": 1.0,
+    "dose_source": 4.0,
+    "dose_receiver": 1.0,
 }
 """Relative time of each step within one pour; an answer without a step takes `GLANCE`."""
 

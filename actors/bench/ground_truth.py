@@ -12,12 +12,12 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from actors.arm.arm_interface import Executed, PlannedPour
-from actors.interfaces import InvalidActionError, LaboratoryError, SimulatorPool
+from actors.interfaces import DoseTarget, InvalidActionError, LaboratoryError, SimulatorPool
 from actors.laboratory_settings import BenchSettings
 from sim_engine.action import Action
 from sim_engine.outcome import PourOutcome, RecordedFrames, SimulatedPour
@@ -216,6 +216,20 @@ class GroundTruth:
         Raises:
             LaboratoryError: the masses are unknown.
         """
+
+    async def prepare_dose(self, scene: Scene, dose: DoseTarget, seed: int) -> None:
+        """Called before the operator prepares a dose.
+
+        Raises:
+            InvalidActionError: a virtual bench has no such cup.
+        """
+
+    async def flows(self) -> None:
+        """Called when the arm is about to tilt for a dose: from now on the liquid follows its motion."""
+
+    async def flowed(self) -> dict[str, Any]:
+        """Called after a dose, also after an aborted one. Returns the true amount of a virtual bench."""
+        return {}
 
     async def lasting(self, doing: Awaitable[T], seconds: float) -> T:
         """Await an operation of the arm that takes `seconds` of bench time."""

@@ -31,6 +31,7 @@ from actors.balance.weighing_plan import PourMasses
 from actors.bench.consent import STUCK, Consent, Setup, grams, start_question
 from actors.bench.ground_truth import PourAsk
 from actors.interfaces import (
+    DoseProgress,
     InvalidActionError,
     LaboratoryError,
     Notice,
@@ -64,6 +65,7 @@ class PourReport:
         self._stable: bool | None = None
         self._joints: tuple[float, ...] = ()
         self._pourer: tuple[float, ...] = ()
+        self._dose: DoseProgress | None = None
 
     def enter(self, checkpoint: str, done: float = 0.0) -> None:
         """Report that a checkpoint is reached, or that the fraction `done` (0 … 1) of it is."""
@@ -93,6 +95,17 @@ class PourReport:
         self._checkpoint = phase if phase in self._parts else self._checkpoint
         self._fraction = max(self._fraction, (start + fraction * self._motion_time) / sum(self._parts.values()))
         self._publish()
+
+    def dose(self, tilt: float, joints: tuple[float, ...], dose: DoseProgress) -> None:
+        """Report the progress of a dose.
+
+        Args:
+            tilt: of the pourer [rad].
+            joints: of the arm [rad].
+            dose: amounts and flow.
+        """
+        self._tilt, self._dose, self._joints = tilt, dose, joints or self._joints
+        self.enter("dose", min(max(dose.amount / dose.target, 0.0), 1.0))
 
     def stand(self, joints: tuple[float, ...], pourer: tuple[float, ...]) -> None:
         """Report the arm's joints and the pourer's pose, as far as available; see `PourProgress`."""
@@ -124,6 +137,7 @@ class PourReport:
                 self._joints,
                 self._pourer,
                 liquid,
+                self._dose,
             )
             with contextlib.suppress(Exception):
                 self._progress(state)

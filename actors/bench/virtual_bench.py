@@ -26,12 +26,15 @@ from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceEmulator, BalanceSettings
 from actors.balance.scale_model import Load
 from actors.bench.bench_operators import Hands
+from actors.bench.flowing_liquid import FlowEnd, FlowingLiquid, FlowOrder
 from actors.bench.ground_truth import GroundTruth, PourAsk, draw_pose_error, hidden_pour, spill_of, stream
-from actors.interfaces import LaboratoryError, SimulatorPool
+from actors.dosing.dose_series import source_of
+from actors.dosing.simulated_dose import true_cup
+from actors.interfaces import DoseTarget, LaboratoryError, SimulatorPool
 from actors.laboratory_settings import BenchSettings
 from actors.runtime.remote_object import Device
 from sim_engine.liquids import SimulationParameters
-from sim_engine.scene import PoseError, PourTask, SampledMotion
+from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
 
 FloatArray = NDArray[np.float64]
 
@@ -140,6 +143,7 @@ class BenchEmulators:
         self._arm = emulator_of(arm)
         self._weighs = balance
         self._balance: BalanceEmulator | None = None
+        self._flow: FlowingLiquid | None = None
         try:
             self._balance = None if balance is None or balance.typed else balance.start_emulator()
         except BaseException:
@@ -176,6 +180,27 @@ class BenchEmulators:
         """See `ArmEmulator.fault`."""
         return self._arm_emulator.fault(name, arguments)
 
+    def flow(self, order: FlowOrder) -> None:
+        """Let liquid follow the arm from now on; the load on the balance follows it.
+
+        Raises:
+            LaboratoryError: arm and balance have no emulators that can do this.
+        """
+        self.flowed()
+        arm = None if self._arm is None else self._arm.true_arm
+        if not isinstance(arm, UrArmSettings) or self._balance is None:
+            raise LaboratoryError("the virtual bench pours wanted amounts with an emulated UR arm and balance only")
+        self._flow = FlowingLiquid(order, arm, self.history, self._load)
+
+    def flowed(self) -> FlowEnd | None:
+        """End the flow. Returns what flowed; None if nothing did."""
+        flow, self._flow = self._flow, None
+        return None if flow is None else flow.end()
+
+    def _load(self, mass: float) -> None:
+        if self._balance is not None:
+            self._balance.order("load", {"mass": mass})
+
     @property
     def _arm_emulator(self) -> ArmEmulator:
         if self._arm is None:
@@ -190,6 +215,7 @@ class BenchEmulators:
 
     def close(self) -> None:
         """End both emulators. May be called again."""
+        self.flowed()
         if self._arm is not None:
             self._arm.close()
         if self._balance is not None:
@@ -242,6 +268,15 @@ class DeviceEmulators:
         """Send a command to the balance emulator."""
         answer: dict[str, Any] = await self.device.call("order", what, values, deadline=DEADLINE, urgent=True)
         return answer
+
+    async def flow(self, order: FlowOrder) -> None:
+        """Let liquid follow the arm."""
+        await self.device.call("flow", order, deadline=DEADLINE)
+
+    async def flowed(self) -> FlowEnd:
+        """End the flow. Returns what flowed."""
+        end: FlowEnd = await self.device.call("flowed", deadline=DEADLINE)
+        return end
 
     async def close(self) -> None:
         """End both emulators."""
@@ -401,6 +436,8 @@ class FollowedBench(VirtualBench):
         self._joints: list[tuple[float, ...]] = []
         self._since = self._earlier = 0.0
         self._gap = ""
+        self._flow: FlowOrder | None = None
+        self._flowing = False
 
     @contextlib.asynccontextmanager
     async def followed(self) -> AsyncIterator[None]:
@@ -419,6 +456,36 @@ class FollowedBench(VirtualBench):
             await asyncio.sleep(NOTING_INTERVAL / self._arm.time_scale)
             with contextlib.suppress(LaboratoryError):  # the history is read once more at the end
                 await self.note()
+
+    async def prepare_dose(self, scene: Scene, dose: DoseTarget, seed: int) -> None:
+        """See `GroundTruth.prepare_dose`."""
+        source = source_of(scene, dose)
+        cup, rng = true_cup(scene), np.random.default_rng((seed, 51))
+        held = source.mass + source.deviation * float(rng.standard_normal())
+        if source.fill or self.contents.in_pourer <= 0.0:
+            self.contents.in_pourer = min(max(held, 1e-3), 0.99 * cup.capacity * scene.liquid.density)
+        wetness = 0.0 if source.knowledge is None else 0.2 if source.fill else 0.7
+        self._flow = FlowOrder(cup, scene.liquid, source.constants, seed, wetness, 0.0)
+        self._hands.prepare(self.contents.in_pourer, stream(seed, "arm"))
+        await self.emulators.prepare(stream(seed, "balance"))
+        await self.emulators.put(self.contents.carried)
+
+    async def flows(self) -> None:
+        """See `GroundTruth.flows`."""
+        assert self._flow is not None
+        liquid = self._flow.liquid.model_copy(update={"mass": self.contents.in_pourer})
+        order = replace(self._flow, liquid=liquid, base=self.contents.carried)
+        await self.emulators.flow(order)
+        self._flowing = True
+
+    async def flowed(self) -> dict[str, Any]:
+        """See `GroundTruth.flowed`."""
+        if not self._flowing:
+            return {}
+        self._flowing = False
+        end = await self.emulators.flowed()
+        self.contents.receive(end.spilled, end.left)
+        return {"true": end.received, "upright": end.upright}
 
     async def note(self) -> None:
         """Read the arm's motion since the last call.

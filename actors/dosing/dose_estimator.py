@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.dosing.cup_flow import CupFlow
+from actors.interfaces import DoseKnowledge
 
 Floats = NDArray[np.float64]
 
@@ -111,6 +112,51 @@ class DoseBelief:
             np.asarray(lag[0], dtype=float),
             np.asarray(lag[1], dtype=float),
             np.maximum(volume[0] + volume[1] * draws[2], 0.0),
+        )
+
+    @classmethod
+    def known(
+        cls,
+        knowledge: DoseKnowledge,
+        volume: tuple[float, float],
+        lag: tuple[Floats, Floats],
+        rng: np.random.Generator,
+    ) -> DoseBelief:
+        """A belief from what earlier doses have shown; onset and flow keep their correlation.
+
+        Args:
+            knowledge: of the earlier doses; if it has a lag, that one counts.
+            volume, lag, rng: see `prior`.
+        """
+        count = len(lag[0])
+        lag_mean, shape_mean = np.asarray(lag[0], dtype=float), np.asarray(lag[1], dtype=float)
+        if knowledge.lag is not None:
+            middle, deviation, shape, spread = knowledge.lag
+            lag_mean = np.clip(np.exp(middle + deviation * _even_normal(count, rng)), *LAG_RANGE)
+            shape_mean = np.clip(shape + spread * _even_normal(count, rng), *SHAPE_RANGE)
+        root = np.linalg.cholesky(np.reshape(knowledge.covariance, (2, 2)) + 1e-12 * np.eye(2))
+        draws = root @ np.stack([_even_normal(count, rng) for _ in range(2)])
+        return cls(
+            knowledge.onset_flow[0] + draws[0],
+            np.clip(np.exp(knowledge.onset_flow[1] + draws[1]), *FACTOR_RANGE),
+            lag_mean,
+            shape_mean,
+            np.maximum(volume[0] + volume[1] * _even_normal(count, rng), 0.0),
+            knowledge.aim,
+            knowledge.doses,
+        )
+
+    def knowledge(self) -> DoseKnowledge:
+        """The moments of the belief, for `known`."""
+        pair = np.stack([self.onset_bias, np.log(self.flow_factor)])
+        log_lag = np.log(self.lag)
+        values = (log_lag.mean(), log_lag.std(), self.lag_shape.mean(), self.lag_shape.std())
+        return DoseKnowledge(
+            tuple(map(float, pair.mean(axis=1))),
+            tuple(map(float, np.cov(pair).ravel())),
+            tuple(map(float, values)),
+            self.aim,
+            self.doses,
         )
 
     def refilled(self, volume: tuple[float, float], rng: np.random.Generator) -> DoseBelief:

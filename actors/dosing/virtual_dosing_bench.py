@@ -239,6 +239,8 @@ class VirtualDosingBench:
         receiver_mass: of an empty receiver [kg].
         command_interval: time between two calls of the controller [s].
         fall_height: from the lip to the bottom of the receiver [m].
+        dose_seed: of all that differs between doses; None: of the whole series, as `seed`.
+        wetness: of the lip at first, 0 … 1.
     """
 
     def __init__(
@@ -251,6 +253,8 @@ class VirtualDosingBench:
         receiver_mass: float = 0.18,
         command_interval: float = 0.05,
         fall_height: float = 0.15,
+        dose_seed: int | None = None,
+        wetness: float = 0.0,
     ) -> None:
         self.cup, self.liquid, self.scale = cup, liquid, scale
         self.receiver_mass, self.fall_height = receiver_mass, fall_height
@@ -264,10 +268,28 @@ class VirtualDosingBench:
         self._grip = math.radians(float(rng.normal(0.0, 0.4)))
         self._dry_hold = 1e-3 * wets * float(rng.uniform(0.8, 2.0))
         self._wet_hold = 1e-3 * wets * float(rng.uniform(0.1, 0.5))
-        self._discharge = float(rng.normal(0.60, 0.04))
-        self._wetness = 0.0
+        self.discharge = float(rng.normal(0.60, 0.04))
+        self._wetness = wetness
         self._servo_lag = float(rng.uniform(0.03, 0.06))
         self._network = float(rng.uniform(0.008, 0.025))
+        if dose_seed is not None:
+            self._rng = np.random.default_rng((seed, 78, dose_seed))
+
+    def head(self, tilt: float, slosh: float) -> float:
+        """Level above the lip at a tilt [rad] with slosh [m], less what the lip holds back [m]."""
+        hold = self._dry_hold + (self._wet_hold - self._dry_hold) * self._wetness
+        return self._level(tilt - self._grip, self.volume) + slosh - hold
+
+    def ideal_flow(self, tilt: float, head: float) -> float:
+        """Flow without losses at a tilt [rad] and a positive head [m] [m³/s]."""
+        return self._flow_table(tilt, math.sqrt(head))
+
+    def wet(self, flows: bool) -> None:
+        """The lip gets wet in a step in which liquid flows; otherwise it dries slowly."""
+        if flows:
+            self._wetness += (1.0 - self._wetness) * TIME_STEP / 0.25
+        else:
+            self._wetness -= 0.6 * self._wetness * TIME_STEP / 40.0
 
     @property
     def content(self) -> float:
@@ -297,36 +319,28 @@ class VirtualDosingBench:
 
     def dose(self, doser: Doser, fault: DosingFault | None = None) -> DoseRecord:
         """Run one dose into the empty receiver on the balance."""
-        rng, scale, liquid, cup = self._rng, self.scale, self.liquid, self.cup
-        dt, density = TIME_STEP, liquid.density
+        rng, scale = self._rng, self.scale
+        dt = TIME_STEP
         missing = fault is not None and fault.kind == "receiver missing"
         base = 0.0 if missing else self.receiver_mass
         cell, shown = _Filter(scale, base), _Display(scale, rng)
-        thick, nu, tension = liquid.is_thick, liquid.kinematic_viscosity, liquid.surface_tension
-        spouted = cup.spout_length > 0.0
-        critical, clinging = (1.0, 0.25) if spouted else (3.0, 0.08)
-        film_share, film_time = (0.07, 0.7) if thick else (0.03, 0.25)
-        omega = math.sqrt(1.841 * GRAVITY / cup.radius)
         drops = int(rng.integers(0, 4))
-        landing = [0.0] * 120
-        fluctuation, slosh, slosh_speed, film, late = 0.0, 0.0, 0.0, 0.0, 0.0
         tilt = target = speed = ordered = 0.0
         fresh, pending = 0.0, deque[tuple[float, float]]()
-        received = spilled = 0.0
-        first_flow = last_flow = math.inf
         pending_readings: deque[DoseReading] = deque()
         next_call, next_reading = 0.0, float(rng.uniform(0.0, scale.interval))
         finished_at, upright = math.inf, 0.0
         signals: list[tuple[float, float, float, float]] = []
         delivered: list[DoseReading] = []
         normals = rng.standard_normal(int(LONGEST_DOSE / dt) * 2 + 20).tolist()
+        pour = LivePour(self, drops, normals)
         limit, acceleration = math.radians(90.0), math.radians(600.0)
-        k, time, outflow = 0, 0.0, 0.0
+        k, time = 0, 0.0
         while time < LONGEST_DOSE and time < finished_at + 2.5:
             # ---- controller and arm
-            silent = fault is not None and fault.kind in ("stall", "killed") and time > first_flow + fault.at
+            silent = fault is not None and fault.kind in ("stall", "killed") and time > pour.first_flow + fault.at
             if silent and fault is not None and fault.kind == "stall":
-                silent = time < first_flow + fault.at + 0.7
+                silent = time < pour.first_flow + fault.at + 0.7
             if time >= next_call - 1e-9 and finished_at == math.inf and not silent:
                 next_call = time + self._interval
                 arrived = []
@@ -341,7 +355,7 @@ class VirtualDosingBench:
                 _, ordered = pending.popleft()
                 fresh = time
             lost = time - fresh > WATCHDOG
-            if lost and fault is not None and fault.kind == "killed" and tilt < 1e-4 and first_flow < math.inf:
+            if lost and fault is not None and fault.kind == "killed" and tilt < 1e-4 and pour.first_flow < math.inf:
                 finished_at = min(finished_at, time)
             wanted = -math.radians(60.0) if lost or finished_at < math.inf else min(max(ordered, -limit), limit)
             before = speed
@@ -352,66 +366,11 @@ class VirtualDosingBench:
             tilt += (target - tilt) * dt / self._servo_lag
             if tilt > 0.01:
                 upright = time
-            # ---- cup
-            slosh_speed -= dt * (
-                omega**2 * slosh
-                + 0.08 * omega * slosh_speed
-                + 0.5 * omega**2 * cup.radius * 0.08 * (speed - before) / dt / GRAVITY
-            )
-            slosh += dt * slosh_speed
-            hold = self._dry_hold + (self._wet_hold - self._dry_hold) * self._wetness
-            head = self._level(tilt - self._grip, self.volume) + slosh - hold
-            fluctuation += -fluctuation * dt / 0.3 + 0.04 * math.sqrt(2.0 * dt / 0.3) * normals[2 * k]
-            outflow = 0.0
-            if head > 0.0 and self.volume > 0.0:
-                ideal = self._flow_table(tilt, math.sqrt(head))
-                wide = 2.0 * math.sqrt(2.0 * cup.radius * head)
-                if spouted:
-                    wide = cup.spout_width * math.sqrt(min(head / cup.spout_length, 1.0))
-                wide = max(wide, 1e-4)
-                outflow = (self._discharge + 0.06 * math.tanh(head / 4e-3)) * ideal
-                viscous = 0.8 * wide * GRAVITY * head**3 / (3.0 * nu)
-                outflow = outflow * viscous / (outflow**1.5 + viscous**1.5) ** (1.0 / 1.5)
-                outflow = min(outflow * (1.0 + fluctuation), self.volume / dt)
-                thickness = max(0.6 * head, 1e-5)
-                weber = density * (outflow / (wide * thickness)) ** 2 * thickness / tension
-                clings = clinging * min(max((1.5 * critical - weber) / critical, 0.0), 1.0)
-                self._wetness += (1.0 - self._wetness) * dt / 0.25
-                first_flow = min(first_flow, time)
-            else:
-                clings = 0.0
-                self._wetness -= 0.6 * self._wetness * dt / 40.0
-            self.volume -= outflow * dt
-            mass = density * outflow * dt
-            clinging_mass = clings * mass
-            late += 0.5 * clinging_mass - late * dt / 0.8
-            spilled += 0.5 * clinging_mass
-            film += film_share * mass
-            drained = film * dt / film_time
-            film -= drained
-            leaves = (1.0 - film_share) * mass - clinging_mass + drained + late * dt / 0.8
-            if mass == 0.0 and first_flow < math.inf and time > first_flow + 1.0 and drops and normals[2 * k + 1] > 2.9:
-                drops -= 1
-                drop = min(5e-5, self.volume * density)
-                self.volume -= drop / density
-                leaves += drop
-            if mass > 0.0:
-                last_flow = time
-            # ---- stream
-            height = self.fall_height - received / (density * math.pi * 0.035**2)
-            fall = (math.sqrt(0.01 + 2.0 * GRAVITY * height) - 0.1) / GRAVITY
-            place = k + int(fall / dt) + (k % 3)
-            landing[place % 120] += leaves
-            lands = landing[k % 120]
-            landing[k % 120] = 0.0
-            if fault is not None and fault.kind == "miss" and time > first_flow + fault.at:
-                spilled, lands = spilled + lands, 0.0
-            received += lands
-            impact = lands / dt * math.sqrt(0.01 + 2.0 * GRAVITY * height) / GRAVITY * (1.0 + 0.1 * normals[2 * k + 1])
+            missed = fault is not None and fault.kind == "miss" and time > pour.first_flow + fault.at
+            load = base + pour.step(tilt, speed - before, missed=missed)
             # ---- balance
-            load = base + received + impact
             if fault is not None:
-                after = time - first_flow - fault.at
+                after = time - pour.first_flow - fault.at
                 if fault.kind == "knock" and 0.0 <= after < 0.2:
                     load += 5e-3
                 if fault.kind == "unstable":
@@ -419,19 +378,18 @@ class VirtualDosingBench:
             value = cell.step(load)
             if time >= next_reading:
                 next_reading += scale.interval + 0.005 * normals[2 * k + 1] * scale.interval / 0.1
-                if not (fault is not None and fault.kind == "line cut" and time > first_flow + fault.at):
+                if not (fault is not None and fault.kind == "line cut" and time > pour.first_flow + fault.at):
                     pending_readings.append(shown.reading(time + scale.delay, value))
             if k % 4 == 0:
-                signals.append((time, tilt, received, leaves / dt))
+                signals.append((time, tilt, pour.received, pour.flow))
             k += 1
             time = k * dt
-        received += late * 0.5 + sum(landing)
         columns = np.array(signals).T
         return DoseRecord(
-            received,
-            spilled,
+            pour.at_rest(),
+            pour.spilled,
             min(finished_at, LONGEST_DOSE),
-            0.0 if last_flow == math.inf else last_flow,
+            0.0 if pour.last_flow == math.inf else pour.last_flow,
             upright,
             columns[0],
             columns[1],
@@ -439,6 +397,116 @@ class VirtualDosingBench:
             columns[3],
             tuple(delivered),
         )
+
+    def pour(self) -> LivePour:
+        """Liquid that follows a tilt from elsewhere, such as that of an emulated arm."""
+        drops = int(self._rng.integers(0, 4))
+        return LivePour(self, drops, self._rng.standard_normal(int(LONGEST_DOSE / TIME_STEP) * 2 + 20).tolist())
+
+
+class LivePour:
+    """Liquid that leaves the cup of a bench and lands, in steps of `TIME_STEP`.
+
+    Args:
+        bench: its cup and liquid, whose volume and wetness change.
+        drops: number of late drops.
+        normals: standard normal numbers, two for each step.
+
+    Attributes:
+        received, spilled: in the receiver and next to it [kg].
+        flow: past the lip [kg/s].
+        first_flow, last_flow: times of the first and the last outflow [s]; infinity before.
+    """
+
+    def __init__(self, bench: VirtualDosingBench, drops: int, normals: Sequence[float]) -> None:
+        self._bench, self._drops, self._normals = bench, drops, normals
+        self._landing = [0.0] * 120
+        self._fluctuation = self._slosh = self._slosh_speed = self._film = self._late = 0.0
+        self._k = 0
+        self.received = self.spilled = self.flow = 0.0
+        self.first_flow = self.last_flow = math.inf
+
+    def step(self, tilt: float, turned: float, *, missed: bool = False) -> float:
+        """Pour for one step.
+
+        Args:
+            tilt: of the cup [rad].
+            turned: change of the tilt's speed in this step [rad/s].
+            missed: the stream misses the receiver.
+
+        Returns:
+            Load on the balance, without the receiver [kg].
+        """
+        bench, k, dt = self._bench, self._k, TIME_STEP
+        time, cup, liquid = k * dt, bench.cup, bench.liquid
+        noise, kick = self._normals[2 * k % len(self._normals)], self._normals[(2 * k + 1) % len(self._normals)]
+        density, nu, tension = liquid.density, liquid.kinematic_viscosity, liquid.surface_tension
+        spouted = cup.spout_length > 0.0
+        critical, clinging = (1.0, 0.25) if spouted else (3.0, 0.08)
+        film_share, film_time = (0.07, 0.7) if liquid.is_thick else (0.03, 0.25)
+        omega = math.sqrt(1.841 * GRAVITY / cup.radius)
+        # ---- cup
+        self._slosh_speed -= dt * (
+            omega**2 * self._slosh
+            + 0.08 * omega * self._slosh_speed
+            + 0.5 * omega**2 * cup.radius * 0.08 * turned / dt / GRAVITY
+        )
+        self._slosh += dt * self._slosh_speed
+        head = bench.head(tilt, self._slosh)
+        self._fluctuation += -self._fluctuation * dt / 0.3 + 0.04 * math.sqrt(2.0 * dt / 0.3) * noise
+        outflow = 0.0
+        if head > 0.0 and bench.volume > 0.0:
+            ideal = bench.ideal_flow(tilt, head)
+            wide = 2.0 * math.sqrt(2.0 * cup.radius * head)
+            if spouted:
+                wide = cup.spout_width * math.sqrt(min(head / cup.spout_length, 1.0))
+            wide = max(wide, 1e-4)
+            outflow = (bench.discharge + 0.06 * math.tanh(head / 4e-3)) * ideal
+            viscous = 0.8 * wide * GRAVITY * head**3 / (3.0 * nu)
+            outflow = outflow * viscous / (outflow**1.5 + viscous**1.5) ** (1.0 / 1.5)
+            outflow = min(outflow * (1.0 + self._fluctuation), bench.volume / dt)
+            thickness = max(0.6 * head, 1e-5)
+            weber = density * (outflow / (wide * thickness)) ** 2 * thickness / tension
+            clings = clinging * min(max((1.5 * critical - weber) / critical, 0.0), 1.0)
+            bench.wet(True)
+            self.first_flow = min(self.first_flow, time)
+        else:
+            clings = 0.0
+            bench.wet(False)
+        bench.volume -= outflow * dt
+        mass = density * outflow * dt
+        clinging_mass = clings * mass
+        self._late += 0.5 * clinging_mass - self._late * dt / 0.8
+        self.spilled += 0.5 * clinging_mass
+        self._film += film_share * mass
+        drained = self._film * dt / film_time
+        self._film -= drained
+        leaves = (1.0 - film_share) * mass - clinging_mass + drained + self._late * dt / 0.8
+        if mass == 0.0 and self.first_flow < math.inf and time > self.first_flow + 1.0 and self._drops and kick > 2.9:
+            self._drops -= 1
+            drop = min(5e-5, bench.volume * density)
+            bench.volume -= drop / density
+            leaves += drop
+        if mass > 0.0:
+            self.last_flow = time
+        # ---- stream
+        height = bench.fall_height - self.received / (density * math.pi * 0.035**2)
+        fall = (math.sqrt(0.01 + 2.0 * GRAVITY * height) - 0.1) / GRAVITY
+        place = k + int(fall / dt) + (k % 3)
+        self._landing[place % 120] += leaves
+        lands = self._landing[k % 120]
+        self._landing[k % 120] = 0.0
+        if missed:
+            self.spilled, lands = self.spilled + lands, 0.0
+        self.received += lands
+        impact = lands / dt * math.sqrt(0.01 + 2.0 * GRAVITY * height) / GRAVITY * (1.0 + 0.1 * kick)
+        self.flow = leaves / dt
+        self._k += 1
+        return self.received + impact
+
+    def at_rest(self) -> float:
+        """Mass in the receiver when everything has landed [kg]."""
+        return self.received + self._late * 0.5 + sum(self._landing)
 
 
 class _Display:

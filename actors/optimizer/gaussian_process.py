@@ -446,7 +446,7 @@ def _scale(residuals: Array, costs: Array) -> float:
 ENDS = 64
 """Number of lower ends that are tried, evenly spaced in the probability below them."""
 
-HALVINGS = 50
+HALVINGS = 30
 
 
 def highest_density_intervals(weights: Array, means: Array, deviations: Array, level: float) -> Array:

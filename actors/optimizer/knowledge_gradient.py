@@ -75,7 +75,7 @@ from scipy.special import ndtr
 from actors.optimizer import acquisition
 from actors.optimizer.feasible_region import Feasibility, Region
 from actors.optimizer.gaussian_process import GaussianProcess
-from actors.optimizer.model_discrepancy import ModelAveragedProcess, clipped_moments, shortfall
+from actors.optimizer.model_discrepancy import ModelAveragedProcess, clipped_mean, shortfall
 from actors.optimizer.questions import BenchOffset, DiscrepancyFound, ModelDiscrepancy, PourQuery, SimulationQuery
 from actors.optimizer.surrogate_models import QueryArrays, tuples
 
@@ -215,7 +215,7 @@ def looked_ahead(
     if left == 0:
         return pour
     means, deviations, noises = process.components(candidates)
-    costs = clipped_moments(means, deviations)[0]
+    costs = clipped_mean(means, deviations)
     between = process.mixture @ means**2 - (process.mixture @ means) ** 2
     disputed = np.sqrt(np.maximum(between, 0.0)) / (process.mixture @ noises)
     heavy = np.argsort(-process.mixture, kind="stable")[:HEAVIEST]
@@ -248,7 +248,7 @@ def predicted_minimum(process: ModelAveragedProcess, places: Array, targets: Arr
         slope = covariances[:, i] / spreads[:, i, None] ** 2
         left = np.sqrt(np.maximum(deviations**2 - slope * covariances[:, i], 1e-10))
         moved = means + slope * (SHOWN[:, None] - at[:, i])[:, :, None]  # (shown, components, targets)
-        costs = clipped_moments(moved, np.broadcast_to(left, moved.shape))[0]
+        costs = clipped_mean(moved, np.broadcast_to(left, moved.shape))
         found.append(float(np.einsum("kc,c,kcm->km", chances, process.mixture, costs).min(axis=1).sum()))
     return np.array(found)
 
@@ -289,7 +289,7 @@ def least_loss(
     def score(points: Array) -> Array:
         means, deviations, _ = process.components(points)
         saved = shortfall(best, means, deviations) - shortfall(0.0, means, deviations)
-        return allowed(process.mixture @ (clipped_moments(means, deviations)[0] - left * saved), points)
+        return allowed(process.mixture @ (clipped_mean(means, deviations) - left * saved), points)
 
     return score
 

@@ -5,19 +5,24 @@ from the simulator's best action x̂, with a scaled cost, plus a discrepancy δ 
 
     f(x) = μ_j(x) + δ(x),    μ_j(x) = clip(e^{g_j} f̂_s(z_j(x)), 0, 1),    δ ~ GP(0, v_j(x) v_j(x′) M_{ℓ_j}(x, x′))
     z_j(x) = x̂ + e^{h_j} (A_j x + s_j − x̂),    v_j² = σ_j² + e^{2 g_j} s_s²(z_j(x))
-    y = f(x) + ε,    ε ~ N(0, (n_j + 0.15 μ_j(x))²)
+    y = f(x) + ε,    ε ~ N(0, (n_j + m_j μ_j(x))²)
 
 f̂_s and s_s are posterior mean and deviation of a GP of the simulations, with costs in units of the largest one. h
 makes the valley wider or narrower than simulated, as deviating walls and lips do. Each hypothesis has a factor on the
-deviations of these errors: by some the simulator is nearly right, by others it is far off. n, the scatter of pours of
-one action, belongs to the hypothesis, too: a few pours close together determine it.
+deviations of these errors: by some the simulator is nearly right, by others it is far off. n and m, the scatter of
+pours of one action and its growth with the cost, belong to the hypothesis, too: a few pours close together determine them.
 
-Two further groups of hypotheses, of equal prior weight, do not rely on the simulator. In the contrary group it predicts
+Two further groups of hypotheses do not rely on the simulator. In the contrary group it predicts
 the opposite, μ_j = clip(e^{g_j} (1 − f̂_s(z_j(x))), 0, 1). In the uninformative group it contains no information about
 this bench, and f is a GP around 0.6, more towards corners.
 
 The posterior weights are prior times marginal likelihood of the observations. No hypothesis is removed: the weight of a
-failing one decreases. The weight of the two further groups measures how unreliable the simulator is.
+failing one decreases. The weight of the two further groups measures how unreliable the simulator is. An observation
+counts with a finite resolution, and one of nearly everything lost only as such: otherwise a hypothesis that is certain of
+a total loss would gain from each failed pour over one that is less certain.
+
+The prior draws are coarse: with steep walls, a few pours leave a handful of 2,048. The ones that are used for predictions
+are therefore moved by Markov chains that keep the posterior.
 
 **A bench that changes.** Once an observation lies outside its 99 % prediction interval, the hypotheses are weighed
 together with the start of the present segment: the observations before it were made on another bench, and say nothing
@@ -25,17 +30,19 @@ of this one. Two Cholesky factors of every hypothesis, in both orders, give the 
 and ends. Alternatively the latest observation is an outlier.
 
 Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001;
-changes, Adams & MacKay, Bayesian online changepoint detection, 2007, and binary segmentation, Scott & Knott 1974.
-Limitations: the set of hypotheses is fixed; predictions use at most 32 draws of them, and the uninformative group.
+changes, Adams & MacKay, Bayesian online changepoint detection, 2007, and binary segmentation, Scott & Knott 1974;
+moves after resampling, Gilks & Berzuini 2001.
+Limitations: the weights of the groups, and of the starts of a segment, come from the prior draws; predictions use 48
+moved draws, and the uninformative group.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.spatial.distance import cdist
 from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
@@ -44,10 +51,11 @@ from actors.optimizer.gaussian_process import GaussianProcess, highest_density_i
 from actors.optimizer.questions import ModelDiscrepancy
 
 Array = NDArray[np.float64]
+Remake = Callable[[Array], "Hypotheses"]
 
 HYPOTHESES = 2048
-KEPT = 32
-"""Number of draws from the posterior weights for predictions, evenly by weight: at most as many hypotheses."""
+KEPT = 48
+"""Number of draws from the posterior weights for predictions, evenly by weight."""
 GAIN = 0.3
 """Standard deviation of g."""
 WIDTH = 0.25
@@ -61,27 +69,40 @@ The far ones are tails for a bench that deviates far."""
 NEAR_SHARE = 0.3
 """Fraction of the hypotheses by which the simulator is nearly right. A first pour can thus rely on it; where it is
 wrong, that pour refutes them."""
-NOISES, NOISE_GROWTH = (0.002, 0.05), 0.15
-"""Smallest and largest standard deviation of one observation at zero cost, log-uniform; and its increase at the largest
-cost."""
+NOISES, NOISE_GROWTHS = (0.002, 0.05), (0.02, 0.2)
+"""Smallest and largest standard deviation of one observation at zero cost, and its increase at the largest cost;
+log-uniform."""
 UNINFORMATIVE_MEAN, UNINFORMATIVE_SIGNAL = 0.6, 0.4
 UNINFORMATIVE_EDGE = 0.3
 """Difference of the uninformative group's expected cost between corners and middle: search boxes are drawn around good
 actions."""
 UNINFORMATIVE_LENGTHS = np.repeat((0.15, 0.3, 0.6), 3)
 UNINFORMATIVE_NOISES = np.tile((0.003, 0.01, 0.03), 3)
-"""ℓ and n of the components of the uninformative group. With a fixed scatter, pours that hardly scatter would count
+UNINFORMATIVE_GROWTHS = np.tile((0.03, 0.06, 0.15), 3)
+"""ℓ, n and m of the components of the uninformative group. With a fixed scatter, pours that hardly scatter would count
 against it."""
-CONTRARY, CONTRARY_REST = 128, 0.15
-"""Number of contrary hypotheses, which hold half of the prior weight of both groups; and their smallest σ. If they were
-certain of a total loss where the simulation has none, any failed pour would count for them."""
+CONTRARY, CONTRARY_SHARE, CONTRARY_REST = 128, 0.2, 0.15
+"""Number of contrary hypotheses, their fraction of the prior weight of both groups, and their smallest σ. A total loss
+where the simulation has none is evidence for them, but a displaced valley explains it, too."""
 SURPRISE = 0.99
 """Probability of the prediction intervals; an observation outside makes a change of the bench possible."""
-CHANGE, MISHAP, NOTICED = 0.02, 0.005, 0.9
-"""Prior probabilities of a change before each observation, and that the latest one is an outlier with any cost;
-posterior probability of a change from which it is reported, with two observations since then at least."""
+CHANGE, MISHAP, NOTICED = 0.02, 0.001, 0.9
+"""Prior probabilities of a change before each observation, and that the latest one is an outlier; posterior probability
+of a change from which it is reported, with two observations since then at least."""
+ALL_BY_MISHAP = 0.5
+"""Probability that everything is lost by an outlier; otherwise any cost is equally likely."""
+NEAR_CHANGED = 0.1
+"""Factor on the prior weight of the hypotheses by which the simulator is nearly right, after a change of the bench."""
+TOTAL, RESOLUTION, LEAST_CHANCE = 0.95, 0.01, 1e-12
+"""Cost above which everything is lost, whatever the exact cost: it says nothing about the place of the valley. Other
+costs count with this resolution, so that no hypothesis gains by being more certain than it needs to be. And the least
+probability of an observation by any hypothesis."""
 FORGOTTEN = 1e3
 """Noise of an observation that does not count."""
+STEPS = (0.5, 0.25, 0.12) * 4
+"""Sizes of the steps of the Markov chains, relative to the prior's standard deviation."""
+RECENT = 4
+"""Number of sets of points whose projections are kept."""
 KNOWN_SHARE = 0.75
 """Fraction of the hypotheses around earlier bench offsets, if there are any."""
 KNOWN_SPREAD = 0.25
@@ -99,6 +120,8 @@ class Hypotheses:
         rests: (J,), σ.
         lengths: (J,), ℓ.
         noises: (J,), n.
+        growths: (J,), m.
+        near: (J,), whether by the hypothesis the simulator is nearly right.
         contrary: (J,), whether the hypothesis reverses the simulator.
         centre: (dimension,), the simulated best.
     """
@@ -110,18 +133,19 @@ class Hypotheses:
     rests: Array
     lengths: Array
     noises: Array
+    growths: Array
+    near: NDArray[np.bool_]
     contrary: NDArray[np.bool_]
     centre: Array
 
     @classmethod
-    def of(cls, discrepancy: ModelDiscrepancy, centre: Array) -> Hypotheses:
-        """Draw the hypotheses, the same for the same question: quasi-random, for even coverage by few draws."""
+    def of(cls, discrepancy: ModelDiscrepancy, centre: Array, latent: Array, contrary: NDArray[np.bool_]) -> Hypotheses:
+        """Return the hypotheses of latent variables (J, `latent_size`), a priori standard normal."""
         dimension = len(discrepancy.offset_priors)
-        rows = qmc.Sobol(2 * dimension + 7, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES)
-        rows = np.clip(np.concatenate([rows, rows[:CONTRARY]]), 1e-6, 1.0 - 1e-6)
-        z = ndtri(rows[:, : 2 * dimension])
-        width, gain, rest, length, far, known, noise = rows[:, 2 * dimension :].T
-        near, contrary = far < NEAR_SHARE, np.arange(len(rows)) >= HYPOTHESES
+        z, rows = latent[:, : 2 * dimension], ndtr(latent[:, 2 * dimension :])
+        width, gain = latent[:, 2 * dimension : 2 * dimension + 2].T
+        rest, length, far, known, noise, growth = rows[:, 2:].T
+        near = far < NEAR_SHARE
         beyond = (far - NEAR_SHARE) / (1.0 - NEAR_SHARE)
         spread = np.where(near, _evenly(NEAR, far / NEAR_SHARE), _evenly(FARTHER, beyond))
         less = np.minimum(spread, 1.0)
@@ -141,18 +165,20 @@ class Hypotheses:
         return cls(
             factors * scales,
             factors * shifts + moved,
-            less * WIDTH * ndtri(width),
-            less * GAIN * ndtri(gain),
+            less * WIDTH * width,
+            less * GAIN * gain,
             np.where(contrary, _evenly((CONTRARY_REST, RESTS[1]), rest), _evenly(RESTS, rest)),
             _evenly(LENGTHS, length),
             _evenly(NOISES, noise),
+            _evenly(NOISE_GROWTHS, growth),
+            near & ~contrary,
             contrary,
             centre,
         )
 
     def only(self, kept: NDArray[np.int_]) -> Hypotheses:
         """Return a subset."""
-        names = "scales", "shifts", "widths", "gains", "rests", "lengths", "noises", "contrary"
+        names = "scales", "shifts", "widths", "gains", "rests", "lengths", "noises", "growths", "near", "contrary"
         return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
     def moved(self, points: Array) -> Array:
@@ -211,24 +237,39 @@ class ModelAveragedProcess:
         """
         self.simulated, self.points, self.worst = simulated, points, discrepancy.worst
         self._costs = np.clip(costs / discrepancy.worst, 0.0, 1.0)
-        self._all = Hypotheses.of(discrepancy, _least(simulated))
-        half, J = 0.5 * discrepancy.uninformative, len(self._all.gains)
-        prior = np.where(self._all.contrary, half / CONTRARY, (1.0 - discrepancy.uninformative) / HYPOTHESES)
-        ignorant = np.full(len(UNINFORMATIVE_LENGTHS), half / len(UNINFORMATIVE_LENGTHS))
-        segments = self._segments(np.log(np.concatenate([prior, ignorant])))
+        dimension, centre = len(discrepancy.offset_priors), _least(simulated)
+        size, J, distrust = latent_size(dimension), HYPOTHESES + CONTRARY, discrepancy.uninformative
+        rows = np.clip(qmc.Sobol(size, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES), 1e-6, 1 - 1e-6)
+        latent = ndtri(np.concatenate([rows, rows[:CONTRARY]]))  # the same for the same question, and even
+        contrary = np.arange(J) >= HYPOTHESES
+        self._all = Hypotheses.of(discrepancy, centre, latent, contrary)
+        numbers = HYPOTHESES, CONTRARY, len(UNINFORMATIVE_LENGTHS)
+        shares = 1.0 - distrust, CONTRARY_SHARE * distrust, (1.0 - CONTRARY_SHARE) * distrust
+        segments = self._segments(np.log(np.repeat(np.divide(shares, numbers), numbers)))  # prior weights
         self.since, weights = segments.since, segments.weights
         informed, uninformative = weights[:, :J], weights[:, J:]
         self._trusting = np.where(self._all.contrary, 0.0, informed.sum(axis=0))
         self.uninformative = float(informed[:, self._all.contrary].sum() + uninformative.sum())
-        drawn, times = np.unique(_evenly_drawn(informed.ravel(), KEPT), return_counts=True)
-        self._kept = self._all.only(drawn % J)
-        self.mixture = np.concatenate([times / KEPT * informed.sum(), uninformative.sum(axis=0)])
+        drawn = _evenly_drawn(informed.ravel(), KEPT)
+        counting = segments.counting[drawn // J]
+        drawn = drawn % J
+        self._kept = self._all.only(drawn)
+        if len(points):
+
+            def make(moved: Array) -> Hypotheses:
+                return Hypotheses.of(discrepancy, centre, moved, contrary[drawn])
+
+            self._kept = self._resampled(latent[drawn], self._kept, counting, make)
+        self.mixture = np.concatenate([np.full(KEPT, informed.sum() / KEPT), uninformative.sum(axis=0)])
         self._lengths = np.concatenate([self._kept.lengths, UNINFORMATIVE_LENGTHS])
         self._least_noises = np.concatenate([self._kept.noises, UNINFORMATIVE_NOISES])
+        self._growths = np.concatenate([self._kept.growths, UNINFORMATIVE_GROWTHS])
         at_data = self._prior(points, self._costs)
-        counting = segments.counting[np.concatenate([drawn // J, uninformative.argmax(axis=0)])]
+        counting = np.concatenate([counting, segments.counting[uninformative.argmax(axis=0)]])
         self._at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
-        self._factors = self._factorised(self._at_data, self._lengths, points)
+        self._inverses = np.linalg.inv(self._factorised(self._at_data, self._lengths, points))
+        self._residuals = np.einsum("jik,jk->ji", self._inverses, self._costs - self._at_data.means)
+        self._recent: dict[bytes, tuple[_Prior, Array]] = {}
 
     # -- prior moments ---------------------------------------------------------------------------------------------
 
@@ -242,21 +283,53 @@ class ModelAveragedProcess:
         gain = np.exp(hypotheses.gains)[:, None] / self.worst
         means = np.clip(gain * np.where(hypotheses.contrary[:, None], self.worst - mean, mean), 0.0, 1.0)
         spreads = np.hypot(hypotheses.rests[:, None], gain * deviation)
-        return _Prior(means, spreads, hypotheses.noises[:, None] + NOISE_GROWTH * means)
+        return _Prior(means, spreads, hypotheses.noises[:, None] + hypotheses.growths[:, None] * means)
 
     def _uninformative(self, points: Array, seen: Array | float) -> _Prior:
         shape = len(UNINFORMATIVE_LENGTHS), len(points)
         edge = ((2.0 * points - 1.0) ** 2).mean(axis=1)
         means = np.broadcast_to(UNINFORMATIVE_MEAN + UNINFORMATIVE_EDGE * np.clip(edge, 0.0, 1.0), shape)
-        noises = UNINFORMATIVE_NOISES[:, None] + NOISE_GROWTH * np.broadcast_to(
-            seen, shape
-        )  # from observed costs, if any
+        # from observed costs, if any
+        noises = UNINFORMATIVE_NOISES[:, None] + UNINFORMATIVE_GROWTHS[:, None] * np.broadcast_to(seen, shape)
         return _Prior(means, np.full(shape, UNINFORMATIVE_SIGNAL), noises)
 
     def _prior(self, points: Array, seen: Array | float = UNINFORMATIVE_MEAN) -> _Prior:
         return _joined(self._informed(self._kept, points), self._uninformative(points, seen))
 
     # -- posterior weights -----------------------------------------------------------------------------------------
+
+    def _resampled(self, latent: Array, kept: Hypotheses, counting: NDArray[np.bool_], make: Remake) -> Hypotheses:
+        """Move drawn hypotheses (k) by Markov chains that keep the posterior: the drawn ones are few, and coarse.
+
+        Args:
+            latent: (k, D), their latent variables.
+            kept: the hypotheses.
+            counting: (k, n), the observations that count for each.
+            make: returns hypotheses of latent variables.
+
+        Source: preconditioned Crank–Nicolson, Cotter et al., Statistical Science 2013; moves after resampling, Gilks &
+        Berzuini 2001.
+        """
+        rng = np.random.default_rng(1)
+        likelihood = self._likelihood(kept, counting)
+        for step in STEPS:
+            proposed = np.sqrt(1.0 - step**2) * latent + step * rng.standard_normal(latent.shape)
+            candidates = make(proposed)
+            theirs = self._likelihood(candidates, counting)
+            accepted = np.log(rng.random(len(latent))) < theirs - likelihood
+            latent = np.where(accepted[:, None], proposed, latent)
+            likelihood = np.where(accepted, theirs, likelihood)
+        return make(latent)
+
+    def _likelihood(self, hypotheses: Hypotheses, counting: NDArray[np.bool_]) -> Array:
+        """Log-likelihoods (k,) of the observations that count for each hypothesis, (k, n), and the weights after a
+        change.
+        """
+        at_data = self._informed(hypotheses, self.points)
+        at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
+        chances = self._sequential(at_data, hypotheses.lengths, np.arange(len(self.points)))[0]
+        unlikely = np.where(hypotheses.near & ~counting[:, 0], np.log(NEAR_CHANGED), 0.0)
+        return np.asarray(np.where(counting, chances, 0.0).sum(axis=1) + unlikely)
 
     def _segments(self, prior: Array) -> _Segments:
         """Weigh the starts of the present segment together with the hypotheses, of log prior weights (J,).
@@ -277,8 +350,13 @@ class ModelAveragedProcess:
         """Weights of the starts of a segment among the observations from `begin`, with at most one change there."""
         n, m = len(self.points), len(self.points) - begin
         order = np.arange(begin, n)
-        densities, residuals = self._sequential(at_data, lengths, order)
-        before = prior[:, None] + np.concatenate([np.zeros((len(prior), 1)), np.cumsum(densities, axis=1)], axis=1)
+        chances, residuals = self._sequential(at_data, lengths, order)
+        changed = prior + np.log(
+            np.append(np.where(self._all.near, NEAR_CHANGED, 1.0), np.ones(len(UNINFORMATIVE_LENGTHS)))
+        )
+        changed -= _log_sum(changed)
+        first = changed if begin else prior
+        before = first[:, None] + np.concatenate([np.zeros((len(prior), 1)), np.cumsum(chances, axis=1)], axis=1)
         so_far = np.exp(before[:, :-1] - before[:, :-1].max(axis=0, initial=-np.inf))
         below = (so_far * ndtr(residuals)).sum(axis=0) / so_far.sum(axis=0)  # of each observation, given those before
         surprising = np.abs(below - 0.5) > 0.5 * SURPRISE
@@ -287,10 +365,12 @@ class ModelAveragedProcess:
             after = np.cumsum(self._sequential(at_data, lengths, order[::-1])[0], axis=1)[:, ::-1]
             for start in range(1, m):
                 counting.append(np.arange(n) >= begin + start)
-                logs.append(prior + after[:, start] + _log_sum(before[:, start]) + np.log(CHANGE))
+                logs.append(changed + after[:, start] + _log_sum(before[:, start]) + np.log(CHANGE))
             if surprising[-1]:
                 counting.append(counting[0] & (np.arange(n) < n - 1))
-                logs.append(before[:, m - 1] + np.log(MISHAP))
+                logs.append(
+                    before[:, m - 1] + np.log(MISHAP * (ALL_BY_MISHAP if self._costs[-1] > TOTAL else RESOLUTION))
+                )
         weights = np.exp(np.array(logs) - np.max(logs))
         weights /= weights.sum()
         starts = weights[1:m].sum(axis=1)
@@ -299,15 +379,21 @@ class ModelAveragedProcess:
         return _Segments(np.array(counting), weights, bool(surprising.any()), since)
 
     def _sequential(self, prior: _Prior, lengths: Array, order: NDArray[np.int_]) -> tuple[Array, Array]:
-        """Log densities (J, n) of observations given those before them in an order, and standardised residuals."""
+        """Log probabilities (J, n) of observations given those before them in an order, and standardised residuals."""
         if not len(order):
             return np.empty((len(lengths), 0)), np.empty((len(lengths), 0))
         prior = _Prior(*(getattr(prior, name)[:, order] for name in ("means", "spreads", "noises")))
         L = self._factorised(prior, lengths, self.points[order])
-        residuals = np.linalg.solve(L, (self._costs[order] - prior.means)[:, :, None])[:, :, 0]
+        costs = self._costs[order]
+        residuals = np.linalg.solve(L, (costs - prior.means)[:, :, None])[:, :, 0]
         deviations = np.diagonal(L, axis1=1, axis2=2)
-        densities = -0.5 * residuals**2 - np.log(deviations * np.sqrt(2.0 * np.pi))
-        return np.asarray(densities), np.asarray(residuals)
+        high = np.where(costs > TOTAL, np.inf, residuals + 0.5 * RESOLUTION / deviations)
+        low = np.where(
+            costs > TOTAL, residuals - (costs - TOTAL) / deviations, residuals - 0.5 * RESOLUTION / deviations
+        )
+        low = np.where(costs < 0.5 * RESOLUTION, -np.inf, low)
+        chances = np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))
+        return np.log(np.maximum(chances, LEAST_CHANCE)), np.asarray(residuals)
 
     # -- posterior moments -----------------------------------------------------------------------------------------
 
@@ -322,42 +408,40 @@ class ModelAveragedProcess:
 
     def components(self, points: Array) -> tuple[Array, Array, Array]:
         """Posterior means, deviations and noises (components, m) at points (m, dimension), in units of the worst."""
-        prior = self._prior(points)
-        if not len(self.points):
-            return prior.means, prior.spreads, prior.noises
-        cross = self._cross(prior, points)
-        means, variances = np.empty_like(prior.means), np.empty_like(prior.means)
-        for j, L in enumerate(self._factors):
-            V = solve_triangular(L, cross[j].T, lower=True, check_finite=False)
-            residuals = solve_triangular(L, self._costs - self._at_data.means[j], lower=True, check_finite=False)
-            means[j] = prior.means[j] + V.T @ residuals
-            variances[j] = prior.spreads[j] ** 2 - np.einsum("ij,ij->j", V, V)
+        prior, V = self._projected(points)
+        means = prior.means + np.einsum("jim,ji->jm", V, self._residuals)
+        variances = prior.spreads**2 - np.einsum("jim,jim->jm", V, V)
         return means, np.sqrt(np.maximum(variances, 1e-10)), self._noises(means)
 
+    def _projected(self, points: Array) -> tuple[_Prior, Array]:
+        """Prior moments at points (m, dimension), and V (components, n, m): Vᵀ V is the covariance that observations
+        explain. The latest results are kept, because one decision needs the same points several times.
+        """
+        key = points.tobytes()
+        if key not in self._recent:
+            prior = self._prior(points)
+            cross = _correlation(self.points, points, self._lengths)
+            cross *= self._at_data.spreads[:, :, None] * prior.spreads[:, None, :]
+            if len(self._recent) == RECENT:
+                self._recent.pop(next(iter(self._recent)))
+            self._recent[key] = prior, self._inverses @ cross
+        return self._recent[key]
+
     def _noises(self, means: Array) -> Array:
-        return np.asarray(self._least_noises[:, None] + NOISE_GROWTH * np.clip(means, 0.0, 1.0))
+        return np.asarray(self._least_noises[:, None] + self._growths[:, None] * np.clip(means, 0.0, 1.0))
 
     def covariances(self, first: Array, second: Array) -> Array:
         """Posterior covariances (components, m, k) of f between points (m, dimension) and others (k, dimension)."""
-        at_first, at_second = self._prior(first), self._prior(second)
+        (at_first, V), (at_second, W) = self._projected(first), self._projected(second)
         found = _correlation(first, second, self._lengths)
         found *= at_first.spreads[:, :, None] * at_second.spreads[:, None, :]
-        if len(self.points):
-            crosses = self._cross(at_first, first), self._cross(at_second, second)
-            for j, L in enumerate(self._factors):
-                V, W = (solve_triangular(L, cross[j].T, lower=True, check_finite=False) for cross in crosses)
-                found[j] -= V.T @ W
-        return np.asarray(found)
+        return np.asarray(found - V.transpose(0, 2, 1) @ W)
 
     def differences(self, points: Array, place: Array) -> Array:
         """Posterior deviations (components, m) of f(points) − f(place), place (dimension,)."""
         own = self.covariances(points, place[None, :])[:, :, 0]
         deviations, at_place = self.components(points)[1], self.components(place[None, :])[1]
         return np.sqrt(np.maximum(deviations**2 + at_place**2 - 2.0 * own, 1e-12))
-
-    def _cross(self, prior: _Prior, points: Array) -> Array:
-        correlation = _correlation(points, self.points, self._lengths)
-        return np.asarray(correlation * prior.spreads[:, :, None] * self._at_data.spreads[:, None, :])
 
     # -- moments of the cost ---------------------------------------------------------------------------------------
 
@@ -418,15 +502,27 @@ def _least(simulated: GaussianProcess) -> Array:
     return np.asarray(simulated.points[int(np.argmin(simulated.predict(simulated.points)[0]))])
 
 
+def latent_size(dimension: int) -> int:
+    """Number of latent variables of a hypothesis."""
+    return 2 * dimension + 8
+
+
 def clipped_moments(means: Array, deviations: Array) -> tuple[Array, Array]:
     """E clip(f, 0, 1) and E clip(f, 0, 1)² of normal f."""
     low, high = -means / deviations, (1.0 - means) / deviations
-    inside = ndtr(high) - ndtr(low)
-    p, q = _density(low), _density(high)
-    above = ndtr(-high)
-    first = means * inside + deviations * (p - q) + above
-    second = (means**2 + deviations**2) * inside + deviations * (means * p - (means + 1.0) * q) + above
+    below, under = ndtr(low), ndtr(high)
+    p, q, above = _density(low), _density(high), 1.0 - under
+    first = means * (under - below) + deviations * (p - q) + above
+    second = (means**2 + deviations**2) * (under - below) + deviations * (means * p - (means + 1.0) * q) + above
     return np.clip(first, 0.0, 1.0), np.clip(second, 0.0, 1.0)
+
+
+def clipped_mean(means: Array, deviations: Array) -> Array:
+    """E clip(f, 0, 1) of normal f."""
+    low, high = -means / deviations, (1.0 - means) / deviations
+    under = ndtr(high)
+    first = means * (under - ndtr(low)) + deviations * (_density(low) - _density(high)) + 1.0 - under
+    return np.asarray(np.clip(first, 0.0, 1.0))
 
 
 def shortfall(level: Array | float, means: Array, deviations: Array) -> Array:

@@ -14,8 +14,6 @@ import stat
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from orchestrator.journal.journal import JOURNAL_NAME
-
 VARIABLE = "DECANT_STATE"
 
 
@@ -116,6 +114,8 @@ def known(state: Path) -> list[Path]:
 
 def runs_below(directory: Path) -> Iterator[Path]:
     """Run folders in a folder, at any depth, including itself; links are not followed."""
+    from orchestrator.journal.journal import JOURNAL_NAME  # late: clients of the daemon need only its state directory
+
     for folder, folders, files in os.walk(directory):
         folders.sort()
         if JOURNAL_NAME in files:

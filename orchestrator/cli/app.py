@@ -23,6 +23,7 @@ from orchestrator.cli import (
     robot_commands,
     run_commands,
     simulate_command,
+    station_commands,
     study_command,
     vessel_command,
     view_command,
@@ -173,6 +174,12 @@ _add(
     to=_robot,
 )
 _add(
+    robot_commands.archive,
+    "decant robot archive day-one.zip day-one-robot.json day-one-balance.jsonl runs/first-pour-20300131-1",
+    "decant robot archive day-one.zip   # replay it without the rig",
+    to=_robot,
+)
+_add(
     robot_commands.jog,
     "decant robot jog configs/laboratories/virtual.yaml         # practise without a robot",
     "decant robot jog configs/laboratories/ur10-kern.yaml --enable-motion",
@@ -208,6 +215,8 @@ _add(
     to=_server,
 )
 _add(queue_commands.shutdown, "decant server stop", name="stop", to=_server)
+_add(station_commands.backup, "decant server backup decant-2030-03-01.zip", to=_server)
+_add(station_commands.restore, "decant server restore decant-2030-03-01.zip --state ./restored", to=_server)
 
 _queue = _group("queue", "Submit campaigns to the server, follow and control them, and answer their questions.")
 _add(
@@ -233,6 +242,19 @@ _add(
 )
 _add(queue_commands.enable, "decant queue enable narrow-1b2c3d", to=_queue)
 _add(queue_commands.move, "decant queue move narrow-1b2c3d --first", to=_queue)
+_add(
+    station_commands.order,
+    "decant queue pour plan-17:4 --from beaker-1 --into vial-7 --amount '30 g'",
+    "decant queue pour plan-17:4 --from beaker-1 --into vial-7 --amount '30 g' --dry-run",
+    name="pour",
+    to=_queue,
+)
+_add(station_commands.batch, "decant queue batch plate.json", to=_queue)
+_add(station_commands.batch_status, "decant queue batch-status plate-1", name="batch-status", to=_queue)
+_add(station_commands.hold, "decant queue hold narrow-1b2c3d", "decant queue hold narrow-1b2c3d --release", to=_queue)
+_add(station_commands.reserve, "decant queue reserve left --hours 2", to=_queue)
+_add(station_commands.materials, "decant queue materials", to=_queue)
+_add(station_commands.weigh, "decant queue weigh beaker-1 '412.3 g' --liquid water", to=_queue)
 
 _add(queue_commands.estop, "decant estop", "decant estop --rig left", "decant estop --clear")
 

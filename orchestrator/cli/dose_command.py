@@ -1,35 +1,43 @@
-"""The command `decant dose`: pours wanted amounts, or predicts them.
-
-Only simulated benches pour wanted amounts; the command refuses every laboratory with an arm before anything starts.
-"""
+"""The command `decant dose`: pours wanted amounts, or predicts them; `decant run` pours a campaign's own series."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import Campaign, InProcess, OtherLaboratory, Quiet, Seed
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_message, print_note
+from orchestrator.cli.command_options import Campaign, InProcess, Json, OtherLaboratory, Quiet, Seed
+from orchestrator.cli.console import (
+    BAD_INPUT,
+    FAILED,
+    RefusalError,
+    Refused,
+    print_json,
+    print_message,
+    print_note,
+)
 
 if TYPE_CHECKING:
     from actors.dosing.dose_series import DoseForecast
-    from actors.interfaces import DoseTarget
-    from orchestrator.strategies.campaign_plan import CampaignPlan
-    from orchestrator.strategies.dispense import Dispensed, Dose
-    from sim_engine.action import Action
+    from actors.interfaces import DoseSource
+    from orchestrator.strategies.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
+    from orchestrator.strategies.dispense import Dose, KnownSource
     from sim_engine.scene import Scene
-
-STAGE = "dose"
 
 
 def dose(
     campaign: Campaign,
     amount: Annotated[
-        list[str], typer.Option(help="Wanted in the receiver, for example '50 g'. Repeatable, one dose each.")
-    ],
+        list[str] | None,
+        typer.Option(
+            help="Wanted in the receiver, for example '50 g'. Repeatable, one dose each. With --dry-run, by default "
+            "the campaign's own series.",
+            show_default=False,
+        ),
+    ] = None,
     tolerance: Annotated[
         str,
         typer.Option(help="Excess to avoid: the cup turns back as soon as more has an estimated probability of 1 %."),
@@ -40,6 +48,10 @@ def dose(
             metavar="NAME", help="Name of one of the campaign's receivers; default: the first.", show_default=False
         ),
     ] = None,
+    as_left: Annotated[
+        bool,
+        typer.Option("--as-left", help="Begin with what earlier doses have left in the source, not with a full one."),
+    ] = False,
     dry_run: Annotated[
         bool,
         typer.Option("--dry-run", help="Predict amount, time, spill risk and content of the source; pour nothing."),
@@ -47,34 +59,32 @@ def dose(
     seed: Seed = None,
     laboratory: OtherLaboratory = None,
     in_process: InProcess = False,
+    as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Pour wanted amounts: the tilt is decided from the balance while the liquid flows.
 
-    Works on simulated benches only, which have no arm (configs/laboratories/twin.yaml). Hardware and virtual arms are
-    refused. The pourer is a straight cup, and it holds the campaign's load before every dose.
-
-    The doses are recorded in a journal and weighed, as a small run.
+    The source holds the campaign's load at first, and is filled again when it holds too little. The doses are recorded
+    in a journal and weighed, as a small run. A whole series belongs to the section 'dispense' of a campaign: 'decant
+    run' pours it, 'decant dose --dry-run' predicts it.
     """
-    targets = _targets(amount, tolerance)
-    plan, scene, action = _chosen(campaign, laboratory, receiver, targets)
+    plan = _chosen(campaign, laboratory, receiver, amount, tolerance, as_left=as_left, dry_run=dry_run)
     plan = dataclasses.replace(plan, seed=plan.seed if seed is None else seed)
     if dry_run:
-        for target in targets:
-            _predict(scene, target, plan.seed)
-        print_message("nothing was poured")
+        _predict(plan, as_json=as_json)
         return
+    assert amount is not None
     options = "".join(
         f" {name} '{value}'"
         for name, value in (("--laboratory", laboratory), ("--receiver", receiver))
         if value is not None
     )
     again = f"Another dose: decant dose {campaign}{options} --amount '{amount[0]}'"
-    _pour(plan, scene, action, targets, in_process=in_process, again=again)
+    _pour(plan, in_process=in_process, as_json=as_json, again=again)
 
 
-def _targets(amounts: list[str], tolerance: str) -> list[DoseTarget]:
-    from actors.interfaces import DoseTarget
+def _planned_doses(amounts: Sequence[str], tolerance: str, receiver: str) -> tuple[PlannedDose, ...]:
+    from orchestrator.strategies.campaign_plan import PlannedDose
     from sim_engine.settings.quantity import QuantityError, parse_quantity
 
     with Refused(QuantityError, at="--tolerance: "):
@@ -83,59 +93,135 @@ def _targets(amounts: list[str], tolerance: str) -> list[DoseTarget]:
         wanted = [parse_quantity(text, "kg", "50 g") for text in amounts]
     if limit <= 0.0 or min(wanted) <= limit:
         raise RefusalError("--amount: every amount should be larger than the tolerance, and both above 0", BAD_INPUT)
-    return [DoseTarget(amount, limit) for amount in wanted]
+    return tuple(PlannedDose(amount, limit, receiver) for amount in wanted)
 
 
 def _chosen(
-    path: Path, laboratory: Path | None, receiver: str | None, targets: list[DoseTarget]
-) -> tuple[CampaignPlan, Scene, Action]:
-    """The campaign, its scene, and an action in the middle of the searched ranges.
+    path: Path,
+    laboratory: Path | None,
+    receiver: str | None,
+    amounts: Sequence[str] | None,
+    tolerance: str,
+    *,
+    as_left: bool,
+    dry_run: bool,
+) -> CampaignPlan:
+    """The campaign with nothing but a series of doses.
 
     Raises:
-        RefusalError: the campaign can't be read, it has no bench that pours wanted amounts, or a dose is impossible
-            (exit code 2).
+        RefusalError: the campaign can't be read, it has no bench, or a dose is impossible (exit code 2).
     """
-    from actors.dosing.simulated_dose import check_dose
-    from actors.interfaces import InvalidActionError
     from orchestrator.cli.foreground_run import read_campaign
-    from orchestrator.config.campaign_checks import check_vessels
-    from orchestrator.runs.stages import named_scenes
+    from orchestrator.config.campaign_checks import check_campaign
+    from orchestrator.strategies.campaign_plan import DispensePlan
 
     plan = read_campaign(path, laboratory)
     if not plan.laboratory.pours:
         raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
-    if plan.laboratory.arm is not None:
-        raise RefusalError(
-            f"laboratory {plan.laboratory.name} has an arm, and wanted amounts are poured on simulated benches only; "
-            "name a laboratory without an arm, for example --laboratory configs/laboratories/twin.yaml",
-            BAD_INPUT,
-        )
-    found = list(named_scenes(plan).values())
-    names = [scene.receiver.name for scene, _ in found]
-    if receiver is not None and receiver not in names:
-        known = ", ".join(dict.fromkeys(names))
-        raise RefusalError(f"--receiver {receiver}: the campaign has no such receiver; there are {known}", BAD_INPUT)
-    scene, space = found[0 if receiver is None else names.index(receiver)]
-    # the receiver has to hold the amount, not the load: see `check_dose`
-    if problems := check_vessels(scene, plan.source, wanted=0.0):
+    series = plan.dispense
+    if not amounts:
+        if series is None or not dry_run:
+            hint = f"; 'decant run {path}' pours its own series" if series is not None else ", for example '50 g'"
+            raise RefusalError(f"--amount: name the wanted amount{hint}", BAD_INPUT)
+        if as_left:
+            series = dataclasses.replace(series, as_left=True)
+    else:
+        found = _scenes(plan)
+        names = [scene.receiver.name for scene in found]
+        if receiver is not None and receiver not in names:
+            known = ", ".join(dict.fromkeys(names))
+            text = f"--receiver {receiver}: the campaign has no such receiver; there are {known}"
+            raise RefusalError(text, BAD_INPUT)
+        scene = found[0 if receiver is None else names.index(receiver)]
+        doses = _planned_doses(amounts, tolerance, scene.receiver.name)
+        series = DispensePlan((scene,), doses, 0.0, as_left, plan.laboratory.name)
+    small = dataclasses.replace(plan, name=f"{plan.name}-dose", calibration=None, deployment=None, dispense=series)
+    if problems := check_campaign(small, as_written=not amounts):
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
-    for target in targets:
-        with Refused(InvalidActionError, at=f"--amount '{1e3 * target.amount:g} g': "):
-            check_dose(scene, target)
-    return plan, scene, scene.action({axis.name: axis.decode(0.5) for axis in space.axes})
+    return small
 
 
-def _predict(scene: Scene, target: DoseTarget, seed: int) -> None:
-    from actors.dosing.simulated_dose import forecast
+def _scenes(plan: CampaignPlan) -> list[Scene]:
+    """Scenes to pour doses in; searched dimensions have the middle of their ranges."""
+    from orchestrator.runs.stages import named_scenes
 
-    print(forecast_text(target, forecast(scene, target, seed)))
+    if plan.dispense is not None:
+        return list(plan.dispense.scenes)
+    return [
+        dataclasses.replace(scene, fixed={**scene.fixed, **{axis.name: axis.decode(0.5) for axis in space.axes}})
+        for scene, space in named_scenes(plan).values()
+    ]
 
 
-def forecast_text(target: DoseTarget, predicted: DoseForecast) -> str:
+def _known(plan: DispensePlan) -> dict[str, KnownSource]:
+    from orchestrator.catalogue.source_account import SourceAccount
+
+    if not plan.as_left:
+        return {}
+    try:
+        return SourceAccount.open().known(plan)
+    except OSError as error:
+        raise RefusalError(f"the content of the sources is not known: {error}", FAILED) from None
+
+
+def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
+    """Predict one dose after the other; each leaves the source with its expected content."""
+    from actors.dosing.dose_series import predict_dose
+    from actors.interfaces import DoseTarget
+    from orchestrator.strategies.dispense import FILL_DEVIATION, WEIGHED_DEVIATION, Dispense, KnownSource
+    from orchestrator.strategies.trials import SeedStream
+
+    assert plan.dispense is not None
+    series, known = plan.dispense, _known(plan.dispense)
+    strategy, seeds = Dispense(series, plan.seed, known), SeedStream(plan.seed, "predict doses")
+    count = 20 if len(series.doses) == 1 else 8
+    rows: list[dict[str, Any]] = []
+    total, filled = 0.0, 0
+    for number, planned in enumerate(series.doses, start=1):
+        source = strategy.next_source(planned)
+        scene = series.scene(source.name, planned.receiver)
+        target = DoseTarget(planned.amount, planned.limit, planned.position, source)
+        found = predict_dose(scene, target, seeds.next() % 2**32, plan.laboratory.dosing, count)
+        left = max(source.mass - found.amount, 0.0)
+        deviation = max(source.deviation, FILL_DEVIATION) + WEIGHED_DEVIATION
+        strategy.assume(source.name, KnownSource(mass=left, deviation=deviation))
+        total, filled = total + found.duration, filled + source.fill
+        rows.append(_row(number, planned, source, found, left))
+        if not as_json:
+            print(forecast_text(planned, source, found))
+    if as_json:
+        print_json({"doses": rows})
+    elif len(rows) > 1:
+        times = "once" if filled == 1 else f"{filled} times"
+        print(f"{len(rows)} doses: {total:.0f} s of pouring and weighing; sources filled {times}")
+    print_message("nothing was poured")
+
+
+def _row(number: int, planned: PlannedDose, source: DoseSource, found: DoseForecast, left: float) -> dict[str, Any]:
+    return {
+        "number": number,
+        "wanted_g": 1e3 * planned.amount,
+        "position": planned.position,
+        "source": source.name,
+        "filled": source.fill,
+        "expected_g": 1e3 * found.amount,
+        "interval_g": [1e3 * value for value in found.interval],
+        "duration_s": found.duration,
+        "longest_s": found.longest,
+        "enough": found.enough,
+        "fine_flow_g_s": 1e3 * found.fine_flow,
+        "clean_flow_g_s": 1e3 * found.clean_flow,
+        "left_g": 1e3 * left,
+        "ends": {str(end): count for end, count in found.ends.items()},
+    }
+
+
+def forecast_text(planned: PlannedDose, source: DoseSource, predicted: DoseForecast) -> str:
     """A forecast in a few lines.
 
     Args:
-        target: the dose.
+        planned: the dose.
+        source: of the dose.
         predicted: its forecast.
     """
     low, high = (1e3 * value for value in predicted.interval)
@@ -143,10 +229,13 @@ def forecast_text(target: DoseTarget, predicted: DoseForecast) -> str:
     risk = f"the last stream has {fine:.1f} g/s and leaves the lip cleanly"
     if fine < clean:
         risk = f"the last stream has {fine:.1f} g/s only; a part may run down the outside of the pourer"
+    place = f" into {planned.position}" if planned.position else ""
+    filled = "filled before; " if source.fill else ""
     lines = [
-        f"{1e3 * target.amount:g} g: {low:.1f} to {high:.1f} g expected (90 %), weighed after "
+        f"{1e3 * planned.amount:g} g{place}: {low:.1f} to {high:.1f} g expected (90 %), weighed after "
         f"{predicted.duration:.0f} s, in 95 % of the doses within {predicted.longest:.0f} s",
-        f"  source: holds enough with a probability of {100.0 * predicted.enough:.0f} %",
+        f"  source {source.name}: {filled}{1e3 * source.mass:.0f} g, holds enough with a probability of "
+        f"{100.0 * predicted.enough:.0f} %",
         f"  spill risk: {risk}",
     ]
     for end, count in predicted.ends.items():
@@ -155,43 +244,58 @@ def forecast_text(target: DoseTarget, predicted: DoseForecast) -> str:
     return "\n".join(lines)
 
 
-def _pour(
-    plan: CampaignPlan, scene: Scene, action: Action, targets: list[DoseTarget], *, in_process: bool, again: str
-) -> None:
+def _pour(plan: CampaignPlan, *, in_process: bool, as_json: bool, again: str) -> None:
     """As a small run of its own: journalled and weighed."""
     from orchestrator.cli.campaign_commands import run_directory
-    from orchestrator.cli.foreground_run import check_laboratory_answers, run_in_front_of_people
-    from orchestrator.cli.pour_command import plan_of_scene
+    from orchestrator.cli.foreground_run import (
+        check_laboratory_answers,
+        check_somebody_is_there,
+        run_in_front_of_people,
+    )
+    from orchestrator.cli.motion_control import confirm
     from orchestrator.journal.codec import result_of
     from orchestrator.run_service import RunRequest, RunResources
-    from orchestrator.runs.stages import StageDefinition
-    from orchestrator.strategies.dispense import Dispense, Dispensed
-
-    small = dataclasses.replace(
-        plan_of_scene(plan, scene, pours=len(targets)),
-        name=f"{plan.name}-dose",
-        # the recording shows the motions of an arm, and there is none
-        outputs=plan.outputs.model_copy(update={"recording": False}),
+    from orchestrator.runs.motion_approval import (
+        SafetyRecordError,
+        campaign_pours,
+        envelope,
+        envelope_lines,
+        required_checksum,
     )
+    from orchestrator.runs.stages import DOSES, dispense_stages
+    from orchestrator.strategies.dispense import Dispensed
 
-    def build(results: object, stage_seed: int) -> Dispense:
-        return Dispense(scene, action, targets, stage_seed)
-
-    request = RunRequest(small, [StageDefinition(STAGE, build, pours=True)])
-    resources = RunResources(in_process=in_process)
+    assert plan.dispense is not None
+    if plan.laboratory.arm is None:  # the recording shows the motions of an arm, and there is none
+        plan = dataclasses.replace(plan, outputs=plan.outputs.model_copy(update={"recording": False}))
+    assert plan.dispense is not None
+    request = RunRequest(plan, dispense_stages(plan.dispense))
+    checksum = ""
+    if plan.laboratory.mode == "hardware":
+        assert plan.laboratory.arm is not None
+        with Refused(SafetyRecordError):
+            checksum = required_checksum(plan)
+        found = envelope(plan.laboratory.arm, campaign_pours(plan, request.stages))
+        confirm(plan.laboratory, [f"doses          {len(plan.dispense.doses)}", *envelope_lines(found)])
+    resources = RunResources(in_process=in_process, approved_checksum=checksum)
+    check_somebody_is_there(plan.laboratory)
     check_laboratory_answers(request, resources)
-    directory = run_directory(small, resume=False, run_id=None)
+    directory = run_directory(plan, resume=False, run_id=None)
     finished, _ = run_in_front_of_people(
         dataclasses.replace(request, folder=directory),
         resources,
         again=again,
         not_resumed="these doses are not resumed; what was weighed of them",
     )
-    result: Dispensed = result_of(finished.results, STAGE, Dispensed)
-    for one in result.doses:
-        print(dose_text(one))
+    result: Dispensed = result_of(finished.results, DOSES, Dispensed)
+    if as_json:
+        doses = [one.model_dump(mode="json", exclude={"signals"}) for one in result.doses]
+        print_json({"run": str(directory), "doses": doses})
+    else:
+        for one in result.doses:
+            print(dose_text(one))
     print_note(f"run: {directory}")
-    if any(one.received_g is None for one in result.doses) or len(result.doses) < len(targets):
+    if any(one.received_g is None for one in result.doses):
         raise RefusalError("not every dose was poured", FAILED)
 
 

@@ -15,7 +15,9 @@ from actors.arm.arm_interface import PathReport
 from actors.interfaces import DeviceCheck
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail, RunComparison
 from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, StatusOut
+from orchestrator.daemon.station_schemas import BatchOut, MaterialsOut, PourOut
 from orchestrator.results.run_summary import ReceiverSummary, RunSummary, UntitledSchema
+from orchestrator.strategies.dispense import Dose
 from orchestrator.strategies.single_action import WeighedPour
 from sim_engine.liquids import SimulationParameters
 
@@ -310,6 +312,16 @@ class BalanceCheckOutput(_Output):
     checks: list[DeviceCheck]
 
 
+class ArchiveOutput(_Output):
+    """Replay of the recordings of a commissioning day."""
+
+    archive: str
+    ready: bool
+    """Whether all recordings are read as on the day."""
+
+    checks: list[DeviceCheck]
+
+
 class ValidateSolverOutput(_Output):
     """Results of the solver's validation cases."""
 
@@ -421,11 +433,65 @@ class EventOutput(BaseModel):
     campaign: str | None = None
 
 
+_DOSE = [name for name in Dose.model_fields if name != "signals"]
+
+
+class DoseOutput(_Output):
+    """Doses that were poured."""
+
+    run: str
+    """Folder of the run."""
+
+    doses: list[create_model("DoseOut", __base__=_Output, __doc__="One dose.", **_part(Dose, _DOSE))]  # type: ignore[valid-type]
+    """Completed doses, in the order made."""
+
+
+class PredictedDoseOutput(_Output):
+    """One dose, predicted."""
+
+    number: int
+    wanted_g: float
+    position: str
+    source: str
+    filled: bool
+    """Whether the source is filled before."""
+
+    expected_g: float
+    interval_g: tuple[float, float]
+    """The expected amount lies in it with a probability of 90 %."""
+
+    duration_s: float
+    longest_s: float
+    """Duration that 95 % of the doses do not exceed."""
+
+    enough: float
+    """Probability that the source holds the amount."""
+
+    fine_flow_g_s: float
+    """Flow at the end of the dose."""
+
+    clean_flow_g_s: float
+    """Smallest flow that leaves the lip cleanly; a slower one may run down the outside."""
+
+    left_g: float
+    """Expected content of the source after the dose."""
+
+    ends: dict[str, int]
+    """Number of predicted doses by their end."""
+
+
+class DosePredictionOutput(_Output):
+    """Doses that were predicted (`--dry-run`)."""
+
+    doses: list[PredictedDoseOutput]
+
+
 OUTPUTS: dict[str, Any] = {
     "run": RunOutput,
     "calibrate": CalibrateOutput,
     "plan": PlanOutput,
     "simulate": SimulateOutput | SimulateTableOutput,
+    "dose": DoseOutput | DosePredictionOutput,
     "pour": PourOutput | EmptyPourOutput | DryRunOutput,
     "report": ReportOutput,
     "plugins": PluginsOutput,
@@ -440,11 +506,16 @@ OUTPUTS: dict[str, Any] = {
     "study run": StudyOutput | StudyCostOutput,
     "study report": StudyOutput,
     "robot check": CheckOutput,
+    "robot archive": ArchiveOutput,
     "balance check": BalanceCheckOutput,
     "queue submit": CampaignOut,
     "queue list": QueueOutput,
     "queue show": CampaignDetailOut,
     "queue logs": EventOutput,
+    "queue pour": PourOut,
+    "queue batch": BatchOut,
+    "queue batch-status": BatchOut,
+    "queue materials": MaterialsOut,
 }
 """Models of the output, by command."""
 

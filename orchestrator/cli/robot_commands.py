@@ -2,6 +2,7 @@
 
 - `check` checks whether a bench is ready to pour, and advises how to solve each problem. Nothing moves; the balance is
   tared only on request.
+- `archive` collects the recordings of a commissioning day in one file, and replays them.
 - `jog` moves the arm by typed steps, `home` brings it home; the session itself is in `motion_control`.
 """
 
@@ -45,6 +46,14 @@ def check(
         bool,
         typer.Option("--tare", help="Also tare the balance as a test: the load on it then reads zero."),
     ] = False,
+    record_to: Annotated[
+        Path | None,
+        typer.Option(
+            "--record",
+            help="Also write what the controller sent into this new file (.json), for 'decant robot archive'.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Check everything that a pour needs, and print advice: network, controller, safety settings, balance.
@@ -55,6 +64,7 @@ def check(
     from actors.balance.balance_settings import balance_diagnostics
     from actors.interfaces import DeviceCheck, LaboratoryError
     from actors.laboratory import check_bench_packages, reached
+    from orchestrator.commissioning_archive import ArchiveError, write_robot_check
     from orchestrator.installed_plugins import broken
     from orchestrator.runs.motion_approval import SafetyRecordError, read_record
 
@@ -83,6 +93,9 @@ def check(
         look = ready.arm.diagnostics()
         if accept_safety and not virtual:
             record = _accept(laboratory, look)
+        if record_to is not None:
+            with Refused(OSError, ArchiveError, at=f"--record {record_to}: "):
+                write_robot_check(record_to, laboratory, look, record, virtual=virtual)
         checks = look.checks(record, accept=f"decant robot check {laboratory} --accept-safety", virtual=virtual)
         checks += balance_diagnostics(ready.balance, tare=tare)
     checks += _packages(spec)
@@ -96,6 +109,42 @@ def check(
     if failed:
         raise RefusalError(f"{len(failed)} of {len(checks)} checks fail; nothing should move before they are fixed")
     print_message("ready" if all(check.state == "ok" for check in checks) else "ready, with warnings")
+
+
+def archive(
+    archive: Annotated[
+        Path, typer.Argument(help="The archive (.zip); created if it does not exist.", show_default=False)
+    ],
+    recordings: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Recordings to add: files of '--record', and run folders.", show_default=False),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Keep the recordings of a commissioning day in one file, and replay them all without the rig.
+
+    A replay reads every recording again and compares the results with those of the day: the lines of 'robot check', the
+    stable weights of the balance, the weighed pours of runs. Exit code 1 if this version of Decant reads one of them
+    differently. Nothing is connected.
+    """
+    from orchestrator.commissioning_archive import ArchiveError, CommissioningArchive
+
+    with Refused(ArchiveError, OSError):
+        kept = CommissioningArchive(archive)
+        if recordings:
+            kept.add(recordings)
+        elif not archive.exists():
+            raise RefusalError(f"{archive}: there is no such archive, and no recording to begin one with", BAD_INPUT)
+    checks = list(kept.replay())
+    failed = [one for one in checks if one.state == "fail"]
+    if as_json:
+        table = [dataclasses.asdict(one) for one in checks]
+        print_json({"archive": str(archive), "ready": not failed, "checks": table})
+    else:
+        print_table(checks)
+    if failed:
+        raise RefusalError(f"{len(failed)} of {len(checks)} recordings are read differently")
+    print_message(f"{archive}: {len(checks)} recordings, read as on the day")
 
 
 def _packages(spec: LaboratorySettings) -> list[DeviceCheck]:

@@ -20,12 +20,13 @@ import numpy as np
 
 from actors.arm.arm_settings import ArmSettings
 from actors.bench.pour_feasibility import vessel as built
+from actors.dosing.simulated_dose import check_straight
 from actors.interfaces import InvalidActionError, UnreachablePlaceError
 from orchestrator.config.yaml.file_access import why_not_writable
 from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.config.yaml.yaml_source import Document, Loc
 from orchestrator.strategies.calibration.action_prior import actions_all_over
-from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
+from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan, DispensePlan
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.collision import contact_during, describe_contact
 from sim_engine.hydrostatics import level
@@ -251,11 +252,14 @@ class _Checker:
                 self.vessels[spec] = None
         return self.vessels[spec]
 
-    def scene(self, scene: Scene, role: _Role, wanted: float | None = None) -> tuple[Vessel, Vessel] | None:
+    def scene(
+        self, scene: Scene, role: _Role, wanted: float | None = None, *, dosed: bool = False
+    ) -> tuple[Vessel, Vessel] | None:
         """The scene's vessels, if both are valid and hold the liquid.
 
         Args:
             wanted: volume that the receiver has to hold [m³]; the whole load unless given.
+            dosed: a controller ends the pour at this volume.
         """
         places = {"pourer": role.places(("pourer",)), "receiver": (*role.receiver, *role.places(("receiver",)))}
         pourer = self.vessel(scene.pourer, places["pourer"])
@@ -274,7 +278,7 @@ class _Checker:
             except VesselError as error:
                 ok = False
                 self.add(places[name], f"{role.text}: {name} can't hold {what if less else load}: {error}")
-        if ok and less and scene.liquid.volume > receiver.capacity:
+        if ok and less and not dosed and scene.liquid.volume > receiver.capacity:
             text = (
                 f"{role.text}: the receiver holds {1e6 * receiver.capacity:.4g} mL, enough for what is asked for, not "
                 f"for {load}: a pour that misses its target may run over"
@@ -371,6 +375,36 @@ class _Checker:
             return f"{action.display(*actions.names)}: {error}"
         return ""
 
+    def doses(self, plan: DispensePlan, *, simulated: bool) -> None:
+        """Every dose must fit into its receiver and come out of a full source."""
+        for scene in plan.scenes:
+            doses = [one for one in plan.doses if one.receiver == scene.receiver.name]
+            largest = max((one.amount + one.limit for one in doses), default=0.0)
+            role = _Role(f"doses from '{scene.pourer.name}' into '{scene.receiver.name}'", ("dispense",))
+            if self.scene(scene, role, largest / scene.liquid.density, dosed=True) is None:
+                continue
+            if simulated:
+                try:
+                    check_straight(scene)
+                except InvalidActionError as error:
+                    self.add(role.places(("sources",), ("pourer",)), f"{role.text}: {error}")
+            elif self.arm is not None:
+                if not self.arm.doses:
+                    self.add(role.places(), f"an arm of the kind '{self.arm.kind}' can't pour wanted amounts")
+                    continue
+                try:
+                    self.arm.plan(scene, scene.action({}))
+                except InvalidActionError as error:
+                    self.add(role.places(("motion",)), f"{role.text}: the arm can't make the tilt: {error}")
+        full = min(scene.liquid.mass for scene in plan.scenes)
+        for i, dose in enumerate(plan.doses):
+            if dose.amount + dose.limit + plan.refill_below >= full:
+                text = (
+                    f"a full source holds {1e3 * full:g} g, and the dose, its tolerance and refill_below need "
+                    f"{1e3 * (dose.amount + dose.limit + plan.refill_below):g} g"
+                )
+                self.add((("dispense", "doses", i, "amount"), ("dispense", "doses")), text)
+
     def recorded(self, scene: Scene, recorded: list[Action], role: _Role, place: Loc) -> None:
         """Recorded pours were possible: if their vessels touch, the description of the scene is wrong."""
         vessels = self.scene(scene, role)
@@ -445,6 +479,15 @@ def check_campaign(
             receiver = (("deployment", "receiver"), ("deployment", "receivers", i), ("receivers", i))
             role = _Role(f"deployment into '{scene.receiver.name}'", ("deployment",), receiver)
             checker.reachable(plan.deployment, scene, role)
+    if plan.dispense is not None:
+        balance = plan.laboratory.balance
+        if plan.laboratory.arm is not None and (balance is None or balance.placement not in ("receiver", "everything")):
+            text = (
+                f"laboratory '{plan.laboratory.name}': wanted amounts need a connected balance under the receiver; "
+                "write 'balance: {placement: receiver}' and set it up so"
+            )
+            checker.add((("dispense",), ("laboratory",)), text)
+        checker.doses(plan.dispense, simulated=plan.laboratory.arm is None)
     return list(dict.fromkeys(checker.problems))
 
 

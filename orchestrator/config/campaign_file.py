@@ -280,6 +280,61 @@ AnyCalibration: Any = tagged(CALIBRATIONS)
 AnyDeployment: Any = tagged(DEPLOYMENTS)
 
 
+DoseAmount = Annotated[float, Quantity("kg", "50 g", 0.0, 10.0, positive=True)]
+
+
+class DoseSettings(Settings):
+    """One wanted amount."""
+
+    amount: Annotated[DoseAmount, Example("50 g")]
+    """Wanted in the receiver."""
+
+    position: Text = ""
+    """Name of the receiver's place; the operator puts this receiver on the balance."""
+
+    tolerance: DoseAmount | None = None
+    """Excess to avoid; the series' unless given."""
+
+    receiver: PathOr[VesselFile] | None = None
+    """Receiver; the campaign's unless given."""
+
+
+class DispenseSettings(Settings):
+    """A series of wanted amounts: the tilt of each dose is decided from the balance while the liquid flows."""
+
+    doses: Annotated[list[DoseSettings], Example("[{amount: 50 g, position: A1}]")]
+    """The amounts, with their receivers."""
+
+    order: Literal["listed", "largest_first"] = "listed"
+    """Order of pouring."""
+
+    tolerance: DoseAmount = 1e-3
+    """Excess to avoid: the cup turns back as soon as more has an estimated probability of 1 %."""
+
+    sources: list[PathOr[VesselFile]] | None = None
+    """Source vessels, in the order of use, each with the campaign's liquid; the campaign's pourer unless given."""
+
+    refill_below: Annotated[float, Quantity("kg", "80 g", 0.0, 10.0)] = 0.0
+    """A source that would hold less than this after a dose is filled before."""
+
+    start: Literal["filled", "as_left"] = "filled"
+    """Whether the sources are filled at the beginning, or hold what earlier runs in this laboratory have left."""
+
+    motion: Motion | None = None
+    """Values that differ from the campaign's `motion`."""
+
+    def check_values(self, problems: Problems) -> None:
+        """Check that there are doses, and that each is larger than its tolerance."""
+        if problems.valid("doses") and not self.doses:
+            problems.add("is empty; name at least one, for example '- {amount: 50 g}'", "doses")
+        for i, dose in enumerate(self.doses or ()):
+            limit = self.tolerance if dose.tolerance is None else dose.tolerance
+            if dose.amount is not None and limit is not None and dose.amount <= limit:
+                problems.add("should be larger than the tolerance", "doses", i, "amount")
+        if self.sources is not None and not self.sources:
+            problems.add("is empty; name at least one vessel, or remove it", "sources")
+
+
 class SimulatorSettings(Settings):
     """The simulator."""
 
@@ -288,7 +343,7 @@ class SimulatorSettings(Settings):
 
 
 class CampaignFile(Settings):
-    """A campaign: calibrate the simulator, deploy with the calibrated parameters, or both."""
+    """A campaign: calibrate the simulator, deploy with the calibrated parameters, pour wanted amounts, or several."""
 
     name: Annotated[Name, Example("narrow-cup")]
     """Its name in run directories and figures."""
@@ -326,6 +381,9 @@ class CampaignFile(Settings):
     deployment: AnyDeployment | None = None
     """Deployment: find actions for vessels that calibration did not use."""
 
+    dispense: DispenseSettings | None = None
+    """A series of wanted amounts."""
+
     on_unknown: Literal["ask", "repeat"] = "ask"
     """Treatment on resume of a pour that had started and has no outcome; 'repeat' on a virtual bench only."""
 
@@ -338,9 +396,9 @@ class CampaignFile(Settings):
 
     def check_values(self, problems: Problems) -> None:
         """Check that there is something to do, and that calibration searches the ranges of parameters."""
-        calibration, stages = self.calibration, problems.valid("calibration", "deployment")
-        if calibration is None and self.deployment is None and stages:
-            problems.add("there is nothing to do; add a 'calibration' or a 'deployment' section")
+        calibration, stages = self.calibration, problems.valid("calibration", "deployment", "dispense")
+        if calibration is None and self.deployment is None and self.dispense is None and stages:
+            problems.add("there is nothing to do; add a 'calibration', a 'deployment' or a 'dispense' section")
         ranges = {} if self.simulator.parameters is None else self.simulator.parameters.ranges()
         at = ("simulator", "parameters")
         inner = problems.within(*at)

@@ -9,6 +9,8 @@ Sections are validated before (`orchestrator.config.yaml.section_validation`); v
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +20,7 @@ from orchestrator.config.campaign_file import (
     CalibrationSection,
     CampaignFile,
     DeploymentSection,
+    DispenseSettings,
     LearningSettings,
     PoursSettings,
     StageSettings,
@@ -35,7 +38,9 @@ from orchestrator.strategies.campaign_plan import (
     CalibrationPlan,
     CampaignPlan,
     DeploymentPlan,
+    DispensePlan,
     NormalPrior,
+    PlannedDose,
     Premises,
 )
 from orchestrator.strategies.deployment.objectives import STOPS, Objectives
@@ -246,6 +251,57 @@ def resolve_calibration(
     )
 
 
+DOSE_MOTION = {"angular_velocity": math.radians(115.0), "max_angle": math.radians(110.0)}
+"""Fastest tilt and range of a dose, where the motion does not limit them."""
+
+
+def resolve_dispense(
+    section: DispenseSettings, builder: SceneBuilder, place: Place, laboratory: LaboratorySettings | None
+) -> DispensePlan | None:
+    """The plan of a series of doses. Problems are added to the report; the plan may then be None."""
+    report = builder.report
+    if laboratory is not None and not laboratory.pours:
+        report.add(place, f"laboratory '{laboratory.name}' has no bench to pour on; name one with a bench", key=True)
+    pourers: list[VesselSpec | None] = (
+        [builder.pourer(None, place)]
+        if section.sources is None
+        else [builder.references.vessel(one, place.at("sources", i)) for i, one in enumerate(section.sources)]
+    )
+    receivers: dict[str, VesselSpec | None] = {}
+    doses = []
+    for i, dose in enumerate(section.doses or ()):
+        vessel = builder.receiver(dose.receiver, place.at("doses", i))
+        if vessel is None or dose.amount is None:
+            continue
+        if receivers.setdefault(vessel.name, vessel) != vessel:
+            report.add(place.at("doses", i), f"two different receivers are both called '{vessel.name}'")
+        limit = section.tolerance if dose.tolerance is None else dose.tolerance
+        doses.append(PlannedDose(dose.amount, limit, vessel.name, dose.position))
+    names = [one.name for one in pourers if one is not None]
+    if len(set(names)) < len(names):
+        report.add(place.at("sources"), "two sources have the same name; give each vessel its own")
+    if report.problems or laboratory is None:
+        return None
+    given: set[str] = set()
+    for motion in (builder.file.motion, section.motion):
+        given |= set() if motion is None else set(motion.fixed())
+    constants = {name: value for name, value in DOSE_MOTION.items() if name not in given}
+    scenes = []
+    for pourer, (name, receiver) in itertools.product(pourers, receivers.items()):
+        assert pourer is not None
+        motions = ((section.motion, place.at("motion")),)
+        scene = builder.scene(
+            f"dispense-{pourer.name}-{name}", pourer, receiver, motions, (), place, constants=constants
+        )
+        if scene is None:
+            return None
+        scenes.append(scene)
+    if section.order == "largest_first":
+        doses.sort(key=lambda one: -one.amount)
+    as_left = section.start == "as_left"
+    return DispensePlan(tuple(scenes), tuple(doses), section.refill_below, as_left, laboratory.name)
+
+
 def _prior(
     section: CalibrationSection,
     builder: SceneBuilder,
@@ -291,6 +347,9 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         )
     if file.deployment is not None:
         deployment = resolve_deployment(file.deployment, builder, root.at("deployment"), laboratory)
+    dispense = None
+    if file.dispense is not None:
+        dispense = resolve_dispense(file.dispense, builder, root.at("dispense"), laboratory)
     broken = any(report.is_broken(root.at(key)) for key in ("calibration", "deployment"))
     if not broken and (file.calibration is None or file.calibration.actions is not None):
         builder.refuse_prior(file.actions, root, "decides nothing: no calibration takes its actions from here")
@@ -308,7 +367,7 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         name=file.name,
         seed=file.seed,
         source=root.document.path,
-        laboratory=laboratory,
+        laboratory=laboratory if dispense is None else laboratory.in_real_time(),
         parameters=SimulationParameters.from_values(in_force),
         calibration=calibration,
         deployment=deployment,
@@ -317,6 +376,7 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         on_unknown=file.on_unknown,
         resolved=as_file(file.model_copy(update={"outputs": outputs}), root, references),
         laboratory_source=(resolved(root.directory / file.laboratory) if isinstance(file.laboratory, str) else None),
+        dispense=dispense,
     )
 
 

@@ -22,7 +22,7 @@ from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
 from orchestrator.journal.upgrade import upgraded_campaign
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from sim_engine.liquids import RETIRED_PARAMETERS, SimulationParameters
+from sim_engine.liquids import RETIRED_PARAMETERS, Liquid, LiquidSettings, SimulationParameters
 from sim_engine.settings.model import MADE, Settings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.vessel.shapes import VesselSpec
@@ -93,6 +93,25 @@ def load_vessel(path: Path | str) -> VesselSpec:
     report.raise_if_any()
     assert vessel is not None, "a vessel without problems has a spec"
     return vessel
+
+
+def vessel_from(document: Document) -> VesselSpec:
+    """The vessel of a document, see `load_vessel`. Raises ConfigError."""
+    report, place = Report(), Place(document)
+    section = validate(VesselFile, place, report)
+    vessel = None if section is None else resolve_vessel(section, place, report)
+    report.raise_if_any()
+    assert vessel is not None, "a vessel without problems has a spec"
+    return vessel
+
+
+def liquid_from(document: Document) -> Liquid:
+    """The load of a document with the keys of a campaign's `liquid`. Raises ConfigError."""
+    report = Report()
+    section = validate(LiquidSettings, Place(document), report)
+    report.raise_if_any()
+    assert section is not None, "a liquid without problems has settings"
+    return section.load()
 
 
 def load_laboratory(path: Path) -> LaboratorySettings:

@@ -24,6 +24,7 @@ from orchestrator.catalogue.catalogue import Catalogue, NoSuchRunError
 from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail, RunComparison
 from orchestrator.daemon.access_control import Daemon, Operator, Viewer
+from orchestrator.daemon.materials import Materials
 from orchestrator.daemon.run_readout import REPORT
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.run_errors import RunError
@@ -128,7 +129,7 @@ async def runs(daemon: Daemon, person: Viewer, asked: RunsAsked) -> Any:
     return await _in_catalogue(daemon, lambda catalogue: catalogue.runs(asked))
 
 
-@router.get("/pours", operation_id="pours", response_model=_several(PreviousPour))
+@router.get("/runs/pours", operation_id="run_pours", response_model=_several(PreviousPour))
 async def pours(daemon: Daemon, person: Viewer, asked: PoursAsked) -> Any:
     """List the pours of all runs, oldest first: the action, the measured spillage and the prediction."""
     return await _in_catalogue(daemon, lambda catalogue: catalogue.pours(asked))
@@ -151,8 +152,12 @@ async def compare(
     responses={200: {"content": {"application/zip": {}}, "description": "runs.*, pours.*, dictionary.csv."}},
 )
 async def export(daemon: Daemon, person: Viewer, asked: ExportAsked) -> Response:
-    """Export runs and pours as files with a data dictionary, in one zip archive."""
+    """Export runs and pours as files with a data dictionary, in one zip archive.
+
+    `account.csv` is the account of the materials, with the run of each ordered pour.
+    """
     formats = dict.fromkeys(asked.pop("format"))
+    account = Materials(daemon.store).table()
 
     def written(catalogue: Catalogue) -> bytes:
         archive = BytesIO()
@@ -160,6 +165,7 @@ async def export(daemon: Daemon, person: Viewer, asked: ExportAsked) -> Response
             found = catalogue.export(Path(folder), asked, list(formats))
             for path in map(Path, found.pop("files")):
                 packed.write(path, path.name)
+            packed.writestr("account.csv", account)
             packed.comment = json.dumps(found).encode()
         return archive.getvalue()
 

@@ -15,27 +15,33 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import httpx
 
 from orchestrator.catalogue.run_registry import state_directory
-from orchestrator.daemon.access_control import Role, token_of
-from orchestrator.daemon.daemon_settings import PORT
-from orchestrator.journal.run_record import Row
+from orchestrator.daemon import PORT
+from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.run_errors import RunError
+
+if TYPE_CHECKING:  # a command that only asks the daemon reads no run
+    from orchestrator.journal.run_record import Row
 
 V1 = "/api/v1"
 TIMEOUT = httpx.Timeout(60.0, connect=5.0)
 
 
 class DaemonError(RunError):
-    """The daemon can't be reached, or it refuses; the message is the daemon's own if there is one."""
+    """The daemon can't be reached, or it refuses; the message is the daemon's own if there is one.
 
-    def __init__(self, text: str, exit_code: int = 1) -> None:
+    Attributes:
+        unreachable: the connection failed, so the call may or may not have been executed.
+    """
+
+    def __init__(self, text: str, exit_code: int = 1, *, unreachable: bool = False) -> None:
         super().__init__(text)
-        self.exit_code = exit_code
+        self.exit_code, self.unreachable = exit_code, unreachable
 
 
 @dataclass(frozen=True)
@@ -103,7 +109,8 @@ class Client:
             )
         return DaemonError(
             f"no daemon answers at {self.url} ({error}); start one with 'decant server start', or say where it is: "
-            "--url, --state"
+            "--url, --state",
+            unreachable=True,
         )
 
     def events(
@@ -225,7 +232,7 @@ class RemoteCatalogueClient:
 
     def pours(self, conditions: Mapping[str, Any]) -> list[Row]:
         """See `CatalogueClient`."""
-        return list(self._client.get("/pours", **conditions))
+        return list(self._client.get("/runs/pours", **conditions))
 
     def run(self, name: str) -> Row:
         """See `CatalogueClient`."""

@@ -7,7 +7,9 @@ of the command line.
 
 from __future__ import annotations
 
+import ipaddress
 import ssl
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -21,12 +23,12 @@ from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
+from orchestrator.daemon import PORT
 from orchestrator.daemon.notifications import NotifySettings, problem_of
 from sim_engine.settings.model import Count, FilePath, Name, PositiveCount, Settings, Switch, Text
 from sim_engine.settings.quantity import Quantity
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
-PORT = 8377
 ANY_RIG = "virtual"
 """The rig of a daemon whose settings name none: each campaign's own laboratory, which must be virtual."""
 
@@ -78,6 +80,24 @@ class LiveSettings(Settings):
     """TCP port of the viewer's page; by default the usual one or the next free one."""
 
 
+class MadsciSettings(Settings):
+    """Serve the daemon as a MADSci node. The protocol has no password: list the addresses that may call."""
+
+    required: ClassVar[dict[str, str]] = {"allow": "[192.0.2.10]"}
+
+    host: Text = "127.0.0.1"
+    """Address to listen at."""
+
+    port: Port = 2000
+    """TCP port; 0 selects a free one."""
+
+    allow: list[Text] | None = None
+    """Addresses of the clients, such as that of the workcell manager; networks as 192.0.2.0/28."""
+
+    name: Text = "decant"
+    """Name of the node."""
+
+
 class RecordingsSettings(Settings):
     """Retention of recordings (`.rrd`). Journals, figures and summaries are always kept."""
 
@@ -117,6 +137,9 @@ class DaemonFile(Settings):
 
     notify: NotifySettings | None = None
     """Receivers of notifications; none by default."""
+
+    madsci: MadsciSettings | None = None
+    """Serve a MADSci node at an address of its own; off by default."""
 
     keep_free: Annotated[float, Quantity("MB", "500 MB", 40.0, 1e7)] = 500.0
     """Free disk space below which no campaign starts."""
@@ -167,6 +190,7 @@ class DaemonSettings:
     events: int = 50_000
     live: tuple[str, int | None] | None = None
     notify: NotifySettings | None = None
+    madsci: MadsciSettings | None = None
     quick_start: bool = field(default=True, compare=False)
     """Whether simulators start at once instead of with the first campaign."""
 
@@ -196,6 +220,11 @@ class DaemonSettings:
     def rig(self, name: str) -> Rig:
         """Return a rig by its name. Raises KeyError."""
         return next(rig for rig in (*self.rigs, Rig(NO_RIG)) if rig.name == name)
+
+
+def networks(allow: Sequence[str]) -> list[ipaddress.IPv4Network | ipaddress.IPv6Network]:
+    """Return the networks of addresses. Raises ValueError."""
+    return [ipaddress.ip_network(text, strict=False) for text in allow]
 
 
 def load_settings(path: Path | None, **given: Any) -> DaemonSettings:
@@ -285,6 +314,11 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> DaemonSettings:
             "other machines reach this address, and tokens would cross the network in plain text; add 'tls', or "
             "'plain: true' where something in front of it encrypts",
         )
+    if file.madsci is not None:
+        try:
+            networks(file.madsci.allow or ())
+        except ValueError as error:
+            report.add(place.at("madsci", "allow"), f"{error}; write addresses such as 192.0.2.10 or 192.0.2.0/28")
     if file.notify is not None:
         _check_receivers(file.notify, place.at("notify"), report)
     state = path(file.state, place)
@@ -307,4 +341,5 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> DaemonSettings:
         events=file.events,
         live=None if file.live is None else (file.live.host, file.live.port),
         notify=file.notify,
+        madsci=file.madsci,
     )

@@ -2,7 +2,8 @@
 
 `Store` is the only writer of one SQLite file and flushes every change to disk. `QueueItem` is a submitted campaign with
 its desired state (`DesiredState`); `StoredQuestion` is a question to the operator. The journal of a run remains the
-authoritative record of its events; this file holds the operators' intentions.
+authoritative record of its events; this file holds the operators' intentions. The tables of ordered pours and of
+materials are read and written by `pour_orders` and `materials`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import json
 import os
 import sqlite3
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
@@ -21,7 +23,7 @@ from orchestrator.catalogue.run_registry import make_state_directory
 from orchestrator.journal.journal_file import locked_alone
 from orchestrator.run_errors import RunError
 
-FORMAT = 2
+FORMAT = 3
 
 _SCHEMA = """
 create table campaign (
@@ -29,7 +31,8 @@ create table campaign (
     priority integer not null, rank real not null, state text not null, desired_state text not null,
     reason text not null,
     by text not null, created real not null, begun real, ended real, run text, motion_enabled integer not null,
-    answers text not null check (json_valid(answers))
+    answers text not null check (json_valid(answers)),
+    batch text not null default '', held integer not null default 0, not_before real
 ) strict;
 create index campaign_by_state on campaign (state, rig);
 create table question (
@@ -48,6 +51,55 @@ create trigger audit_is_never_changed before update on audit begin
     select raise(abort, 'audit entries are append-only'); end;
 create trigger audit_is_never_deleted before delete on audit begin
     select raise(abort, 'audit entries are append-only'); end;
+"""
+
+_STATION = """
+create table batch (
+    id text primary key, name text not null, by text not null, created real not null, body text not null
+) strict;
+create table reservation (
+    id integer primary key, rig text not null, by text not null, begins real not null, ends real not null,
+    note text not null
+) strict;
+create table pour_order (
+    id text primary key, campaign text not null unique, body text not null check (json_valid(body)),
+    source text not null, receiver text not null, amount real,
+    predicted text check (predicted is null or json_valid(predicted)),
+    result text check (result is null or json_valid(result))
+) strict;
+create index order_by_source on pour_order (source);
+create table liquid (
+    id text primary key, code text unique, properties text not null check (json_valid(properties)),
+    created real not null
+) strict;
+create table position (
+    id text primary key, code text unique, rig text not null, note text not null, created real not null
+) strict;
+create table vessel (
+    id text primary key, code text unique, shape text not null check (json_valid(shape)), capacity real not null,
+    position text unique, liquid text, created real not null
+) strict;
+create table node_action (
+    id text primary key, name text not null, args text not null check (json_valid(args)), created real not null,
+    started real, campaign text, error text, json_result text
+) strict;
+create table account (
+    id integer primary key, t real not null, vessel text not null, kind text not null, change real, deviation real,
+    liquid text, pour text, by text not null, note text not null
+) strict;
+create unique index account_once on account (pour, vessel) where pour is not null;
+create index account_by_vessel on account (vessel);
+create trigger account_is_never_changed before update on account begin
+    select raise(abort, 'account entries are append-only'); end;
+create trigger account_is_never_deleted before delete on account begin
+    select raise(abort, 'account entries are append-only'); end;
+"""
+"""Batches, reservations, ordered pours and materials; added in format 3. Masses in kg, capacities in m³."""
+
+_FROM_2 = """
+alter table campaign add column batch text not null default '';
+alter table campaign add column held integer not null default 0;
+alter table campaign add column not_before real;
 """
 
 
@@ -83,7 +135,7 @@ class QueueItem:
 
     Attributes:
         id: unique and short enough to type.
-        task: task: 'run', 'calibrate' or 'plan'.
+        task: task: 'run', 'calibrate', 'plan', or 'pour' for an ordered pour.
         rig: rig that it leases; 'none' if it pours nothing.
         mode: mode of that rig: 'virtual', 'hardware' or 'none'.
         priority: higher priorities run first.
@@ -94,6 +146,9 @@ class QueueItem:
         by: user who submitted it.
         run: name of its run's folder; None before the run starts.
         motion_enabled: whether motion is enabled for the coming part of its run.
+        batch: id of its batch; '' without one.
+        held: whether it waits in the queue until it is released.
+        not_before: earliest start, seconds since 1970; None: at once.
     """
 
     id: str
@@ -113,6 +168,9 @@ class QueueItem:
     run: str | None = None
     motion_enabled: bool = False
     answers: dict[str, Any] = field(default_factory=dict)
+    batch: str = ""
+    held: bool = False
+    not_before: float | None = None
 
 
 @dataclass(frozen=True)
@@ -151,7 +209,7 @@ class StoredQuestion:
 
 
 _JSON = {"answers", "options", "details"}
-_BOOLEAN = {"motion_enabled", "hands"}
+_BOOLEAN = {"motion_enabled", "hands", "held"}
 
 
 class Store:
@@ -200,7 +258,9 @@ class Store:
         self._db.execute("pragma synchronous = full")
         version = self._db.execute("pragma user_version").fetchone()[0]
         if version == 0:
-            self._db.executescript(f"begin immediate; {_SCHEMA} pragma user_version = {FORMAT}; commit;")
+            self._db.executescript(f"begin immediate; {_SCHEMA} {_STATION} pragma user_version = {FORMAT}; commit;")
+        elif version == 2:  # a queue outlives an upgrade of the program
+            self._db.executescript(f"begin immediate; {_FROM_2} {_STATION} pragma user_version = {FORMAT}; commit;")
         elif version != FORMAT:
             raise StoreError(f"{self.path}: written in format {version}, and this version of Decant has {FORMAT}")
 
@@ -245,6 +305,11 @@ class Store:
         )
         return [_item(row) for row in rows]
 
+    def batch_items(self, batch: str) -> list[QueueItem]:
+        """Return the campaigns of a batch, in the order in which they were submitted."""
+        rows = self._db.execute("select * from campaign where batch = ? order by rowid", [batch])
+        return [_item(row) for row in rows]
+
     def last_rank(self) -> float:
         """Return the largest rank so far; 0 before the first campaign."""
         return float(self._db.execute("select coalesce(max(rank), 0) from campaign").fetchone()[0])
@@ -252,6 +317,22 @@ class Store:
     def counts(self) -> dict[str, int]:
         """Return the number of campaigns in each state."""
         return dict(self._db.execute("select state, count(*) from campaign group by state").fetchall())
+
+    def reserved_by(self, rig: str, now: float) -> str | None:
+        """Return the user who has reserved a rig at a time; None if it is free. The first reservation counts."""
+        found = self.rows(
+            "select by from reservation where rig = ? and begins <= ? and ends > ? order by id limit 1", rig, now, now
+        )
+        return str(found[0]["by"]) if found else None
+
+    def coming(self, rig: str, now: float) -> list[float]:
+        """Return the times at which a queued campaign of a rig may start: its own, or the end of a reservation."""
+        rows = self.rows(
+            "select not_before as at from campaign where state = 'queued' and rig = ? and not_before > ? "
+            "union select ends from reservation where rig = ? and ends > ?",
+            *(rig, now, rig, now),
+        )
+        return [float(row["at"]) for row in rows]
 
     # ---- questions
 
@@ -319,6 +400,33 @@ class Store:
         where, arguments = ("", []) if campaign is None else ("where campaign = ?", [campaign])
         query = f"select t, by, what, campaign, detail from audit {where} order by id desc limit ?"
         return [dict(row) for row in self._db.execute(query, [*arguments, limit])]
+
+    # ---- for the modules that have tables of their own here
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Store all changes made inside, or none of them. Must not be nested, and must not be left open by `await`."""
+        self.write("begin immediate")
+        try:
+            yield
+            self.write("commit")
+        except BaseException:
+            if self._db.in_transaction:
+                self._db.execute("rollback")
+            raise
+
+    def rows(self, query: str, *arguments: Any) -> list[dict[str, Any]]:
+        """Return the rows of a query."""
+        return [dict(row) for row in self._db.execute(query, arguments)]
+
+    def write(self, statement: str, *arguments: Any) -> int:
+        """Execute a statement and return the id of the inserted row, if any.
+
+        Raises:
+            StoreError: the disk is full or can't be written.
+            sqlite3.IntegrityError: a constraint is violated.
+        """
+        return self._write(statement, *arguments)
 
     def _write(self, statement: str, *arguments: Any) -> int:
         try:

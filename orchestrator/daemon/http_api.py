@@ -13,8 +13,10 @@ from typing import Any
 
 from fastapi import FastAPI, Response
 
-from orchestrator.daemon import archive_routes, command_routes, query_routes
-from orchestrator.daemon.access_control import Daemon, RequestGuard, Tokens
+from orchestrator.daemon import archive_routes, command_routes, query_routes, station_routes
+from orchestrator.daemon.access_control import Daemon, RequestGuard
+from orchestrator.daemon.access_tokens import Tokens
+from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.page import page_router
 from orchestrator.daemon.schemas import HealthOut, ProblemOut
 from orchestrator.daemon.supervisor import Supervisor
@@ -52,6 +54,7 @@ def create_app() -> FastAPI:
     )
     app.include_router(query_routes.router, prefix=V1, responses=_ERRORS)
     app.include_router(command_routes.router, prefix=V1, responses=_ERRORS)
+    app.include_router(station_routes.router, prefix=V1, responses=_ERRORS)
     app.include_router(archive_routes.router, prefix=V1, responses=_ERRORS)
     app.add_api_route("/healthz", _health, operation_id="health", response_model=HealthOut)
     app.add_api_route(
@@ -78,6 +81,7 @@ def serve_app(daemon: Supervisor, tokens: Tokens, shutdown: Callable[[], None], 
     """
     app = create_app()
     app.state.daemon, app.state.tokens, app.state.shutdown = daemon, tokens, shutdown
+    app.state.ordering = Ordering(daemon)
     app.state.live = live or _nowhere
     app.add_middleware(RequestGuard, limit=daemon.settings.body_limit, host=daemon.settings.host)
     return app

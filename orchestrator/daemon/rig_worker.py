@@ -21,9 +21,11 @@ from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.daemon_settings import DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
+from orchestrator.daemon.materials import Materials
+from orchestrator.daemon.pour_orders import POUR, OrderBook, OrderError, PourOrder, renew_load, settled_pour
 from orchestrator.daemon.remote_operator import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.run_readout import prune_recordings
-from orchestrator.daemon.submissions import run_request
+from orchestrator.daemon.submissions import CAMPAIGN, run_request
 from orchestrator.journal.journal_file import MB, JournalError, free_space
 from orchestrator.journal.run_record import CampaignResult
 from orchestrator.live_view.live_server import LiveView, recorder_of
@@ -100,6 +102,8 @@ class Running:
             asyncio.CancelledError: it was paused, stopped, aborted.
             RunError, LaboratoryError, ConfigError, OSError: it can't go on.
         """
+        if self.item.task == POUR and self.item.run is None:
+            await self._renew_order()
         found = await asyncio.to_thread(run_request, self._shared.settings, self.item, self._rig)
         request, warned = await asyncio.to_thread(_prepared, found)
         assert request.folder is not None
@@ -118,6 +122,21 @@ class Running:
             await asyncio.to_thread(handle.close)
         await asyncio.to_thread(handle.publish)
         return result
+
+    async def _renew_order(self) -> None:
+        """Check the materials of an ordered pour again, since other pours came before it, and take its load from them.
+
+        Raises:
+            OrderError: they can't serve it any more; nothing has moved.
+        """
+        folder = self._shared.settings.snapshots / self.item.id
+        order = await asyncio.to_thread(PourOrder.read, folder)
+        materials = Materials(self._shared.store)
+        more = order.tolerance
+        if reason := materials.refusal(order.source, order.receiver, order.liquid, order.amount, more, pour=order.id):
+            raise OrderError(f"{reason}. Nothing was poured")
+        content = materials.content(order.source)
+        await asyncio.to_thread(renew_load, folder / CAMPAIGN, content.mass or 0.0, content.deviation)
 
     def _resources(self, request: RunRequest, checksum: str) -> RunResources:
         asking, key, rig = self._shared.asking, self.item.id, self._rig.name
@@ -247,6 +266,27 @@ class Running:
         return self.checkpoint != ""
 
 
+async def settle(shared: SharedServices, item: QueueItem, rig: Rig, *, ended: bool) -> None:
+    """Store the result of an ordered pour and enter it in the account, if its journal has an outcome.
+
+    Args:
+        shared: services of the daemon.
+        item: campaign of the order.
+        rig: where it was poured.
+        ended: whether the campaign does not continue.
+    """
+    if item.run is None:
+        return
+    settings = shared.settings
+    try:
+        found = await asyncio.to_thread(settled_pour, settings.runs / item.run, settings.snapshots / item.id, rig.spec)
+        OrderBook(shared.store).settle(item, found, ended=ended)
+    except (RunError, OSError, ValueError) as error:
+        _log.error("pour of %s is not in the account: %s", item.id, error)
+        text = f"its outcome could not be entered in the account of the materials: {error}"
+        shared.feed.publish("LogLine", {"level": "error", "text": text, "stage": ""}, item.id)
+
+
 RETRY = 30.0
 """Before a lane that was kept from beginning looks again [s]."""
 
@@ -331,7 +371,7 @@ class RigWorker:
                 self.running = None if item is None else Running(self._shared, item, self.rig)
             if item is None or self.running is None:
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(RETRY):
+                    async with asyncio.timeout(self._pause()):
                         await self.wake.wait()
                 continue
             self._resting.clear()
@@ -386,11 +426,24 @@ class RigWorker:
         begun = sorted(
             (one for one in mine if one.run is not None and one.state not in ENDED), key=lambda one: one.begun or 0.0
         )
-        queued = [one for one in mine if one.state == "queued"]
+        now, other = time.time(), store.reserved_by(self.rig.name, time.time())
+        queued = [
+            one
+            for one in mine
+            if one.state == "queued"
+            and not one.held
+            and (one.not_before is None or one.not_before <= now)
+            and other in (None, one.by)
+        ]
         if self._daemon.queue_paused:
             queued = []
         found = next((one for one in (*begun, *queued) if one.mode != "hardware" or one.motion_enabled), None)
         return found if found is not None and self._has_room() else None
+
+    def _pause(self) -> float:
+        """Time until the queue is read again at the latest [s]: sooner if a campaign may start by its time."""
+        times = self._shared.store.coming(self.rig.name, time.time())
+        return min([RETRY, *(max(at - time.time(), 0.01) for at in times)])
 
     def _has_room(self) -> bool:
         settings = self._shared.settings
@@ -459,6 +512,8 @@ class RigWorker:
 
     async def _leave(self, running: Running, state: str, reason: str, desired: DesiredState) -> None:
         store, key = self._shared.store, running.item.id
+        if running.item.task == POUR:
+            await settle(self._shared, running.item, self.rig, ended=desired is DesiredState.STOP)
         if desired is DesiredState.STOP and state != "finished":
             state = STOPPED
             try:

@@ -138,6 +138,15 @@ class CampaignOut(_Out):
     run: str | None
     """Name of its run's folder."""
 
+    batch: str
+    """Id of its batch; '' without one."""
+
+    held: bool
+    """Whether it waits in the queue until it is released."""
+
+    not_before: float | None
+    """Earliest start."""
+
     motion_enabled: bool
     needs_enabling: bool
     """The campaign uses hardware and waits for `decant queue enable` to enable motion."""

@@ -23,12 +23,14 @@ from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
 import uvicorn
+from fastapi import FastAPI
 from pythonjsonlogger.json import JsonFormatter
 
 from orchestrator.catalogue.run_registry import make_state_directory, use_state_directory
-from orchestrator.daemon.access_control import Tokens
-from orchestrator.daemon.daemon_settings import DaemonSettings
+from orchestrator.daemon.access_tokens import Tokens
+from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
 from orchestrator.daemon.http_api import serve_app
+from orchestrator.daemon.madsci_node import create_node
 from orchestrator.daemon.notifications import OCCASIONS, Notifier, NotifyError, pass_on
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.live_view.live_server import LiveView
@@ -236,6 +238,7 @@ async def _serve_with(
     daemon = Supervisor(settings, live)
     ending = _Ending(daemon)
     app = serve_app(daemon, tokens, ending, None if live is None else lambda campaign: live.url)
+    node = None if settings.madsci is None else _node_server(daemon, app, settings.madsci)
     server = _Server(
         uvicorn.Config(
             app,
@@ -253,6 +256,7 @@ async def _serve_with(
     for number in ENDING:
         loop.add_signal_handler(number, ending)
     serving = asyncio.create_task(server.serve([listening]))
+    serving_node: asyncio.Task[None] | None = None
     notifying = None if notifier is None else asyncio.create_task(pass_on(daemon.feed.read(), notifier))
     daemon.notification_counts = {} if notifier is None else notifier.counts
     url = _url(settings, listening)
@@ -260,6 +264,8 @@ async def _serve_with(
     watch = RayWatch(daemon, restart, ending.asked.is_set)
     try:
         await daemon.start()
+        if node is not None:
+            serving_node = asyncio.create_task(node[0].serve([node[1]]))
         _log.info("serving %s", url, extra={"url": url, "state": str(settings.state)})
         ready(url)
         until = [asyncio.ensure_future(event.wait()) for event in (ending.asked, daemon.left)]
@@ -277,6 +283,11 @@ async def _serve_with(
             settings.address.unlink(missing_ok=True)
         server.should_exit = True
         await serving
+        if node is not None:
+            node[0].should_exit = True
+            if serving_node is not None:
+                await serving_node
+            node[1].close()
         for number in ENDING:
             loop.remove_signal_handler(number)
     return again
@@ -296,18 +307,29 @@ class _Ending:
 
 
 def _listen(settings: DaemonSettings) -> socket.socket:
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    return _socket(settings.host, settings.port, "--port")
+
+
+def _socket(host: str, port: int, option: str) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listening = socket.socket(family, socket.SOCK_STREAM)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listening.bind((settings.host, settings.port))
+        listening.bind((host, port))
     except OSError as error:
         listening.close()
         raise ServeError(
-            f"{settings.host}:{settings.port}: can't listen there: {error.strerror}; is another daemon running? "
-            "--port names another port, 0 a free one"
+            f"{host}:{port}: can't listen there: {error.strerror}; is another daemon running? "
+            f"{option} names another port, 0 a free one"
         ) from None
     return listening
+
+
+def _node_server(daemon: Supervisor, app: FastAPI, settings: MadsciSettings) -> tuple[_Server, socket.socket]:
+    """The server of the MADSci node, with its listening socket; the orders are those of the API."""
+    listening = _socket(settings.host, settings.port, "madsci: port")
+    node = create_node(daemon, app.state.ordering, settings)
+    return _Server(uvicorn.Config(node, log_config=None, access_log=False, lifespan="off")), listening
 
 
 def _url(settings: DaemonSettings, listening: socket.socket) -> str:

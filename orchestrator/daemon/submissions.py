@@ -25,6 +25,7 @@ from orchestrator.config.yaml.file_access import confined, out_of_bounds, resolv
 from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.daemon.daemon_settings import ANY_RIG, NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import DesiredState, QueueItem
+from orchestrator.daemon.pour_orders import POUR, PourOrder, order_request
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_file import whole_copy
 from orchestrator.run_errors import RunError
@@ -162,7 +163,10 @@ def run_request(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunReque
     theta = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
     # A daemon never repeats a pour by itself: it asks the operator, whatever the campaign says.
     plan = replace(plan, on_unknown="ask", outputs=plan.outputs.model_copy(update={"directory": str(settings.runs)}))
-    request = task_request(plan, item.task, given=theta)  # type: ignore[arg-type]  # written by us
+    if item.task == POUR:
+        request = order_request(plan, PourOrder.read(folder))
+    else:
+        request = task_request(plan, item.task, given=theta)  # type: ignore[arg-type]  # written by us
     if item.run is None:
         return request
     return replace(request, folder=settings.runs / item.run, resume="if begun")
@@ -180,6 +184,8 @@ class Submission:
 
     Attributes:
         rig: name of the rig; '' selects the matching one.
+        order: of an ordered pour, whose campaign `text` is.
+        batch, held, not_before: see `QueueItem`.
     """
 
     text: str = ""
@@ -188,6 +194,10 @@ class Submission:
     task: str = "run"
     rig: str = ""
     priority: int = 0
+    order: PourOrder | None = None
+    batch: str = ""
+    held: bool = False
+    not_before: float | None = None
 
 
 def prepare(settings: DaemonSettings, submission: Submission, key: str, by: str) -> QueueItem:
@@ -236,6 +246,8 @@ def _prepared(settings: DaemonSettings, submission: Submission, key: str, by: st
     if submission.path:
         text, files = _from_path(settings, submission.path)
     campaign = unpack(text, files, folder)
+    if submission.order is not None:
+        submission.order.write(folder)
     plan = load_confined(campaign, [folder.resolve()])
     draft = QueueItem(
         key,
@@ -250,6 +262,9 @@ def _prepared(settings: DaemonSettings, submission: Submission, key: str, by: st
         "",
         by,
         0.0,
+        batch=submission.batch,
+        held=submission.held,
+        not_before=submission.not_before,
     )
     anywhere = run_request(settings, draft, Rig(ANY_RIG))
     rig = _rig(settings, submission.rig, anywhere)

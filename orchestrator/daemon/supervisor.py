@@ -13,6 +13,7 @@ import logging
 import secrets
 import shutil
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,8 +24,9 @@ from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, WITHDRAWN, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.notifications import Counts
+from orchestrator.daemon.pour_orders import POUR
 from orchestrator.daemon.remote_operator import Asking
-from orchestrator.daemon.rig_worker import RigWorker, Running, SharedServices
+from orchestrator.daemon.rig_worker import RigWorker, Running, SharedServices, settle
 from orchestrator.daemon.run_readout import Pours
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.run_errors import RunError
@@ -85,6 +87,9 @@ class Supervisor:
                 found = f"found {item.state} after the daemon had ended without a word"
                 self.store.change(item.id, state="paused", reason=found)
                 self.feed.publish("CampaignFound", {"state": item.state, "text": found}, item.id)
+        for item in self.store.items(limit=1_000_000):
+            if item.task == POUR and item.state not in (*ENDED, "queued"):
+                await self.settle(item)
         self._tasks = [asyncio.create_task(self.feed.flushing(), name="feed")]
         self._tasks += [
             asyncio.create_task(worker.work(), name=f"rig {worker.rig.name}") for worker in self.workers.values()
@@ -176,12 +181,30 @@ class Supervisor:
         Raises:
             RequestRefusedError: the daemon or the rig accepts no new work.
         """
-        self.refuse_new_work(item.rig)
-        item = replace(item, rank=self.store.last_rank() + 1.0, created=time.time())
-        self.store.add(item)
-        self.note(item.by, "submit", item.id)
+        return self.submit_all([item], lambda at: None)[0]
+
+    def submit_all(self, items: Sequence[QueueItem], enter: Callable[[int], None]) -> list[QueueItem]:
+        """Queue campaigns whose snapshots have been checked, in their order: all or none.
+
+        Args:
+            items: the campaigns.
+            enter: called with each index in the same transaction, after its campaign was stored; may raise.
+
+        Raises:
+            RequestRefusedError: the daemon or a rig accepts no new work, or `enter` refuses one.
+        """
+        for rig in {item.rig for item in items}:
+            self.refuse_new_work(rig)
+        added = []
+        with self.store.together():
+            for at, item in enumerate(items):
+                added.append(replace(item, rank=self.store.last_rank() + 1.0, created=time.time()))
+                self.store.add(added[-1])
+                enter(at)
+        for item in added:
+            self.note(item.by, "submit", item.id)
         self.wake()
-        return item
+        return added
 
     def refuse_new_work(self, rig: str = "") -> None:
         """Raise RequestRefusedError if the daemon or one rig accepts no new work."""
@@ -231,6 +254,35 @@ class Supervisor:
         self.note(by, "move", item.id)
         self.wake()
         return self.item(item.id)
+
+    def reserve(self, rig: str, by: str, begins: float, ends: float, note: str) -> dict[str, Any]:
+        """Reserve a rig for the campaigns of a user. What runs already is not interrupted.
+
+        Raises:
+            RequestRefusedError: another reservation overlaps.
+        """
+        for one in self.reservations():
+            if one["rig"] == rig and one["by"] != by and begins < one["ends"] and one["begins"] < ends:
+                raise RequestRefusedError(f"rig {rig} is reserved by {one['by']} (reservation {one['id']})")
+        values = rig, by, begins, ends, note
+        number = self.store.write(
+            "insert into reservation (rig, by, begins, ends, note) values (?, ?, ?, ?, ?)", *values
+        )
+        self.note(by, "reserve", detail=f"rig {rig}")
+        self.wake()
+        return next(one for one in self.reservations() if one["id"] == number)
+
+    def reservations(self) -> list[dict[str, Any]]:
+        """Return the reservations that have not ended, in the order of their begin."""
+        return self.store.rows("select * from reservation where ends > ? order by begins, id", time.time())
+
+    def cancel_reservation(self, number: int, by: str) -> None:
+        """Cancel a reservation. Raises KeyError."""
+        if not self.store.rows("select id from reservation where id = ?", number):
+            raise KeyError(number)
+        self.store.write("delete from reservation where id = ?", number)
+        self.note(by, "cancel reservation", detail=str(number))
+        self.wake()
 
     def pause_queue(self, paused: bool, by: str) -> None:
         """Start no further campaigns, or start them again. Running campaigns continue."""
@@ -285,6 +337,8 @@ class Supervisor:
                 )
             elif desired is DesiredState.STOP:
                 self.store.change(item.id, state=STOPPED, ended=time.time(), reason=f"by {by}")
+                if item.task == POUR:
+                    self.workers[item.rig].background(self.settle(item, ended=True))
         self.wake()
         return self.item(item.id)
 
@@ -299,6 +353,30 @@ class Supervisor:
         self.store.change(item.id, desired_state=str(DesiredState.ABORT))
         self.note(by, "abort", item.id)
         await stopping
+        return self.item(item.id)
+
+    async def settle(self, item: QueueItem, *, ended: bool = False) -> None:
+        """Store the result of an ordered pour that rests; see `rig_worker.settle`."""
+        worker = self.workers.get(item.rig)
+        if worker is not None:
+            await settle(self._shared, item, worker.rig, ended=ended)
+
+    def change(self, key: str, by: str, *, hold: bool | None = None, not_before: float | None = None) -> QueueItem:
+        """Hold or release a queued campaign, or set its earliest start; 0 removes it.
+
+        Raises:
+            KeyError: the campaign does not exist.
+            RequestRefusedError: it is not queued.
+        """
+        item = self.item(key)
+        if item.state != "queued":
+            raise RequestRefusedError(f"{item.id} is {item.state}; only a queued campaign can be held or postponed")
+        if hold is not None:
+            self.store.change(item.id, held=hold)
+        if not_before is not None:
+            self.store.change(item.id, not_before=not_before or None)
+        self.note(by, "release" if hold is False else "hold" if hold else "postpone", item.id)
+        self.wake()
         return self.item(item.id)
 
     def resume(self, key: str, by: str) -> QueueItem:

@@ -6,13 +6,14 @@ the nearest actions in the same scene: minimum, median and maximum of their spil
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.interfaces import PourProgress
+from actors.interfaces import DoseProgress, PourProgress
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink, Track, columns_of
 from orchestrator.requests import Pour
@@ -66,7 +67,7 @@ class BalanceStage:
         self._rr, self._sink, self._scale = rr, sink, time_scale
         self._simulated: dict[str, list[tuple[Action, PourOutcome]]] = {}
         self._running: _Running | None = None
-        self._checkpoint = ""
+        self._checkpoint = self._phase = ""
         for name, label, colour, width in (
             ("shown", "display [g]", style.MEASURED, 3.0),
             ("net", "since the tare [g]", style.MEASURED, 3.0),
@@ -78,6 +79,10 @@ class BalanceStage:
             ("pour/high", "simulated, most [g]", "#f0c27a", 1.5),
             ("pour/weighed", "balance [g]", style.MEASURED, 3.0),
             ("pour/liquid", "virtual liquid [g]", style.FALLING, 3.0),
+            ("dose/target", "wanted [g]", style.BEST, 1.5),
+            ("dose/reading", "balance [g]", style.MEASURED, 3.0),
+            ("dose/estimated", "estimated in the receiver and falling [g]", style.PREDICTED, 3.0),
+            ("dose/tilt", "tilt [deg]", style.FALLING, 1.5),
         ):
             appearance = rr.SeriesLines(names=label, colors=shapes.rgb(colour), widths=width)
             sink.log(f"{PLACE}/{name}", appearance, static=True)
@@ -86,6 +91,7 @@ class BalanceStage:
             ("tare", "tare [g]", style.INK, 6.0),
             ("verdict", "weighed [g]", style.BEST, 9.0),
             ("pour/verdict", "weighed [g]", style.BEST, 9.0),
+            ("dose/stop", "turned back [g]", style.INK, 9.0),
         ):
             sink.log(
                 f"{PLACE}/{name}",
@@ -132,10 +138,24 @@ class BalanceStage:
                     and net <= 1e3 * running.scene.liquid.mass
                 ):
                     self._number("net", net)
+        if told.dose is not None:
+            self._dose(told.dose, told.tilt)
         if told.checkpoint == self._checkpoint:
             return None
         self._checkpoint = told.checkpoint
         return told.checkpoint
+
+    def _dose(self, dose: DoseProgress, tilt: float | None) -> None:
+        """Log a dose: its target, reading, estimate and tilt, and the moment at which the cup is turned back."""
+        self._number("dose/target", 1e3 * dose.target)
+        self._number("dose/estimated", 1e3 * dose.amount)
+        if dose.reading is not None:
+            self._number("dose/reading", 1e3 * dose.reading)
+        if tilt is not None:
+            self._number("dose/tilt", math.degrees(tilt))
+        if dose.phase == "return" and self._phase != "return":
+            self._number("dose/stop", 1e3 * dose.amount)
+        self._phase = dose.phase
 
     def finish(self, measured: PourMeasurement) -> _Running | None:
         """Log the result of a pour; return its readings for `beside`."""

@@ -37,6 +37,7 @@ def campaign_blueprint(
     *,
     theta_slices: bool = False,
     action_slices: bool = False,
+    doses: bool = False,
 ) -> rrb.Blueprint:
     """Return the layout of a campaign.
 
@@ -46,8 +47,19 @@ def campaign_blueprint(
         loss_label: label of the pours' loss.
         theta_slices: whether θ has more axes than one picture shows.
         action_slices: whether actions have more axes.
+        doses: the campaign pours wanted amounts and does nothing else.
     """
     import rerun.blueprint as rrb
+
+    if doses:
+        dosing = rrb.Horizontal(
+            _cell(),
+            rrb.Vertical(*_dose(), row_shares=[5, 3]),
+            rrb.Vertical(_status(), _log(), _lanes(), row_shares=[5, 3, 3]),
+            column_shares=[5, 7, 4],
+            name="Dosing",
+        )
+        return _blueprint(rrb.Tabs(dosing), moment)
 
     # Created again for each tab: a view has one parent, and remains empty in a second one.
     def losses() -> list[Any]:
@@ -218,6 +230,14 @@ def _shares() -> Any:
 def _weight() -> Any:
     contents = ["/balance/net", "/balance/verdict", "/balance/expected/**"]
     return _recent("/balance", "Balance: spilled [g], and what simulations expect", 60.0, contents=contents)
+
+
+def _dose() -> list[Any]:
+    amounts = ["/balance/dose/target", "/balance/dose/reading", "/balance/dose/estimated", "/balance/dose/stop"]
+    return [
+        _recent("/balance/dose", "Dose: wanted, balance and estimate [g]", 30.0, contents=amounts),
+        _recent("/balance/dose", "Tilt [deg]", 30.0, contents=["/balance/dose/tilt"]),
+    ]
 
 
 def _display() -> Any:

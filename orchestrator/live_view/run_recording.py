@@ -250,4 +250,5 @@ def blueprint_of(plan: CampaignPlan, moment: Moment) -> rrb.Blueprint:
         unit.label,
         theta_slices=calibration is not None and calibration.parameters.dimension > MAPPED,
         action_slices=deployment is not None and deployment.actions.dimension > MAPPED,
+        doses=plan.dispense is not None and calibration is None and deployment is None,
     )

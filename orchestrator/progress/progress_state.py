@@ -39,6 +39,7 @@ CHECKPOINT_WORDS = {
     "tilt": "tilting",
     "hold": "holding",
     "return": "returning upright",
+    "dose": "dosing",
     "settle": "settling",
     "weigh": "weighing",
     "record": "recording",
@@ -253,7 +254,9 @@ class ProgressState:
         if pour is None:
             return None
         total = None
-        if pour.calibrating:
+        if self.plan.dispense is not None:
+            total = len(self.plan.dispense.doses)
+        elif pour.calibrating:
             total = self.plan.calibration.pour_count if self.plan.calibration is not None else None
         elif self.plan.deployment is not None:
             total = self.plan.deployment.confirm if pour.confirming else self.plan.deployment.pours

@@ -32,7 +32,7 @@ from orchestrator.runs.events import (
     StageOpened,
     StrategyProgressed,
 )
-from orchestrator.runs.stages import CALIBRATION, CONFIRMATION, DEPLOYMENT, EVALUATION, POURS
+from orchestrator.runs.stages import CALIBRATION, CONFIRMATION, DEPLOYMENT, DOSES, EVALUATION, POURS
 from orchestrator.strategies.calibration.calibration_scores import DRAWS
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.strategies.strategy import Progress
@@ -256,6 +256,9 @@ def work_of(plan: CampaignPlan, stages: Sequence[str]) -> dict[str, WorkEstimate
 
 def _work(plan: CampaignPlan, name: str) -> WorkEstimate:
     calibration, deployment = plan.calibration, plan.deployment
+    if plan.dispense is not None and name == DOSES:
+        doses = len(plan.dispense.doses)
+        return WorkEstimate(pours=doses, pour_time=pour_time(plan.laboratory, plan.dispense.scenes[0]))
     if calibration is not None:
         pour = pour_time(plan.laboratory, calibration.scene, calibration.actions)
         if name == POURS:
@@ -311,16 +314,16 @@ def _deployed(plan: DeploymentPlan, pour: float) -> WorkEstimate:
     return WorkEstimate(settings.simulations, pours, settings.simulations_beside, pour_time=pour)
 
 
-def pour_time(laboratory: LaboratorySettings, scene: Scene, actions: Space) -> float:
+def pour_time(laboratory: LaboratorySettings, scene: Scene, actions: Space | None = None) -> float:
     """Duration of one whole pour with the operator's part, as planned [s of wall time].
 
     Args:
         laboratory: laboratory with the operator and the bench.
         scene: scene with the fixed parameters of the motion.
-        actions: searched parameters of the motion; the middle of their ranges is used.
+        actions: searched parameters of the motion; the middle of their ranges is used. None: nothing is searched.
     """
     values = {**{name: d.lower for name, d in ACTION_DIMENSIONS.items()}, **scene.fixed}
-    values |= {axis.name: 0.5 * (axis.lower + axis.upper) for axis in actions.axes}
+    values |= {axis.name: 0.5 * (axis.lower + axis.upper) for axis in (() if actions is None else actions.axes)}
     angle, speed, back, hold = (
         values.get(name) for name in ("max_angle", "angular_velocity", "return_velocity", "hold_time")
     )

@@ -37,6 +37,8 @@ def receiver_names(plan: CampaignPlan) -> dict[str, str]:
                 names.setdefault(known.scene.name, known.scene.receiver.name)
         for scene in plan.calibration.poured:
             names.setdefault(scene.name, scene.receiver.name)
+    for scene in () if plan.dispense is None else plan.dispense.scenes:
+        names.setdefault(scene.name, scene.receiver.name)
     return names
 
 

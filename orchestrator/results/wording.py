@@ -455,6 +455,7 @@ def what_was_asked(plan: CampaignPlan, record: RunRecord) -> dict[str, str]:
     scenes = (list(plan.calibration.poured) if plan.calibration is not None else []) + (
         list(plan.deployment.scenes) if plan.deployment is not None else []
     )
+    scenes += [] if plan.dispense is None else plan.dispense.scenes
     if scenes:
         liquid = scenes[0].liquid
         volume = liquid.millilitres(liquid.mass)
@@ -638,12 +639,15 @@ def _dose_table(stage: str, dispensed: Dispensed) -> ResultTable:
     rows = []
     for dose in dispensed.doses:
         error = None if dose.received_g is None else dose.received_g - dose.wanted_g
-        cells = [str(dose.number), f"{dose.wanted_g:g}"]
+        cells = [str(dose.number), dose.position or "—", f"{dose.wanted_g:g}"]
         cells += ["—" if grams is None else f"{grams:.2f}" for grams in (dose.received_g, error, dose.spilled_g)]
-        cells += ["—" if dose.duration_s is None else f"{dose.duration_s:.1f}", dose.end]
+        cells += ["—" if dose.duration_s is None else f"{dose.duration_s:.1f}", dose.source or "—"]
+        cells += ["—" if dose.left_g is None else f"{dose.left_g:.0f} ± {2.0 * (dose.left_deviation_g or 0.0):.1f}"]
+        cells += [f"{dose.end}{', source filled before' if dose.filled else ''}"]
         rows.append(ResultRow(cells, "bad" if dose.received_g is None else ""))
-    header = ["dose", "wanted [g]", "received [g]", "difference [g]", "spilled [g]", "time [s]", "end"]
-    return ResultTable(f"{stage}: {len(rows)} wanted amounts", header, rows, frozenset(range(len(header) - 1)))
+    header = ["dose", "position", "wanted [g]", "received [g]", "difference [g]", "spilled [g]", "time [s]"]
+    header += ["source", "left [g]", "end"]
+    return ResultTable(f"{stage}: {len(rows)} wanted amounts", header, rows, frozenset({0, *range(2, 7), 8})).filled()
 
 
 def _pour_table(stage: str, pours: Sequence[PourSummary]) -> ResultTable:

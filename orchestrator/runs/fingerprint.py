@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from orchestrator.journal.codec import to_json
+from orchestrator.requests import WRITTEN_IF_SET
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.liquids import Liquid
 from sim_engine.scene import Scene
@@ -49,7 +50,7 @@ def deciding(value: Any) -> Any:
     if isinstance(value, ProfileShape) and value.unit != "m":
         return deciding(value.outline())  # the same shape in another unit is the same
     if isinstance(value, BaseModel) or (dataclasses.is_dataclass(value) and not isinstance(value, type)):
-        free = value.free_fields() if isinstance(value, Liquid | ProfileShape) else frozenset()
+        free = value.free_fields() if isinstance(value, Liquid | ProfileShape) else _absent(value)
         fields = {
             name: (getattr(value, name), mark)
             for name, mark in marks_of(type(value)).items()
@@ -65,3 +66,14 @@ def deciding(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [deciding(found) for found in value]
     return to_json(value)
+
+
+def _absent(value: Any) -> frozenset[str]:
+    """Fields that runs of earlier versions lack, while they are None."""
+    if isinstance(value, BaseModel):
+        return frozenset()
+    return frozenset(
+        field.name
+        for field in dataclasses.fields(value)
+        if field.metadata == WRITTEN_IF_SET and getattr(value, field.name) is None
+    )

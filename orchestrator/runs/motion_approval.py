@@ -23,7 +23,7 @@ from actors.arm.arm_settings import ArmSettings, SafetyRecord
 from actors.interfaces import InvalidActionError
 from actors.optimizer.questions import Linear
 from orchestrator.run_errors import RunError
-from orchestrator.runs.stages import CONFIRMATION, DEPLOYMENT, StageDefinition
+from orchestrator.runs.stages import CONFIRMATION, DEPLOYMENT, DOSES, StageDefinition
 from orchestrator.strategies.calibration.action_prior import actions_all_over
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.action import Action
@@ -187,6 +187,8 @@ def campaign_pours(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> lis
     if plan.deployment is not None and deploying:
         for scene in plan.deployment.scenes:
             cases += _from_all_over(scene, plan.deployment.actions, plan.deployment.constraints)
+    if plan.dispense is not None and any(stage.name == DOSES for stage in stages):
+        cases += [(scene, scene.action({})) for scene in plan.dispense.scenes]
     return cases
 
 
@@ -204,6 +206,8 @@ def pour_count(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> int:
     """How many pours the stages may ask for."""
     calibrating, deploying = _pouring(stages)
     count = plan.calibration.pour_count if plan.calibration is not None and calibrating else 0
+    if plan.dispense is not None and any(stage.name == DOSES for stage in stages):
+        count += len(plan.dispense.doses)
     if plan.deployment is None:
         return count
     confirming = sum(stage.name.startswith(CONFIRMATION) for stage in stages)
@@ -212,7 +216,11 @@ def pour_count(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> int:
 
 def _pouring(stages: Sequence[StageDefinition]) -> tuple[bool, int]:
     """Whether the calibration's pours are among the stages, and how many deployments that pour."""
-    names = [stage.name for stage in stages if stage.pours and not stage.name.startswith(CONFIRMATION)]
+    names = [
+        stage.name
+        for stage in stages
+        if stage.pours and not stage.name.startswith(CONFIRMATION) and stage.name != DOSES
+    ]
     deploying = sum(name.startswith(DEPLOYMENT) for name in names)
     return deploying < len(names), deploying
 

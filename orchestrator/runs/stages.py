@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from orchestrator.catalogue.source_account import SourceAccount
 from orchestrator.journal.codec import Results, result_of
 from orchestrator.requests import Order
 from orchestrator.run_errors import RunError
@@ -34,6 +35,7 @@ from orchestrator.strategies.campaign_plan import (
     CalibrationPlan,
     CampaignPlan,
     DeploymentPlan,
+    DispensePlan,
     KnownSimulation,
     MeasuredPour,
     RecordSet,
@@ -41,6 +43,7 @@ from orchestrator.strategies.campaign_plan import (
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_monitoring import displacement
+from orchestrator.strategies.dispense import Dispense, ReadSources, SourcesRead
 from orchestrator.strategies.single_action import Confirmation, RepeatedSimulation
 from orchestrator.strategies.strategy import Strategy
 from sim_engine.liquids import SimulationParameters
@@ -51,8 +54,11 @@ POURS, CALIBRATION, EVALUATION = "pours", "calibration", "evaluation"
 DEPLOYMENT, CONFIRMATION, PREDICTION = "deployment:", "confirmation:", "prediction:"
 """Names of the calibration's stages, and prefixes of the receivers' stage names."""
 
+SOURCES, DOSES = "sources", "doses"
+"""Names of the stages of a series of doses."""
+
 POSTERIOR_DRAWS = 64
-"""Number of draws from the posterior of θ that a deployment under risk uses."""
+"""Number of draws from the posterior of θ that a deployment's simulations use."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +111,8 @@ def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
         found += [records.scene for records in (plan.calibration.records, plan.calibration.transfer) if records]
     if plan.deployment is not None:
         found += plan.deployment.scenes
+    if plan.dispense is not None:
+        found += plan.dispense.scenes
     scenes: dict[str, Scene] = {}
     for scene in found:
         if scenes.setdefault(scene.name, scene) != scene:
@@ -119,7 +127,26 @@ def stages_of(plan: CampaignPlan) -> tuple[StageDefinition, ...]:
         stages += calibration_stages(plan.calibration, plan.deployment)
     if plan.deployment is not None:
         stages += deployment_stages(plan, plan.deployment)
+    if plan.dispense is not None:
+        stages += dispense_stages(plan.dispense)
     return tuple(stages)
+
+
+def dispense_stages(plan: DispensePlan) -> list[StageDefinition]:
+    """The content of the sources, which is read once, and the doses."""
+
+    def sources(results: Results, seed: int) -> Strategy:
+        if not plan.as_left:
+            return ReadSources({})
+        try:
+            return ReadSources(SourceAccount.open().known(plan))
+        except OSError as error:
+            raise RunError(f"the content of the sources is not known: {error}; write 'start: filled'") from error
+
+    def doses(results: Results, seed: int) -> Strategy:
+        return Dispense(plan, seed, result_of(results, SOURCES, SourcesRead).sources)
+
+    return [StageDefinition(SOURCES, sources), StageDefinition(DOSES, doses, pours=True)]
 
 
 def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None = None) -> list[StageDefinition]:
@@ -242,16 +269,32 @@ def prediction_stages(
 
 
 def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPlan:
-    """The deployment with the posterior draws of θ that its settings need, from the preceding calibration.
+    """The deployment with posterior draws of θ from the preceding calibration; its simulations use them in turn.
+
+    There are none if the calibration has no posterior, or if the weighed pours do not justify θ*. A strategy that
+    learns the bench's offsets from its pours receives what calibration knows of them separately (`with_bench`): if
+    offsets were searched, its simulations use θ*.
 
     Raises:
-        RunError: the calibration has no posterior.
+        RunError: the settings need a posterior, and the calibration has none.
     """
-    if not deployment.settings.needs_posterior or deployment.thetas:
+    if deployment.thetas:
         return deployment
     found = calibrated_theta(results) if CALIBRATION in results else None
-    if found is None or found.posterior is None or not found.posterior.thetas:
-        raise RunError("deployment.risk: theta: posterior, but no calibration of this campaign tells one; C4 does")
+    posterior = () if found is None or found.posterior is None else found.posterior.thetas
+    if deployment.settings.needs_posterior:
+        if not posterior:
+            raise RunError("deployment.risk: theta: posterior, but no calibration of this campaign tells one; C4 does")
+    elif (
+        found is None
+        or not posterior
+        or deployed_theta(results) != found.theta
+        or (
+            deployment.settings.learns_of_benches and set(SimulationParameters.nuisances()).intersection(found.searched)
+        )
+    ):
+        return deployment
+    assert found is not None
     return replace(deployment, thetas=posterior_draws(found, POSTERIOR_DRAWS))
 
 

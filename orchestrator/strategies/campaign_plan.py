@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import BenchOffset, Linear, Point
+from orchestrator.requests import WRITTEN_IF_SET
 from orchestrator.strategies.deployment.objectives import Objectives
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
@@ -413,8 +414,8 @@ class DeploymentPlan(StagePlan):
         objectives: objectives to minimise instead of the loss.
         constraints: constraints on actions in addition to the bounds of their space.
         confirm: number of repetitions of the recommended action in each scene after the strategy has ended.
-        thetas: equally likely draws of a posterior, for settings that need them. They are given if no calibration of
-            the same campaign provides them.
+        thetas: equally likely draws of a posterior, which simulations use in turn. They are given if no calibration of
+            the same campaign provides them; without any, all simulations use θ*.
         bench: equally likely offsets of the bench from the simulator; empty if nothing is known about it.
         left_over: residual shift of a calibration (`sim_engine.prediction_band`), given in the same case as `thetas`;
             None if unknown.
@@ -446,6 +447,56 @@ class DeploymentPlan(StagePlan):
     def loss_name(self) -> str:
         """Name of the minimised quantity in results."""
         return self.loss.name if self.objectives is None else "objectives"
+
+
+@dataclass(frozen=True)
+class PlannedDose:
+    """One wanted amount.
+
+    Attributes:
+        amount, limit: see `actors.interfaces.DoseTarget` [kg].
+        receiver: name of the receiver's vessel.
+        position: name of the receiver's place; '' if there is only one.
+    """
+
+    amount: float
+    limit: float
+    receiver: str
+    position: str = ""
+
+
+@dataclass(frozen=True)
+class DispensePlan:
+    """Plan of a series of doses.
+
+    Attributes:
+        scenes: one for each source and each receiver vessel; the source is the scene's pourer, its load the content
+            of a full source.
+        doses: in the order of pouring.
+        refill_below: a source that would hold less after a dose is not used before it is filled again [kg].
+        as_left: whether the series begins with what earlier runs left in the sources; otherwise they are filled.
+        laboratory: name under which the content of the sources is tracked.
+    """
+
+    scenes: tuple[Scene, ...]
+    doses: tuple[PlannedDose, ...]
+    refill_below: float
+    as_left: bool
+    laboratory: str
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the sources, in the order of use."""
+        return tuple(dict.fromkeys(scene.pourer.name for scene in self.scenes))
+
+    def scene(self, source: str, receiver: str) -> Scene:
+        """The scene of a source and a receiver."""
+        return next(one for one in self.scenes if (one.pourer.name, one.receiver.name) == (source, receiver))
+
+    def tracked(self, source: str) -> str:
+        """Name under which a source's content is tracked: laboratory, vessel and liquid."""
+        scene = next(one for one in self.scenes if one.pourer.name == source)
+        return f"{self.laboratory}/{source}/{scene.liquid.name}"
 
 
 class OutputSettings(Settings):
@@ -486,6 +537,7 @@ class CampaignPlan:
             a seed leads to the same requests on every machine.
         on_unknown: treatment, on resume, of a pour that had started and has no outcome.
         resolved: the YAML file with all defaults filled in, ready for JSON, as stored with the run.
+        dispense: the series of doses; None without one.
     """
 
     name: str
@@ -500,6 +552,7 @@ class CampaignPlan:
     on_unknown: Annotated[Literal["ask", "repeat"], NOT_IN_FINGERPRINT] = "ask"
     resolved: Annotated[dict[str, Any], NOT_IN_FINGERPRINT] = field(default_factory=dict)
     laboratory_source: Annotated[Path | None, NOT_IN_FINGERPRINT] = field(default=None, compare=False)
+    dispense: DispensePlan | None = field(default=None, metadata=WRITTEN_IF_SET)
 
 
 @dataclass(frozen=True)

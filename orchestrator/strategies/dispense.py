@@ -1,24 +1,91 @@
-"""Wanted amounts, one after the other: the strategy of `decant dose`.
+"""Wanted amounts, one after the other: the strategies of `dispense:` and of `decant dose`.
 
-`Dispense` requests one pour with a `DoseTarget` for each amount; `Dispensed` is its result. A dose that failed is not
-repeated, and the next one is requested.
+- `ReadSources` makes no request. Its result is the content of the sources when the series began, so that a resumed run
+  requests the same doses.
+- `Dispense` requests one pour with a `DoseTarget` for each amount; `Dispensed` is its result. It chooses the source,
+  has it filled again, and passes the estimates of each dose to the next one. A dose that failed is not repeated, and
+  the next one is requested.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping
 from typing import Any, Literal
 
-from actors.interfaces import DoseTarget
+from actors.interfaces import DoseKnowledge, DoseSource, DoseTarget
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
+from orchestrator.strategies.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from orchestrator.strategies.strategy import Progress
 from orchestrator.strategies.trials import SeedStream
-from sim_engine.action import Action
-from sim_engine.scene import Scene
 
 DOSE = "dose"
 """Purpose of these pours."""
+
+FILL_DEVIATION = 0.5e-3
+"""Standard deviation of the content of a source that was filled on a scale [kg]."""
+
+WEIGHED_DEVIATION = 0.3e-3
+"""Standard deviation of the mass that a dose takes from its source beyond the weighed amount [kg]."""
+
+ENOUGH = 3.0
+"""Standard deviations of the content by which a source has to hold more than the amount."""
+
+
+class KnownSource(ResultPart):
+    """Content of a source, and what its doses have shown."""
+
+    mass: float
+    """Expected content [kg]."""
+
+    deviation: float
+    """Standard deviation of the content [kg]."""
+
+    knowledge: dict[str, Any] | None = None
+    """Fields of `actors.interfaces.DoseKnowledge`."""
+
+
+class SourcesRead(StageResult):
+    """Content of the sources when a series began."""
+
+    kind: Literal["sources"] = "sources"
+
+    sources: dict[str, KnownSource]
+    """By name; sources of unknown content are absent."""
+
+
+class ReadSources:
+    """Keeps the content of the sources as a result; it makes no request.
+
+    Args:
+        sources: by name.
+    """
+
+    def __init__(self, sources: Mapping[str, KnownSource]) -> None:
+        self._sources = dict(sources)
+        self.decisions: list[Decision] = []
+
+    @property
+    def finished(self) -> bool:
+        """True: nothing is requested."""
+        return True
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """Return no request."""
+        return []
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """Raises ValueError: nothing was requested."""
+        raise ValueError(f"nothing was asked for: {request}")
+
+    def progress(self) -> Progress:
+        """Return no work."""
+        return Progress()
+
+    def result(self) -> SourcesRead:
+        """The content of the sources."""
+        return SourcesRead(sources=self._sources)
 
 
 class DoseSignals(ResultPart):
@@ -58,6 +125,21 @@ class Dose(ResultPart):
     end: str
     """How the dose ended, or why it failed."""
 
+    position: str = ""
+    """Name of the receiver's place."""
+
+    source: str = ""
+    """Name of the source vessel."""
+
+    filled: bool = False
+    """Whether the source was filled before the dose."""
+
+    left_g: float | None = None
+    """Estimated content of the source after the dose [g]; None if it is unknown."""
+
+    left_deviation_g: float | None = None
+    """Standard deviation of this content [g]."""
+
     signals: DoseSignals = DoseSignals()
     """Signals over time."""
 
@@ -68,7 +150,7 @@ class Dispensed(StageResult):
     kind: Literal["doses"] = "doses"
 
     scene: str
-    """Name of the scene."""
+    """Name of the first scene."""
 
     doses: tuple[Dose, ...]
     """Completed doses, in the order made."""
@@ -78,15 +160,16 @@ class Dispense:
     """Pour amounts, one after the other.
 
     Args:
-        scene: scene to pour in.
-        action: place of the pourer, and range of the tilt.
-        doses: wanted amounts, in order.
+        plan: sources, amounts and their order.
         seed: seed of a virtual bench's random numbers.
+        known: content of the sources; one that is absent is filled before its first dose.
     """
 
-    def __init__(self, scene: Scene, action: Action, doses: Sequence[DoseTarget], seed: int) -> None:
-        self._scene, self._action, self._targets = scene, action, tuple(doses)
-        self._seeds = SeedStream(seed, f"dispense {scene.name}")
+    def __init__(self, plan: DispensePlan, seed: int, known: Mapping[str, KnownSource] | None = None) -> None:
+        self._plan = plan
+        self._seeds = SeedStream(seed, "dispense")
+        self._constants = self._seeds.next()
+        self._sources: dict[str, KnownSource] = dict(known or {})
         self._pouring: Pour | None = None
         self._doses: list[Dose] = []
         self.decisions: list[Decision] = []
@@ -94,17 +177,53 @@ class Dispense:
     @property
     def finished(self) -> bool:
         """Whether all doses are completed."""
-        return len(self._doses) == len(self._targets)
+        return len(self._doses) == len(self._plan.doses)
 
     def ask(self, slots: Slots) -> list[Request]:
         """Return the next dose, if none is running."""
         if self.finished or self._pouring is not None or slots.pours < 1:
             return []
         number = len(self._doses) + 1
-        target = self._targets[number - 1]
-        self._pouring = Pour(self._scene.name, self._action, number, self._seeds.next(), purpose=DOSE, dose=target)
-        self.decisions.append(Decision(f"dose {number}/{len(self._targets)}: {1e3 * target.amount:g} g"))
+        planned = self._plan.doses[number - 1]
+        source = self.next_source(planned)
+        scene = self._plan.scene(source.name, planned.receiver)
+        target = DoseTarget(planned.amount, planned.limit, planned.position, source)
+        self._pouring = Pour(scene.name, scene.action({}), number, self._seeds.next(), purpose=DOSE, dose=target)
+        into = f" into {planned.position}" if planned.position else ""
+        filled = ", filled before" if source.fill else f", which holds {1e3 * source.mass:.0f} g"
+        text = f"dose {number}/{len(self._plan.doses)}: {1e3 * planned.amount:g} g{into} from {source.name}{filled}"
+        self.decisions.append(Decision(text))
         return [self._pouring]
+
+    def next_source(self, planned: PlannedDose) -> DoseSource:
+        """The source of a dose: the first one that holds enough; if there is none, the fullest is filled."""
+        names = self._plan.sources
+        for name in names:
+            known = self._sources.get(name)
+            if known is not None and self._holds(known, planned):
+                return self._source(name, known, fill=False)
+        unknown = [name for name in names if name not in self._sources]
+        name = unknown[0] if unknown else max(names, key=lambda one: self._sources[one].mass)
+        scene = self._plan.scene(name, planned.receiver)
+        before = self._sources.get(name)
+        filled = KnownSource(
+            mass=scene.liquid.mass,
+            deviation=FILL_DEVIATION,
+            knowledge=None if before is None else before.knowledge,
+        )
+        return self._source(name, filled, fill=True)
+
+    def assume(self, name: str, content: KnownSource) -> None:
+        """Set the content of a source, for a forecast of the doses after it."""
+        self._sources[name] = content
+
+    def _holds(self, known: KnownSource, planned: PlannedDose) -> bool:
+        sure = known.mass - ENOUGH * known.deviation
+        return sure > planned.amount + planned.limit and known.mass - planned.amount >= self._plan.refill_below
+
+    def _source(self, name: str, known: KnownSource, *, fill: bool) -> DoseSource:
+        knowledge = None if known.knowledge is None else _knowledge(known.knowledge)
+        return DoseSource(name, known.mass, known.deviation, fill, self._constants, knowledge)
 
     def tell(self, request: Request, outcome: Outcome) -> None:
         """Record the outcome of a dose.
@@ -116,40 +235,84 @@ class Dispense:
         if pour is None or request != pour:
             raise ValueError(f"this dose was not asked for: {request}")
         assert pour.dose is not None
+        assert pour.dose.source is not None
         self._pouring = None
-        wanted = 1e3 * pour.dose.amount
+        left = left_after(pour.dose, outcome)
+        if left is None:
+            self._sources.pop(pour.dose.source.name, None)
+        else:
+            self._sources[pour.dose.source.name] = left
+        about: dict[str, Any] = {}
+        received = spilled = None
         match outcome:
             case Poured(measured):
-                about: dict[str, Any] = measured.notes.get(DOSE, {})
-                self._doses.append(
-                    Dose(
-                        number=pour.number,
-                        wanted_g=wanted,
-                        received_g=1e3 * float(about.get("received", measured.delivered)),
-                        spilled_g=1e3 * measured.spilled,
-                        duration_s=about.get("duration"),
-                        end=str(about.get("end", "")),
-                        signals=DoseSignals(**{name: about.get(name, ()) for name in DoseSignals.model_fields}),
-                    )
-                )
+                about = measured.notes.get(DOSE, {})
+                received, spilled = 1e3 * float(about.get("received", measured.delivered)), 1e3 * measured.spilled
+                end = str(about.get("end", ""))
             case Failed(kind, reason):
-                self._doses.append(
-                    Dose(
-                        number=pour.number,
-                        wanted_g=wanted,
-                        received_g=None,
-                        spilled_g=None,
-                        duration_s=None,
-                        end=f"{kind}: {reason}",
-                    )
-                )
+                end = f"{kind}: {reason}"
             case _:
                 raise ValueError(f"a dose can't be answered by {type(outcome).__name__}")
+        self._doses.append(
+            Dose(
+                number=pour.number,
+                wanted_g=1e3 * pour.dose.amount,
+                received_g=received,
+                spilled_g=spilled,
+                duration_s=about.get("duration"),
+                end=end,
+                position=pour.dose.position,
+                source=pour.dose.source.name,
+                filled=pour.dose.source.fill,
+                left_g=None if left is None else 1e3 * left.mass,
+                left_deviation_g=None if left is None else 1e3 * left.deviation,
+                signals=DoseSignals(**{name: about.get(name, ()) for name in DoseSignals.model_fields}),
+            )
+        )
 
     def progress(self) -> Progress:
         """Doses made, and their total number."""
-        return Progress(pours=len(self._doses), of_pours=len(self._targets))
+        return Progress(pours=len(self._doses), of_pours=len(self._plan.doses))
 
     def result(self) -> Dispensed:
         """The doses so far."""
-        return Dispensed(scene=self._scene.name, doses=tuple(self._doses))
+        return Dispensed(scene=self._plan.scenes[0].name, doses=tuple(self._doses))
+
+
+def left_after(dose: DoseTarget, outcome: Outcome) -> KnownSource | None:
+    """Content of a dose's source after it, and what the dose has shown; None if the content is unknown.
+
+    Args:
+        dose: with its source.
+        outcome: of its pour.
+    """
+    source = dose.source
+    if source is None:
+        return None
+    before = None if source.knowledge is None else _fields(source.knowledge)
+    match outcome:
+        case Poured(measured):
+            about = measured.notes.get(DOSE, {})
+            if "left" in about:
+                mass, deviation = map(float, about["left"])
+                return KnownSource(mass=max(mass, 0.0), deviation=deviation, knowledge=about.get("knowledge", before))
+            mass = max(source.mass - measured.delivered - measured.spilled, 0.0)  # an operator weighed it
+            return KnownSource(mass=mass, deviation=math.hypot(source.deviation, WEIGHED_DEVIATION), knowledge=before)
+        case Failed(kind="invalid_action"):  # nothing was poured
+            return KnownSource(mass=source.mass, deviation=source.deviation, knowledge=before)
+    return None
+
+
+def _fields(knowledge: DoseKnowledge) -> dict[str, Any]:
+    return {name: getattr(knowledge, name) for name in DoseKnowledge.__dataclass_fields__}
+
+
+def _knowledge(fields: Mapping[str, Any]) -> DoseKnowledge:
+    lag = fields["lag"]
+    return DoseKnowledge(
+        tuple(fields["onset_flow"]),
+        tuple(fields["covariance"]),
+        None if lag is None else tuple(lag),
+        float(fields["aim"]),
+        int(fields["doses"]),
+    )

@@ -10,7 +10,6 @@ A failed pour is never repeated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Literal
 
 from orchestrator.requests import (
@@ -249,7 +248,7 @@ class RepeatedSimulation:
         if not isinstance(request, Simulate) or request not in self._open:
             raise ValueError(f"this simulation was not asked for, or has been answered already: {request}")
         self._open.discard(request)
-        costing = replace(self._costing, parameters=request.parameters)
+        costing = self._costing.of_theta(request.parameters)
         cost = costing.simulated(outcome, request.action)
         if isinstance(outcome, Simulated) and cost is not None:
             self._outcomes.append(outcome.outcome)

@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[2]
 PRODUCT = ("decant", "orchestrator", "actors", "sim_engine")
 SCRIPTS = ("tests", "benchmarks", "docs")
 
-STARTS = 400
+STARTS = 120
 """By each of two threads. Without a copy of the environment about one start in seventy fails."""
 
 

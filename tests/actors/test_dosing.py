@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from actors.dosing.cup_flow import CupFlow
-from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder, DosingSettings
+from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, identify_lag
 from actors.dosing.dose_series import DoseSeries, SourceContent
+from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import DoseRecord, DosingFault, TrueCup, TrueScale, VirtualDosingBench
 from sim_engine.hydrostatics import level, tilting_cup_outflow
 from sim_engine.liquids import Liquid

@@ -105,7 +105,7 @@ def test_after_a_pour_that_lost_all_in_place_of_little_the_next_goes_where_the_s
     assert second.discrepancy.uninformative > 0.5
 
 
-@pytest.mark.parametrize(("simulated_width", "factor"), [(1.4, 1.1), (0.7, 0.95)])
+@pytest.mark.parametrize(("simulated_width", "factor"), [(1.4, 1.1), (0.7, 0.97)])
 def test_pours_tell_that_the_valley_is_narrower_or_wider_than_simulated(simulated_width, factor):
     def widened(points):
         return cup((0.35, 0.6) + (np.atleast_2d(points) - (0.35, 0.6)) / simulated_width)
@@ -134,7 +134,7 @@ def test_the_first_pour_goes_where_least_is_lost_however_many_follow():
 def test_before_any_pour_the_simulator_is_expected_to_be_nearly_right():
     first = propose(asked(cup, [], acquisition="least_loss"))
     assert cup(first.points[0])[0] < 0.01
-    assert first.means[0] < 0.22
+    assert first.means[0] < 0.28  # 0.30 if it were as likely to be far off
 
 
 @pytest.mark.parametrize("middle", [0.004, 0.4, 0.99])
@@ -154,6 +154,24 @@ def test_most_pours_lie_in_the_bands_that_come_with_them():
     low, high = answer.bands[0]
     assert 0.0 <= low <= cup(answer.points[0])[0] <= high
     assert high < answer.means[0] + 2.0 * float(np.hypot(answer.deviations, answer.noises)[0])
+
+
+def test_intervals_hold_the_share_of_pours_that_they_state():
+    """Benches displaced as the priors say; pours all over the box, predicted after three others."""
+    inside, number = {0.5: 0, 0.9: 0, 0.99: 0}, 0
+    for bench in range(20):
+        rng = np.random.default_rng(bench)
+        moved = rng.standard_normal(2) * (0.14, 0.02)
+        poured, ahead = rng.random((3, 2)), rng.random((12, 2))
+        model = averaged(asked(lambda x, moved=moved: cup(np.atleast_2d(x) - moved), poured))
+        lost = np.clip(cup(ahead) * (1.0 + 0.03 * rng.standard_normal(12)), 0.0, 1.0)
+        number += len(lost)
+        for level in inside:
+            low, high = model.bands(ahead, level).T
+            inside[level] += int(((low <= lost) & (lost <= high)).sum())
+    assert 0.45 < inside[0.5] / number < 0.6
+    assert 0.84 < inside[0.9] / number < 0.97
+    assert inside[0.99] / number > 0.95
 
 
 def test_with_something_good_in_hand_no_unknown_corner_is_tried():

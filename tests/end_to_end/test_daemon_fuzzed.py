@@ -16,7 +16,7 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from orchestrator.daemon.access_control import Role
+from orchestrator.daemon.access_tokens import Role
 from orchestrator.daemon.http_api import create_app
 from tests.support.daemon_thread import Real
 from tests.support.hypothesis_examples import examples

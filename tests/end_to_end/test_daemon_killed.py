@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.daemon.access_control import Role, token_of
+from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.journal.codec import decode_outcome
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Poured

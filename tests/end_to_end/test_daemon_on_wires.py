@@ -16,7 +16,7 @@ import pytest
 
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.ur_controller.controller_process import VirtualController
-from orchestrator.daemon.access_control import Role, token_of
+from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.journal.journal import Kind
 from orchestrator.runs.motion_approval import SafetyRecord, write_record

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from actors.interfaces import Notice, ProgressCallback
+from actors.interfaces import DoseSource, DoseTarget, Notice, ProgressCallback
 from actors.runtime.child_process import child_environment
 from orchestrator.cli.campaign_commands import run_directory
 from orchestrator.cli.foreground_run import BAD_INPUT, RefusalError
@@ -169,3 +169,37 @@ def test_a_reserve_is_held_anew_before_the_next_pour(tmp_path: Path) -> None:
     assert not reserve.release()
     reserve.check_pour()
     assert reserve.release()
+
+
+class DosingBench(ToyBench):
+    """Pours a wanted amount, with the signals of a long dose in its record; the disk fills while it flows."""
+
+    happens: Callable[[], None] = staticmethod(lambda: None)
+
+    async def pour(
+        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None, dose: Any = None
+    ) -> PourMeasurement:
+        self.happens()
+        measured = await super().pour(scene, action, seed=seed, progress=progress)
+        signals = {name: [round(1.2345 * k, 3) for k in range(600)] for name in SIGNALS}
+        return replace(measured, notes={"dose": {"received": 0.05, "left": [0.2, 1e-3], "end": "reached", **signals}})
+
+
+SIGNALS = ("times", "tilt_deg", "read_at", "readings_g")
+
+
+def test_with_the_disk_full_in_the_flow_the_amount_of_a_dose_is_kept(disk: Path) -> None:
+    bench = DosingBench()
+    bench.happens = lambda: fill(disk)
+    source = DoseSource("beaker", 0.25, 1e-3, fill=False, constants=1)
+    wanted = [replace(one, dose=DoseTarget(0.05, source=source)) for one in (pour(1), pour(2))]
+    script = Script(*wanted)
+    with pytest.raises(NoSpaceError, match="20 MB are needed before anything"):
+        run(disk / "run", ToyLaboratory(bench=bench), stages=one_stage(script))
+    (outcome,) = [outcome for _, outcome in script.told]
+    assert isinstance(outcome, Poured)
+    with JournalReader(disk / "run" / JOURNAL_NAME) as journal:
+        (entry,) = [entry for entry in journal.entries() if entry.kind == Kind.POUR_FINISHED]
+    about = entry.body["outcome"]["measurement"]["notes"]["dose"]
+    assert (about["received"], len(about["readings_g"])) == (0.05, 600)
+    assert states(disk / "run")[-1] == "paused"

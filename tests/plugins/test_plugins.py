@@ -184,6 +184,18 @@ outputs: {directory: runs}
 """
 
 
+@pytest.mark.slow
+def test_a_campaign_runs_with_an_arm_of_seven_joints(decant: Decant, folder: Path) -> None:
+    arm = "arm: {kind: seven-joint}\ncell: {receiver: {x: 700 mm, y: 0 mm, z: 150 mm}, direction: 90 deg}"
+    laboratory = LABORATORY.replace("arm: {kind: stand, fastest: 130 deg/s}", arm).replace("scale: 60", "scale: 4")
+    (folder / "example.yaml").write_text(laboratory)
+    (folder / "campaign.yaml").write_text(CAMPAIGN)
+    ran = decant("run", "campaign.yaml", "--json", cwd=folder)
+    assert ran.returncode == 0, ran.stderr
+    (run,) = (folder / "runs").iterdir()
+    assert json.loads((run / "summary.json").read_text())["pours"] == 2
+
+
 def test_a_campaign_of_things_from_outside_is_run_from_beginning_to_end(decant: Decant, folder: Path) -> None:
     (folder / "campaign.yaml").write_text(CAMPAIGN)
     ran = decant("run", "campaign.yaml", "--json", cwd=folder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -212,6 +213,22 @@ class KeepsConsent(Stand):
         return lost
 
 
+class Coasts(Stand):
+    """Returns from stop while what it moves goes on for 0.2 s."""
+
+    def stop(self) -> float:
+        took = super().stop()
+        if took > 0.0:
+            threading.Thread(target=self._coast, daemon=True).start()
+        return took
+
+    def _coast(self) -> None:
+        begun, tilt, height = self._drive.read()
+        while (now := self._drive.read()[0]) < begun + 0.2 * self._spec.time_scale:
+            self._drive.go(tilt + 0.5 * (now - begun), height)
+            time.sleep(0.002)
+
+
 pytestmark = pytest.mark.realtime
 """The stand turns by the clock: a machine that stalls for a whole tilt has neither seen it nor a jump in it."""
 
@@ -220,6 +237,7 @@ AS_REPORTED = "test_it_moves_as_it_reports_and_goes_home"
 MEASURED = "test_the_poses_it_reports_are_measured"
 AFTER_A_STOP = "test_after_a_stop_it_comes_upright_goes_home_and_pours_again"
 BROKEN_OFF = "test_a_stop_breaks_the_pour_off_and_tells_how_far_it_came"
+STANDS = "test_it_stands_soon_after_a_stop"
 LOST = "test_a_connection_lost_during_a_pour_is_an_error_and_the_arm_stands"
 LOST_AT_REST = "test_a_connection_lost_at_rest_is_an_error_of_the_next_call"
 
@@ -238,6 +256,7 @@ LOST_AT_REST = "test_a_connection_lost_at_rest_is_an_error_of_the_next_call"
         (ReportsThePlan, True, MEASURED, r"away from where the witness measured the pourer; report measured poses"),
         (ReportsThePlan, False, MEASURED, r"the same poses for a disturbed pour .* it reports commanded poses"),
         (ReportsThePlanWhenStopped, True, BROKEN_OFF, r"away from where the witness measured the pourer"),
+        (Coasts, True, STANDS, r"by the witness the pourer still moved 0\.\d\d s .* after stop\(\) had returned"),
         (PoursOnPaper, True, LOST, r"execute returned as if all were well although the connection was cut"),
         (PoursOnPaper, False, LOST, r"execute returned as if all were well although the connection was cut"),
         (WaitsForItsCable, False, LOST, r"execute still waits 5 s after the connection was cut"),

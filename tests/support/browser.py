@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import pytest
 import uvicorn
 
-from orchestrator.daemon.access_control import Role, Tokens
+from orchestrator.daemon.access_tokens import Role, Tokens
 from orchestrator.daemon.http_api import serve_app
 from tests.support.small_campaign import write_campaign
 from tests.support.toy_daemon import CAMPAIGN, Make, Served, held, serving

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import uvicorn
 
-from orchestrator.daemon.access_control import Role, Tokens, token_of
+from orchestrator.daemon.access_tokens import Role, Tokens, token_of
 from orchestrator.daemon.daemon_client import Client
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.daemon.http_api import serve_app

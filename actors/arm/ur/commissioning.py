@@ -8,7 +8,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from actors.arm.arm_geometry import JOINT_NAMES, Pose
 from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord, UrArmSettings
@@ -19,20 +21,19 @@ from actors.arm.ur.controller_readout import (
     Exchange,
     Findings,
     ReadoutError,
+    findings_of,
     look_at,
     read_status,
+    recorded_findings,
 )
 from actors.arm.ur.primary_interface import RobotState
-from actors.arm.ur.robot_comparison import robot_checks
+from actors.arm.ur.robot_comparison import payload_check, robot_checks
 from actors.arm.ur.robot_models import same_robot
 from actors.arm.ur.worker_messages import SAFETY_MODES, safety_mode, why_not_ready
 from actors.interfaces import DeviceCheck, State
 
 TOOL_TOLERANCE, TURN_TOLERANCE = 1e-3, math.radians(0.5)
 """Largest difference between the controller's TCP and the file's [m], [rad]."""
-
-PAYLOAD_TOLERANCE, CENTRE_TOLERANCE = 0.1, 0.02
-"""Largest differences of payload [kg] and payload centre [m]."""
 
 MOUNT_TOLERANCE, GRAVITY = math.radians(15.0), 9.81
 """Largest angle between the measured and the configured vertical [rad], because the tool's accelerometer is not a
@@ -82,23 +83,6 @@ def mount_check(spec: UrArmSettings, state: RobotState, exchange: Exchange) -> D
     )
 
 
-def payload_check(spec: UrArmSettings, exchange: Exchange) -> DeviceCheck:
-    """Compare the controller's payload with the file's."""
-    if exchange.payload is None or exchange.payload_centre is None:
-        return DeviceCheck("payload", "warn", "not told", "compare payload and centre with the teach pendant yourself")
-    away = math.dist(exchange.payload_centre, spec.payload_centre.vector)
-    text = f"{exchange.payload:.2f} kg"
-    if abs(exchange.payload - spec.payload) <= PAYLOAD_TOLERANCE and away <= CENTRE_TOLERANCE:
-        return DeviceCheck("payload", "ok", text)
-    return DeviceCheck(
-        "payload",
-        "fail",
-        f"{text} on the controller, {spec.payload:.2f} kg in the file; centres {1e3 * away:.0f} mm apart",
-        "set payload and centre in the installation on the teach pendant, or correct them in the file: a wrong payload "
-        "ends in protective stops",
-    )
-
-
 def home_check(spec: UrArmSettings, state: RobotState) -> DeviceCheck:
     """Check whether the arm stands at its home pose."""
     away = [abs(a - b) for a, b in zip(state.joints, spec.home.angles, strict=True)]
@@ -138,6 +122,9 @@ GOOD_ROUND_TRIP, GOOD_GAP, LONGEST_GAP = 10e-3, 60e-3, 0.2
 KNOWN_SOFTWARE: dict[int, tuple[int, int]] = {3: (14, 15), 5: (6, 17)}
 """Minor versions, by major version, with which the authors of the client library have tested it."""
 
+POLYSCOPE_X, FIRST_X = 10, 14
+"""Major version of PolyScope X, and the first minor one whose Robot API reports model and serial number."""
+
 
 @dataclass(frozen=True)
 class UrDiagnostics(ArmDiagnostics):
@@ -154,7 +141,20 @@ class UrDiagnostics(ArmDiagnostics):
     @classmethod
     def at(cls, spec: UrArmSettings) -> UrDiagnostics:
         """Read everything from the controller."""
-        found = look_at(spec.address)
+        return cls._of(spec, look_at(spec.address))
+
+    @classmethod
+    def of_record(cls, spec: UrArmSettings, recorded: Mapping[str, Any]) -> UrDiagnostics:
+        """From `recorded`."""
+        found = findings_of(recorded)
+        return cls._of(spec.with_values(address=found.address), found)
+
+    def recorded(self) -> dict[str, Any]:
+        """See `ArmDiagnostics.recorded`."""
+        return {} if self.found is None else recorded_findings(self.found)
+
+    @classmethod
+    def _of(cls, spec: UrArmSettings, found: Findings) -> UrDiagnostics:
         return cls(
             checksum="" if found.state is None else found.state.checksum,
             serial=found.serial,
@@ -209,7 +209,9 @@ def judge(
     if found.state is not None and found.exchange is not None:
         checks.append(mount_check(spec, found.state, found.exchange))
     if found.exchange is not None:
-        checks += [payload_check(spec, found.exchange), *_motion(found.exchange), _network(found.exchange)]
+        exchange = found.exchange
+        payload = payload_check(spec, exchange.payload, exchange.payload_centre)
+        checks += [payload, *_motion(exchange), _network(exchange)]
     return checks
 
 
@@ -283,12 +285,20 @@ def _ports(found: Findings) -> list[DeviceCheck]:
 def _software(found: Findings) -> DeviceCheck:
     version = ".".join(str(part) for part in found.software[:3])
     major, minor = found.software[:2]
+    if major == POLYSCOPE_X and minor >= FIRST_X:
+        return DeviceCheck(
+            "software",
+            "warn",
+            f"PolyScope X {version}",
+            "Decant's support of PolyScope X follows public documents and was tried on none; go slowly through the "
+            "commissioning page",
+        )
     if major not in KNOWN_SOFTWARE:
         return DeviceCheck(
             "software",
             "fail",
             f"PolyScope {version}",
-            "Decant needs PolyScope 3 (CB3) or 5 (e-Series); PolyScope X has no dashboard server",
+            f"Decant needs PolyScope 3 (CB3), 5 (e-Series), or PolyScope X from {POLYSCOPE_X}.{FIRST_X}",
         )
     low, high = KNOWN_SOFTWARE[major]
     if low <= minor <= high:
@@ -392,7 +402,8 @@ def _motion(exchange: Exchange) -> list[DeviceCheck]:
     if any(value is None for value in values):
         return [DeviceCheck("motion", "warn", "not told", "look at the teach pendant whether the arm is ready")]
     robot, safety, runtime, slider = (value[0] for value in values if value is not None)
-    why = why_not_ready(int(robot), int(safety), int(runtime), slider)
+    (status,) = exchange.values.get("robot_status_bits", (0,))
+    why = why_not_ready(int(robot), int(safety), int(runtime), slider, int(status))
     if not why:
         return [DeviceCheck("motion", "ok", "the arm is ready to move")]
     return [DeviceCheck("motion", "fail", why, "mend that first: no motion begins before")]

@@ -4,7 +4,8 @@ It sends queries to the dashboard, reads the robot's state from the primary port
 move the arm or change a setting. They also work in states in which a driver cannot connect, so that the user can find
 the cause.
 
-`look_at` returns `Findings`; `actors.arm.ur.commissioning` evaluates them.
+`look_at` returns `Findings`; `actors.arm.ur.commissioning` evaluates them. `recorded_findings` and `findings_of` write
+and read them as JSON.
 """
 
 from __future__ import annotations
@@ -18,11 +19,13 @@ import statistics
 import struct
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from typing import Any
 
 from actors.arm.ur import dashboard as dashboard_port
 from actors.arm.ur import primary_interface as primary
-from actors.arm.ur import rtde
+from actors.arm.ur import robot_api, rtde
 from actors.arm.ur.dashboard import Dashboard, DashboardError
 from actors.arm.ur.primary_interface import RobotState
 from actors.arm.ur.robot_models import model_named
@@ -32,6 +35,7 @@ from actors.interfaces import LaboratoryError
 SCRIPTS, RTDE = 30003, rtde.PORT
 PORTS: dict[int, str] = {
     dashboard_port.PORT: "dashboard",
+    **dict.fromkeys(robot_api.PORTS, "Robot API of PolyScope X"),
     primary.PORT: "primary interface",
     SCRIPTS: "programs",
     RTDE: "real-time data exchange",
@@ -50,7 +54,7 @@ QUESTIONS = (
 """Queries on the dashboard; none of them changes anything."""
 
 SLIDER = "target_speed_fraction"
-STATUS = ("robot_mode", "safety_mode", "runtime_state", SLIDER)
+STATUS = ("robot_mode", "safety_mode", "runtime_state", "robot_status_bits", SLIDER)
 """RTDE values that determine whether the arm can move."""
 
 ROUND_TRIPS = 20
@@ -209,14 +213,20 @@ class Findings:
         address: to which the name resolves; '' if it does not.
         ports: why each cannot be reached; None if it can.
         dashboard: responses by query.
+        parts: of the robot's state, as bytes by type.
     """
 
     address: str
     ports: dict[int, str | None] = field(default_factory=dict)
     dashboard: dict[str, str] | None = None
-    state: RobotState | None = None
+    parts: dict[int, bytes] | None = None
     exchange: Exchange | None = None
     problems: tuple[str, ...] = ()
+
+    @cached_property
+    def state(self) -> RobotState | None:
+        """The robot's state."""
+        return None if self.parts is None else primary.robot_state(self.parts)
 
     @property
     def software(self) -> tuple[int, ...]:
@@ -250,16 +260,24 @@ def read_status(host: str) -> Findings:
         address = _resolved(host)
     except OSError as error:
         return Findings("", problems=(str(error),))
-    ports = {port: port_problem(address, port) for port in (dashboard_port.PORT, RTDE)}
+    control = _control_port(address)
+    ports = {port: port_problem(address, port) for port in (control, RTDE)}
     dashboard = exchange = None
     problems: list[str] = []
-    if ports[dashboard_port.PORT] is None:
+    if ports[control] is None:
         with _noting(problems):
             dashboard = ask_dashboard(address)
     if ports[RTDE] is None:
         with _noting(problems):
             exchange = read_exchange(address, rate=10.0, seconds=0.0)
     return Findings(address, ports, dashboard, None, exchange, tuple(problems))
+
+
+def _control_port(address: str) -> int:
+    """The dashboard's port; on PolyScope X that of the Robot API."""
+    with contextlib.suppress(dashboard_port.DashboardError), Dashboard(address, patience=2.0) as dashboard:
+        return dashboard.port
+    return dashboard_port.PORT
 
 
 def _resolved(host: str) -> str:
@@ -278,22 +296,61 @@ def look_at(host: str) -> Findings:
         address = _resolved(host)
     except OSError as error:
         return Findings("", problems=(str(error),))
-    ports = {port: port_problem(address, port) for port in PORTS}
-    dashboard = state = exchange = None
+    control = _control_port(address)
+    ports = {port: port_problem(address, port) for port in (control, primary.PORT, SCRIPTS, RTDE)}
+    dashboard = parts = exchange = None
     problems: list[str] = []
-    if ports[dashboard_port.PORT] is None:
+    if ports[control] is None:
         with _noting(problems):
             dashboard = ask_dashboard(address)
     if ports[primary.PORT] is None:
         with _noting(problems):
-            state = primary.read_state(address)
+            parts = primary.read_parts(address)
     if ports[RTDE] is None:
         with _noting(problems):
             exchange = read_exchange(address)
             # a gap may be caused by this computer, so measure twice and keep the better result
             if exchange.gap > PATIENT_GAP:
                 exchange = min(exchange, read_exchange(address), key=lambda e: e.gap)
-    return Findings(address, ports, dashboard, state, exchange, tuple(problems))
+    return Findings(address, ports, dashboard, parts, exchange, tuple(problems))
+
+
+def recorded_findings(found: Findings) -> dict[str, Any]:
+    """JSON-ready values, from which `findings_of` makes the same findings."""
+    return {
+        "address": found.address,
+        "ports": {str(port): problem for port, problem in found.ports.items()},
+        "dashboard": found.dashboard,
+        "primary": None if found.parts is None else {str(kind): body.hex() for kind, body in found.parts.items()},
+        "exchange": None if found.exchange is None else asdict(found.exchange),
+        "problems": list(found.problems),
+    }
+
+
+def findings_of(recorded: Mapping[str, Any]) -> Findings:
+    """The findings that were recorded.
+
+    Raises:
+        ValueError: these are not recorded findings.
+    """
+    try:
+        primary_parts, values = recorded["primary"], recorded["exchange"]
+        exchange = None
+        if values is not None:
+            lists = {name: tuple(values[name]) for name in ("version",)}
+            centre = None if values["payload_centre"] is None else tuple(values["payload_centre"])
+            numbers = {name: tuple(value) for name, value in values["values"].items()}
+            exchange = Exchange(**{**values, **lists, "payload_centre": centre, "values": numbers})
+        return Findings(
+            recorded["address"],
+            {int(port): problem for port, problem in recorded["ports"].items()},
+            recorded["dashboard"],
+            None if primary_parts is None else {int(kind): bytes.fromhex(body) for kind, body in primary_parts.items()},
+            exchange,
+            tuple(recorded["problems"]),
+        )
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"not a readout of a controller: {error!r}") from error
 
 
 @contextlib.contextmanager

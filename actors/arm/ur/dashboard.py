@@ -1,8 +1,13 @@
-"""The dashboard interface over a plain socket. It can also stop a program when the other interfaces do not respond."""
+"""The dashboard interface over a plain socket. It can also stop a program when the other interfaces do not respond.
+
+PolyScope X has no dashboard: `Dashboard` then uses its Robot API, with the same queries and answers.
+"""
 
 from __future__ import annotations
 
 import socket
+
+from actors.arm.ur.robot_api import RobotApi, RobotApiError
 
 PORT = 29999
 PATIENCE = 1.5
@@ -27,12 +32,23 @@ class Dashboard:
     """
 
     def __init__(self, address: str, patience: float = PATIENCE) -> None:
+        self._api: RobotApi | None = None
         try:
             self._socket = socket.create_connection((address, PORT), timeout=patience)
             self._lines = self._socket.makefile("rb")
             self._lines.readline()
+        except ConnectionRefusedError as error:
+            try:
+                self._api = RobotApi(address, patience)
+            except RobotApiError as also:
+                raise DashboardError(f"dashboard of {address}:{PORT}: {error}; {also}") from error
         except OSError as error:
             raise DashboardError(f"dashboard of {address}:{PORT}: {error}") from error
+
+    @property
+    def port(self) -> int:
+        """At which it answers: the dashboard's, or the Robot API's."""
+        return PORT if self._api is None else self._api.port
 
     def ask(self, line: str) -> str:
         """Send a line. Returns the response.
@@ -41,8 +57,12 @@ class Dashboard:
             DashboardError: there is none.
         """
         try:
+            if self._api is not None:
+                return self._api.ask(line)
             self._socket.sendall(line.encode() + b"\n")
             answer = self._lines.readline()
+        except RobotApiError as error:
+            raise DashboardError(str(error)) from error
         except OSError as error:
             raise DashboardError(f"dashboard: no answer to '{line}': {error}") from error
         if not answer:
@@ -63,8 +83,9 @@ class Dashboard:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._lines.close()
-        self._socket.close()
+        if self._api is None:
+            self._lines.close()
+            self._socket.close()
 
 
 def stop_program(address: str, patience: float = PATIENCE) -> None:

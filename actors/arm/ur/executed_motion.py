@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,14 +15,20 @@ import numpy as np
 from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath
 from actors.arm.planning.kinematics import cell_transforms, forward, pourer_motion
-from actors.arm.ur.worker_messages import MotionOutcome, Sample
+from actors.arm.ur.worker_messages import ForceSample, MotionOutcome, Sample
 
 LONGEST_LAG = 0.3
 """Largest lag that is searched to explain the difference between path and readings [s]."""
 
 
 def executed_path(
-    samples: list[Sample], path: JointPath, spec: UrArmSettings, *, completed: bool, slider: float = 1.0
+    samples: list[Sample],
+    path: JointPath,
+    spec: UrArmSettings,
+    *,
+    completed: bool,
+    slider: float = 1.0,
+    forces: Sequence[ForceSample] = (),
 ) -> ExecutedPath:
     """The readings on the path's own clock.
 
@@ -34,6 +41,7 @@ def executed_path(
         spec: of the arm.
         completed: False if it was stopped before its end.
         slider: lowest position of the speed slider.
+        forces: readings on the path.
     """
     stamps = np.array([t for t, _, _ in samples])
     joints = np.array([q for _, q, _ in samples]).reshape(-1, 6)
@@ -52,7 +60,30 @@ def executed_path(
     followed = np.ones(len(times), dtype=bool) if completed else times <= clocks.max()
     tracking = _tracking(times[followed], joints[followed], path, spec) if np.any(followed) else {}
     poses = pourer_motion(joints, times, spec).poses if len(times) > 1 else np.zeros((0, 7))
-    return ExecutedPath(times, joints, completed, tracking | {"slider": slider}, poses)
+    return ExecutedPath(times, joints, completed, tracking | {"slider": slider}, poses, _forces(forces))
+
+
+def _forces(readings: Sequence[ForceSample]) -> FloatArray:
+    """See `ExecutedPath.forces`."""
+    unknown = (np.nan,) * 6
+    rows = [(clock, *(force or unknown), *(wrist or unknown)) for clock, force, wrist in readings]
+    return np.array(rows).reshape(-1, 13)
+
+
+def executed_dose(samples: list[Sample], spec: UrArmSettings, *, completed: bool) -> ExecutedPath:
+    """The readings of a dose on the controller's clock; there is no planned motion to compare them with.
+
+    Args:
+        samples: in the order of their times.
+        spec: of the arm.
+        completed: False if it was stopped before its end.
+    """
+    if len(samples) < 2:
+        return ExecutedPath(np.zeros(0), np.zeros((0, 6)), False, {})
+    times = np.array([t for t, _, _ in samples])
+    joints = np.array([q for _, q, _ in samples])
+    times = times - times[0]
+    return ExecutedPath(times, joints, completed, {}, pourer_motion(joints, times, spec).poses)
 
 
 def best_lag(times: FloatArray, joints: FloatArray, path: JointPath) -> float:

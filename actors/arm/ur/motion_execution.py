@@ -10,6 +10,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
@@ -17,6 +18,7 @@ from actors.arm.ur.primary_interface import Primary, PrimaryError
 from actors.arm.ur.rtde_client import AT_REST, RtdeClient
 from actors.arm.ur.worker_messages import (
     DONE,
+    FREEDRIVE,
     FULL_SPEED,
     PLAYING,
     READY,
@@ -26,6 +28,7 @@ from actors.arm.ur.worker_messages import (
     STOPPED,
     STOPPED_PROGRAM,
     DataPackage,
+    ForceSample,
     MotionOrder,
     MotionOutcome,
     MotionProgress,
@@ -38,6 +41,9 @@ from actors.arm.ur.worker_messages import (
 
 AT_START = 0.01
 """Largest distance of the joints from a path's first point [rad]; the program first removes it slowly."""
+
+UPRIGHT = 1e-3
+"""Tilt below which the cup of a dose counts as upright [rad]."""
 
 AT_END = 0.01
 """Largest distance of the joints from a path's last point [rad] for the path to count as completed."""
@@ -52,6 +58,9 @@ OVERTIME = 10.0
 """Longest delay of a path beyond its planned duration [s of controller time]."""
 
 BEAT_INTERVAL, TELL_INTERVAL, LOOK_INTERVAL = 0.02, 0.05, 0.002
+FORCE_INTERVAL = 0.1
+"""Time between two recorded forces [s of the path]."""
+
 OWNER_SILENCE = 3.0
 """Time without a sign of life after which the driver counts as dead [s of the clock]."""
 
@@ -79,6 +88,7 @@ class MotionMonitor:
         self._report, self._owner_seen = tell, owner_seen
         self._ordered = threading.Event()
         self._samples: list[Sample] = []
+        self._forces: list[ForceSample] = []
         self._clock, self._slider = 0.0, 1.0
         self._joints: tuple[float, ...] = motion.start
         self._began = 0.0
@@ -89,9 +99,20 @@ class MotionMonitor:
         self._answered: float | None = None
 
     def order_stop(self) -> None:
-        """Order a stop; may be called from any thread."""
+        """Order a stop; may be called from any thread.
+
+        In a dose the first order ends the commands: the program turns the cup back upright and ends. A second order
+        stops the arm where it is.
+        """
+        again = self._ordered.is_set()
         self._ordered.set()
-        self._client.order_stop(self._motion.number)
+        if not self._motion.tilts or again or not self._went:
+            self._client.order_stop(self._motion.number)
+
+    def tilt(self, speed: float) -> None:
+        """Pass on a wanted speed of the tilt [rad/s]; may be called from any thread."""
+        if self._motion.tilts and self._went and not self._ordered.is_set():
+            self._client.tilt(speed)
 
     def run(self) -> MotionOutcome:
         """Execute the whole motion.
@@ -102,7 +123,14 @@ class MotionMonitor:
         reading = self._client.fresh()
         pours = self._motion.pours
         self._refuse_if(
-            why_not_ready(reading.robot_mode, reading.safety_mode, reading.runtime, reading.slider, pours=pours)
+            why_not_ready(
+                reading.robot_mode,
+                reading.safety_mode,
+                reading.runtime,
+                reading.slider,
+                reading.status_bits,
+                pours=pours,
+            )
         )
         self._refuse_if(_elsewhere(reading.joints, self._motion.start))
         self._refuse_if(_not_remote(self._address))
@@ -179,14 +207,21 @@ class MotionMonitor:
             reading = self._look()
             if reading.status == STOPPED and reading.number == motion.number:
                 self._answered = time.monotonic()
-                return self._broken_off("operator", "stopped by the operator")
+                upright = "; the cup was turned back upright" if motion.tilts and reading.clock < UPRIGHT else ""
+                return self._broken_off("operator", "stopped by the operator" + upright)
+            if motion.tilts and self._ordered.is_set() and reading.clock < UPRIGHT and reading.stands:
+                self._client.order_stop(motion.number)
             if self._is_stopped(reading):
-                return self._stopped_by_safety(reading)
+                return self._stopped_by_safety(reading, primary)
+            if reading.status_bits & FREEDRIVE:
+                return self._broken_off("safety", "the freedrive button was pressed")
             if reading.status == DONE and reading.number == motion.number:
                 arrived = arrived or time.monotonic()
                 if reading.runtime == STOPPED_PROGRAM and reading.stands:
                     if _near(reading.joints, motion.end, AT_END):
                         self._standing = time.monotonic()
+                        if motion.tilts and self._ordered.is_set():
+                            return self._outcome("operator", "stopped by the operator; the cup was turned back upright")
                         return self._outcome("completed", "")
                     return self._outcome(
                         "program ended", f"the path was run through, but {_elsewhere(reading.joints, motion.end)}"
@@ -197,17 +232,19 @@ class MotionMonitor:
                 return self._stopped_by_program(primary)
             if reading.time - self._began > motion.duration + OVERTIME + STANDING_TIME:
                 return self._broken_off("program ended", "the motion takes far longer than planned")
-            if time.monotonic() - self._owner_seen() > OWNER_SILENCE:
+            if time.monotonic() - self._owner_seen() > OWNER_SILENCE and not motion.tilts:
                 self.order_stop()
             time.sleep(LOOK_INTERVAL)
 
-    def _stopped_by_safety(self, reading: DataPackage) -> MotionOutcome:
+    def _stopped_by_safety(self, reading: DataPackage, primary: Primary) -> MotionOutcome:
         # After a safeguard stop the program would resume when the safeguard is reset, after a protective stop at
         # 'play'.
         mode = safety_mode(reading.safety_mode)
         if may_move(reading.safety_mode, pours=self._motion.pours):
             return self._broken_off("safety", f"the robot is {ROBOT_MODES.get(reading.robot_mode, 'not running')}")
-        return self._broken_off(mode.kind or "safety", mode.text)
+        outcome = self._broken_off(mode.kind or "safety", mode.text)
+        causes = "; ".join(primary.causes)  # they may arrive after the mode, and have by now
+        return replace(outcome, text=f"{outcome.text}: {causes}") if causes else outcome
 
     def _is_stopped(self, reading: DataPackage) -> bool:
         allowed = may_move(reading.safety_mode, pours=self._motion.pours)
@@ -217,7 +254,7 @@ class MotionMonitor:
         time.sleep(0.05)  # the safety mode may be reported a little later
         reading = self._look()
         if self._is_stopped(reading):
-            return self._stopped_by_safety(reading)
+            return self._stopped_by_safety(reading, primary)
         if self._ordered.is_set():
             return self._broken_off("operator", "stopped by the operator")
         limit = 1.0 / SLOWEST_HEARTBEAT
@@ -264,6 +301,7 @@ class MotionMonitor:
             self._answered,
             self._went,
             self._slider,
+            tuple(self._forces),
         )
 
     # ---- each iteration
@@ -278,6 +316,8 @@ class MotionMonitor:
                 self._clock = reading.clock
             if not self._samples or reading.time > self._samples[-1][0]:
                 self._samples.append((reading.time, reading.joints, reading.clock))
+                if not self._forces or reading.clock - self._forces[-1][0] >= FORCE_INTERVAL:
+                    self._forces.append((reading.clock, reading.force, reading.wrist))
         now = time.monotonic()
         if now > self._next_report:
             self._next_report = now + TELL_INTERVAL

@@ -34,6 +34,16 @@ _JOINT = struct.Struct(">3d4fB")
 _CONFIGURATION, _KINEMATICS = struct.Struct(">53d4i"), struct.Struct(">6I24d")
 
 
+CAUSES = {
+    153: "a joint deviates from its commanded position",
+    157: "collision detected by a joint",
+    158: "collision detected by a joint",
+    159: "a joint deviates from its commanded position",
+}
+"""Meaning of frequent error codes of protective stops, whose messages have no text. Source: the manufacturer's list of
+error codes; second-hand, not seen on a robot."""
+
+
 class PrimaryError(Exception):
     """The primary interface cannot be reached, or its data cannot be understood."""
 
@@ -115,7 +125,12 @@ def _calibration(data: bytes) -> Calibration | None:
 
 
 def read_state(address: str, patience: float = 3.0) -> RobotState:
-    """The robot's state, once all its parts have arrived.
+    """The robot's state; see `read_parts`."""
+    return robot_state(read_parts(address, patience))
+
+
+def read_parts(address: str, patience: float = 3.0) -> dict[int, bytes]:
+    """The parts of the robot's state by type, once all have arrived.
 
     Args:
         address: of the controller.
@@ -143,7 +158,7 @@ def read_state(address: str, patience: float = 3.0) -> RobotState:
         raise PrimaryError(f"the primary port at {address} can't be read: {error}") from error
     if not needed <= parts.keys():
         raise PrimaryError(f"the primary port at {address} sent no robot state within {patience:g} s")
-    return robot_state(parts)
+    return parts
 
 
 class Primary:
@@ -154,6 +169,7 @@ class Primary:
 
     Attributes:
         complaints: its latest messages about programs.
+        causes: its latest error codes, as for a protective stop, with their meaning.
         broken: it reported that a program cannot be read, or cannot continue.
 
     Raises:
@@ -162,6 +178,7 @@ class Primary:
 
     def __init__(self, address: str) -> None:
         self.complaints: deque[str] = deque(maxlen=8)
+        self.causes: deque[str] = deque(maxlen=4)
         self.broken = False
         self._rest = b""
         try:
@@ -218,5 +235,7 @@ class Primary:
         elif kind == _KEY and len(rest) >= 9:
             self.complaints.append(rest[9 + rest[8] :].decode("utf-8", "replace"))
         elif kind == _ERROR and len(rest) >= 20:
-            code = int.from_bytes(rest[:4], "big", signed=True)
-            self.complaints.append(f"C{code}: {rest[20:].decode('utf-8', 'replace')}")
+            code, argument = struct.unpack_from(">2i", rest)
+            text = rest[20:].decode("utf-8", "replace").strip("\0 ") or CAUSES.get(code, "see the log on the pendant")
+            self.causes.append(f"C{code}A{argument} ({text})")
+            self.complaints.append(self.causes[-1])

@@ -19,6 +19,9 @@ from actors.arm.ur.primary_interface import RobotState
 from actors.arm.ur.robot_models import SAME_ANGLE, SAME_PLACE, model_named, same_robot
 from actors.interfaces import DeviceCheck
 
+PAYLOAD_TOLERANCE, CENTRE_TOLERANCE = 0.1, 0.02
+"""Largest differences of payload [kg] and payload centre [m]."""
+
 SAME_LENGTH = 5e-3
 """Largest difference between a length that a robot reports as nominal and the model's [m]."""
 
@@ -59,6 +62,23 @@ def robot_checks(
     checks = [DeviceCheck("model", "ok", spec.model.upper())]
     checks += [_lengths(spec, state), *_limits(spec, state)]
     return checks + ([_kinematics(spec, state)] if rests and state.pose and state.joints else [])
+
+
+def payload_check(spec: UrArmSettings, payload: float | None, centre: Sequence[float] | None) -> DeviceCheck:
+    """Compare the controller's payload [kg] and its centre [m] with the file's; None if they are not reported."""
+    if payload is None or centre is None:
+        return DeviceCheck("payload", "warn", "not told", "compare payload and centre with the teach pendant yourself")
+    away = math.dist(centre, spec.payload_centre.vector)
+    text = f"{payload:.2f} kg"
+    if abs(payload - spec.payload) <= PAYLOAD_TOLERANCE and away <= CENTRE_TOLERANCE:
+        return DeviceCheck("payload", "ok", text)
+    return DeviceCheck(
+        "payload",
+        "fail",
+        f"{text} on the controller, {spec.payload:.2f} kg in the file; centres {1e3 * away:.0f} mm apart",
+        "set payload and centre in the installation on the teach pendant, or correct them in the file: a wrong payload "
+        "ends in protective stops",
+    )
 
 
 def _lengths(spec: UrArmSettings, state: RobotState) -> DeviceCheck:

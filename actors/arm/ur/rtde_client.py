@@ -18,10 +18,11 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
 
 from actors.arm.ur import rtde
+from actors.arm.ur.dashboard import Dashboard, DashboardError
 from actors.arm.ur.worker_messages import (
     CLOCK,
     GO,
@@ -29,6 +30,8 @@ from actors.arm.ur.worker_messages import (
     NUMBER,
     STATUS,
     STOP_ORDER,
+    TILT_COUNTER,
+    TILT_SPEED,
     TOOL,
     DataPackage,
     TroubleError,
@@ -45,7 +48,7 @@ def client_missing() -> str | None:
     )
 
 
-PORTS = {rtde.PORT: "RTDE", 29999: "dashboard", 30001: "primary interface"}
+PORTS = {rtde.PORT: "RTDE", 30001: "primary interface"}
 PROBE_TIME = 2.0
 CONSTRUCTION_TIME = 5.0
 """Time after which a blocked constructor ends the process [s], because it holds the interpreter lock."""
@@ -58,6 +61,12 @@ previous connection was cut.
 AT_REST = 8.0
 """Factor of the longest silence while nothing moves, because a controller may be loading a program."""
 
+ORDERS = ((STOP_ORDER,), (HEARTBEAT,), (GO,))
+"""Integer inputs, each written alone."""
+
+TILT_INPUTS = ((TILT_SPEED, TILT_COUNTER),)
+"""Double inputs of a dose, written together."""
+
 _SAME_READINGS = 10
 """Number of readings with the same time before data count as stale: a single late reading proves nothing."""
 
@@ -67,6 +76,8 @@ _VARIABLES = [
     *(f"output_int_register_{n}" for n in (NUMBER, STATUS)),
     *(f"output_double_register_{n}" for n in (CLOCK, *range(TOOL, TOOL + 6))),
 ]
+_FORCE, _WRIST = "actual_TCP_force", "ft_raw_wrench"
+"""Read from controllers that have them; the second one since 5.9, from robots with a sensor in the wrist."""
 
 
 class RtdeClient:
@@ -85,15 +96,22 @@ class RtdeClient:
     def __init__(self, address: str, rate: float, silence: float, registers: int) -> None:
         for port, name in PORTS.items():
             _probe(address, port, name)
+        try:
+            with Dashboard(address, PROBE_TIME):
+                pass
+        except DashboardError as error:
+            raise TroubleError("lost", f"no robot at {address}: {error}. {_ENABLED}") from None
         if (missing := client_missing()) is not None:
             raise TroubleError("refused", missing)
         from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
 
         for attempt in range(1, ATTEMPTS + 1):
             try:
+                self._forces = _offered(address, (_FORCE, _WRIST))
                 with _bounded(CONSTRUCTION_TIME):
-                    self._receive: Any = RTDEReceiveInterface(address, rate, _VARIABLES)
+                    self._receive: Any = RTDEReceiveInterface(address, rate, [*_VARIABLES, *self._forces])
                 self._inputs = InputWriter(address, registers)
+                self._tilt: InputWriter | None = None
                 break
             except (RuntimeError, ValueError, TroubleError) as error:
                 if attempt == ATTEMPTS:
@@ -101,6 +119,8 @@ class RtdeClient:
                         raise
                     raise TroubleError("lost", f"{address}: {error}") from None
                 time.sleep(BETWEEN_ATTEMPTS)
+        self._address, self._registers = address, registers
+        self._commands = int(time.monotonic() * 1e3) % 1_000_000  # not the number that an earlier client wrote last
         self._silence = silence
         self._last: DataPackage | None = None
         self._same_readings = 0
@@ -145,6 +165,9 @@ class RtdeClient:
                 status=r.getOutputIntRegister(STATUS),
                 clock=r.getOutputDoubleRegister(CLOCK),
                 tool=tuple(r.getOutputDoubleRegister(TOOL + k) for k in range(6)),
+                status_bits=r.getRobotStatus(),
+                force=tuple(r.getActualTCPForce()) if _FORCE in self._forces else (),
+                wrist=tuple(r.getFtRawWrench()) if _WRIST in self._forces else (),
             )
             if r.getTimestamp() == time_before:
                 self._last, self._same_readings = reading, 0
@@ -179,40 +202,65 @@ class RtdeClient:
         """Write the order to stop."""
         self._inputs.write(STOP_ORDER, number)
 
+    def claim_tilt(self) -> None:
+        """Claim the inputs of a dose, the first time that one is poured.
+
+        Raises:
+            TroubleError: the controller does not answer, or another client writes one of them.
+        """
+        if self._tilt is None:
+            self._tilt = InputWriter(self._address, self._registers, TILT_INPUTS, "DOUBLE")
+
+    def tilt(self, speed: float) -> None:
+        """Write the wanted speed of the tilt [rad/s] with a new counter, in one package."""
+        if self._tilt is not None:
+            self._commands += 1
+            self._tilt.write(TILT_SPEED, speed, float(self._commands))
+
 
 class InputWriter:
-    """Writes three integer inputs over a connection of its own, and claims no other variable.
+    """Writes inputs over a connection of its own, and claims no other variable.
 
     Args:
         address: of the controller.
-        first: number of the first input; the others follow.
+        first: number of the first input.
+        groups: inputs that are written together, counted from the first.
+        kind: of the inputs, 'INT32' or 'DOUBLE'.
 
     Raises:
         TroubleError: the controller does not answer, or another client writes one of the inputs.
     """
 
-    def __init__(self, address: str, first: int) -> None:
+    def __init__(
+        self,
+        address: str,
+        first: int,
+        groups: Sequence[tuple[int, ...]] = ORDERS,
+        kind: Literal["INT32", "DOUBLE"] = "INT32",
+    ) -> None:
         self._writing = threading.Lock()
         self._recipes: dict[int, int] = {}
+        self._code = "i" if kind == "INT32" else "d"
+        word = "int" if kind == "INT32" else "double"
         try:
             self._socket = socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME)
             requests = rtde.Requests(self._socket)
             if requests.ask(rtde.REQUEST_PROTOCOL_VERSION, b"\0\2") != b"\1":
                 raise TroubleError("lost", f"{address}: its RTDE does not know protocol 2")
-            for register in (STOP_ORDER, HEARTBEAT, GO):
-                name = f"input_int_register_{first + register}"
+            for group in groups:
+                name = ",".join(f"input_{word}_register_{first + register}" for register in group)
                 answer = requests.ask(rtde.SETUP_INPUTS, name.encode("ascii"))
-                self._recipes[register] = answer[0]
-                self._check(address, name, rtde.names(answer[1:]))
+                self._recipes[group[0]] = answer[0]
+                self._check(address, name, rtde.names(answer[1:]), [kind] * len(group))
             self._socket.setblocking(False)  # a write never waits: some bytes always fit into the buffer
         except (OSError, rtde.PackageError, IndexError) as error:
             raise TroubleError("lost", f"{address}: its RTDE does not answer as it should: {error}") from None
 
-    def _check(self, address: str, name: str, kinds: list[str]) -> None:
-        if kinds == ["INT32"]:
+    def _check(self, address: str, name: str, kinds: list[str], wanted: list[str]) -> None:
+        if kinds == wanted:
             return
         self._socket.close()
-        if kinds == ["IN_USE"]:
+        if "IN_USE" in kinds:
             raise TroubleError(
                 "refused",
                 f"{address}: another client writes {name}, such as a PLC, a gripper's URCap, a ROS driver or another "
@@ -224,19 +272,33 @@ class InputWriter:
             "older one choose 'registers' below 21",
         )
 
-    def write(self, register: int, value: int) -> None:
-        """Write one of the inputs. A lost connection is noticed by reading, and by the program's watchdog."""
+    def write(self, register: int, *values: float) -> None:
+        """Write a group of inputs, named by its first one.
+
+        A lost connection is noticed by reading, and by the program's watchdog.
+        """
         # If another thread is blocked here, the stop must still be attempted by other means.
         if not self._writing.acquire(timeout=0.2):
             return
         try:
             with contextlib.suppress(OSError):
-                self._socket.sendall(
-                    rtde.package(rtde.DATA_PACKAGE, struct.pack(">Bi", self._recipes[register], value))
-                )
+                data = struct.pack(f">B{len(values)}{self._code}", self._recipes[register], *values)
+                self._socket.sendall(rtde.package(rtde.DATA_PACKAGE, data))
                 self._socket.recv(4096)  # messages of the controller, which nothing reads; usually there are none
         finally:
             self._writing.release()
+
+
+def _offered(address: str, names: tuple[str, ...]) -> list[str]:
+    """Which values the controller has. It refuses a recipe that names another one."""
+    try:
+        with socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME) as connection:
+            requests = rtde.Requests(connection)
+            requests.ask(rtde.REQUEST_PROTOCOL_VERSION, b"\0\2")
+            answer = requests.ask(rtde.SETUP_OUTPUTS, struct.pack(">d", 1.0) + ",".join(names).encode("ascii"))
+    except (OSError, rtde.PackageError) as error:
+        raise TroubleError("lost", f"{address}: its RTDE does not answer as it should: {error}") from None
+    return [name for name, kind in zip(names, rtde.names(answer[1:]), strict=False) if kind in rtde.FORMATS]
 
 
 def _probe(address: str, port: int, name: str) -> None:
@@ -246,9 +308,11 @@ def _probe(address: str, port: int, name: str) -> None:
     except OSError as error:
         raise TroubleError(
             "lost",
-            f"no robot at {address}: its {name} (port {port}) does not answer: {error}. "
-            "Is the controller on, on this network, and are its services enabled?",
+            f"no robot at {address}: its {name} (port {port}) does not answer: {error}. {_ENABLED}",
         ) from None
+
+
+_ENABLED = "Is the controller on, on this network, and are its services enabled?"
 
 
 @contextlib.contextmanager

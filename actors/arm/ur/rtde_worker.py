@@ -81,6 +81,9 @@ class Worker:
                     self._stops = max(self._stops, request[1])
                     if (monitor := self._monitor) is not None:
                         monitor.order_stop()
+                elif request[0] == "tilt":
+                    if (monitor := self._monitor) is not None:
+                        monitor.tilt(request[1])
                 elif request[0] == "call":
                     self._requests.put(request[1:])
         os._exit(0)  # the heartbeat ends with the process, and any motion with the heartbeat
@@ -131,6 +134,8 @@ class Worker:
 
     def run(self, motion: MotionOrder) -> MotionOutcome:
         """Execute a motion."""
+        if motion.tilts:
+            self.client.claim_tilt()
         monitor = MotionMonitor(self.client, self._address, motion, self._report, lambda: self._owner_seen)
         self._monitor = monitor
         try:

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import os
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,14 +30,15 @@ from actors.arm.arm_interface import (
     NotAcceptedError,
 )
 from actors.arm.arm_settings import UrArmSettings
-from actors.arm.planned_pour import ExecutedPath, PourPath
+from actors.arm.planned_pour import ExecutedPath, FloatArray, PourPath
 from actors.arm.planning.kinematics import cell_transforms, forward
 from actors.arm.planning.path_checks import recheck
 from actors.arm.ur.dashboard import DashboardError, stop_program
-from actors.arm.ur.executed_motion import Stops, StopTimes, executed_path
+from actors.arm.ur.executed_motion import Stops, StopTimes, executed_dose, executed_path
 from actors.arm.ur.motion_segments import MotionSegment, jog_path, upright_way, way_home
+from actors.arm.ur.robot_comparison import payload_check
 from actors.arm.ur.ur_session import ANSWER_TIME, Session, UrFacts
-from actors.arm.ur.urscript_writer import path_program
+from actors.arm.ur.urscript_writer import TiltLimits, path_program, tilt_program
 from actors.arm.ur.worker_messages import REDUCED, DataPackage, MotionOrder, MotionOutcome, MotionSettings
 from actors.interfaces import LaboratoryError
 
@@ -51,6 +54,30 @@ it to."""
 
 STOP_TIME = 1.0
 """Time for each means of stopping before the next one is tried [s]."""
+
+UPRIGHT_TIME = 3.5
+"""Longest time for a dose's program to turn the cup back and to end [s]."""
+
+TILT_ACCELERATION = math.radians(600.0)
+"""Acceleration of the tilt in a dose [rad/s²]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Tilts:
+    """The range of a dose.
+
+    Attributes:
+        tilts: increasing, (T,) [rad].
+        joints: at these tilts, (T, 6) [rad].
+        limits: of the motion.
+        longest: duration [s of controller time].
+    """
+
+    tilts: FloatArray
+    joints: FloatArray
+    limits: TiltLimits
+    longest: float
+
 
 _numbers = itertools.count(os.getpid() % 4096 * 65536 + 1)
 """Numbers of motions, different from any that another process may have left in the controller's registers."""
@@ -76,6 +103,7 @@ class UrArm:
         self.last_stop: StopTimes | None = None
         self._segment: MotionSegment | None = None
         self._announced = False
+        self._tilting: _Tilts | None = None
         self._last_pour: PourPath | None = None
         self._tilt = 0.0
 
@@ -142,6 +170,10 @@ class UrArm:
         if segment is None:
             joints = () if progress is None else progress.joints
             return ArmState(stopped=self._stopped, tilt=self._tilt, joints=joints)
+        if (tilting := self._tilting) is not None and not self._announced:
+            tilt = float(tilting.tilts[0]) + (0.0 if progress is None else progress.clock)
+            joints = () if progress is None else progress.joints
+            return ArmState(moving=True, stopped=self._stopped, phase="dose", tilt=tilt, joints=joints)
         clock = 0.0 if progress is None or self._announced else min(progress.clock, segment.path.duration)
         return ArmState(
             moving=not self._announced,
@@ -169,6 +201,23 @@ class UrArm:
             executed = self._go(MotionSegment.of_pour(path), pours=True)
             self._tilt = float(path.tilts[-1])
             return executed
+
+    def dose(self, path: PourPath, longest: float) -> ExecutedPath:
+        """See `DosingArm.dose`."""
+        with self._at_work("dosing"):
+            self._check_calibration(path)
+            self._last_pour = path
+            tilts, joints = path.tilt_part
+            limits = TiltLimits(path.report.tilt_speed, TILT_ACCELERATION)
+            try:
+                return self._go(MotionSegment.of_pour(path), pours=True, tilts=_Tilts(tilts, joints, limits, longest))
+            finally:
+                self._tilting = None
+
+    def drive(self, speed: float) -> ArmState:
+        """See `DosingArm.drive`."""
+        self._session.tilt(speed)
+        return self.state()
 
     def retreat(self, path: PourPath) -> None:
         """See `Arm.retreat`."""
@@ -216,7 +265,8 @@ class UrArm:
     def stop(self) -> float:
         """See `Arm.stop`. Three means are tried one after another:
 
-        - a stop order, which the running program reads in every cycle;
+        - a stop order, which the running program reads in every cycle; in a dose, the end of the commands, after which
+          the program turns the cup back upright;
         - the dashboard, over a separate connection;
         - the end of the heartbeat.
         """
@@ -227,7 +277,11 @@ class UrArm:
         if not self._stops.under_way:
             return 0.0
         for means in (self._stop_by_dashboard, self._session.kill, None):
-            if self._stops.wait_for_end(STOP_TIME):
+            # in a dose the cup is turned back upright first
+            patience = STOP_TIME
+            if self._tilting is not None and means == self._stop_by_dashboard:
+                patience = UPRIGHT_TIME / min(self._spec.time_scale, 1.0)
+            if self._stops.wait_for_end(patience):
                 if self._stops.unseen:
                     break
                 times = self._stops.times(asked)
@@ -284,11 +338,12 @@ class UrArm:
                 "(`ArmSettings.fitted_to`)"
             )
 
-    def _go(self, segment: MotionSegment, *, pours: bool = False) -> ExecutedPath:
+    def _go(self, segment: MotionSegment, *, pours: bool = False, tilts: _Tilts | None = None) -> ExecutedPath:
         """Execute one motion to its end.
 
         Args:
             segment: the motion.
+            tilts: of a dose, which goes to and fro on the tilt of the segment.
             pours: it may carry or pour liquid. Other motions are allowed in reduced mode, where they are slowed.
         """
         stops = self._stops.count  # before consent is checked, so that a stop in between counts
@@ -303,15 +358,20 @@ class UrArm:
             raise ArmLostError("the arm is not connected; connect first")
         settings = MotionSettings(tuple(spec.tool.as_list), spec.payload, spec.payload_centre.vector, spec.registers)
         number = next(_numbers)
-        program = path_program(path, settings, number, cb3=not facts.e_series)
         start, end = (tuple(map(float, path.joints[k])) for k in (0, -1))
-        motion = MotionOrder(program, number, start, end, path.duration, settings, stops, pours)
+        duration = path.duration
+        if tilts is None:
+            program = path_program(path, settings, number, cb3=not facts.e_series)
+        else:
+            program = tilt_program(tilts.tilts, tilts.joints, tilts.limits, settings, number, cb3=not facts.e_series)
+            end, duration = start, tilts.longest
+        motion = MotionOrder(program, number, start, end, duration, settings, stops, pours, tilts is not None)
         self._announced, self._segment = True, segment
         self._session.forget_progress()
         self._stops.begin()
         try:
             self._announce(released, segment, stops)
-            self._announced = False
+            self._announced, self._tilting = False, tilts
             outcome = self._run(motion, segment)
             return self._evaluate(outcome, segment)
         except LaboratoryError:
@@ -347,10 +407,37 @@ class UrArm:
 
     def _evaluate(self, outcome: MotionOutcome, segment: MotionSegment) -> ExecutedPath:
         self._stops.came_to(outcome)
+        completed = outcome.kind == "completed"
+        if self._tilting is not None:
+            executed = executed_dose(outcome.samples, self._spec, completed=completed)
+            tilted = float(self._tilting.tilts[0]) + outcome.clock
+            self._tilt = tilted
+            if not completed:
+                self._stopped = True
+                if outcome.kind == "lost":
+                    self._session.kill()
+                    raise ArmLostError(
+                        f"{outcome.text}. The pourer was last seen at {math.degrees(tilted):.0f}°", executed
+                    )
+                text = f"dose: {outcome.text}"
+                raise ArmStoppedError(
+                    text,
+                    outcome.kind,
+                    "dose",
+                    float(executed.times[-1]) if len(executed.times) else 0.0,
+                    tilted,
+                    executed,
+                )
+            return executed
         executed = executed_path(
-            outcome.samples, segment.path, self._spec, completed=outcome.kind == "completed", slider=outcome.slider
+            outcome.samples,
+            segment.path,
+            self._spec,
+            completed=completed,
+            slider=outcome.slider,
+            forces=outcome.forces,
         )
-        if outcome.kind == "completed":
+        if completed:
             return executed
         self._tilt, self._stopped = segment.tilt_left(outcome), True
         if outcome.kind == "lost":
@@ -381,8 +468,14 @@ class AcceptedArm(UrArm):
 
         Raises:
             NotAcceptedError: the safety settings differ from the accepted ones; the arm is disconnected.
+            ArmRefusedError: the payload that is set on the controller differs from the settings'; likewise.
         """
-        return self._compared(super().connect())
+        facts = self._compared(super().connect())
+        payload = payload_check(self._spec, facts.payload, facts.payload_centre)
+        if payload.state == "fail":
+            self.close()
+            raise ArmRefusedError(f"arm at {self._address}: payload {payload.found}: {payload.advice}")
+        return facts
 
     def facts(self) -> UrFacts:
         """See `UrArm.facts`; raises as `connect`."""

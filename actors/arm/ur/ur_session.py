@@ -82,7 +82,7 @@ def facts_of(worker_facts: Facts) -> UrFacts:
         model=worker_facts.model,
         serial=worker_facts.serial,
         version=".".join(map(str, worker_facts.version)),
-        problem=why_not_ready(r.robot_mode, r.safety_mode, r.runtime, r.slider),
+        problem=why_not_ready(r.robot_mode, r.safety_mode, r.runtime, r.slider, r.status_bits),
         robot_mode=ROBOT_MODES.get(r.robot_mode, str(r.robot_mode)),
         safety_mode=safety_mode(r.safety_mode).text,
         remote=worker_facts.remote,
@@ -164,6 +164,10 @@ class WorkerProcess:
     def stop(self, stops: int) -> None:
         """Order a stop of any motion; does not wait."""
         self._send(("stop", stops))
+
+    def tilt(self, speed: float) -> None:
+        """Send the wanted speed of the tilt in a dose [rad/s]; does not wait."""
+        self._send(("tilt", speed))
 
     def kill(self) -> None:
         """End the process; its watchdog ends a running motion."""
@@ -283,6 +287,11 @@ class Session:
         """Order a stop; does not wait."""
         if self._worker is not None:
             self._worker.stop(stops)
+
+    def tilt(self, speed: float) -> None:
+        """Send the wanted speed of the tilt in a dose [rad/s]; does not wait."""
+        if self._worker is not None:
+            self._worker.tilt(speed)
 
     def kill(self) -> None:
         """End the worker; its watchdog ends a running motion."""

@@ -55,6 +55,9 @@ MOST_POINTS = 1_800
 NEWS_TIMEOUT, FIRST_NEWS_TIMEOUT = 0.2, 2.0
 """Time without a new command after which a dose's program turns the cup back, and the same before the first [s]."""
 
+END_TIMEOUT = 1.5
+"""Time without a command after which the program of a dose ends, if the cup is upright [s of controller time]."""
+
 _ALIGNING_SPEED, _ALIGNING_ACCELERATION = 0.05, 0.3
 
 
@@ -174,8 +177,9 @@ def tilt_program(
     """A program that tilts the pourer at the speed in a register, within a checked range of tilts.
 
     A client writes the speed to `TILT_SPEED` and then changes `TILT_COUNTER`. If the counter does not change for
-    `NEWS_TIMEOUT`, the program turns the cup back and ends: a tilted cup that stands still pours on. A dose ends in
-    the same way, by silence. The heartbeat's watchdog of `path_program` would stop the arm where it is, so this program
+    `NEWS_TIMEOUT`, the program turns the cup back: a tilted cup that stands still pours on. An upright cup waits for
+    `END_TIMEOUT`, so that a computer that paused can pour on; then the program ends. A dose ends in the same way, by
+    silence. The heartbeat's watchdog of `path_program` would stop the arm where it is, so this program
     has none. An order to stop still stops the arm at once.
 
     Args:
@@ -213,7 +217,7 @@ def tilt_program(
             *_preparation(settings, number, heartbeat=False),
             f"  movej({_list(points.joints[0])}, a={_ALIGNING_ACCELERATION}, v={_ALIGNING_SPEED})",
             f"  local d_counter = read_input_float_register({settings.registers + TILT_COUNTER})",
-            f"  while d_tilt > 0.0 or d_silence < {NEWS_TIMEOUT}:",
+            f"  while d_tilt > 0.0 or d_silence < {END_TIMEOUT}:",
             f"    local d_news = read_input_float_register({settings.registers + TILT_COUNTER})",
             "    if d_news != d_counter:",
             "      d_counter = d_news",

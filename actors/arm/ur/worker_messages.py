@@ -109,6 +109,9 @@ def safety_mode(number: int) -> SafetyMode:
 
 
 RUNNING_MODE, NORMAL, REDUCED = 7, 1, 2
+FREEDRIVE = 1 << 2
+"""Bit of `robot_status_bits`: the freedrive button on the teach pendant is pressed."""
+
 STOPPED_PROGRAM, PLAYING = 1, 2
 
 
@@ -116,7 +119,9 @@ FULL_SPEED, LEAST_SPEED = 0.99, 0.01
 """Smallest fractions of the programmed speed while liquid moves, and for any motion."""
 
 
-def why_not_ready(robot_mode: int, safety: int, runtime: int, slider: float, *, pours: bool = True) -> str:
+def why_not_ready(
+    robot_mode: int, safety: int, runtime: int, slider: float, status: int = 0, *, pours: bool = True
+) -> str:
     """Why an arm cannot move; '' if it can. Driver, worker, `decant robot check` and its display all use this decision.
 
     Reduced mode prevents pours: they are planned within the normal limits, and would end in a protective stop. Slow
@@ -125,12 +130,15 @@ def why_not_ready(robot_mode: int, safety: int, runtime: int, slider: float, *, 
     Args:
         robot_mode, safety, runtime: RTDE's numbers (`robot_mode`, `safety_mode`, `runtime_state`).
         slider: `target_speed_fraction`, 0 … 1.
+        status: `robot_status_bits`.
         pours: whether the motion carries or pours liquid.
     """
     if not may_move(safety, pours=pours):
         return f"{safety_mode(safety).text} is in force"
     if robot_mode != RUNNING_MODE:
         return f"the robot is {ROBOT_MODES.get(robot_mode, f'in mode {robot_mode}')}, not running"
+    if status & FREEDRIVE:
+        return "the freedrive button is pressed: a person moves the arm by hand; let it go"
     if runtime != STOPPED_PROGRAM:
         return "a program runs on the controller, or is paused; stop it at the pendant"
     if slider < (FULL_SPEED if pours else LEAST_SPEED):
@@ -185,6 +193,8 @@ class MotionOrder:
         settings: read back before the start.
         stops: number of stops when the motion was requested; if there is another one, it does not start.
         pours: it carries or pours liquid, so it needs the normal limits and the full speed.
+        tilts: it is a dose, whose speed comes over registers. Without news it ends by itself, upright; the first order
+            to stop ends it in this way.
     """
 
     program: str
@@ -195,6 +205,7 @@ class MotionOrder:
     settings: MotionSettings
     stops: int
     pours: bool
+    tilts: bool = False
 
 
 @dataclass(frozen=True)
@@ -209,6 +220,10 @@ class DataPackage:
         scaling: the controller's own slowing, 0 … 1.
         payload: [kg]; `centre` [m].
         number, status, clock, tool: of the program, see the registers.
+        status_bits: `robot_status_bits`.
+        force: external force and torque at the TCP, in the base's frame [N], [N m], as the controller estimates them.
+        wrist: raw force and torque of the sensor in the wrist, in a frame that no document names; empty if the robot
+            has none.
     """
 
     time: float
@@ -226,6 +241,9 @@ class DataPackage:
     status: int
     clock: float
     tool: tuple[float, ...]
+    status_bits: int = 0
+    force: tuple[float, ...] = ()
+    wrist: tuple[float, ...] = ()
 
     @property
     def speed(self) -> float:
@@ -243,6 +261,9 @@ STANDSTILL = 2e-3
 
 Sample = tuple[float, tuple[float, ...], float]
 """Controller time [s], joints [rad], time on the path [s]."""
+
+ForceSample = tuple[float, tuple[float, ...], tuple[float, ...]]
+"""Time on the path [s], external force, raw wrist force; see `DataPackage`."""
 
 
 @dataclass(frozen=True)
@@ -274,6 +295,7 @@ class MotionOutcome:
         answered: when the program was first seen to accept a stop order [s of `time.monotonic`].
         moved: it had been ordered to start.
         slider: lowest fraction of the programmed speed that was seen.
+        forces: ten readings a second.
     """
 
     kind: str
@@ -285,6 +307,7 @@ class MotionOutcome:
     answered: float | None = None
     moved: bool = True
     slider: float = 1.0
+    forces: tuple[ForceSample, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -213,9 +213,10 @@ class SerialBalanceEmulator:
 
     def __init__(self, spec: SerialBalanceSettings, scale: ScaleSettings) -> None:
         dialect = USUAL_DIALECT if spec.dialect == AUTO else spec.dialect
-        # baud=0: in scaled time, the transmission of characters would limit the speed of the bench.
+        # In scaled time, the transmission of characters would limit the speed of the bench.
+        baud = spec.candidates()[0].baud if spec.time_scale == 1.0 and spec.dialect != AUTO else 0
         self._balance = VirtualSerialBalance.start(
-            dialect, baud=0, scale=scale, time_scale=spec.time_scale, latency=0.002
+            dialect, baud=baud, scale=scale, time_scale=spec.time_scale, latency=0.002
         )
         self._spec = spec.with_values(port=self._balance.port, dialect=dialect)
 

@@ -207,6 +207,8 @@ class Emulation:
         match order:
             case {"do": "put", "times": times, "masses": masses}:
                 self._scale.put(Load(tuple(times), tuple(masses)))
+            case {"do": "load", "mass": mass}:
+                self._scale.change(float(mass))
             case {"do": "prepare", "seed": seed}:
                 self._scale.prepare(tuple(seed))
                 self._waiting = self._repeat_at = self._following = None

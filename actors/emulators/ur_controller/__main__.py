@@ -6,12 +6,13 @@ import argparse
 import asyncio
 import json
 import sys
+from dataclasses import replace
 from math import radians
 
 from actors.emulators.ur_controller.control_clock import Host, until_orphaned
 from actors.emulators.ur_controller.controller import Controller
 from actors.emulators.ur_controller.fault_injection import FaultServer
-from actors.emulators.ur_controller.robot import HOME, MODELS, RobotMode, calibrated
+from actors.emulators.ur_controller.robot import HOME, MODELS, X_SOFTWARE, RobotMode, calibrated
 from actors.emulators.ur_controller.safety_system import SafetyConfiguration
 
 _STATES = {"running": RobotMode.RUNNING, "idle": RobotMode.IDLE, "off": RobotMode.POWER_OFF}
@@ -22,6 +23,7 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m actors.emulators.ur_controller", description=__doc__)
     parser.add_argument("--address", default="127.0.0.2", help="loopback address of all ports (default %(default)s)")
     parser.add_argument("--model", choices=sorted(MODELS), default="ur10e")
+    parser.add_argument("--polyscope-x", action="store_true", help="software 10.14, with a Robot API, no dashboard")
     parser.add_argument("--calibrated", action="store_true", help="a robot that differs from nominal by millimetres")
     parser.add_argument("--time-scale", type=float, default=1.0, help="controller seconds per wall second")
     parser.add_argument("--frequency", type=float, help="control cycles per controller second; the model's by default")
@@ -39,6 +41,8 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
         parser.error(
             f"--address {chosen.address}: only loopback addresses (127.x.y.z); nobody outside is to reach this"
         )
+    if chosen.polyscope_x and not MODELS[chosen.model].e_series:
+        parser.error(f"--polyscope-x: a {chosen.model} has a CB3 controller, which does not run it")
     if not 0.0 < chosen.time_scale <= 1000.0:
         parser.error(f"--time-scale {chosen.time_scale:g}: 0 < scale ≤ 1000")
     if chosen.frequency is not None and not 10.0 <= chosen.frequency <= 1000.0:
@@ -59,6 +63,8 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
 async def serve(chosen: argparse.Namespace) -> None:
     """Open all ports, print one line of JSON when ready, and run until the end."""
     model = MODELS[chosen.model]
+    if chosen.polyscope_x:
+        model = replace(model, version=X_SOFTWARE)
     controller = Controller(
         calibrated(model) if chosen.calibrated else model,
         frequency=chosen.frequency,

@@ -19,10 +19,11 @@ from dataclasses import dataclass
 
 from actors.emulators.ur_controller.controller import Controller
 from actors.emulators.ur_controller.servers import connections as script_server
-from actors.emulators.ur_controller.servers import dashboard_server, primary_server, rtde_server
+from actors.emulators.ur_controller.servers import dashboard_server, primary_server, robot_api_server, rtde_server
 from actors.emulators.ur_controller.servers.connections import Connections, ScriptConnection
 from actors.emulators.ur_controller.servers.dashboard_server import DashboardConnection, DashboardServer
 from actors.emulators.ur_controller.servers.primary_server import PrimaryConnection, PrimaryServer
+from actors.emulators.ur_controller.servers.robot_api_server import RobotApiConnection
 from actors.emulators.ur_controller.servers.rtde_server import RtdeConnection, RtdeServer
 
 SLOWEST_WAKE = 0.002
@@ -141,7 +142,11 @@ class Host:
         return [
             (rtde_server.PORT, lambda: RtdeConnection(self.rtde)),
             (script_server.PORT, lambda: ScriptConnection(self.connections)),
-            (dashboard_server.PORT, lambda: DashboardConnection(self.connections, self.dashboard)),
+            *(
+                []
+                if self.controller.model.polyscope_x
+                else [(dashboard_server.PORT, lambda: DashboardConnection(self.connections, self.dashboard))]
+            ),
             *((port, primary_factory(*kind)) for port, kind in primary_server.PORTS.items()),
         ]
 
@@ -154,6 +159,18 @@ class Host:
         loop = asyncio.get_running_loop()
         for port, factory in self._port_factories():
             self._servers.append(await loop.create_server(factory, self.address, port))
+        if self.controller.model.polyscope_x:
+            self._servers.append(await self._open_robot_api(loop))
+
+    async def _open_robot_api(self, loop: asyncio.AbstractEventLoop) -> asyncio.Server:
+        def factory() -> asyncio.Protocol:
+            return RobotApiConnection(self.connections)
+
+        first, second = robot_api_server.PORTS
+        try:
+            return await loop.create_server(factory, self.address, first)
+        except PermissionError:
+            return await loop.create_server(factory, self.address, second)
 
     def close(self) -> None:
         """Stop listening; connections stay."""

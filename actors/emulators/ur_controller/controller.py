@@ -59,6 +59,7 @@ class Controller:
         now: controller time [s].
         known_commands: the translator's view of the commands that programs may call.
         switches: number of switches between remote and local control.
+        freedrive: the freedrive button is pressed.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class Controller:
         self.time_scale = time_scale
         self.remote = remote
         self.switches = 0
+        self.freedrive = False
         self.now = 0.0
         self.ticks = 0
         configuration = configuration or SafetyConfiguration.of(model)
@@ -205,13 +207,21 @@ class Controller:
 
     # ---- safety
 
-    def protective_stop(self, reason: str) -> None:
-        """Stop the arm and pause the program; a person has to unlock the stop."""
+    def protective_stop(self, reason: str, code: int = 0) -> None:
+        """Stop the arm and pause the program; a person has to unlock the stop.
+
+        Args:
+            reason: as a message.
+            code: of the error that clients of the primary interface receive, without text, as from many controllers; 0
+                for none.
+        """
         self.safety.protective_stop(self.now)
         self.safety_popup = True
         self._hold()
         self._resumes = False
         self.tell("safety", f"protective stop: {reason}")
+        if code:
+            self.tell("error", "", code)
 
     def emergency_stop(self, *, system: bool = False) -> None:
         """Stop the arm, end the program, and switch the power off."""

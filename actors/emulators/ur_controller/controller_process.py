@@ -49,6 +49,7 @@ class VirtualController:
         state: str = "running",
         local: bool = False,
         calibrated: bool = False,
+        polyscope_x: bool = False,
         joints: Sequence[float] | None = None,
         prioritised: bool = True,
         patience: float = START_TIME,
@@ -63,6 +64,7 @@ class VirtualController:
             state: initial power mode, 'running', 'idle' or 'off'.
             local: start in local control.
             calibrated: the robot differs from nominal lengths, as a real one does.
+            polyscope_x: software 10.14, with a Robot API instead of the dashboard.
             joints: six initial positions [rad]; a pose in the middle of its workspace by default.
             prioritised: raise the priority of its clock; see docs/laboratory/virtual-devices.md, "Control period".
             patience: longest wait [s].
@@ -75,6 +77,7 @@ class VirtualController:
         command += [] if frequency is None else ["--frequency", repr(float(frequency))]
         command += ["--local"] if local else []
         command += ["--calibrated"] if calibrated else []
+        command += ["--polyscope-x"] if polyscope_x else []
         command += [] if prioritised else ["--normal-priority"]
         command += [] if joints is None else ["--joints=" + ",".join(repr(degrees(q)) for q in joints)]
         process = ChildProcess(command)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import math
 from collections.abc import Callable
@@ -35,6 +36,8 @@ class ControllerFaults:
         self._controller = host.controller
         self._names: dict[str, Callable[..., dict[str, Any] | None]] = {
             "protective_stop": self.protective_stop,
+            "freedrive": self.freedrive,
+            "force": self.force,
             "emergency_stop": self.emergency_stop,
             "release_emergency_stop": self.release_emergency_stop,
             "safeguard": self.safeguard,
@@ -108,9 +111,26 @@ class ControllerFaults:
 
     # ---- safety
 
-    def protective_stop(self, reason: str = "fault port", **when: Any) -> None:
-        """Trigger a protective stop."""
-        self._when(lambda: self._controller.protective_stop(str(reason)), **when)
+    def protective_stop(self, reason: str = "fault port", code: int = 157, **when: Any) -> None:
+        """Trigger a protective stop, with the code of an error; 157 is a collision."""
+        self._when(lambda: self._controller.protective_stop(str(reason), int(code)), **when)
+
+    def freedrive(self, active: bool = True, **when: Any) -> None:
+        """Press the freedrive button, or let it go; nothing is moved by hand."""
+
+        def apply() -> None:
+            self._controller.freedrive = bool(active)
+
+        self._when(apply, **when)
+
+    def force(self, wrench: list[float], **when: Any) -> None:
+        """Push the tool: force and torque in the base's frame [N], [N m]. Only the reported values change."""
+        x, y, z, rx, ry, rz = map(_finite, wrench)
+
+        def apply() -> None:
+            self._controller.robot.external_force = (x, y, z, rx, ry, rz)
+
+        self._when(apply, **when)
 
     def emergency_stop(self, system: bool = False, **when: Any) -> None:
         """Press the emergency stop button."""
@@ -302,7 +322,8 @@ class ControllerFaults:
     def history(self, since: float = 0.0) -> dict[str, Any]:
         """Return the executed joint positions since a controller time, without noise."""
         start = _finite(since)
-        kept = [(t, q) for t, q in self._controller.robot.history if t >= start]
+        newest = itertools.takewhile(lambda one: one[0] >= start, reversed(self._controller.robot.history))
+        kept = list(newest)[::-1]
         return {"times": [t for t, _ in kept], "joints": [list(q) for _, q in kept]}
 
     def clear(self) -> None:

@@ -60,6 +60,7 @@ class Robot:
         lag: time constant with which the joints follow their targets [s].
         payload: [kg]; `cog` [m], `inertia` [kg m²].
         gravity: direction in the base's frame [m/s²].
+        external_force: on the tool, in the base's frame [N], [N m]; it moves nothing.
         recent: measured positions of the last cycles.
         history: (time, q) as executed, without noise, at `HISTORY_RATE`.
     """
@@ -74,6 +75,7 @@ class Robot:
         self.cog: Vector = (0.0, 0.0, 0.0)
         self.inertia: Pose = (0.0,) * 6
         self.gravity: Vector = (0.0, 0.0, 9.82)
+        self.external_force: Pose = (0.0,) * 6
         self.noise = 0.0
         self.lag = TRACKING_LAG
         self._random = random.Random(0)
@@ -348,13 +350,19 @@ class ControlledModel(RobotModel):
         return self.kind, 2 if self.cb3 else 1
 
     @property
+    def polyscope_x(self) -> bool:
+        """Whether it runs PolyScope X, with a Robot API instead of the dashboard."""
+        return self.version[0] >= 10
+
+    @property
     def e_series(self) -> bool:
         """Whether the controller belongs to the generation after CB3."""
         return self.version[0] >= 5
 
 
 CB3_SOFTWARE, E_SERIES_SOFTWARE, LATER_SOFTWARE = (3, 15, 8, 106339), (5, 12, 6, 1102099), (5, 17, 2, 1000000)
-"""Versions of the emulated controllers' software. The build of the last one is invented."""
+X_SOFTWARE = (10, 14, 0, 0)
+"""Versions of the emulated controllers' software. The builds of the last two are invented."""
 
 
 def _controlled(key: str, model: RobotModel) -> ControlledModel:

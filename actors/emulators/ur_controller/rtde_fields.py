@@ -11,6 +11,7 @@ inputs and outputs the guide gives no version; they are assumed to exist since t
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -123,7 +124,7 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         return (_RUNNING if power.running else _IDLE if power.powered else _POWER_OFF,) * 6
 
     def status_bits() -> int:
-        return int(power.powered) | (int(controller.playing) << 1)
+        return int(power.powered) | (int(controller.playing) << 1) | (int(controller.freedrive) << 2)
 
     readers: dict[str, tuple[str, Callable[[], Any]]] = {
         "timestamp": ("DOUBLE", lambda: controller.now),
@@ -140,7 +141,7 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         "joint_control_output": ("VECTOR6D", slow.currents),
         "actual_TCP_pose": ("VECTOR6D", lambda: robot.pose),
         "actual_TCP_speed": ("VECTOR6D", lambda: robot.tool_speed),
-        "actual_TCP_force": ("VECTOR6D", lambda: _ZERO6),
+        "actual_TCP_force": ("VECTOR6D", lambda: robot.external_force),
         "target_TCP_pose": ("VECTOR6D", lambda: robot.target_pose),
         "target_TCP_speed": ("VECTOR6D", lambda: robot.target_tool_speed),
         "actual_digital_input_bits": ("UINT64", lambda: signals.digital_in),
@@ -181,7 +182,7 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         "tool_output_voltage": ("INT32", lambda: 0),
         "tool_output_current": ("DOUBLE", lambda: 0.0),
         "tool_temperature": ("DOUBLE", lambda: 33.0),
-        "tcp_force_scalar": ("DOUBLE", lambda: 0.0),
+        "tcp_force_scalar": ("DOUBLE", lambda: math.hypot(*robot.external_force[:3])),
         "output_bit_registers0_to_31": ("UINT32", lambda: registers.output_bits & 0xFFFFFFFF),
         "output_bit_registers32_to_63": ("UINT32", lambda: registers.output_bits >> 32 & 0xFFFFFFFF),
         "input_bit_registers0_to_31": ("UINT32", lambda: registers.input_bits & 0xFFFFFFFF),
@@ -194,7 +195,7 @@ def output_fields(controller: Controller) -> dict[str, Field]:
     }
     if controller.model.e_series:
         readers |= {
-            "ft_raw_wrench": ("VECTOR6D", lambda: _ZERO6),
+            "ft_raw_wrench": ("VECTOR6D", slow.wrench),
             "tcp_offset": ("VECTOR6D", lambda: robot.tcp),
             "tool_output_mode": ("UINT8", lambda: _DIGITAL_OUTPUTS),
             "tool_digital_output0_mode": ("UINT8", lambda: _SINKING),
@@ -239,6 +240,13 @@ class _Slow:
 
     def currents(self) -> tuple[float, ...]:
         return tuple(t / 10.0 for t in self.torques())
+
+    def wrench(self) -> tuple[float, ...]:
+        """The external force and the payload's weight. The base's frame is an assumption: no document names one."""
+        robot = self._controller.robot
+        x, y, z, *torque = robot.external_force
+        gx, gy, gz = (-robot.payload * g for g in robot.gravity)
+        return (x + gx, y + gy, z + gz, *torque)
 
     def accelerometer(self) -> tuple[float, float, float]:
         m = self._controller.robot.frame[0]

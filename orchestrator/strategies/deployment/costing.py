@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import statistics
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, ClassVar
 
@@ -46,6 +46,10 @@ class Costing:
         """Costing of a plan in one of its scenes."""
         objectives = None if plan.objectives is None else (plan.objectives, plan.actions)
         return cls(plan.loss, scene, parameters, objectives)
+
+    def of_theta(self, parameters: SimulationParameters) -> Costing:
+        """The same for simulations with another θ, which may have another number of particles."""
+        return self if parameters.particles == self.parameters.particles else replace(self, parameters=parameters)
 
     @cached_property
     def worst_vector(self) -> Vector:

@@ -165,10 +165,16 @@ class D3Settings(SearchSettings):
         return (FreeHybrid if self.beside is None else Hybrid)(plan, scene, parameters, seed)
 
 
+AIMED, TOGETHER, FOUND = 3, 4, 0.5
+"""One prior simulation in this many is made for the decision about the first pour; how many of them at once; and the
+loss that a simulated action must keep below, relative to the largest one: otherwise the search goes on."""
+
+
 class Hybrid(Deployment[D3Settings]):
     """D3: as D2, but the surrogate's prior mean comes from m2 simulations, and from further ones between pours.
 
-    First, Bayesian optimisation in simulation chooses m2 actions. Their surrogate becomes the prior of the real
+    First, Bayesian optimisation in simulation chooses m2 actions; with 'adaptive', the last third of them are chosen for
+    the decision about the first pour, once a good action was simulated. Their surrogate becomes the prior of the real
     cost, f_r(a) = f_s(a) + δ(a): its posterior mean is the prior mean, its posterior covariance adds to δ's. The first
     pour is the minimiser of the prior mean; every further one minimises m(a) − κ s(a) given the weighed pours.
 
@@ -235,6 +241,14 @@ class Hybrid(Deployment[D3Settings]):
             self._scalarization.weigh(exploring=True)
             # in the paper κ is constant, and no simulation only fills space
             known, pending, plain = self._simulated(), self._trials.pending(), not self._settings.adaptive
+            left = self._settings.prior_simulations - self._spent
+            aimed = self._acquisition == "least_loss" and left <= self._settings.prior_simulations // AIMED
+            if aimed and min(known.costs, default=0.0) < FOUND * max(known.costs, default=0.0):
+                # those for the first pour: where it may be made, and where it tells the hypotheses apart
+                count = 1 + min(left, TOGETHER)
+                about = self._informed(self._real(), known, count=count, acquisition="least_loss", pending=pending)
+                self._questions.put(about, "prior", lambda answer: self._simulate(answer, "prior", first=1))
+                return
             query = self._query(MinimumQuery, known, everything=False, pending=pending, plain=plain, replicates=plain)
             self._questions.put(query, "prior", simulate)
 

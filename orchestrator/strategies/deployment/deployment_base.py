@@ -53,6 +53,9 @@ simulations before further ones count against the budget."""
 
 MAP_RESOLUTION = 25
 
+GOLDEN_RATIO = 0.6180339887498949
+"""Multiples of it modulo 1 cover the unit interval evenly, however many there are."""
+
 S = TypeVar("S", bound=DeploymentSettings)
 """Settings of a deployment."""
 
@@ -67,6 +70,10 @@ class Deployment(ABC, Generic[S]):
     or moved. It has no cost. The optimiser is given the place, and avoids places where another refusal is likely. A
     refusal does not count against a budget; at most `MAX_REFUSED` are free. A pour that failed after something had
     moved counts, and enters the data with the worst cost (`on_failed_pour: penalise`) or not at all (`ignore`).
+
+    If the plan has posterior draws of θ, the simulations use them in turn, so that the expected loss over all θ that
+    fit the weighed pours is minimised. Where many θ fit equally well, θ* is one of them that rounding may decide; the mean
+    over the draws is stable.
     """
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
@@ -75,6 +82,7 @@ class Deployment(ABC, Generic[S]):
         self._data = plan.data if plan.settings.learns_on_pours else None
         self._scene = scene
         self._parameters = parameters
+        self._simulated_thetas = 0
         self._costing = Costing.of(plan, scene, parameters)
         self._seeds = SeedStream(seed, f"{plan.strategy} {scene.name}")
         self._scalarization = Scalarization(self._costing, self._seeds.rng)
@@ -129,7 +137,7 @@ class Deployment(ABC, Generic[S]):
             if avoided and isinstance(outcome, Failed) and outcome.kind == "invalid_action":
                 self._trials.settle(request, None, refused=True)
             else:
-                vector = self._costing.simulated(outcome, request.action)
+                vector = self._costing.of_theta(request.parameters).simulated(outcome, request.action)
                 self._trials.settle(request, self._scalarization.note(request, vector))
         elif request == self._pouring:
             self._pouring = None
@@ -159,9 +167,17 @@ class Deployment(ABC, Generic[S]):
             self._decide(f"simulate ({purpose})", values, suggestion, i)
 
     def _repeated(self, action: Action, purpose: str, repeats: int) -> tuple[Simulate, ...]:
-        """Simulations of one action."""
-        name, parameters = self._scene.name, self._parameters
-        return tuple(Simulate(name, action, parameters, self._seeds.next(), purpose) for _ in range(repeats))
+        """Simulations of one action, each with the next θ."""
+        name, seeds = self._scene.name, self._seeds
+        return tuple(Simulate(name, action, self._next_theta(), seeds.next(), purpose) for _ in range(repeats))
+
+    def _next_theta(self) -> SimulationParameters:
+        """The next of the plan's draws of θ, in an order of which any section covers them evenly; θ* without draws."""
+        thetas = self._plan.thetas
+        if not thetas:
+            return self._parameters
+        self._simulated_thetas += 1
+        return thetas[int(self._simulated_thetas * GOLDEN_RATIO % 1.0 * len(thetas))]
 
     def _pour(self, point: Point, prediction: Prediction | None) -> None:
         """Queue a pour."""

@@ -115,6 +115,7 @@ class Makers:
         scale = changes.pop("time_scale", SCALE)
         options: dict[str, Any] = {"model": changes.pop("there", "ur10e"), "time_scale": scale, "joints": HOME}
         options["frequency"] = changes.pop("frequency", 125.0)
+        options["polyscope_x"] = changes.pop("polyscope_x", False)
         controller = VirtualController.start(address=free_address(), **options)
         arm = UrArm(settings(controller.address, time_scale=scale, **changes))
         rig = Rig(controller, arm, path or pour_path())

@@ -26,12 +26,11 @@ from tests.support.planning_cell import cell_of
 from .test_planned import ACTION, motion, vessels
 
 
-def bench_of(cls: type[UrArm], model: str = "ur10e") -> Iterator[ArmBench]:
+def bench_of(cls: type[UrArm], model: str = "ur10e", *, polyscope_x: bool = False) -> Iterator[ArmBench]:
     """An arm and its controller, whose true joints are the witness. The robot is calibrated, as a real one is."""
     true = cell_of(model, warning_time=0.0, time_scale=5.0, calibration=calibrated(MODELS[model]).calibration)
-    with VirtualController.start(
-        free_address(), true.model, true.time_scale, 125.0, calibrated=True, joints=true.home.angles
-    ) as controller:
+    options = {"calibrated": True, "polyscope_x": polyscope_x, "joints": true.home.angles}
+    with VirtualController.start(free_address(), true.model, true.time_scale, 125.0, **options) as controller:
 
         def true_poses(since: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
             kept = controller.fault("history", since=max(since + 1e-6, 0.0))
@@ -68,6 +67,13 @@ class TestUrArm(ArmContract):
     @pytest.fixture(params=[name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in MODELS])
     def bench(self, request: pytest.FixtureRequest) -> Iterator[ArmBench]:
         yield from bench_of(UrArm, request.param)
+
+
+@pytest.mark.slow
+class TestUrArmWithPolyscopeX(ArmContract):
+    @pytest.fixture
+    def bench(self) -> Iterator[ArmBench]:
+        yield from bench_of(UrArm, "ur20", polyscope_x=True)
 
 
 class ReportsThePlan(UrArm):

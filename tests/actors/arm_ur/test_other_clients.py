@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from actors.arm.arm_interface import ArmRefusedError
 from actors.arm.ur import rtde
 from actors.emulators.ur_controller.rtde_fields import INPUT_KINDS
+from actors.runtime.child_process import child_environment
+from tests.support.waiting import PATIENCE
 
-from .conftest import Makers, Rig
+from .conftest import Call, Makers, Rig
+
+ROOT = Path(__file__).parents[3]
 
 OUTPUTS = [name for name in INPUT_KINDS if "output" in name or "slider" in name]
 RESERVED = [f"input_{kind}_register_{n}" for kind in ("int", "double") for n in range(24)]
@@ -57,3 +66,51 @@ def test_other_inputs_can_be_chosen(make_rig: Makers) -> None:
     for _ in claim(rig.controller.address, [f"input_int_register_{n}" for n in (29, 33, 43, 44, 45)]):
         rig.arm.connect()
         rig.to_start()
+
+
+@contextlib.contextmanager
+def other_client(name: str, address: str) -> Iterator[list[str]]:
+    """A client in a process of its own; on leaving, its number of cycles and 'taken' if its values arrived."""
+    if importlib.util.find_spec({"ur_rtde": "rtde_io", "makers": "urpy"}[name]) is None:
+        pytest.skip(f"the client {name} is not installed (makers: the package urpy)")
+    program = [sys.executable, "-m", "tests.support.other_clients", name, address]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    found: list[str] = []
+    with subprocess.Popen(program, env=child_environment(), cwd=ROOT, **pipes) as child:  # type: ignore[call-overload]
+        try:
+            assert child.stdout.readline() == "ready\n"
+            yield found
+            out, _ = child.communicate(timeout=PATIENCE)
+            found += out.split()
+        finally:
+            child.kill()
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("name", ["ur_rtde", "makers"])
+def test_a_client_of_other_makers_exchanges_values_while_the_arm_pours(unconnected: Rig, name: str) -> None:
+    rig = unconnected
+    with other_client(name, rig.controller.address) as found:
+        rig.arm.connect()
+        rig.to_start()
+        rig.arm.release()
+        executed = rig.arm.execute(rig.path)
+    assert executed.completed
+    assert executed.tracking["slider"] == 1.0
+    cycles, taken = found
+    assert int(cycles) > 10
+    assert taken == "taken"
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+def test_a_client_that_speaks_no_protocol_does_not_disturb_a_pour(unconnected: Rig) -> None:
+    rig = unconnected
+    with socket.create_connection((rig.controller.address, rtde.PORT), timeout=5.0) as flood:
+        rig.arm.connect()
+        rig.to_start()
+        rig.arm.release()
+        pouring = Call(rig.arm.execute, rig.path)
+        rig.await_that(lambda: rig.arm.state().moving, "motion")
+        flood.sendall(b"\0\0\0 no package of any protocol" * 50)
+    assert pouring.result().completed

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from actors.arm.arm_interface import ArmNotReleasedError, ArmRefusedError, ArmStoppedError
+from actors.arm.ur.ur_driver import AcceptedArm
 from actors.arm.ur.worker_messages import may_move, safety_mode
 from tests.support.ur_pours import HOME, START, pour_path
 
@@ -271,3 +272,60 @@ def test_every_safety_mode_has_a_name_a_class_and_advice(number: int) -> None:
     assert (mode.kind == "") == may_move(number, pours=False)
     assert (mode.advice == "") == (number == 1)
     assert may_move(number, pours=True) == (number == 1)
+
+
+# ---- causes, hands, forces
+
+
+@pytest.mark.realtime
+def test_a_protective_stop_names_its_code_and_is_unlocked_after_five_seconds(make_rig: Make) -> None:
+    rig = make_rig(LONG_HOLD)
+    rig.fault("protective_stop", code=153, joint=5, above=START[5] + 0.6)
+    error = stopped(rig.pouring())
+    assert "C153A0 (a joint deviates from its commanded position)" in str(error)
+    begun = rig.now
+    rig.fault("protective_stop")  # the five seconds begin again
+    rig.arm.release()
+    assert "unlocked" in rig.arm.recover()
+    assert rig.now - begun > 5.0
+
+
+@pytest.mark.realtime
+def test_nothing_moves_while_the_freedrive_button_is_pressed(make_rig: Make) -> None:
+    rig = make_rig(LONG_HOLD)
+    rig.fault("freedrive")
+    assert "freedrive button is pressed" in rig.arm.facts().problem
+    rig.arm.release()
+    with pytest.raises(ArmRefusedError, match="freedrive button is pressed"):
+        rig.arm.move_to_start(rig.path)
+    rig.fault("freedrive", active=False)
+    rig.fault("freedrive", joint=5, above=START[5] + 0.6)
+    error = stopped(rig.pouring())
+    assert (error.kind, error.phase) == ("safety", "tilt")
+    assert "freedrive button was pressed" in str(error)
+    holds_until_released(rig)
+
+
+@pytest.mark.realtime
+def test_forces_at_the_tool_and_in_the_wrist_are_recorded(rig: Rig) -> None:
+    rig.fault("force", wrench=[0.0, 0.0, -3.0, 0.0, 0.0, 0.0], joint=5, above=START[5] + 0.6)
+    rig.to_start()
+    rig.arm.release()
+    forces = rig.arm.execute(rig.path).record()["forces"]
+    external = np.array(forces["external_force"])[:, 2]
+    assert (external[0], external[-1]) == (0.0, -3.0)
+    wrist = np.array(forces["wrist_force"])[:, 2]
+    assert wrist[-1] - wrist[0] == pytest.approx(-3.0, abs=0.02)
+    assert np.all(np.diff(forces["times"]) > 0.0)
+
+
+@pytest.mark.realtime
+def test_a_payload_on_the_controller_that_differs_from_the_file_is_refused(make_rig: Make) -> None:
+    rig = make_rig(connect=False)
+    spec = rig.arm._spec
+    arm = AcceptedArm(spec, rig.fault("state")["checksum"])
+    try:
+        with pytest.raises(ArmRefusedError, match=r"payload 0.00 kg on the controller, .* in the file"):
+            arm.connect()
+    finally:
+        arm.close()

@@ -10,6 +10,7 @@ import pytest
 from actors.balance.balance_interface import BalanceError, NoConnectionError
 from actors.balance.balance_settings import SettlingRule
 from actors.balance.dialect_registry import dialects
+from actors.balance.serial_balance import OFF_TIME
 from tests.support.waiting import PATIENCE
 
 from .conftest import SOON
@@ -127,6 +128,24 @@ def test_a_balance_that_was_switched_off_does_not_hide_the_spill(driver):
     far.unplug()
     far.power_cycle()
     far.plug()
+    with pytest.raises(BalanceError, match="If it was off"):
+        balance.weigh()
+    balance.tare()
+    far.put(0.37)
+    assert balance.weigh().mass == pytest.approx(0.01, abs=1e-9)
+
+
+def test_a_balance_switched_off_behind_a_port_that_stays_open_does_not_hide_the_spill(driver):
+    far, balance = driver("kcp", answer_time=0.2)
+    far.put(0.35)
+    balance.tare()
+    far.put(0.36)
+    far.faults(silent=True)
+    end = time.monotonic() + OFF_TIME + 1.0
+    while time.monotonic() < end:
+        assert balance.read().status in ("silent", "stable", "unstable")
+    far.power_cycle()
+    far.faults(silent=False)
     with pytest.raises(BalanceError, match="If it was off"):
         balance.weigh()
     balance.tare()

@@ -7,9 +7,8 @@ them run again, on other controllers: fixtures of a module are renewed for it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,34 +29,27 @@ GENERATIONS = ["ur10", "ur10e"]
 SCALE = 8.0
 """Controller seconds per wall second, where a test doesn't need real time."""
 
-SCENARIOS = (
-    "moves",
-    "streams",
-    "paths",
-    "questions",
-    "asynchronous",
-    "signals",
-    "scripts",
-    "second",
-    "unreachable",
-    "dashboards",
-)
-
 HOME = [0.0, -1.5707963, 1.5707963, -1.5707963, -1.5707963, 0.0]
 
 
-@dataclass
 class Robot:
-    """A controller, and what clients have seen of it or are about to see."""
+    """A controller, and what clients have seen of it; each scenario runs when a test asks for it first."""
 
-    model: str
-    controller: VirtualController
-    sightings: dict[str, Future[dict[str, Any]]]
+    def __init__(self, model: str, controller: VirtualController) -> None:
+        self.model = model
+        self.controller = controller
+        self._sightings: dict[str, dict[str, Any]] = {}
+
+    def seen(self, scenario: str) -> dict[str, Any]:
+        if scenario not in self._sightings:
+            asked = {"model": self.model} if scenario == "questions" else {}
+            self._sightings[scenario] = observe(scenario, self.controller.address, **asked)
+        return self._sightings[scenario]
 
 
 @pytest.fixture(scope="module")
 def robots() -> Iterator[dict[str, Robot]]:
-    """One of each model. All scenarios run from the start, one after the other on each and side by side on both."""
+    """One of each generation."""
     with ExitStack() as stack:
         found = {}
         for model in GENERATIONS:
@@ -65,22 +57,18 @@ def robots() -> Iterator[dict[str, Robot]]:
                 VirtualController.start(address=free_address(), model=model, time_scale=SCALE)
             )
             controller.fault("inputs", digital={"3": True, "4": False}, analog=[3.3])
-            queue = ThreadPoolExecutor(1)
-            stack.callback(queue.shutdown, cancel_futures=True)
-            asked = {name: {"model": model} if name == "questions" else {} for name in SCENARIOS}
-            sightings = {name: queue.submit(observe, name, controller.address, **asked[name]) for name in SCENARIOS}
-            found[model] = Robot(model, controller, sightings)
+            found[model] = Robot(model, controller)
         yield found
 
 
-@pytest.fixture(params=GENERATIONS)
+@pytest.fixture(params=[pytest.param("ur10", marks=pytest.mark.slow), "ur10e"])
 def robot(request: pytest.FixtureRequest, robots: dict[str, Robot]) -> Robot:
     return robots[request.param]
 
 
 @pytest.fixture
 def seen(robot: Robot) -> Seen:
-    return lambda scenario: robot.sightings[scenario].result()
+    return robot.seen
 
 
 def near(values: list[float], tolerance: float = 2e-5) -> Any:
@@ -328,11 +316,12 @@ def test_what_can_not_be_reached_ends_the_program_and_a_new_upload_helps(seen: S
 
 @pytest.mark.realtime
 def test_two_robots_side_by_side_keep_out_of_each_other_s_way(robots: dict[str, Robot]) -> None:
-    # All the scenarios above ran on both at the same time; each moved and told of its own arm only.
-    poses = [robot.sightings["questions"].result()["pose"] for robot in robots.values()]
+    with ThreadPoolExecutor(len(robots)) as pool:
+        seen = list(pool.map(lambda robot: observe("moves", robot.controller.address), robots.values()))
+    assert all(moves["moveJ reached"] == near(moves["moveJ target"]) for moves in seen)
+    poses = [robot.seen("questions")["pose"] for robot in robots.values()]
     assert poses[0] != near(poses[1], 1e-3)
     assert len({robot.controller.address for robot in robots.values()}) == 2
-    assert all(sighting.result() for robot in robots.values() for sighting in robot.sightings.values())
 
 
 # ---- time

@@ -14,6 +14,7 @@ from orchestrator.runs.prior_data import read_former_run
 from orchestrator.shipped import shipped
 from orchestrator.strategies.dispense import Dispensed
 from tests.support import small_campaign
+from tests.support.output_schema import validated
 
 HARDWARE = shipped("laboratories/ur5e-mettler.yaml")
 
@@ -48,7 +49,7 @@ def test_doses_are_poured_weighed_and_recorded(campaign: Path) -> None:
     for _, wanted, received in weighed:
         assert float(received) == pytest.approx(float(wanted), abs=2.0)
     run = next(Path("runs").iterdir())
-    recorded = read_result(run).results["dose"]
+    recorded = read_result(run).results["doses"]
     assert isinstance(recorded, Dispensed)
     assert [dose.number for dose in recorded.doses] == [1, 2]
     page = (run / "report.html").read_text(encoding="utf-8")
@@ -57,7 +58,71 @@ def test_doses_are_poured_weighed_and_recorded(campaign: Path) -> None:
     assert "minimised" not in page.partition("Settings and versions")[0]
     assert "Dose 2: 40 g wanted" in (run / "figures" / "dose-2.svg").read_text(encoding="utf-8")
     assert f"<td>{recorded.doses[1].received_g:.2f}</td>" in re.sub(r"<td[^>]*>", "<td>", page)
+    assert [dose.filled for dose in recorded.doses] == [True, False]
+    left = recorded.doses[-1].left_g
+    assert left == pytest.approx(100.0 - sum(dose.received_g or 0.0 for dose in recorded.doses), abs=4.0)
     assert read_former_run(run).pours == ()
+
+    result = decant("dose", str(campaign), "--amount", "15 g", "--as-left", "--dry-run", "--json")
+    (predicted,) = validated("dose", result.stdout)["doses"]
+    assert (predicted["filled"], predicted["left_g"]) == (False, pytest.approx((left or 0.0) - 15.0, abs=1.5))
+
+
+SERIES = """\
+name: series
+seed: 3
+laboratory: {name: small, bench: {liquid: {particles: 400}, time_scale: 0}}
+liquid: {name: water, mass: 100 g}
+pourer: beaker.yaml
+receiver: narrow.yaml
+motion: {x_offset: 70 mm, height: 60 mm}
+dispense:
+  refill_below: 40 g
+  doses: [{amount: 20 g, position: A1}, {amount: 25 g, position: A2}, {amount: 20 g, position: A3}]
+on_unknown: repeat
+outputs: {directory: runs}
+"""
+
+
+def test_a_campaign_pours_its_series_and_fills_the_source_again(campaign: Path) -> None:
+    path = small_campaign.write_campaign(campaign.parent, SERIES)
+    result = decant("dose", str(path), "--dry-run")
+    assert result.exit_code == 0, result.output
+    assert len(re.findall(r"g into A\d: [\d.]+ to [\d.]+ g expected", result.stdout)) == 3
+    assert "sources filled 2 times" in result.stdout
+    result = decant("run", str(path), "--in-process")
+    assert result.exit_code == 0, result.output
+    run = next(Path("runs").iterdir())
+    recorded = read_result(run).results["doses"]
+    assert isinstance(recorded, Dispensed)
+    assert [(dose.position, dose.filled) for dose in recorded.doses] == [("A1", True), ("A2", False), ("A3", True)]
+    for dose in recorded.doses:
+        assert dose.received_g == pytest.approx(dose.wanted_g, abs=2.0)
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert "source filled before" in page
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (("refill_below: 40 g", "refill_below: 90 g"), "a full source holds 100 g"),
+        (("amount: 25 g", "amount: 0.5 g"), "should be larger than the tolerance"),
+        (("position: A2", "place: A2"), "unknown key"),
+        (("[{amount: 20 g, position: A1}, {amount: 25 g, position: A2}, {amount: 20 g, position: A3}]", "[]"), "empty"),
+    ],
+)
+def test_an_impossible_series_is_refused(campaign: Path, change: tuple[str, str], text: str) -> None:
+    path = small_campaign.write_campaign(campaign.parent, SERIES.replace(*change))
+    result = decant("run", str(path))
+    assert result.exit_code == 2
+    assert text in result.stderr
+    assert not Path("runs").exists()
+
+
+def test_an_amount_is_needed(campaign: Path) -> None:
+    result = decant("dose", str(campaign))
+    assert result.exit_code == 2
+    assert "--amount: name the wanted amount" in result.stderr
 
 
 def test_the_same_seed_pours_the_same_doses(campaign: Path) -> None:
@@ -75,8 +140,8 @@ def test_the_same_seed_pours_the_same_doses(campaign: Path) -> None:
         (("--amount", "25 mL"), "--amount: "),
         (("--amount", "0.5 g"), "larger than the tolerance"),
         (("--amount", "25 g", "--receiver", "nowhere"), "there are narrow, tumbler"),
-        (("--amount", "150 g"), "the pourer holds 100 g, and 150 g are wanted"),
-        (("--amount", "25 g", "--laboratory", str(shipped("laboratories/virtual.yaml"))), "simulated benches only"),
+        (("--amount", "150 g"), "a full source holds 100 g"),
+        (("--amount", "25 g", "--laboratory", str(shipped("laboratories/virtual.yaml"))), "balance under the receiver"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(campaign: Path, arguments: tuple[str, ...], text: str) -> None:
@@ -86,12 +151,12 @@ def test_bad_input_is_refused_before_anything_is_written(campaign: Path, argumen
     assert not Path("runs").exists()
 
 
-def test_hardware_is_refused_before_anything_is_written(campaign: Path) -> None:
+def test_a_balance_in_another_place_is_refused_before_anything_is_written(campaign: Path) -> None:
     text = campaign.read_text(encoding="utf-8").replace("on_unknown: repeat\n", "")
     campaign.write_text(text, encoding="utf-8")
     result = decant("dose", str(campaign), "--amount", "25 g", "--laboratory", str(HARDWARE))
     assert result.exit_code == 2
-    assert "ur5e-mettler has an arm, and wanted amounts are poured on simulated benches only" in result.stderr
+    assert "wanted amounts need a connected balance under the receiver" in result.stderr
     assert not Path("runs").exists()
 
 

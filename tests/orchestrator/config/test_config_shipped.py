@@ -141,7 +141,7 @@ def test_recorded_campaign_describes_the_scene_of_its_records() -> None:
     assert first.action.height == pytest.approx(0.090)
     assert (first.action.angular_acceleration, first.action.return_velocity) == (None, None)
     assert first.action.hold_time == pytest.approx(1.2)
-    assert first.spilled == pytest.approx(0.4e-3)
+    assert first.spilled == pytest.approx(0.1e-3)
     assert [sum(p.split == split for p in records.pours) for split in ("train", "test")] == [28, 4]
     assert len(transfer.pours) == 16
     assert transfer.pours[0].action.x_offset == pytest.approx(0.1401)

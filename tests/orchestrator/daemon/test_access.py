@@ -18,22 +18,15 @@ import pytest
 
 from orchestrator.catalogue.catalogue import Catalogue
 from orchestrator.catalogue.run_registry import enter
-from orchestrator.daemon.access_control import (
-    DRAIN,
-    FAILURES,
-    WINDOW,
-    Role,
-    TokenFileError,
-    Tokens,
-    TooManyFailuresError,
-)
+from orchestrator.daemon.access_control import DRAIN
+from orchestrator.daemon.access_tokens import FAILURES, WINDOW, Role, TokenFileError, Tokens, TooManyFailuresError
 from orchestrator.daemon.submissions import SubmissionBundleError, unpack
 from tests.support.browser import on_port
 from tests.support.toy_daemon import Served, held, run, serving
 
 LOOKING = (
     *("/status", "/campaigns", "/campaigns/x", "/questions", "/rigs", "/events", "/metrics", "/campaigns/x/report"),
-    *("/runs", "/pours", "/runs/compare?run=a&run=b", "/runs/export", "/runs/x", "/runs/x/report"),
+    *("/runs", "/pours", "/runs/pours", "/runs/compare?run=a&run=b", "/runs/export", "/runs/x", "/runs/x/report"),
 )
 DOING = (
     "/campaigns",

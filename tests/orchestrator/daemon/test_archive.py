@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from orchestrator.catalogue.run_registry import VARIABLE, use_state_directory
 from orchestrator.cli.app import app
-from orchestrator.daemon.access_control import Role
+from orchestrator.daemon.access_tokens import Role
 from tests.orchestrator.test_catalogue import made
 from tests.support.daemon_thread import Real
 from tests.support.toy_daemon import Served, run, serving
@@ -41,7 +41,7 @@ def test_runs_and_pours_of_the_daemon_are_found_and_tagged_by_operators_only(tmp
             (found,) = await served.get("/runs", receiver="NARR*", strategy="D2")
             assert (found["run"], found["pours"], found["mode"]) == (name, 3, "virtual")
             assert await served.get("/runs", since="2031") == []
-            pours = await served.get("/pours", run=name)
+            pours = await served.get("/runs/pours", run=name)
             assert [pour["number"] for pour in pours] == [1, 2, 3]
             assert all(60 <= pour["angular_velocity_deg_s"] <= 180 for pour in pours)
 

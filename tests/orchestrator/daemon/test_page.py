@@ -21,7 +21,7 @@ from actors.interfaces import OperatorQuestion
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.catalogue.run_registry import VARIABLE
 from orchestrator.config.file_loading import load_laboratory
-from orchestrator.daemon.access_control import Role, token_of
+from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.daemon.daemon_settings import Rig
 from tests.support.browser import OnPort, browser, on_port
 from tests.support.hardware_laboratory import hardware_rig

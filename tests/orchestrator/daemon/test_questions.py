@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from actors.interfaces import OperatorQuestion
-from orchestrator.daemon.access_control import Role
+from orchestrator.daemon.access_tokens import Role
 from tests.support.toy_daemon import HeldLaboratory, run, serving
 
 REFILL = OperatorQuestion("Refill the beaker to 100 g.", "done", about="refill", details={"load": 100.0})

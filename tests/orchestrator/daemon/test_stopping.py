@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.daemon.access_control import Role
+from orchestrator.daemon.access_tokens import Role
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from tests.support.toy_daemon import HeldLaboratory, held, run, serving
 

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from actors.runtime.child_process import child_environment
 from orchestrator.cli.app import app
-from orchestrator.daemon.access_control import Role
+from orchestrator.daemon.access_tokens import Role
 from orchestrator.shipped import shipped
 from tests.support.daemon_thread import Real
 

@@ -1,30 +1,37 @@
-"""A series of wanted amounts: one dose after the other, none repeated."""
+"""A series of wanted amounts: one dose after the other, none repeated, out of sources that are tracked and filled."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from actors.interfaces import DoseTarget
+from actors.interfaces import DoseSource
+from orchestrator.catalogue.source_account import SourceAccount
 from orchestrator.journal.codec import decode_request, decode_result, encode_request, encode_result
 from orchestrator.requests import Failed, Pour, Poured, Slots
-from orchestrator.strategies.dispense import Dispense
+from orchestrator.runs.events import CampaignOpened, RequestFinished, RequestStarted
+from orchestrator.strategies.campaign_plan import DispensePlan, PlannedDose
+from orchestrator.strategies.dispense import Dispense, KnownSource
 from sim_engine.action import Action
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import cylinder
 
-SCENE = Scene(
-    "tumbler",
-    cylinder("beaker", inner_radius=0.04, inner_height=0.1),
-    cylinder("tumbler", inner_radius=0.03, inner_height=0.09),
-    Liquid(mass=0.3),
-)
 ACTION = Action(1.0, 0.09, 0.06)
+TUMBLER = cylinder("tumbler", inner_radius=0.03, inner_height=0.09)
+KNOWLEDGE = {"onset_flow": [0.01, 0.0], "covariance": [1e-4, 0.0, 0.0, 0.04], "lag": None, "aim": 3e-4, "doses": 1}
 
 
-def series(*grams: float) -> Dispense:
-    return Dispense(SCENE, ACTION, [DoseTarget(1e-3 * g) for g in grams], seed=5)
+def scene(source: str) -> Scene:
+    pourer = cylinder(source, inner_radius=0.04, inner_height=0.1)
+    return Scene(f"dispense-{source}-tumbler", pourer, TUMBLER, Liquid(mass=0.3), fixed=ACTION.values())
+
+
+def plan(*grams: float, sources: tuple[str, ...] = ("beaker",), refill_below: float = 0.0) -> DispensePlan:
+    doses = tuple(PlannedDose(1e-3 * g, 1e-3, "tumbler", f"A{i}") for i, g in enumerate(grams, start=1))
+    return DispensePlan(tuple(map(scene, sources)), doses, refill_below, True, "bench")
 
 
 def asked(strategy: Dispense) -> Pour:
@@ -33,37 +40,83 @@ def asked(strategy: Dispense) -> Pour:
     return request
 
 
-def poured(grams: float, **notes: object) -> Poured:
-    loaded = 0.3
-    return Poured(PourMeasurement(loaded, 0.0, loaded - 1e-3 * grams, {"dose": {"received": 1e-3 * grams, **notes}}))
+def source_of(pour: Pour) -> DoseSource:
+    assert pour.dose is not None
+    assert pour.dose.source is not None
+    return pour.dose.source
+
+
+def poured(pour: Pour, grams: float, **notes: object) -> Poured:
+    held = source_of(pour).mass
+    about = {"received": 1e-3 * grams, "left": [held - 1e-3 * grams, 1e-3], "knowledge": KNOWLEDGE, **notes}
+    return Poured(PourMeasurement(held, 0.0, held - 1e-3 * grams, {"dose": about}))
 
 
 def test_doses_are_asked_one_after_the_other_in_order() -> None:
-    strategy = series(50, 25)
+    strategy = Dispense(plan(50, 25), seed=5)
     first = asked(strategy)
     assert strategy.ask(Slots(0)) == []
-    strategy.tell(first, poured(50.3, end="reached", duration=8.0))
+    strategy.tell(first, poured(first, 50.3, end="reached", duration=8.0))
     second = asked(strategy)
     assert [pour.dose and pour.dose.amount for pour in (first, second)] == [0.05, 0.025]
+    assert [pour.dose and pour.dose.position for pour in (first, second)] == ["A1", "A2"]
     assert first.seed != second.seed
-    strategy.tell(second, poured(24.9, end="reached"))
+    strategy.tell(second, poured(second, 24.9, end="reached"))
     assert strategy.finished
     assert [dose.received_g for dose in strategy.result().doses] == pytest.approx([50.3, 24.9])
 
 
-def test_a_failed_dose_is_kept_and_not_repeated() -> None:
-    strategy = series(50, 25)
+def test_a_dose_knows_what_the_earlier_ones_have_shown_and_left() -> None:
+    strategy = Dispense(plan(50, 25), seed=5)
+    first = asked(strategy)
+    assert (source_of(first).fill, source_of(first).knowledge) == (True, None)
+    strategy.tell(first, poured(first, 50.3))
+    second = source_of(asked(strategy))
+    assert (second.fill, second.mass, second.deviation) == (False, pytest.approx(0.2497), 1e-3)
+    assert second.knowledge is not None
+    assert second.knowledge.onset_flow == (0.01, 0.0)
+    assert second.constants == source_of(first).constants
+
+
+def test_a_source_is_filled_before_it_would_hold_less_than_the_threshold() -> None:
+    strategy = Dispense(plan(100, 100, 100, refill_below=0.08), seed=5)
+    fills = []
+    for _ in range(3):
+        pour = asked(strategy)
+        fills.append((source_of(pour).fill, source_of(pour).mass))
+        strategy.tell(pour, poured(pour, 100.0))
+    assert fills == [(True, 0.3), (False, pytest.approx(0.2)), (True, 0.3)]
+
+
+def test_several_sources_are_used_before_one_is_filled_again() -> None:
+    known = {"beaker": KnownSource(mass=0.12, deviation=1e-3), "jug": KnownSource(mass=0.25, deviation=1e-3)}
+    strategy = Dispense(plan(100, 100, 100, 100, sources=("beaker", "jug")), seed=5, known=known)
+    used = []
+    while not strategy.finished:
+        pour = asked(strategy)
+        used.append((source_of(pour).name, source_of(pour).fill, pour.scene))
+        strategy.tell(pour, poured(pour, 100.0))
+    assert [name for name, _, _ in used] == ["beaker", "jug", "jug", "jug"]
+    assert [fill for _, fill, _ in used] == [False, False, False, True]
+    assert used[1][2] == "dispense-jug-tumbler"
+
+
+def test_a_failed_dose_is_kept_and_not_repeated_and_its_source_is_filled() -> None:
+    strategy = Dispense(plan(50, 25), seed=5)
     strategy.tell(asked(strategy), Failed("pour_failed", "the cup fell"))
-    assert asked(strategy).number == 2
+    second = asked(strategy)
+    assert second.number == 2
+    assert source_of(second).fill  # what it holds is not known
     (failed,) = strategy.result().doses
-    assert (failed.received_g, failed.end) == (None, "pour_failed: the cup fell")
+    assert (failed.received_g, failed.end, failed.left_g) == (None, "pour_failed: the cup fell", None)
 
 
 def test_requests_and_results_survive_the_journal() -> None:
-    strategy = series(50)
+    strategy = Dispense(plan(50, 25), seed=5)
     request = asked(strategy)
-    assert decode_request(encode_request(request)) == request
-    strategy.tell(request, poured(50.3, end="reached"))
+    strategy.tell(request, poured(request, 50.3, end="reached"))
+    for one in (request, asked(strategy)):
+        assert decode_request(encode_request(one)) == one
     assert decode_result(encode_result(strategy.result())) == strategy.result()
 
 
@@ -71,3 +124,47 @@ def test_a_pour_without_an_amount_is_written_as_before() -> None:
     data = encode_request(Pour("tumbler", ACTION, 1, 3))
     assert "dose" not in data
     assert decode_request(data) == Pour("tumbler", ACTION, 1, 3)
+
+
+# ---- the account of the sources
+
+
+def test_the_account_follows_a_run_once_and_another_process_reads_it(tmp_path: Path) -> None:
+    series, path = plan(50, 25), tmp_path / "sources.sqlite"
+    strategy = Dispense(series, seed=5)
+    opened = CampaignOpened(name="c", run_directory=tmp_path, stages=("doses",), mode="virtual", simulators=1)
+    follow = SourceAccount(path).follow(series)
+    follow(opened)
+    first = asked(strategy)
+    follow(RequestStarted(stage="doses", id=1, request=first))
+    name = series.tracked("beaker")
+    begun = SourceAccount(path).content(name)
+    assert begun is not None
+    assert begun.kind == "begun"
+    assert begun.mass + 2 * begun.deviation > 0.3 > 0.25 > begun.mass - 2 * begun.deviation  # all or nothing of it
+    outcome = poured(first, 50.0)
+    finished = RequestFinished(stage="doses", id=1, request=first, outcome=outcome)
+    for _ in range(2):  # a resumed run tells of it again
+        follow(finished)
+    assert [entry.kind for entry in SourceAccount(path).history(name)] == ["dosed", "begun", "filled"]
+    known = SourceAccount(path).known(series)["beaker"]
+    assert known.mass == pytest.approx(0.25)
+    again = source_of(asked(Dispense(series, seed=6, known={"beaker": known})))
+    assert (again.fill, again.mass) == (False, pytest.approx(0.25))
+    assert again.knowledge is not None
+    assert again.knowledge.lag is None  # the balance may be another one
+
+
+def test_a_weighing_replaces_the_estimate_and_an_unknown_dose_ends_it(tmp_path: Path) -> None:
+    series = plan(50)
+    account, name = SourceAccount(tmp_path / "sources.sqlite"), series.tracked("beaker")
+    account.fill(name, 0.3, 1e-3)
+    account.weigh(name, 0.27, 1e-4)
+    found = account.content(name)
+    assert found is not None
+    assert (found.mass, found.deviation) == (0.27, 1e-4)
+    pour = asked(Dispense(series, seed=5, known=account.known(series)))
+    account.finish(name, pour, Failed("pour_unknown", "nobody saw it"), key="run 1")
+    assert account.content(name) is None
+    assert account.known(series) == {}
+    assert [entry.kind for entry in account.all()] == ["unknown"]

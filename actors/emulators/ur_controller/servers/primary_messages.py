@@ -215,9 +215,9 @@ class ControllerMessage:
 
     Attributes:
         kind: 'text' (from a program), 'key' (from the controller), 'exception' (a program cannot continue), 'safety',
-            'popup'.
+            'error' (with a code), 'popup'.
         text: its text.
-        line: of the program, for an exception.
+        line: of the program, for an exception; code, for an error.
         time: of the controller [s].
     """
 

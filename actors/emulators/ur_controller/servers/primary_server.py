@@ -103,6 +103,8 @@ class PrimaryServer:
             case "safety":
                 data = primary.safety_message(now, self.controller.safety.mode)
                 data += primary.key_message(now, "safety", text)
+            case "error":
+                data = primary.error_message(now, message.line, text)
             case "popup":
                 data = primary.popup_message(now, text)
             case _:

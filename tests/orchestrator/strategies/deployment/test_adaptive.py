@@ -96,6 +96,16 @@ def test_prior_simulations_are_not_made_at_one_place() -> None:
     assert near.sum(axis=1).max() <= 3
 
 
+def test_the_last_prior_simulations_are_made_for_the_first_pour() -> None:
+    strategy = adaptive(4, pours=1, prior_simulations=24)
+    StrategyHarness(narrow_cup).run(strategy)
+    (poured,) = strategy.result().weighed
+    points = np.array([ACTIONS.encode(one.action_si) for one in strategy.result().simulated[:24]])
+    away = np.linalg.norm(points - ACTIONS.encode(poured.action_si), axis=1)
+    assert np.median(away[16:]) < 0.5 * np.median(away[:16])
+    assert losses(strategy)[0] < 0.05
+
+
 def test_a_bench_that_changes_is_noticed_and_said() -> None:
     poured = 0
 

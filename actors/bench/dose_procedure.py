@@ -1,0 +1,409 @@
+"""One dose on a bench with an arm and a balance under the receiver: steps, consent, control loop, and what was weighed.
+
+The controller (`actors.dosing.dose_controller`) decides the tilt about twenty times a second. The arm's program limits
+it, and turns the cup back by itself without commands for 0.2 s: when this process is killed, pauses, or loses the
+connection.
+
+1. Fill the source, if requested.
+2. Put the empty receiver on the balance. Its readings show the lag of the balance.
+3. Consent, approach, dose, way home.
+4. Report the amount in the receiver: weighed, or UNKNOWN.
+
+The rules of `actors.bench.pour_procedure` hold here, too. The content of the source is not weighed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import time
+from collections.abc import AsyncIterator
+from typing import Any
+
+import numpy as np
+
+from actors.arm.arm_interface import ArmFacts, ArmState, Executed, PlannedPour
+from actors.balance.balance_interface import BalanceError
+from actors.balance.weighing_plan import Placement
+from actors.bench.consent import STUCK, Consent, Setup, grams, start_question
+from actors.bench.pour_procedure import PourReport
+from actors.dosing.dose_controller import DoseController, DoseOrder, DoseResult
+from actors.dosing.dose_estimator import DoseReading
+from actors.dosing.dose_series import DoseSeries, after_dose, check_dose, series_of, source_of, unknown_amount
+from actors.dosing.dosing_settings import DosingSettings
+from actors.interfaces import (
+    DoseProgress,
+    DoseTarget,
+    InvalidActionError,
+    LaboratoryError,
+    Notice,
+    NotPouredError,
+    OperatorQuestion,
+    PourFailedError,
+    ProgressCallback,
+    UnknownPourError,
+)
+from sim_engine.outcome import PourMeasurement
+from sim_engine.scene import SampledMotion, Scene
+
+TICK = 0.05
+"""Time between two decisions [s]."""
+
+BEFORE_PLACING, AFTER_PLACING = 0.5, 2.0
+"""Readings are recorded for so long before and after the receiver is put on the balance [s]."""
+
+LIGHTEST_RECEIVER = 5e-3
+"""Smallest rise of the reading that counts as a receiver [kg]."""
+
+CLOSING_TIME = 60.0
+"""Time of a dose beyond its limit, for settling, top-ups and the return [s]."""
+
+SIGNALS = 400
+"""Largest number of samples of a dose's signals in its record."""
+
+
+class BalanceReadings:
+    """Reads the balance as fast as it answers, and keeps each reading once.
+
+    Args:
+        setup: parts of the bench.
+        report: receives the display.
+    """
+
+    def __init__(self, setup: Setup, report: PourReport) -> None:
+        assert setup.balance is not None
+        self._balance, self._report = setup.balance, report
+        self._scale = setup.spec.time_scale
+        self._kept: list[DoseReading] = []
+        self._taken = 0
+        self.step = 0.0
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Read while the body runs."""
+        task = asyncio.create_task(self._read())
+        try:
+            yield
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    def fresh(self) -> list[DoseReading]:
+        """Readings since the last call."""
+        found, self._taken = self._kept[self._taken :], len(self._kept)
+        return found
+
+    @property
+    def all(self) -> tuple[DoseReading, ...]:
+        """All readings so far; their times are `time.monotonic` in bench time."""
+        return tuple(self._kept)
+
+    async def _read(self) -> None:
+        last = -math.inf
+        while True:
+            with contextlib.suppress(LaboratoryError):
+                weight = await self._balance.read()
+                if weight.status in ("stable", "unstable") and math.isfinite(weight.mass) and weight.time > last:
+                    last, now = weight.time, time.monotonic()
+                    # the driver's clock is this one, unless it runs on another machine
+                    moment = weight.time if 0.0 <= now - weight.time < 1.0 else now
+                    self.step = weight.step or self.step
+                    self._kept.append(DoseReading(self._scale * moment, weight.mass, weight.stable))
+                    self._report.show(weight.mass, weight.stable)
+            await asyncio.sleep(0.01)
+
+
+class DoseProcedure:
+    """One dose, from the first question to the weighed amount.
+
+    Args:
+        setup: parts of the bench.
+        scene: pourer, receiver and liquid.
+        dose: wanted amount, with its source.
+        path: checked path of the arm, whose first phase is the range of the tilt.
+        seed: of the controller, and of a virtual bench's randomness.
+        settings: of the dose.
+        progress: receives the progress.
+
+    Raises:
+        InvalidActionError: the dose can't be made here.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        scene: Scene,
+        dose: DoseTarget,
+        path: PlannedPour,
+        *,
+        seed: int,
+        settings: DosingSettings,
+        progress: ProgressCallback | None,
+    ) -> None:
+        check_bench(setup)
+        check_dose(scene, dose)
+        self._setup, self._scene, self._dose, self._path = setup, scene, dose, path
+        self._seed, self._settings = seed, settings
+        self._consent = Consent(setup, path)
+        parts = {
+            "operator": setup.operator_time,
+            "approach": setup.spec.warning_time + path.approach_time,
+            "dose": 10.0,
+            "record": path.retreat_time,
+        }
+        self._report = PourReport(progress, parts, 10.0)
+        self._readings = BalanceReadings(setup, self._report)
+        self._series: DoseSeries | None = None
+        self._begun = False
+        self._facts: ArmFacts | None = None
+        self._executed: Executed | None = None
+        self._tilts: list[tuple[float, float]] = []
+        self._zero = self._at = self._duration = 0.0
+
+    async def run(self) -> PourMeasurement:
+        """Run the whole dose.
+
+        Raises:
+            NotPouredError: nothing was poured.
+            UnknownPourError: the amount in the receiver is unknown.
+        """
+        setup = self._setup
+        setup.questions.take_log()
+        try:
+            result = await self._steps()
+        except asyncio.CancelledError as error:
+            await self._consent.leave_safe()
+            if self._begun:
+                setup.tell(Notice("warning", f"the dose was given up after it had begun; {await self._remaining()}"))
+                raise
+            raise NotPouredError("the dose was given up before it began; nothing was poured") from error
+        except (InvalidActionError, PourFailedError):
+            await self._consent.leave_safe()
+            raise
+        except LaboratoryError as error:
+            text = f"{error}. Nothing was poured"
+            if self._begun:
+                text = f"{error}. It was not the dose that was asked for: {await self._remaining()}"
+            await self._consent.leave_safe()
+            raise (UnknownPourError if self._begun else NotPouredError)(text) from error
+        finally:
+            await setup.ground_truth.end()
+        return result
+
+    # ---- steps in order
+
+    async def _steps(self) -> PourMeasurement:
+        setup = self._setup
+        assert setup.balance is not None
+        self._report.enter("operator")
+        self._facts = await setup.arm.ready()
+        await self._consent.make_safe()
+        await setup.balance.device.revive()
+        await setup.balance.resume()
+        await setup.balance.connect()
+        await setup.ground_truth.prepare_dose(self._scene, self._dose, self._seed)
+        async with self._readings.running():
+            await self._prepare()
+            await self._consent.given(start_question(setup.spec, self._path))
+            async with setup.ground_truth.followed():
+                result = await self._out_and_home()
+        self._report.enter("record", 1.0)
+        truth = await setup.ground_truth.flowed()
+        if result.amount is None:
+            raise UnknownPourError(unknown_amount(result))
+        return self._measurement(result, truth)
+
+    async def _prepare(self) -> None:
+        """Fill the source, put the receiver on, and measure the lag of the balance."""
+        source, dose = source_of(self._scene, self._dose), self._dose
+        if source.fill:
+            await self._consent.ask(
+                OperatorQuestion(
+                    f"Fill '{source.name}' with {1e3 * source.mass:.0f} g of {self._scene.liquid.name}, weighed, and "
+                    "give it to the gripper. Take everything off the balance.",
+                    wants="done",
+                    about="dose_source",
+                )
+            )
+        else:
+            await self._consent.ask(
+                OperatorQuestion(
+                    "Take everything off the balance, and wipe its pan.", wants="done", about="dose_cleared"
+                )
+            )
+        place = f" {dose.position}" if dose.position else ""
+        problem = ""
+        while True:
+            await self._sleep(BEFORE_PLACING)
+            before = self._readings.all[-3:]
+            await self._consent.ask(
+                OperatorQuestion(
+                    f"Put the empty receiver{place} on the balance in one movement, and let go; nothing else may touch "
+                    "its pan.",
+                    "done",
+                    problem,
+                    about="dose_receiver",
+                )
+            )
+            await self._sleep(AFTER_PLACING)
+            after = self._readings.all[-3:]
+            if not before or not after:
+                raise BalanceError("the balance sends no weight; look at its cable and its display")
+            rise = after[-1].mass - before[-1].mass
+            if rise >= LIGHTEST_RECEIVER:
+                break
+            problem = (
+                f"the balance shows {grams(rise)} more than before; a receiver weighs at least "
+                f"{grams(LIGHTEST_RECEIVER)}"
+            )
+        begin = before[0].time - 1.0
+        placed = tuple(
+            DoseReading(one.time - begin, one.mass, one.stable) for one in self._readings.all if one.time >= begin
+        )
+        rng = np.random.default_rng((self._seed, 41))
+        step = self._readings.step or 1e-4
+        self._series = series_of(self._scene, dose, self._settings, placed, rng, step=step)
+        self._zero = after[-1].mass
+
+    async def _out_and_home(self) -> DoseResult:
+        setup, path = self._setup, self._path
+        self._report.enter("approach")
+        try:
+            await setup.arm.move_to_start(path, self._seen)
+        except STUCK as error:
+            await self._consent.bring_home(error, begun=self._begun)
+            raise
+        await setup.ground_truth.flows()
+        self._begun = True
+        self._report.enter("dose")
+        try:
+            result = await self._controlled()
+        except STUCK as error:
+            await self._upright(error)
+            await self._home()
+            raise
+        await self._home()
+        return result
+
+    async def _upright(self, error: Exception) -> None:
+        """After a stop: the cup may have turned back by itself; if it has not, the operator consents to its return."""
+        if getattr(error, "kind", "") == "operator" and abs(getattr(error, "tilt", 1.0)) < math.radians(1.0):
+            await self._consent.given(start_question(self._setup.spec, self._path))
+            return
+        await self._consent.bring_upright(error)
+        await self._setup.arm.release()
+
+    async def _home(self) -> None:
+        try:
+            await self._setup.arm.retreat(self._path, self._seen)
+        except STUCK as error:
+            await self._consent.bring_home(error, begun=self._begun)
+
+    async def _controlled(self) -> DoseResult:
+        """The control loop: ends when the controller has a result, or the motion has been stopped."""
+        assert self._series is not None
+        arm, dose = self._setup.arm, self._dose
+        order = DoseOrder(dose.amount, dose.limit, receiver_mass=self._zero)
+        controller = self._series.controller(order, seed=self._seed)
+        longest = self._settings.time_limit + CLOSING_TIME
+        motion = asyncio.create_task(arm.dose(self._path, longest))
+        try:
+            while (await arm.state()).phase != "dose":  # the program is uploaded first
+                if motion.done():
+                    await motion
+                await asyncio.sleep(0.01)
+            self._readings.fresh()
+            begin = self._at = self._now()
+            state = await arm.drive(0.0)
+            upright = state.tilt or 0.0
+            while controller.result is None and not motion.done():
+                now = self._now()
+                tilt = (state.tilt or 0.0) - upright
+                self._tilts.append((now - begin, tilt))
+                command = controller.step(now, tilt, self._readings.fresh())
+                state = await arm.drive(command.speed)
+                self._show(controller, state, tilt)
+                await self._sleep(max(now + TICK - self._now(), 0.0))
+            self._executed = await motion  # without commands the cup turns back, and the program ends
+        finally:
+            if not motion.done():
+                await asyncio.gather(asyncio.wait_for(motion, 1.0), return_exceptions=True)
+        self._duration = self._now() - begin
+        self._tilts.append((self._duration, 0.0))
+        if controller.result is None:
+            raise LaboratoryError("the dose's program ended on the controller before the dose was over")
+        self._series.finish(controller.result)
+        return controller.result
+
+    def _now(self) -> float:
+        """The clock in bench time [s]."""
+        return self._setup.spec.time_scale * time.monotonic()
+
+    async def _sleep(self, seconds: float) -> None:
+        await asyncio.sleep(seconds / self._setup.spec.time_scale)
+
+    # ---- results
+
+    async def _remaining(self) -> str:
+        """What is in the receiver after an aborted dose, as text."""
+        assert self._setup.balance is not None
+        with contextlib.suppress(LaboratoryError):
+            await self._setup.ground_truth.flowed()
+            await self._setup.balance.resume()
+            weight = await self._setup.balance.weigh()
+            return f"the balance shows {grams(weight.mass - self._zero)} in the receiver"
+        return "the amount in the receiver is UNKNOWN"
+
+    def _measurement(self, result: DoseResult, truth: dict[str, Any]) -> PourMeasurement:
+        assert self._series is not None
+        assert result.amount is not None
+        source = source_of(self._scene, self._dose)
+        every = max(len(self._tilts) // SIGNALS, 1)
+        during = [one for one in self._readings.all if one.time >= self._at]
+        about = {
+            **after_dose(self._series),
+            "wanted": self._dose.amount,
+            "received": result.amount,
+            "end": str(result.end),
+            "top_ups": result.top_ups,
+            "duration": self._duration,
+            "times": [round(t, 3) for t, _ in self._tilts[::every]],
+            "tilt_deg": [round(math.degrees(tilt), 2) for _, tilt in self._tilts[::every]],
+            "read_at": [round(one.time - self._at, 3) for one in during],
+            "readings_g": [round(1e3 * (one.mass - self._zero), 3) for one in during],
+            **truth,
+        }
+        notes: dict[str, Any] = {"mode": self._setup.mode, "dose": about, "operator": self._setup.questions.take_log()}
+        if self._executed is not None and len(self._executed.times) > 1:
+            motion = SampledMotion(self._executed.times, self._executed.poses)
+            notes["largest_tilt_deg"] = math.degrees(float(motion.tilt(self._executed.times).max()))
+            notes["executed"] = self._executed.record()
+        # neither the source nor the spilled liquid was weighed
+        retained = max(source.mass - result.amount, 0.0)
+        return PourMeasurement(source.mass, max(source.mass - retained - result.amount, 0.0), retained, notes)
+
+    # ---- progress
+
+    def _show(self, controller: DoseController, state: ArmState, tilt: float) -> None:
+        last = self._readings.all[-1:]
+        reading = last[0].mass - self._zero if last else None
+        amount, deviation = controller.amount
+        progress = DoseProgress(controller.phase, self._dose.amount, amount, deviation, controller.flow, reading)
+        self._report.dose(tilt, state.joints, progress)
+
+    def _seen(self, state: ArmState) -> None:
+        self._report.stand(state.joints, state.pourer)
+
+
+def check_bench(setup: Setup) -> None:
+    """Check that a bench can pour wanted amounts.
+
+    Raises:
+        InvalidActionError: the balance is not under the receiver, or is not connected.
+    """
+    if setup.balance is None or setup.balance_spec.position not in (Placement.RECEIVER, Placement.EVERYTHING):
+        raise InvalidActionError(
+            f"wanted amounts need a connected balance under the receiver ('placement: receiver'), and this one has "
+            f"'placement: {setup.balance_spec.placement}'"
+        )

@@ -1,0 +1,177 @@
+"""Loss against pours: D1, D2, D3, and what they compete with, on the same benches.
+
+    python benchmarks/learning_curves.py [--arms D1 D2 ...] [--seeds 20] [--first 3000] [--pours 15] [--kept FILE]
+                                         [--rivals PYTHON] [--write]
+
+Benches are numbers: the valleys with steep walls of `mismatch_worlds.py`, with a simulator of moderate error. Nobody
+knows a bench before; D1 and D3 have its simulator. A loss is counted without scatter. Each run is added to
+docs/data/learning-curves.json and not made again; `--kept` takes the runs of D3 from a file of `mismatch.py`. `--write`
+puts the table into docs/data/results.json; docs/make_learning_picture.py draws the curves.
+
+    random, Sobol   points that nothing chooses
+    rule of thumb   a slow tilt over the middle, every time: a fifth of the range of speeds, the middle of all others
+    BoTorch qNEI    four Sobol points, then noisy expected improvement: `qLogNoisyExpectedImprovement` with a
+                    `SingleTaskGP`, defaults of BoTorch, in the environment of `optimisers.py` (or that of `--rivals`)
+    D1              30 simulations; the planned action is poured every time
+    D2              pours alone
+    D3              37 simulations, and two next to each pour
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from machine import describe, say, single_threaded
+from mismatch import campaign, numbers
+from mismatch_worlds import Valley
+from optimiser_problems import Floats
+from optimisers import RIVALS_FILE, environment
+from players import SCENE, interval, play
+from scipy.stats import qmc
+from threadpoolctl import threadpool_limits
+
+from orchestrator.strategies.campaign_plan import DeploymentPlan
+from orchestrator.strategies.deployment.d1 import D1Settings
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import Loss
+
+DATA = Path(__file__).resolve().parents[1] / "docs" / "data"
+CURVES, RESULTS = DATA / "learning-curves.json", DATA / "results.json"
+LEVEL, PRIOR, BESIDE, SLOW, INITIAL = "cliff, moderate", 37, 2, 0.2, 4
+ARMS = ("rule of thumb", "random", "Sobol", "BoTorch qNEI", "D1", "D2", "D3")
+Ask = Callable[[int, list[Floats], list[float]], Floats]
+
+
+def asked_by(arm: str, valley: Valley, seed: int, rival: Ask | None) -> list[float]:
+    """Losses of pours at the points of an arm that knows no simulator, without end."""
+    dimension = len(valley.space.axes)
+    start = qmc.Sobol(dimension, scramble=True, rng=np.random.default_rng(seed)).random(64)
+    rng = np.random.default_rng([seed, 1])
+    points: list[Floats] = []
+    costs: list[float] = []
+    for index in range(15):
+        if arm == "rule of thumb":
+            point = np.array([SLOW, *[0.5] * (dimension - 1)])
+        elif arm == "random":
+            point = rng.random(dimension)
+        elif arm == "Sobol" or rival is None or index < INITIAL:
+            point = start[index]
+        else:
+            point = rival(seed, points, costs)
+        points.append(point)
+        costs.append(valley.observe(point, index))
+    return [valley.true(point) for point in points]
+
+
+def planned(valley: Valley, seed: int) -> list[float]:
+    """D1: the same action every time."""
+    settings = D1Settings()
+    plan, parameters = DeploymentPlan(settings, (SCENE,), valley.space, Loss()), SimulationParameters()
+    world = numbers(valley)
+    play(settings.build(plan, SCENE, parameters, seed), world.answer)
+    return world.poured * 15
+
+
+@contextmanager
+def rival(python: Path) -> Iterator[Ask]:
+    """BoTorch in a child process."""
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    child = subprocess.Popen([str(python), str(RIVALS_FILE), "BoTorch qLogNEI"], env=single_threaded(), **pipes)
+    assert child.stdin is not None
+    assert child.stdout is not None
+
+    def ask(seed: int, points: list[Floats], costs: list[float]) -> Floats:
+        job = {"seed": seed, "points": [point.tolist() for point in points], "costs": costs}
+        print(json.dumps(job), file=child.stdin, flush=True)
+        return np.array(json.loads(child.stdout.readline())["point"])
+
+    try:
+        yield ask
+    finally:
+        child.kill()
+        child.wait()
+
+
+def run(arm: str, seed: int, ask: Ask | None) -> list[float]:
+    """Losses of the pours of an arm on the bench of a seed."""
+    valley = Valley(LEVEL, seed)
+    if arm == "D1":
+        return planned(valley, seed)
+    if arm in ("D2", "D3"):
+        found = campaign("adaptive" if arm == "D3" else arm, LEVEL, seed, 15, PRIOR, 0.005 if arm == "D3" else 0.0)
+        return list(found["poured"])
+    return asked_by(arm, valley, seed, ask)
+
+
+SIMULATED = {"D1": "30", "D3": f"{PRIOR}, and {BESIDE} a pour"}
+
+
+def rows(kept: dict[str, Any], seeds: list[str]) -> list[list[str]]:
+    """A row for each arm."""
+    found = []
+    for arm in (arm for arm in ARMS if arm in kept["runs"]):
+        losses = np.array([kept["runs"][arm][seed] for seed in seeds])
+        cells = []
+        for values in (losses[:, 0], losses.mean(axis=1), losses[:, 10:].mean(axis=1), losses.min(axis=1)):
+            mean, low, high = interval(values.tolist())
+            cells.append(f"{mean:.3f} ({low:.3f} … {high:.3f})")
+        found.append([arm, SIMULATED.get(arm, "none"), *cells])
+    return found
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=3000)
+    parser.add_argument("--kept", type=Path, help="runs of mismatch.py")
+    parser.add_argument("--rivals", type=Path, help="Python of an environment with BoTorch")
+    parser.add_argument("--write", action="store_true", help="write the table to docs/data/results.json")
+    asked = parser.parse_args()
+    kept = json.loads(CURVES.read_text()) if CURVES.exists() else {"level": LEVEL, "runs": {}, "seconds": {}}
+    for line in asked.kept.read_text().splitlines() if asked.kept else ():
+        made = json.loads(line)
+        if (made["arm"], made["level"]) == ("adaptive", LEVEL):
+            kept["runs"].setdefault("D3", {})[str(made["seed"])] = [round(x, 5) for x in made["poured"]]
+    seeds = [str(seed) for seed in range(asked.first, asked.first + asked.seeds)]
+    with threadpool_limits(1):
+        for arm in asked.arms:
+            done = kept["runs"].setdefault(arm, {})
+            missing = [seed for seed in seeds if seed not in done]
+            if arm == "BoTorch qNEI" and missing:
+                with rival(asked.rivals or environment()) as ask:
+                    done |= {seed: [round(x, 5) for x in run(arm, int(seed), ask)] for seed in missing}
+            else:
+                begun = time.process_time()
+                done |= {seed: [round(x, 5) for x in run(arm, int(seed), None)] for seed in missing}
+                if missing:
+                    kept["seconds"][arm] = round((time.process_time() - begun) / len(missing), 2)
+            say(f"{arm}: done")
+            CURVES.write_text(json.dumps(kept, indent=1) + "\n")
+    table = rows(kept, seeds)
+    print("\n".join(" | ".join(row) for row in table))
+    if asked.write:
+        machine = describe()
+        results = json.loads(RESULTS.read_text())
+        head = ["", "simulations", "first pour", "mean of 15 pours", "pours 11 to 15", "best of 15"]
+        results["learning"] = results["cliffs"] | {
+            "head": head,
+            "rows": table,
+            "command": "python benchmarks/learning_curves.py --write",
+            "settings": f"{LEVEL}; mean loss without scatter, 95 % bootstrap intervals over {asked.seeds} benches",
+            "date": machine["date"][:10],
+        }
+        RESULTS.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
+
+
+if __name__ == "__main__":
+    main()

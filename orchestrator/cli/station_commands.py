@@ -1,0 +1,192 @@
+"""Commands for pours, batches and materials of the daemon, and for backups of its state."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from orchestrator.cli.command_options import Assignments, Json
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message
+from orchestrator.cli.queue_commands import CampaignId, State, Url, connected_client
+
+BatchId = Annotated[str, typer.Argument(help="Id of the batch.", show_default=False)]
+
+
+def order(
+    key: Annotated[
+        str, typer.Argument(metavar="ID", help="Your id of the pour: with it, a repeated call pours only once.")
+    ],
+    source: Annotated[str, typer.Option("--from", help="Vessel to pour from: id or bar code.")],
+    receiver: Annotated[str, typer.Option("--into", help="Vessel to pour into: id or bar code.")],
+    amount: Annotated[str | None, typer.Option(help="Wanted amount, for example '30 g'.", show_default=False)] = None,
+    tolerance: Annotated[str, typer.Option(help="Largest error of the amount.")] = "1 g",
+    assignments: Assignments = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Predict the pour; nothing moves.")] = False,
+    wait: Annotated[float, typer.Option(min=0, max=600, help="Wait for the result [s].")] = 0.0,
+    url: Url = None,
+    state: State = None,
+    as_json: Json = False,
+) -> None:
+    """Order one pour: an amount, or an action."""
+    action = {}
+    for text in assignments or []:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not equals:
+            raise RefusalError(
+                f"--set: {text!r} should be name=value, for example angular_velocity='60 deg/s'", BAD_INPUT
+            )
+        action[name] = value
+    body = {
+        **{"id": key, "source": source, "receiver": receiver, "amount": amount, "tolerance": tolerance},
+        **{"action": action, "dry_run": dry_run},
+    }
+    with connected_client(url, state) as client:
+        found = client.post(f"/pours?wait={wait:g}", body)
+    if as_json:
+        print_json(found)
+        return
+    print(pour_text(found))
+
+
+def pour_text(pour: dict[str, Any]) -> str:
+    """A pour in one line.
+
+    Args:
+        pour: as the API returns it.
+    """
+    result, predicted = pour["result"], pour["predicted"]
+    text = f"{pour['id']}: {pour['state']}"
+    if result is not None and result["received_g"] is not None:
+        text += f", {result['received_g']:.1f} g weighed"
+        if result["error_g"] is not None:
+            text += f" ({result['error_g']:+.1f} g)"
+    elif predicted is not None and predicted.get("interval_g") is not None:
+        low, high = predicted["interval_g"]
+        text += f", {low:.1f} to {high:.1f} g expected"
+    return text + (f" ({pour['reason']})" if pour["reason"] else "")
+
+
+def batch(
+    file: Annotated[Path, typer.Argument(help="Batch as JSON: id, items with a pour or a campaign each.")],
+    url: Url = None,
+    state: State = None,
+    as_json: Json = False,
+) -> None:
+    """Queue the pours and campaigns of a file as a whole, or refuse them as a whole."""
+    try:
+        body = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RefusalError(f"{file}: can't be read as JSON: {error}", BAD_INPUT) from None
+    with connected_client(url, state) as client:
+        found = client.post("/batches", body)
+    _show_batch(found, as_json=as_json)
+
+
+def _show_batch(found: dict[str, Any], *, as_json: bool = False) -> None:
+    if as_json:
+        print_json(found)
+        return
+    print(f"{found['id']}: " + ", ".join(f"{count} {state}" for state, count in found["states"].items()))
+    for one in found["items"]:
+        print(f"  {one['pour'] or one['campaign']}: {one['state']}" + (f" ({one['reason']})" if one["reason"] else ""))
+
+
+def batch_status(key: BatchId, url: Url = None, state: State = None, as_json: Json = False) -> None:
+    """Show a batch with the state of each item."""
+    with connected_client(url, state) as client:
+        _show_batch(client.get(f"/batches/{key}"), as_json=as_json)
+
+
+def hold(
+    key: CampaignId,
+    release: Annotated[bool, typer.Option("--release", help="Release it again.")] = False,
+    url: Url = None,
+    state: State = None,
+) -> None:
+    """Hold a queued campaign or pour until it is released."""
+    with connected_client(url, state) as client:
+        found = client.post(f"/campaigns/{key}/change", {"hold": not release})
+    print(f"{found['id']}: {'held' if found['held'] else 'released'}")
+
+
+def reserve(
+    rig: Annotated[str, typer.Argument(help="Name of the rig.", show_default=False)],
+    hours: Annotated[float, typer.Option(min=0.01, help="Duration from now.")] = 1.0,
+    note: Annotated[str, typer.Option(help="Reason, for other users.")] = "",
+    url: Url = None,
+    state: State = None,
+) -> None:
+    """Reserve a rig for your own campaigns and pours."""
+    now = time.time()
+    with connected_client(url, state) as client:
+        found = client.post("/reservations", {"rig": rig, "begins": now, "ends": now + 3600.0 * hours, "note": note})
+    print(f"reservation {found['id']}: {rig} until {time.strftime('%H:%M', time.localtime(found['ends']))}")
+
+
+def materials(url: Url = None, state: State = None, as_json: Json = False) -> None:
+    """List vessels with their contents."""
+    with connected_client(url, state) as client:
+        found = client.get("/materials")
+    if as_json:
+        print_json(found)
+        return
+    if not found["vessels"]:
+        print_message("no vessel is registered; see docs/laboratory/station.md")
+    for one in found["vessels"]:
+        content = one["content"]
+        mass = (
+            "unknown: weigh it"
+            if content["mass_g"] is None
+            else f"{content['mass_g']:.1f} ± {content['deviation_g']:.1f} g"
+        )
+        print(f"{one['id']:20s} {content['liquid'] or '-':12s} {mass:24s} {one['position']}".rstrip())
+
+
+def weigh(
+    vessel: Annotated[str, typer.Argument(help="Id or bar code of the vessel.", show_default=False)],
+    mass: Annotated[str, typer.Argument(help="Its content, for example '123.4 g'.", show_default=False)],
+    liquid: Annotated[str, typer.Option(help="Liquid, after a filling.", show_default=False)] = "",
+    deviation: Annotated[str, typer.Option(help="Standard deviation of the mass.")] = "0.1 g",
+    url: Url = None,
+    state: State = None,
+) -> None:
+    """Correct the content of a vessel by a weighing, or enter a filling."""
+    with connected_client(url, state) as client:
+        client.post(f"/materials/vessels/{vessel}/weighed", {"mass": mass, "liquid": liquid, "deviation": deviation})
+    print(f"{vessel}: {mass}")
+
+
+def backup(
+    file: Annotated[Path, typer.Argument(help="Archive to write (.zip).", show_default=False)], state: State = None
+) -> None:
+    """Back up a daemon's state, also while it runs: queue, orders, materials, campaigns, runs and tokens."""
+    from orchestrator.catalogue.run_registry import state_directory
+    from orchestrator.daemon.state_backup import back_up
+    from orchestrator.run_errors import RunError
+
+    with Refused(RunError), Refused(OSError):
+        found = back_up(state or state_directory(), file)
+    print(f"{file}: {found['campaigns']} campaigns, {found['runs']} runs, {found['bytes'] / 1e6:.1f} MB")
+    print_message("recordings are left out; the archive contains access tokens")
+
+
+def restore(
+    file: Annotated[Path, typer.Argument(help="Archive of 'decant server backup'.", show_default=False)],
+    state: State = None,
+) -> None:
+    """Restore a backup into a new state directory. The queue is paused: check the pours made since the backup."""
+    from orchestrator.catalogue.run_registry import state_directory
+    from orchestrator.daemon import state_backup
+    from orchestrator.run_errors import RunError
+
+    with Refused(RunError), Refused(OSError):
+        found = state_backup.restore(file, state or state_directory())
+    then = time.strftime("%Y-%m-%d %H:%M", time.localtime(found["time"]))
+    print(f"restored the state of {then}: {found['campaigns']:.0f} campaigns, {found['runs']:.0f} runs")
+    print_message(
+        "the queue is paused. Pours made since then are not in it: weigh the vessels, then decant queue resume"
+    )

@@ -1,0 +1,417 @@
+"""The daemon as a MADSci node: the REST routes that a MADSci workcell calls, over the daemon's own orders.
+
+`create_node` makes the application, which the daemon serves at an address of its own. The routes, status words and
+schemas are those of madsci.client 0.8.1; its packages are not needed. Actions: `pour`, `predict_pour`, `run_campaign`.
+
+- MADSci's client repeats every POST and sends no authorization. Hence an action is started once by its id, and only
+  addresses of the settings' list may call.
+- Enabling the motion of hardware stays an operator's act: the action is 'paused' until then. An emergency stop is
+  cleared by an administrator, not by `reset`.
+- Actions and the node's lock are stored, so they outlive a restart.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.metadata
+import ipaddress
+import json
+import secrets
+import time
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import FastAPI, HTTPException, Request
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ValidationError, WithJsonSchema
+
+from orchestrator.daemon.daemon_settings import MadsciSettings, networks
+from orchestrator.daemon.ordering import Ordering
+from orchestrator.daemon.station_schemas import PourIn
+from orchestrator.daemon.submissions import Submission, prepare
+from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.run_errors import RunError
+from sim_engine.settings.plugin_registry import DISTRIBUTION
+
+PERSON = "madsci"
+"""Author of the node's orders in audit entries."""
+
+LOCKED, NODE_ID = "madsci locked", "madsci node"
+"""Flags of the store."""
+
+_CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
+
+_STATUS = {
+    "queued": "running",
+    "running": "running",
+    "waiting for operator": "running",
+    "paused": "paused",
+    "weighed": "succeeded",
+    "failed": "failed",
+    "unknown": "unknown",
+    "cancelled": "cancelled",
+}
+"""Status words of MADSci for the states of a pour."""
+
+_CAMPAIGN_STATUS = {
+    "paused": "paused",
+    "finished": "succeeded",
+    "failed": "failed",
+    "unknown": "unknown",
+    "stopped": "cancelled",
+    "withdrawn": "cancelled",
+}
+
+_POUR = {
+    "source": ("Vessel to pour from: id or bar code.", True),
+    "receiver": ("Vessel to pour into: id or bar code.", True),
+    "amount": ("Wanted in the receiver, such as '30 g'.", False),
+    "tolerance": ("Largest error, such as '1 g'.", False),
+    "liquid": ("Liquid that the source has to hold.", False),
+    "action": ("Values by dimension, instead of an amount.", False),
+    "rig": ("Rig, if the vessels' positions don't tell it.", False),
+    "predict": ("Whether the pour is predicted first: true or false.", False),
+}
+
+ACTIONS: dict[str, tuple[str, dict[str, tuple[str, bool]]]] = {
+    "pour": ("Pour an amount or an action from one vessel into another, and weigh it.", _POUR),
+    "predict_pour": ("Predict a pour: amount, spread, duration and limits. Nothing moves.", _POUR),
+    "run_campaign": (
+        "Run a campaign of the folders that the daemon may read.",
+        {"path": ("Path of the campaign's file.", True), "rig": ("Rig, if several match.", False)},
+    ),
+}
+"""Actions with their descriptions, and arguments with description and whether they are required."""
+
+
+class ActionIn(BaseModel):
+    """Arguments of an action."""
+
+    args: dict[str, Any] | None = None
+    var_args: Annotated[Any, WithJsonSchema({})] = None
+    var_kwargs: Annotated[Any, WithJsonSchema({})] = None
+
+
+@dataclass(frozen=True)
+class NodeAction:
+    """An action that a client has created."""
+
+    id: str
+    name: str
+    args: dict[str, Any]
+    created: float
+    started: float | None
+    campaign: str | None
+    error: str | None
+    json_result: Any = None
+
+
+def new_ulid(now: float | None = None) -> str:
+    """Return a new ULID: 48 bits of milliseconds and 80 random bits, in Crockford's base 32."""
+    value = int((time.time() if now is None else now) * 1e3) << 80 | secrets.randbits(80)
+    return "".join(_CROCKFORD[value >> 5 * at & 31] for at in reversed(range(26)))
+
+
+class MadsciNode:
+    """State and actions of the node.
+
+    Args:
+        daemon: whose rigs pour.
+        ordering: places the orders.
+        name: of the node.
+    """
+
+    def __init__(self, daemon: Supervisor, ordering: Ordering, name: str) -> None:
+        self._daemon, self._ordering, self._name, self._store = daemon, ordering, name, daemon.store
+        self._starting: dict[str, asyncio.Task[None]] = {}
+
+    def info(self) -> dict[str, Any]:
+        """Return `NodeInfo`."""
+        key = self._store.flag(NODE_ID)
+        if key is None:
+            key = new_ulid()
+            self._store.set_flag(NODE_ID, key)
+        able = dict.fromkeys(
+            ("get_info", "get_state", "get_status", "send_action", "get_action_status", "get_action_result",
+             "get_action_history", "send_admin_commands", "get_log"), True,
+        )  # fmt: skip
+        return {
+            **{"node_name": self._name, "node_id": key, "node_type": "device", "module_name": "decant"},
+            **{"module_version": _semantic(importlib.metadata.version(DISTRIBUTION)), "config": {}},
+            "node_description": "A robot arm that pours liquids and weighs them.",
+            "capabilities": {
+                **able, "set_config": False, "action_files": False, "get_resources": False,
+                "admin_commands": ["cancel", "lock", "pause", "reset", "resume", "safety_stop", "unlock"],
+            },
+            "actions": {name: _definition(name, *about) for name, about in ACTIONS.items()},
+        }  # fmt: skip
+
+    def status(self) -> dict[str, Any]:
+        """Return `NodeStatus`."""
+        daemon = self._daemon
+        stopped = daemon.emergency is not None or bool(daemon.emergencies)
+        rigs = [daemon.workers[rig.name] for rig in daemon.settings.rigs]
+        found = {
+            "busy": all(worker.running is not None for worker in rigs),
+            "paused": daemon.queue_paused,
+            "locked": daemon.store.flag(LOCKED) is not None,
+            "stopped": stopped,
+            "errored": bool(daemon.problems),
+            "disconnected": False,
+            "initializing": not daemon.warm.ready and daemon.settings.quick_start,
+        }
+        running = [
+            one.id
+            for one in self.actions()
+            if one.campaign is not None and any(worker.holds(one.campaign) for worker in rigs)
+        ]
+        return {
+            **found,
+            "running_actions": running,
+            "errors": [{"message": text} for text in daemon.problems.values()],
+            "waiting_for_config": [],
+            "config_values": {},
+            "ready": not any(found.values()),
+            "description": ", ".join(name for name, holds in found.items() if holds) or "Node is ready",
+        }
+
+    # ---- actions
+
+    def create(self, name: str, args: dict[str, Any]) -> str:
+        """Store an action that is started later; return its id."""
+        key = new_ulid()
+        self._store.write(
+            "insert into node_action (id, name, args, created) values (?, ?, ?, ?)",
+            *(key, name, json.dumps(args), time.time()),
+        )
+        return key
+
+    def action(self, key: str) -> NodeAction:
+        """Return an action. Raises KeyError."""
+        rows = self._store.rows("select * from node_action where id = ?", key)
+        if not rows:
+            raise KeyError(key)
+        return _action(rows[0])
+
+    def actions(self) -> list[NodeAction]:
+        """Return the newest actions."""
+        return [_action(row) for row in self._store.rows("select * from node_action order by rowid desc limit 200")]
+
+    async def start(self, key: str) -> dict[str, Any]:
+        """Start an action, or return the result of the one that was started. Raises KeyError."""
+        action = self.action(key)
+        if action.started is None:
+            if (reason := self._not_ready()) is not None:
+                return _result(action, "not_ready", error=reason)
+            task = self._starting.get(key)
+            if task is None:
+                task = self._starting[key] = asyncio.create_task(self._start(action))
+                task.add_done_callback(lambda done: self._starting.pop(key, None))
+            await asyncio.shield(task)
+        return await self.result(key)
+
+    def _not_ready(self) -> str | None:
+        status = self.status()
+        blocking = [name for name in ("locked", "stopped", "paused") if status[name]]
+        return f"the node is {', '.join(blocking)}" if blocking else None
+
+    async def _start(self, action: NodeAction) -> None:
+        """The order has the action's id, so an interrupted start is repeated without a second pour."""
+        error: str | None = None
+        campaign: str | None = None
+        found: dict[str, Any] | None = None
+        try:
+            if action.name == "run_campaign":
+                campaign = await self._submit(action)
+            else:
+                dry = action.name == "predict_pour"
+                request = PourIn.model_validate({**action.args, "id": action.id, "dry_run": dry})
+                found = await self._ordering.pour(request, PERSON)
+                campaign = found["campaign"] or None
+        except ValidationError as problem:
+            told = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in problem.errors())
+            error = f"args: {told}"
+        except RunError as problem:
+            error = str(problem)
+        kept = json.dumps(found) if action.name == "predict_pour" and found is not None else None
+        if action.name != "run_campaign" or error is not None:
+            self._store.write(
+                "update node_action set started = ?, campaign = ?, error = ?, json_result = ? where id = ?",
+                *(time.time(), campaign, error, kept, action.id),
+            )
+
+    async def _submit(self, action: NodeAction) -> str:
+        daemon = self._daemon
+        path, rig = str(action.args.get("path", "")), str(action.args.get("rig", ""))
+        submission = Submission(path=path, rig=rig)
+        item = await asyncio.to_thread(prepare, daemon.settings, submission, daemon.new_key(), PERSON)
+
+        def enter(at: int) -> None:  # in the transaction of the campaign: both are stored, or none
+            self._store.write(
+                "update node_action set started = ?, campaign = ? where id = ?", time.time(), item.id, action.id
+            )
+
+        return daemon.submit_all([item], enter)[0].id
+
+    async def result(self, key: str) -> dict[str, Any]:
+        """Return `RestActionResult`. Raises KeyError."""
+        action = self.action(key)
+        if action.started is None:
+            return _result(action, "not_started")
+        if action.error is not None:
+            return _result(action, "failed", error=action.error)
+        if action.json_result is not None:
+            return _result(action, "succeeded", action.json_result)
+        assert action.campaign is not None
+        if action.name == "run_campaign":
+            item = self._daemon.item(action.campaign)
+            status = _CAMPAIGN_STATUS.get(item.state, "running")
+            about = {"campaign": item.id, "state": item.state, "run": item.run, "reason": item.reason}
+            return _result(action, status, about, item.reason if status == "failed" else "")
+        pour = await self._ordering.pour_out(action.id)
+        status = "paused" if pour["needs_enabling"] else _STATUS[pour["state"]]
+        return _result(action, status, pour, pour["reason"] if status in ("failed", "unknown") else "")
+
+    # ---- administration
+
+    async def command(self, name: str) -> dict[str, Any]:
+        """Execute an admin command; return `AdminCommandResponse`."""
+        daemon = self._daemon
+        own = [item for item in daemon.store.items() if item.by == PERSON]
+        match name:
+            case "safety_stop":
+                await daemon.emergency_stop(PERSON, "safety_stop")
+            case "pause":
+                daemon.pause_queue(True, PERSON)
+            case "resume":
+                daemon.pause_queue(False, PERSON)
+            case "cancel":
+                for item in own:
+                    if item.state not in ("finished", "stopped", "withdrawn", "unknown", "failed"):
+                        daemon.stop(item.id, PERSON)
+            case "lock" | "unlock":
+                daemon.store.set_flag(LOCKED, {"time": time.time()} if name == "lock" else None)
+                daemon.note(PERSON, name)
+            case "reset":
+                if daemon.emergency is not None or daemon.emergencies:
+                    return _refused("an administrator clears the emergency stop: decant estop --clear")
+            case _:
+                return _refused(f"'{name[:40]}' is not offered; an administrator ends the daemon: decant server stop")
+        return {"success": True, "errors": [], "data": None}
+
+
+def create_node(daemon: Supervisor, ordering: Ordering, settings: MadsciSettings) -> FastAPI:
+    """Make the application of the node.
+
+    Args:
+        daemon: whose rigs pour.
+        ordering: places the orders.
+        settings: name, and addresses that may call.
+    """
+    node = MadsciNode(daemon, ordering, settings.name)
+    allowed = networks(settings.allow or ())
+    app = FastAPI(title="Decant as a MADSci node", docs_url=None, redoc_url=None, openapi_url=None)
+
+    @app.middleware("http")
+    async def only_allowed(request: Request, call_next: Any) -> Any:
+        address = "" if request.client is None else request.client.host
+        try:
+            known = any(ipaddress.ip_address(address) in network for network in allowed)
+        except ValueError:
+            known = False
+        if not known:
+            return JSONResponse({"detail": f"{address} is not in the node's list (madsci: allow)"}, 403)
+        return await call_next(request)
+
+    @app.exception_handler(KeyError)
+    async def unknown(request: Request, error: KeyError) -> JSONResponse:
+        return JSONResponse({"detail": f"there is no action {str(error.args[0])[:80]}"}, 404)
+
+    @app.get("/info")
+    async def info() -> Any:
+        return node.info()
+
+    @app.get("/status")
+    async def status() -> Any:
+        return node.status()
+
+    @app.get("/state")
+    async def state() -> Any:
+        return ordering.materials.everything()
+
+    @app.get("/log")
+    async def log() -> Any:
+        return {}
+
+    @app.post("/config")
+    async def config() -> Any:
+        return {"success": False}
+
+    @app.post("/admin/{command}")
+    async def admin(command: str) -> Any:
+        # From Python 3.11 on, the client writes 'AdminCommands.PAUSE' where it means 'pause'.
+        return await node.command(command.rpartition(".")[2].lower())
+
+    @app.get("/action")
+    async def history(action_id: str | None = None) -> Any:
+        keys = [one.id for one in node.actions() if action_id in (None, "", one.id)]
+        return {key: [await node.result(key)] for key in keys}
+
+    @app.post("/action/{name}")
+    async def create(name: str, body: ActionIn | None = None) -> Any:
+        if name not in ACTIONS:
+            raise HTTPException(404, f"there is no action '{name[:80]}'; there are {', '.join(ACTIONS)}")
+        return {"action_id": node.create(name, (body.args if body is not None else None) or {})}
+
+    @app.post("/action/{name}/{key}/start")
+    async def start(name: str, key: str) -> Any:
+        return await node.start(key)
+
+    @app.get("/action/{name}/{key}/status")
+    async def status_by_name(name: str, key: str) -> Any:
+        return (await node.result(key))["status"]
+
+    @app.get("/action/{name}/{key}/result")
+    async def result_by_name(name: str, key: str) -> Any:
+        return await node.result(key)
+
+    @app.get("/action/{key}/status")
+    async def action_status(key: str) -> Any:
+        return (await node.result(key))["status"]
+
+    @app.get("/action/{key}/result")
+    async def action_result(key: str) -> Any:
+        return await node.result(key)
+
+    return app
+
+
+def _definition(name: str, description: str, arguments: dict[str, tuple[str, bool]]) -> dict[str, Any]:
+    args = {
+        key: {"name": key, "description": text, "argument_type": "dict" if key == "action" else "str",
+              "required": required, "default": None}
+        for key, (text, required) in arguments.items()
+    }  # fmt: skip
+    return {"name": name, "description": description, "args": args, "blocking": False, "asynchronous": True}
+
+
+def _result(action: NodeAction, status: str, value: Any = None, error: str = "") -> dict[str, Any]:
+    return {
+        **{"action_id": action.id, "status": status, "json_result": value, "files": None, "datapoints": None},
+        "errors": [{"message": error, "error_type": "DecantError"}] if error else [],
+    }
+
+
+def _refused(text: str) -> dict[str, Any]:
+    return {"success": False, "errors": [{"message": text, "error_type": "DecantError"}], "data": None}
+
+
+def _action(row: dict[str, Any]) -> NodeAction:
+    value = row["json_result"]
+    return NodeAction(**{**row, "args": json.loads(row["args"]), "json_result": value and json.loads(value)})
+
+
+def _semantic(version: str) -> str:
+    """Return the version with three numbers, as MADSci requires."""
+    parts = [part for part in version.split(".") if part.isdigit()]
+    return ".".join((*parts, "0", "0")[:3])

@@ -1,0 +1,447 @@
+"""Materials of a station: liquids, vessels, positions, and the account of what is in which vessel.
+
+`Materials` reads and writes its tables in the daemon's `Store`. The account is append-only: an entry sets the content
+of a vessel (a weighing) or changes it (a pour). `Materials.content` adds the entries up, with their uncertainty.
+`Materials.refusal` is the reason why vessels can't serve a pour; it is checked before anything moves.
+
+Limitations: liquids that were poured together become a mixture, which is no source any more. Evaporation is not
+estimated. Campaigns other than ordered pours are not in the account: an operator refills their pourer.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+from orchestrator.config.file_loading import liquid_from, vessel_from
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.config.yaml.yaml_source import Document
+from orchestrator.daemon.daemon_store import ENDED, Store
+from orchestrator.run_errors import RunError
+from orchestrator.strategies.dispense import ENOUGH
+from sim_engine.liquids import Liquid
+from sim_engine.settings.quantity import QuantityError, parse_quantity
+from sim_engine.vessel.shapes import VesselError
+from sim_engine.vessel.vessel import build_vessel
+
+MIXTURE = "mixture"
+"""Liquid of a vessel that several liquids were poured into."""
+
+SURE = ENOUGH
+"""Number of standard deviations by which a content may be smaller than its estimate, and larger."""
+
+
+class MaterialError(RunError):
+    """A material can't be registered, found, or used; the message gives the reason and a remedy."""
+
+    exit_code = 2
+
+
+@dataclass(frozen=True)
+class VesselContent:
+    """Content of a vessel, from the account.
+
+    Attributes:
+        mass: [kg]; None if a pour with unknown outcome has changed it.
+        deviation: standard deviation of the mass [kg].
+        liquid: id of the liquid, 'mixture', or '' if it is empty.
+        since: time of the last change, seconds since 1970.
+        pour: caller's id of the pour that changed it last; '' after a weighing.
+        weighed: time of the last weighing.
+    """
+
+    mass: float | None
+    deviation: float
+    liquid: str
+    since: float
+    pour: str
+    weighed: float
+
+
+@dataclass(frozen=True)
+class RegisteredVessel:
+    """A vessel of the station.
+
+    Attributes:
+        id: name that callers use.
+        code: bar code; '' without one. Callers may use it instead of the id.
+        shape: as in a vessel file.
+        capacity: up to the brim [m³].
+        position: id of the position where it stands; '' if it stands nowhere.
+    """
+
+    id: str
+    code: str
+    shape: dict[str, Any]
+    capacity: float
+    position: str
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """What a pour has moved [kg], each with its standard deviation; None: unknown."""
+
+    taken: tuple[float, float] | None
+    received: tuple[float, float] | None
+
+
+class Materials:
+    """Materials of one daemon.
+
+    Args:
+        store: its store.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    # ---- registration
+
+    def add_liquid(self, key: str, code: str, properties: Mapping[str, Any]) -> None:
+        """Register a liquid.
+
+        Args:
+            key: its id.
+            code: bar code; '' for none.
+            properties: the keys of a campaign's `liquid`, without its mass and volume.
+
+        Raises:
+            MaterialError: the properties are invalid, or the id or code is in use.
+        """
+        if key == MIXTURE:
+            raise MaterialError(f"'{MIXTURE}' stands for liquids that were poured together; choose another id")
+        if wrong := {"mass", "volume"} & set(properties):
+            raise MaterialError(f"{sorted(wrong)[0]}: belongs to a vessel's content; weigh the vessel")
+        liquid_of(key, properties, 0.1)
+        self._add("liquid", key, code, properties=json.dumps(dict(properties), ensure_ascii=False))
+
+    def add_position(self, key: str, code: str, rig: str, note: str) -> None:
+        """Register a position of a rig. Raises MaterialError if the id or code is in use."""
+        self._add("position", key, code, rig=rig, note=note)
+
+    def add_vessel(self, key: str, code: str, shape: Mapping[str, Any], position: str, by: str) -> None:
+        """Register an empty vessel. `weigh` enters what is in it.
+
+        Raises:
+            MaterialError: the shape is invalid, the position is unknown or taken, or the id or code is in use.
+        """
+        if "mesh" in shape:
+            raise MaterialError(f"{key}: a vessel is registered by its profile; its mesh is a file, which is not sent")
+        text = json.dumps({"name": key, **shape}, ensure_ascii=False)
+        try:
+            capacity = build_vessel(vessel_from(Document.parse(text, Path("vessel.json")))).capacity
+        except ConfigError as error:
+            raise MaterialError("; ".join(f"{one.where or 'shape'}: {one.message}" for one in error.problems)) from None
+        except (VesselError, ValueError) as error:
+            raise MaterialError(f"shape: {error}") from None
+        self._require_free(position, key)
+        with self._store.together():
+            if self._add("vessel", key, code, shape=text, capacity=float(capacity), position=position or None):
+                self._enter(key, "weighed", 0.0, 0.0, "", None, by, "registered as empty")
+
+    def _add(self, table: str, key: str, code: str, **values: Any) -> bool:
+        """Insert a row; an identical row may be registered again."""
+        found = self._store.rows(f"select * from {table} where id = ?", key)
+        if found:
+            if any(found[0][name] != value for name, value in {"code": code or None, **values}.items()):
+                raise MaterialError(f"{table} '{key}' is registered already, with other properties")
+            return False
+        if code and any(self._store.rows(f"select id from {t} where code = ?", code) for t in _TABLES):
+            raise MaterialError(f"code {code} is in use already")
+        values = {"id": key, "code": code or None, **values, "created": time.time()}
+        names, marks = ", ".join(values), ", ".join("?" * len(values))
+        self._store.write(f"insert into {table} ({names}) values ({marks})", *values.values())
+        return True
+
+    def _require_free(self, position: str, vessel: str) -> None:
+        if not position:
+            return
+        self._row("position", position)
+        there = self._store.rows("select id from vessel where position = ? and id != ?", position, vessel)
+        if there:
+            raise MaterialError(f"position {position} is taken by vessel {there[0]['id']}; move that one first")
+
+    def place(self, vessel: str, position: str) -> None:
+        """Record that a vessel was moved to a position; '' for none. Raises MaterialError."""
+        found = self.vessel(vessel)
+        position = str(self._row("position", position)["id"]) if position else ""
+        self._require_free(position, found.id)
+        self._store.write("update vessel set position = ? where id = ?", position or None, found.id)
+
+    # ---- the account
+
+    def weigh(self, vessel: str, mass: float, deviation: float, liquid: str, by: str, note: str = "") -> None:
+        """Correct the content of a vessel by a weighing: an operator's correction, or a filling.
+
+        Args:
+            vessel: id or code.
+            mass: content [kg].
+            deviation: its standard deviation [kg].
+            liquid: id or code; '' keeps the present one.
+            by: who weighed it.
+            note: text of the account's entry.
+
+        Raises:
+            MaterialError: vessel or liquid is unknown, the liquid is missing, or the vessel can't hold that much.
+        """
+        found, before = self.vessel(vessel), self.content(vessel)
+        liquid = str(self._row("liquid", liquid)["id"]) if liquid else before.liquid
+        if mass > 0.0 and not liquid:
+            raise MaterialError(f"{found.id}: is empty so far; name the liquid that it was filled with")
+        if mass > 0.0 and liquid != MIXTURE:
+            volume = mass / self.liquid(liquid).density
+            if volume > found.capacity:
+                raise MaterialError(
+                    f"{found.id}: holds {1e6 * found.capacity:.0f} ml, and {1e6 * volume:.0f} ml are stated"
+                )
+        self._enter(found.id, "weighed", mass, deviation, liquid if mass > 0.0 else "", None, by, note)
+
+    def enter_pour(self, pour: str, source: str, receiver: str, moved: Transfer, by: str) -> None:
+        """Enter a pour in the account of both vessels, once: a second call changes nothing.
+
+        Args:
+            pour: caller's id.
+            source, receiver: ids of the vessels.
+            moved: masses.
+            by: who ordered it.
+        """
+        if self._store.rows("select 1 from account where pour = ? limit 1", pour):
+            return
+        liquid, there = self.content(source).liquid, self.content(receiver).liquid
+        mixed = liquid if there in ("", liquid) else MIXTURE
+        with self._store.together():
+            for vessel, change, sign, kind in (
+                (source, moved.taken, -1.0, liquid),
+                (receiver, moved.received, 1.0, mixed),
+            ):
+                if change is None:
+                    self._enter(vessel, "unknown", None, None, kind, pour, by, "the outcome of this pour is unknown")
+                else:
+                    self._enter(vessel, "poured", sign * change[0], change[1], kind, pour, by, "")
+
+    def _enter(
+        self, vessel: str, kind: str, change: float | None, deviation: float | None, liquid: str, pour: str | None,
+        by: str, note: str,
+    ) -> None:  # fmt: skip
+        self._store.write(
+            "insert into account (t, vessel, kind, change, deviation, liquid, pour, by, note) "
+            "values (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            *(time.time(), vessel, kind, change, deviation, liquid, pour, by, note),
+        )
+
+    def content(self, vessel: str) -> VesselContent:
+        """Return the content of a vessel. Raises MaterialError if the vessel is unknown."""
+        mass: float | None = 0.0
+        variance, liquid, since, pour, weighed = 0.0, "", 0.0, "", 0.0
+        for entry in self.account(self.vessel(vessel).id):
+            since, liquid, pour = entry["t"], entry["liquid"] or "", entry["pour"] or ""
+            if entry["kind"] == "weighed":
+                mass, variance, weighed = entry["change"], entry["deviation"] ** 2, entry["t"]
+            elif entry["kind"] == "unknown":
+                mass = None
+            elif mass is not None:
+                mass, variance = mass + entry["change"], variance + entry["deviation"] ** 2
+        return VesselContent(
+            mass if mass is None else max(mass, 0.0), math.sqrt(variance), liquid, since, pour, weighed
+        )
+
+    def account(self, vessel: str | None = None) -> list[dict[str, Any]]:
+        """Return the entries of one vessel or of all, oldest first. Masses in kg."""
+        where, arguments = ("", []) if vessel is None else ("where vessel = ?", [vessel])
+        return self._store.rows(f"select * from account {where} order by id", *arguments)
+
+    def table(self) -> str:
+        """Return the account as CSV, for the export of runs: masses in g, and the run of each ordered pour."""
+        rows = self._store.rows(
+            "select t, vessel, kind, 1e3 * change as change_g, 1e3 * deviation as deviation_g, liquid, pour, run, "
+            "account.by, note from account left join pour_order on pour_order.id = pour "
+            "left join campaign on campaign.id = campaign order by account.id"
+        )
+        text = StringIO()
+        columns = ("t", "vessel", "kind", "change_g", "deviation_g", "liquid", "pour", "run", "by", "note")
+        writer = csv.DictWriter(text, columns)
+        writer.writeheader()
+        writer.writerows(rows)
+        return text.getvalue()
+
+    # ---- look-up
+
+    def vessel(self, key: str) -> RegisteredVessel:
+        """Return a vessel by its id or code. Raises MaterialError."""
+        row = self._row("vessel", key)
+        return RegisteredVessel(
+            row["id"], row["code"] or "", json.loads(row["shape"]), row["capacity"], row["position"] or ""
+        )
+
+    def liquid(self, key: str, mass: float = 0.1) -> Liquid:
+        """Return a liquid by its id or code, as a load with this mass [kg]. Raises MaterialError."""
+        return liquid_of(key, self.properties(key), mass)
+
+    def properties(self, key: str) -> dict[str, Any]:
+        """Return the properties of a liquid, as in a campaign. Raises MaterialError."""
+        found: dict[str, Any] = json.loads(self._row("liquid", key)["properties"])
+        return found
+
+    def liquid_id(self, key: str) -> str:
+        """Return the id of a liquid given by its id or code. Raises MaterialError."""
+        return str(self._row("liquid", key)["id"])
+
+    def rig_of(self, vessel: str) -> str:
+        """Return the rig on which a vessel stands; '' if it stands nowhere. Raises MaterialError."""
+        position = self.vessel(vessel).position
+        return str(self._row("position", position)["rig"]) if position else ""
+
+    def _row(self, table: str, key: str) -> dict[str, Any]:
+        found = self._store.rows(f"select * from {table} where id = ? or code = ?", key, key)
+        if not found:
+            known = [row["id"] for row in self._store.rows(f"select id from {table} order by created desc limit 20")]
+            raise MaterialError(f"there is no {table} '{key[:80]}'; there are {', '.join(known) or 'none'}")
+        return found[0]
+
+    def everything(self) -> dict[str, list[dict[str, Any]]]:
+        """Return all materials, with the contents of the vessels; ready for JSON, masses in g and volumes in ml."""
+        vessels = []
+        for row in self._store.rows("select * from vessel order by id"):
+            held = asdict(self.content(row["id"]))
+            mass, deviation = held.pop("mass"), held.pop("deviation")
+            held = {"mass_g": None if mass is None else 1e3 * mass, "deviation_g": 1e3 * deviation, **held}
+            vessels.append(
+                {
+                    "id": row["id"], "code": row["code"] or "", "position": row["position"] or "",
+                    "capacity_ml": 1e6 * row["capacity"], "content": held, "promised_g": 1e3 * self.promised(row["id"]),
+                }
+            )  # fmt: skip
+        liquids = [
+            {"id": row["id"], "code": row["code"] or "", "properties": json.loads(row["properties"])}
+            for row in self._store.rows("select * from liquid order by id")
+        ]
+        positions = self._store.rows("select id, coalesce(code, '') as code, rig, note from position order by id")
+        return {"liquids": liquids, "vessels": vessels, "positions": positions}
+
+    # ---- requests
+
+    def promised(self, source: str, but: str = "") -> float:
+        """Return the amounts that queued and running pours will take from a source [kg].
+
+        Args:
+            source: its id.
+            but: caller's id of a pour that does not count.
+        """
+        rows = self._store.rows(
+            "select coalesce(sum(amount), 0) as total from pour_order join campaign on campaign.id = campaign "
+            f"where source = ? and result is null and pour_order.id != ? and state not in ({_ENDED}, 'failed')",
+            *(source, but),
+        )
+        return float(rows[0]["total"])
+
+    def refusal(
+        self, source: str, receiver: str, liquid: str, amount: float | None, more: float = 0.0, *, pour: str = ""
+    ) -> str:
+        """Return the reason why the vessels can't serve a pour; '' if they can.
+
+        Args:
+            source, receiver: ids or codes.
+            liquid: id or code that the source has to hold; '' for any.
+            amount: wanted [kg]; None for an action, which may pour anything up to the whole content.
+            more: possible excess [kg].
+            pour: caller's id of the pour.
+        """
+        try:
+            return self._refusal(self.vessel(source), self.vessel(receiver), liquid, amount, more, pour)
+        except MaterialError as error:
+            return str(error)
+
+    def _refusal(
+        self, source: RegisteredVessel, receiver: RegisteredVessel, liquid: str, amount: float | None, more: float,
+        pour: str,
+    ) -> str:  # fmt: skip
+        if source.id == receiver.id:
+            return f"{source.id}: is source and receiver at once"
+        for vessel in (source, receiver):
+            if other := self._open_pour(vessel.id, pour):
+                return (
+                    f"{vessel.id}: pour {other} has begun and has no outcome; answer its question, resume or cancel it"
+                )
+        held, there = self.content(source.id), self.content(receiver.id)
+        for vessel, content in ((source, held), (receiver, there)):
+            if content.mass is None:
+                return f"{vessel.id}: pour {content.pour} left it with an unknown content; weigh the vessel"
+        assert held.mass is not None
+        assert there.mass is not None
+        if not held.liquid or held.mass <= 0.0:
+            return f"{source.id}: is empty; fill and weigh it"
+        if held.liquid == MIXTURE:
+            return f"{source.id}: holds a mixture of liquids, whose properties are not known"
+        if liquid and self.liquid_id(liquid) != held.liquid:
+            return f"{source.id}: holds {held.liquid}, and {self.liquid_id(liquid)} is wanted"
+        promised = self.promised(source.id, pour)
+        sure = held.mass - SURE * held.deviation - promised
+        wanted = 0.0 if amount is None else amount
+        if sure <= (0.0 if amount is None else amount + more):
+            spoken = f", {1e3 * promised:.4g} g of it are promised to other pours" if promised else ""
+            return (
+                f"{source.id}: holds {1e3 * held.mass:.4g} ± {1e3 * SURE * held.deviation:.2g} g{spoken}, and "
+                f"{1e3 * wanted:.4g} g are wanted; fill and weigh it"
+            )
+        density = self.liquid(held.liquid).density
+        most = (held.mass if amount is None else amount + more) + there.mass + SURE * there.deviation
+        if most / density > receiver.capacity:
+            return (
+                f"{receiver.id}: holds {1e6 * receiver.capacity:.0f} ml up to the brim, and there could be "
+                f"{1e6 * most / density:.0f} ml in it afterwards"
+            )
+        return ""
+
+    def _open_pour(self, vessel: str, pour: str) -> str:
+        rows = self._store.rows(
+            "select pour_order.id from pour_order join campaign on campaign.id = campaign where result is null and "
+            "run is not null and state in ('unknown', 'waiting for operator', 'paused', 'failed') and "
+            "pour_order.id != ? and (source = ? or receiver = ?)",
+            *(pour, vessel, vessel),
+        )
+        return str(rows[0]["id"]) if rows else ""
+
+
+_TABLES = ("liquid", "vessel", "position")
+_ENDED = ", ".join(f"'{state}'" for state in ENDED)
+
+
+def liquid_of(key: str, properties: Mapping[str, Any], mass: float) -> Liquid:
+    """Return a liquid with these properties as a load.
+
+    Args:
+        key: its id, for messages.
+        properties: as in a campaign.
+        mass: [kg].
+
+    Raises:
+        MaterialError: the properties are invalid.
+    """
+    text = json.dumps({"name": "water", **properties, "mass": f"{1e3 * mass:.9g} g"})
+    try:
+        return liquid_from(Document.parse(text, Path("liquid.json")))
+    except ConfigError as error:
+        told = "; ".join(f"{one.where or 'liquid'}: {one.message}" for one in error.problems)
+        raise MaterialError(f"liquid {key}: {told}") from None
+
+
+def mass_of(text: str, name: str) -> float:
+    """Return a mass given as text, such as '30 g' [kg].
+
+    Raises:
+        MaterialError: it is none, or negative; the message names the field.
+    """
+    try:
+        found = parse_quantity(text, "kg", "30 g")
+    except QuantityError as error:
+        raise MaterialError(f"{name}: {error}") from None
+    if found < 0.0:
+        raise MaterialError(f"{name}: {text} is negative; a mass should be 0 g or more")
+    return found

@@ -1,0 +1,544 @@
+"""A pour that another program orders: its request, its run, its prediction and its result.
+
+An order becomes a queued campaign with the task 'pour' and one pour, so that rigs, journal, questions and stops treat
+it as any other campaign. The id of its caller makes it unique: the same order again is the same pour.
+
+- `PourOrder` is the order; `order_bundle` is the campaign of it, `order_request` its run.
+- `predict` predicts it; nothing moves.
+- `OrderBook` stores orders and results in the daemon's `Store`, and enters pours in the account of `materials`.
+
+Amounts are poured by the strategy of `decant dose`, actions by that of `decant pour`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from actors.dosing.dose_series import check_dose, predict_dose
+from actors.dosing.simulated_dose import check_straight
+from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, SimulatorPool
+from actors.laboratory_settings import LaboratorySettings
+from orchestrator.config.action_assignments import AssignmentError, assigned_action, set_action
+from orchestrator.config.campaign_checks import check_vessels, touch
+from orchestrator.daemon.daemon_store import QueueItem, Store
+from orchestrator.daemon.materials import Materials, Transfer, mass_of
+from orchestrator.journal.run_record import RecordedPour, read_record
+from orchestrator.requests import Failed, Simulated, Slots
+from orchestrator.run_errors import RunError
+from orchestrator.run_service import RunRequest
+from orchestrator.runs.stages import StageDefinition
+from orchestrator.shipped import shipped
+from orchestrator.strategies.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
+from orchestrator.strategies.deployment.costing import Costing
+from orchestrator.strategies.dispense import DOSE, Dispense, KnownSource
+from orchestrator.strategies.single_action import OnePour, RepeatedSimulation
+from sim_engine.action import ACTION_DIMENSIONS, Action
+from sim_engine.motion import plan_motion
+from sim_engine.outcome import PourMeasurement
+from sim_engine.scene import PourTask, Scene
+from sim_engine.vessel.vessel import build_vessel
+
+POUR = "pour"
+"""Task of an ordered pour, and name of its stage."""
+
+ORDER = "pour.json"
+"""File of the order in a campaign's snapshot."""
+
+SEEDS = 5
+"""Simulations of an action that predict it."""
+
+INTERVAL = 1.645
+"""Half of an interval of 90 %, in standard deviations."""
+
+HEIGHT, STEP, MARGIN, FARTHEST = 0.06, 0.005, 0.01, 0.3
+"""Default place of the pourer [m]: height of the lip above the rim; step and margin of the search for the smallest
+distance at which the vessels don't touch, and the largest distance."""
+
+VIRTUAL = "laboratories/twin.yaml"
+"""Laboratory of ordered pours where the daemon's settings name no rig."""
+
+
+class OrderError(RunError):
+    """The pour can't be ordered; the message gives the problem and a remedy."""
+
+    exit_code = 2
+
+
+@dataclass(frozen=True)
+class PourOrder:
+    """One pour as ordered. Masses in kg.
+
+    Attributes:
+        id: of the caller.
+        source, receiver: ids of vessels.
+        liquid: id of the liquid; '' for the one in the source.
+        amount: wanted in the receiver; None: the action is poured.
+        tolerance: of the amount; the excess that the pour avoids.
+        action: values by dimension, such as {'angular_velocity': '60 deg/s'}; for an amount, the place of the pourer.
+        deviation: standard deviation of the content of the source, when the pour begins.
+    """
+
+    id: str
+    source: str
+    receiver: str
+    liquid: str = ""
+    amount: float | None = None
+    tolerance: float = 1e-3
+    action: dict[str, str] = field(default_factory=dict)
+    deviation: float = 1e-4
+
+    @property
+    def seed(self) -> int:
+        """Seed of the pour's random numbers, from the caller's id: a repeated prediction is the same."""
+        return int.from_bytes(hashlib.sha256(self.id.encode()).digest()[:4], "big") >> 1
+
+    def write(self, folder: Path) -> None:
+        """Write the order into a snapshot."""
+        (folder / ORDER).write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
+
+    @classmethod
+    def read(cls, folder: Path) -> PourOrder:
+        """Read the order of a snapshot."""
+        return cls(**json.loads((folder / ORDER).read_text(encoding="utf-8")))
+
+
+def order_of(
+    key: str, source: str, receiver: str, liquid: str, amount: str | None, tolerance: str, action: Mapping[str, str]
+) -> PourOrder:
+    """Return an order from the texts of a request.
+
+    Raises:
+        OrderError: neither amount nor action is given, or a value is invalid.
+    """
+    try:
+        wanted = None if amount is None else mass_of(amount, "amount")
+        limit = mass_of(tolerance, "tolerance")
+    except RunError as error:
+        raise OrderError(str(error)) from None
+    if wanted is None and "angular_velocity" not in action:
+        raise OrderError("give an 'amount', such as '30 g', or an 'action' with at least 'angular_velocity'")
+    if wanted is not None and not 0.0 < limit < wanted:
+        raise OrderError("amount: should be larger than the tolerance, and both above 0 g")
+    try:
+        set_action([f"{name}={value}" for name, value in action.items()], fixed=_DEFAULTS)
+    except AssignmentError as error:
+        raise OrderError(f"action: {error}") from None
+    return PourOrder(key, source, receiver, liquid, wanted, limit, dict(action))
+
+
+_MOTION = {"max_angle": "120 deg", "height": f"{1e3 * HEIGHT:g} mm", "x_offset": "100 mm"}
+"""The same for a campaign."""
+
+_DEFAULTS = {"angular_velocity": 0.5, "x_offset": 0.1, "height": HEIGHT}
+"""Values of dimensions that an order may leave out; x_offset is searched."""
+
+
+def resolved_order(order: PourOrder, materials: Materials) -> PourOrder:
+    """Return the order with ids instead of bar codes. Raises MaterialError."""
+    return replace(
+        order,
+        source=materials.vessel(order.source).id,
+        receiver=materials.vessel(order.receiver).id,
+        liquid=materials.liquid_id(order.liquid) if order.liquid else materials.content(order.source).liquid,
+    )
+
+
+def order_bundle(order: PourOrder, materials: Materials) -> str:
+    """Return the campaign of an order, as text. Its load is the present content of the source.
+
+    Args:
+        order: with resolved ids.
+        materials: vessels and liquids.
+
+    Raises:
+        MaterialError: a vessel or the liquid is unknown.
+    """
+    content = materials.content(order.source)
+    speed = order.action.get("angular_velocity", f"{_DEFAULTS['angular_velocity']:g} rad/s")
+    motion = {name: value for name, value in order.action.items() if name != "angular_velocity"}
+    campaign: dict[str, Any] = {
+        "name": POUR,
+        "seed": order.seed,
+        "laboratory": _virtual_laboratory(),  # that of the rig replaces it, if the rig has one
+        "liquid": {"name": "water", **materials.properties(order.liquid), "mass": _grams(content.mass or 0.0)},
+        "pourer": materials.vessel(order.source).shape,
+        "motion": {**_MOTION, **motion},
+        "deployment": {
+            "strategy": "D2",
+            "receiver": materials.vessel(order.receiver).shape,
+            # a campaign searches a range; the pour itself takes the order's value
+            "actions": {"angular_velocity": _range(speed)},
+            "pours": 1,
+        },
+        "outputs": {"recording": False, "figures": False},
+    }
+    return json.dumps(campaign, indent=1, ensure_ascii=False) + "\n"
+
+
+def _range(speed: str) -> list[str]:
+    value = set_action([f"angular_velocity={speed}"], fixed=_DEFAULTS)["angular_velocity"]
+    assert value is not None
+    dimension = ACTION_DIMENSIONS["angular_velocity"]
+    low, high = max(0.99 * value, dimension.lower), min(1.01 * value, dimension.upper)
+    return [f"{end / dimension.factor:.6f} {dimension.display_unit}" for end in (low, high)]
+
+
+def _virtual_laboratory() -> dict[str, Any]:
+    from orchestrator.config.yaml.yaml_source import Document
+
+    found: dict[str, Any] = Document.read(shipped(VIRTUAL)).data
+    return found
+
+
+def _grams(mass: float) -> str:
+    return f"{1e3 * mass:.6f} g"
+
+
+def renew_load(campaign: Path, mass: float, deviation: float) -> None:
+    """Set the load in the snapshot of an order that has not begun: other pours may have changed its source.
+
+    Args:
+        campaign: its file.
+        mass: present content of the source [kg].
+        deviation: its standard deviation [kg].
+    """
+    replace(PourOrder.read(campaign.parent), deviation=deviation).write(campaign.parent)
+    content = json.loads(campaign.read_text(encoding="utf-8"))
+    content["liquid"]["mass"] = _grams(mass)
+    fresh = campaign.with_suffix(".new")
+    fresh.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    fresh.replace(campaign)
+
+
+def order_request(plan: CampaignPlan, order: PourOrder) -> RunRequest:
+    """Return the run of an order.
+
+    Args:
+        plan: loaded from its bundle, with the laboratory of its rig.
+        order: what is poured.
+
+    Raises:
+        OrderError: there is no place for the pourer.
+    """
+    chosen = PlannedOrder.of(plan, order)
+    return RunRequest(
+        chosen.plan, [StageDefinition(POUR, chosen.strategy, pours=True)], problems=chosen.problems, as_written=False
+    )
+
+
+@dataclass(frozen=True)
+class PlannedOrder:
+    """An order with its scene and its whole action."""
+
+    plan: CampaignPlan
+    order: PourOrder
+    scene: Scene
+    action: Action
+
+    @classmethod
+    def of(cls, plan: CampaignPlan, order: PourOrder) -> PlannedOrder:
+        """Plan an order; see `order_request`. The plan of its run may be given, too."""
+        if plan.dispense is not None:
+            scene = plan.dispense.scenes[0]
+            return cls(plan, order, scene, scene.action({}))
+        assert plan.deployment is not None
+        scene = plan.deployment.scenes[0]
+        if "x_offset" not in order.action:
+            scene = _placed(scene, order)
+            plan = replace(plan, deployment=replace(plan.deployment, scenes=(scene,)))
+        action = _action(scene, order)
+        if order.amount is not None:
+            scene = replace(scene, fixed=action.values())
+            dose = PlannedDose(order.amount, order.tolerance, scene.receiver.name)
+            series = DispensePlan((scene,), (dose,), 0.0, False, plan.laboratory.name)
+            plan = replace(plan, deployment=None, dispense=series)
+        return cls(plan, order, scene, action)
+
+    @property
+    def target(self) -> DoseTarget | None:
+        """The wanted amount; None for an action."""
+        if self.order.amount is None:
+            return None
+        source = DoseSource(
+            self.scene.pourer.name, self.scene.liquid.mass, self.order.deviation, fill=False, constants=0
+        )
+        return DoseTarget(self.order.amount, self.order.tolerance, source=source)
+
+    def strategy(self, results: object, seed: int) -> Dispense | OnePour:
+        """Build the strategy."""
+        if self.target is None:
+            return OnePour(self.scene, self.action, seed)
+        assert self.plan.dispense is not None
+        content = KnownSource(mass=self.scene.liquid.mass, deviation=self.order.deviation)
+        return Dispense(self.plan.dispense, seed, {self.scene.pourer.name: content})
+
+    def problems(self) -> list[str]:
+        """Return what prevents this pour; nothing moves."""
+        target, laboratory = self.target, self.plan.laboratory
+        if not laboratory.pours:
+            return [f"laboratory {laboratory.name} has no bench"]
+        if found := check_vessels(self.scene, self.plan.source, None if target is None else 0.0):
+            return [one.message for one in found]
+        try:
+            if target is not None:
+                check_dose(self.scene, target)
+                if laboratory.arm is None:
+                    check_straight(self.scene)
+                return []
+            vessels = build_vessel(self.scene.pourer), build_vessel(self.scene.receiver)
+            contact = touch(self.scene, self.action, *vessels)
+            if contact is None and laboratory.arm is not None:
+                laboratory.arm.plan(self.scene, self.action)
+        except (InvalidActionError, ValueError) as error:
+            return [str(error)]
+        return [] if contact is None else [contact]
+
+    def duration(self) -> float:
+        """Return the expected time until the pour is weighed, without waiting for a person [s of bench time]."""
+        laboratory = self.plan.laboratory
+        if laboratory.arm is not None:
+            return laboratory.arm.plan(self.scene, self.action).report.duration + laboratory.operator.time
+        motion = plan_motion(
+            self.scene, self.action, build_vessel(self.scene.pourer), build_vessel(self.scene.receiver)
+        )
+        bench = laboratory.bench
+        return motion.duration + (0.0 if bench is None else bench.operator_time + bench.balance.settling_time)
+
+    async def predict(self, simulators: Callable[[], SimulatorPool]) -> dict[str, Any]:
+        """Predict the pour; nothing moves.
+
+        Args:
+            simulators: opens the simulators, which only an action needs.
+
+        Returns:
+            'amount_g', 'interval_g' (90 %), 'spilled_g', 'duration_s', and for an amount 'error_g',
+            'error_interval_g', 'enough' (probability that the source holds it) and 'ends'.
+
+        Raises:
+            InvalidActionError: the pour can't be made.
+        """
+        if self.target is not None:
+            import asyncio
+
+            return await asyncio.to_thread(self._forecast)
+        return {**await self._simulated(simulators()), "duration_s": self.duration()}
+
+    def _forecast(self) -> dict[str, Any]:
+        assert self.target is not None
+        found = predict_dose(self.scene, self.target, self.order.seed, self.plan.laboratory.dosing)
+        wanted = self.target.amount
+        bench = self.plan.laboratory.bench
+        low, high = (1e3 * value for value in found.interval)
+        return {
+            "amount_g": 1e3 * found.amount,
+            "interval_g": [low, high],
+            "error_g": 1e3 * (found.amount - wanted),
+            "error_interval_g": [low - 1e3 * wanted, high - 1e3 * wanted],
+            "duration_s": found.duration + (0.0 if bench is None else bench.operator_time),
+            "enough": found.enough,
+            "ends": {str(end): count for end, count in found.ends.items()},
+        }
+
+    async def _simulated(self, pool: SimulatorPool) -> dict[str, Any]:
+        import asyncio
+
+        assert self.plan.deployment is not None
+        costing = Costing.of(self.plan.deployment, self.scene, self.plan.parameters)
+        strategy = RepeatedSimulation(costing, self.action, SEEDS, self.order.seed)
+        asked = strategy.ask(Slots(SEEDS, 0))
+        tasks = [PourTask(self.scene, one.action, one.parameters, one.seed) for one in asked]  # type: ignore[union-attr]
+        done = await asyncio.gather(*map(pool.simulate, tasks), return_exceptions=True)
+        for request, found in zip(asked, done, strict=True):
+            if isinstance(found, BaseException):
+                strategy.tell(request, Failed("simulation", str(found)))
+            else:
+                strategy.tell(request, Simulated(found.outcome))
+        result = strategy.result()
+        load = 1e3 * self.scene.liquid.mass
+        poured, spilled = result.over_seeds.get("poured"), result.over_seeds.get("spilled")
+        if poured is None or spilled is None:
+            return {"simulations": 0, "simulations_lost": result.simulations_lost}
+        amount = load * (poured.mean - spilled.mean)
+        spread = math.hypot(poured.deviation or 0.0, spilled.deviation or 0.0) * math.sqrt(1.0 + 1.0 / SEEDS)
+        half = INTERVAL * load * spread
+        return {
+            "amount_g": amount,
+            "interval_g": [max(amount - half, 0.0), min(amount + half, load)],
+            "spilled_g": load * spilled.mean,
+            "simulations": result.simulations,
+        }
+
+
+def _action(scene: Scene, order: PourOrder) -> Action:
+    fixed = {**_DEFAULTS, **scene.fixed}
+    try:
+        return assigned_action([f"{name}={value}" for name, value in order.action.items()], fixed=fixed)
+    except (AssignmentError, ValueError) as error:
+        raise OrderError(f"action: {error}") from None
+
+
+def _placed(scene: Scene, order: PourOrder) -> Scene:
+    """The scene with the smallest distance at which the vessels don't touch, and a margin."""
+    pourer, receiver = build_vessel(scene.pourer), build_vessel(scene.receiver)
+    offset = pourer.lip_point(0.0)[0]
+    while offset < FARTHEST:
+        tried = replace(scene, fixed={**scene.fixed, "x_offset": float(offset)})
+        if touch(tried, _action(tried, order), pourer, receiver) is None:
+            return replace(scene, fixed={**scene.fixed, "x_offset": float(offset) + MARGIN})
+        offset += STEP
+    raise OrderError("action: the vessels touch at every distance; give 'x_offset' and 'height'")
+
+
+# ---- results
+
+
+def weighing_deviation(laboratory: LaboratorySettings) -> float:
+    """Return the standard deviation of one weighing, as the balance's settings state it [kg]."""
+    if laboratory.bench is not None and laboratory.arm is None:
+        scale = laboratory.bench.balance
+        return math.hypot(scale.noise, scale.resolution / math.sqrt(12.0))
+    balance = laboratory.balance
+    if balance is None:
+        return 0.0
+    # settings of a plug-in's balance need not have them
+    repeatability, step = (getattr(balance, name, None) or 0.0 for name in ("repeatability", "step"))
+    return math.hypot(repeatability, step / math.sqrt(12.0))
+
+
+def weighed_result(order: PourOrder, measured: PourMeasurement, deviation: float) -> dict[str, Any]:
+    """Return the result of a weighed pour, ready for JSON.
+
+    Args:
+        order: what was ordered.
+        measured: what was weighed.
+        deviation: of one weighing [kg]; a mass is the difference of two.
+    """
+    about: dict[str, Any] = measured.notes.get(DOSE, {})
+    received = 1e3 * float(about.get("received", measured.delivered))
+    half = INTERVAL * 1e3 * math.sqrt(2.0) * deviation
+    found: dict[str, Any] = {
+        "received_g": received,
+        "received_interval_g": [received - half, received + half],
+        "spilled_g": 1e3 * measured.spilled,
+        "left_in_source_g": 1e3 * measured.retained,
+        "end": str(about.get("end", "")),
+        "duration_s": about.get("duration"),
+    }
+    if order.amount is not None:
+        error = received - 1e3 * order.amount
+        found["error_g"], found["error_interval_g"] = error, [error - half, error + half]
+        found["within_tolerance"] = abs(error) <= 1e3 * order.tolerance
+    return found
+
+
+@dataclass(frozen=True)
+class SettledPour:
+    """A pour as its journal records it, with the deviation of one weighing [kg]."""
+
+    order: PourOrder
+    pour: RecordedPour
+    deviation: float
+
+
+def settled_pour(run: Path, snapshot: Path, laboratory: LaboratorySettings | None) -> SettledPour | None:
+    """Read the pour of an order from the journal of its run. Reads files; don't call it in an event loop.
+
+    Args:
+        run: folder of the run.
+        snapshot: folder with the order and its campaign.
+        laboratory: of the rig; None: the campaign's own.
+
+    Returns:
+        None if no pour was requested.
+
+    Raises:
+        RunError: the journal can't be read.
+    """
+    pours = read_record(run).pours
+    if not pours:
+        return None
+    if laboratory is None:
+        laboratory = LaboratorySettings.model_validate(_virtual_laboratory())
+    return SettledPour(PourOrder.read(snapshot), pours[0], weighing_deviation(laboratory))
+
+
+class OrderBook:
+    """Orders and results in the daemon's store.
+
+    Args:
+        store: of the daemon.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store, self._materials = store, Materials(store)
+
+    def find(self, key: str) -> dict[str, Any] | None:
+        """Return the row of an order by the caller's id, with JSON decoded; None if there is none."""
+        rows = self._store.rows("select * from pour_order where id = ?", key)
+        return _decoded(rows[0]) if rows else None
+
+    def of_campaign(self, campaign: str) -> dict[str, Any] | None:
+        """Return the row of the order that a queued campaign pours."""
+        rows = self._store.rows("select * from pour_order where campaign = ?", campaign)
+        return _decoded(rows[0]) if rows else None
+
+    def list(self, limit: int, source: str = "") -> list[dict[str, Any]]:
+        """Return orders, newest first."""
+        where, arguments = ("where source = ?", [source]) if source else ("", [])
+        rows = self._store.rows(f"select * from pour_order {where} order by rowid desc limit ?", *arguments, limit)
+        return [_decoded(row) for row in rows]
+
+    def add(
+        self, order: PourOrder, campaign: str, body: Mapping[str, Any], predicted: Mapping[str, Any] | None
+    ) -> None:
+        """Store an order; call it together with `Store.add` of its campaign."""
+        self._store.write(
+            "insert into pour_order (id, campaign, body, source, receiver, amount, predicted) "
+            "values (?, ?, ?, ?, ?, ?, ?)",
+            *(order.id, campaign, json.dumps(body), order.source, order.receiver, order.amount),
+            None if predicted is None else json.dumps(predicted),
+        )
+
+    def settle(self, item: QueueItem, settled: SettledPour | None, *, ended: bool) -> None:
+        """Enter the outcome of a pour in the account and store its result. A second call changes nothing.
+
+        Args:
+            item: campaign of the order.
+            settled: from its journal, see `settled_pour`; None if nothing was requested.
+            ended: whether the campaign does not continue: a pour that has begun remains without outcome.
+        """
+        row = self.of_campaign(item.id)
+        if row is None or row["result"] is not None or settled is None:
+            return
+        order, pour, deviation = settled.order, settled.pour, settled.deviation
+        if pour.measured is not None:
+            result = {"state": "weighed", **weighed_result(order, pour.measured, deviation)}
+            received = 1e-3 * result["received_g"]
+            one = math.sqrt(2.0) * deviation
+            moved: Transfer | None = Transfer((received + pour.measured.spilled, one), (received, one))
+        elif isinstance(pour.outcome, Failed):
+            result = {"state": "failed", "end": pour.reason}
+            # an invalid action was refused before anything moved
+            moved = None if pour.outcome.kind == "invalid_action" else Transfer(None, None)
+        elif ended and pour.state in ("under way", "unknown"):
+            result = {"state": "unknown", "end": "stopped before an operator reported its outcome"}
+            moved = Transfer(None, None)
+        else:
+            return
+        result["seconds"] = pour.seconds
+        if moved is not None:
+            self._materials.enter_pour(row["id"], row["source"], row["receiver"], moved, item.by)
+        self._store.write("update pour_order set result = ? where campaign = ?", json.dumps(result), item.id)
+
+
+def _decoded(row: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: json.loads(value) if name in ("body", "predicted", "result") and value is not None else value
+        for name, value in row.items()
+    }

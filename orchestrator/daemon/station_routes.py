@@ -1,0 +1,284 @@
+"""Routes of the HTTP API for other programs: ordered pours, batches, reservations and materials.
+
+The logic is in `ordering` and `materials`. A refusal has status 409 with the reason, an invalid order 422.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
+
+from orchestrator.daemon.access_control import Daemon, Operator, Viewer
+from orchestrator.daemon.materials import MaterialError, mass_of
+from orchestrator.daemon.ordering import Ordering
+from orchestrator.daemon.query_routes import campaign_out, found_item
+from orchestrator.daemon.schemas import CampaignOut
+from orchestrator.daemon.station_schemas import (
+    AccountOut,
+    BatchIn,
+    BatchOut,
+    LiquidIn,
+    MaterialsOut,
+    PlaceIn,
+    PositionIn,
+    PourIn,
+    PourOut,
+    QueueChangeIn,
+    ReservationIn,
+    ReservationOut,
+    VesselIn,
+    WeighingIn,
+)
+from orchestrator.daemon.submissions import SubmissionError
+from orchestrator.daemon.supervisor import RequestRefusedError, Supervisor
+from orchestrator.run_errors import RunError
+
+LONGEST_WAIT = 600.0
+"""Longest time that a request may wait for its pour [s]."""
+
+router = APIRouter(tags=["station"])
+
+
+async def _ordering(request: Request) -> Ordering:
+    found: Ordering = request.app.state.ordering
+    return found
+
+
+Orders = Annotated[Ordering, Depends(_ordering)]
+Wait = Annotated[float, Query(ge=0.0, le=LONGEST_WAIT, description="Return as soon as the pour rests [s].")]
+
+
+@contextlib.contextmanager
+def _answering() -> Iterator[None]:
+    """Convert refusals and errors to responses."""
+    try:
+        yield
+    except RequestRefusedError as error:
+        raise HTTPException(409, str(error)) from None
+    except (MaterialError, SubmissionError) as error:
+        raise HTTPException(422, str(error)) from None
+    except KeyError as error:
+        raise HTTPException(404, f"there is no '{str(error.args[0])[:80]}'") from None
+    except RunError as error:
+        raise HTTPException(422 if error.exit_code == 2 else 409, str(error)) from None
+
+
+# ---- pours
+
+
+@router.post(
+    "/pours",
+    status_code=201,
+    operation_id="order_pour",
+    response_model=PourOut,
+    responses={200: {"model": PourOut, "description": "A dry run, or a pour that this order has made before."}},
+)
+async def order_pour(
+    orders: Orders, person: Operator, body: PourIn, response: Response, wait: Wait = 0.0
+) -> dict[str, Any]:
+    """Pour an amount or an action from one vessel into another, or predict it.
+
+    The call is idempotent: repeated with the same `id` and the same order, it returns the pour and never pours again.
+    Another order with the same `id` is refused.
+    """
+    with _answering():
+        if body.dry_run or orders.book.find(body.id) is not None:
+            response.status_code = 200
+        found = await orders.pour(body, person.name)
+        return await orders.wait(body.id, wait) if wait and not body.dry_run else found
+
+
+@router.get("/pours", operation_id="pours", response_model=list[PourOut])
+async def pours(
+    orders: Orders,
+    person: Viewer,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    source: Annotated[str, Query(max_length=60, description="Only pours from this vessel.")] = "",
+) -> list[dict[str, Any]]:
+    """List ordered pours, newest first. Pours of all runs are at `runs/pours`."""
+    return [await orders.pour_out(row["id"]) for row in orders.book.list(limit, source)]
+
+
+@router.get("/pours/{key}", operation_id="pour", response_model=PourOut)
+async def pour(orders: Orders, person: Viewer, key: str, wait: Wait = 0.0) -> dict[str, Any]:
+    """Return one pour by its caller's id."""
+    with _answering():
+        return await orders.wait(key, wait)
+
+
+@router.post("/pours/{key}/cancel", operation_id="cancel_pour", response_model=PourOut)
+async def cancel_pour(daemon: Daemon, orders: Orders, person: Operator, key: str) -> dict[str, Any]:
+    """Remove a pour from the queue. A pour that has begun is finished and weighed."""
+    with _answering():
+        campaign = orders.campaign_of(key)
+        if (await orders.pour_out(key))["result"] is None and daemon.item(campaign).state != "withdrawn":
+            daemon.stop(campaign, person.name)
+        return await orders.pour_out(key)
+
+
+@router.post("/pours/{key}/pause", operation_id="pause_pour", response_model=PourOut)
+async def pause_pour(daemon: Daemon, orders: Orders, person: Operator, key: str) -> dict[str, Any]:
+    """Pause before the pour begins. A pour that has begun is finished and weighed."""
+    with _answering():
+        daemon.pause(orders.campaign_of(key), person.name)
+        return await orders.pour_out(key)
+
+
+@router.post("/pours/{key}/resume", operation_id="resume_pour", response_model=PourOut)
+async def resume_pour(daemon: Daemon, orders: Orders, person: Operator, key: str) -> dict[str, Any]:
+    """Resume a paused pour. If its outcome is unknown, an operator is asked first."""
+    with _answering():
+        daemon.resume(orders.campaign_of(key), person.name)
+        return await orders.pour_out(key)
+
+
+# ---- batches and the queue
+
+
+@router.post("/batches", status_code=201, operation_id="order_batch", response_model=BatchOut)
+async def order_batch(orders: Orders, person: Operator, body: BatchIn) -> dict[str, Any]:
+    """Queue pours and campaigns as a whole, or refuse them as a whole. Idempotent by the batch's `id`."""
+    with _answering():
+        return await orders.batch(body, person.name)
+
+
+@router.get("/batches", operation_id="batches", response_model=list[BatchOut])
+async def batches(
+    orders: Orders, person: Viewer, limit: Annotated[int, Query(ge=1, le=200)] = 20
+) -> list[dict[str, Any]]:
+    """List batches, newest first."""
+    return [await orders.batch_out(key) for key in orders.batches(limit)]
+
+
+@router.get("/batches/{key}", operation_id="batch", response_model=BatchOut)
+async def batch(orders: Orders, person: Viewer, key: str) -> dict[str, Any]:
+    """Return a batch with the state and the result of each item."""
+    with _answering():
+        return await orders.batch_out(key)
+
+
+@router.post("/batches/{key}/{change}", operation_id="change_batch", response_model=BatchOut)
+async def change_batch(daemon: Daemon, orders: Orders, person: Operator, key: str, change: str) -> dict[str, Any]:
+    """Hold or release the queued items of a batch, or cancel them: `hold`, `release` or `cancel`."""
+    if change not in ("hold", "release", "cancel"):
+        raise HTTPException(404, f"'{change[:80]}' is no change of a batch; there are hold, release, cancel")
+    with _answering():
+        await orders.batch_out(key)
+        for item in daemon.store.batch_items(key):
+            if item.state == "queued" and change == "cancel":
+                daemon.stop(item.id, person.name)
+            elif item.state == "queued":
+                daemon.change(item.id, person.name, hold=change == "hold")
+        return await orders.batch_out(key)
+
+
+@router.post("/campaigns/{key}/change", operation_id="change_queued")
+async def change_queued(
+    request: Request, daemon: Daemon, person: Operator, key: str, body: QueueChangeIn
+) -> CampaignOut:
+    """Hold or release a queued campaign or pour, or change its earliest start."""
+    found_item(daemon, key)
+    with _answering():
+        found = daemon.change(key, person.name, hold=body.hold, not_before=body.not_before)
+        return campaign_out(request, daemon, found)
+
+
+@router.post("/reservations", status_code=201, operation_id="reserve", response_model=ReservationOut)
+async def reserve(daemon: Daemon, person: Operator, body: ReservationIn) -> dict[str, Any]:
+    """Reserve a rig: between two times, only campaigns and pours of this user start there."""
+    if body.rig not in daemon.workers:
+        raise HTTPException(404, f"there is no rig '{body.rig}'")
+    with _answering():
+        return daemon.reserve(body.rig, person.name, body.begins, body.ends, body.note)
+
+
+@router.get("/reservations", operation_id="reservations", response_model=list[ReservationOut])
+async def reservations(daemon: Daemon, person: Viewer) -> list[dict[str, Any]]:
+    """List reservations that have not ended."""
+    return daemon.reservations()
+
+
+@router.post("/reservations/{number}/cancel", operation_id="cancel_reservation")
+async def cancel_reservation(daemon: Daemon, person: Operator, number: int) -> list[ReservationOut]:
+    """Cancel a reservation."""
+    with _answering():
+        daemon.cancel_reservation(number, person.name)
+    return [ReservationOut.model_validate(one) for one in daemon.reservations()]
+
+
+# ---- materials
+
+
+@router.get("/materials", operation_id="materials", response_model=MaterialsOut)
+async def materials(orders: Orders, person: Viewer) -> Any:
+    """List liquids, vessels with their contents, and positions."""
+    return orders.materials.everything()
+
+
+@router.get("/materials/account", operation_id="account", response_model=list[AccountOut])
+async def account(
+    orders: Orders, person: Viewer, vessel: Annotated[str, Query(max_length=80)] = ""
+) -> list[dict[str, Any]]:
+    """Return the account of one vessel or of all, oldest entry first."""
+    with _answering():
+        rows = orders.materials.account(orders.materials.vessel(vessel).id if vessel else None)
+    return [
+        {
+            **{name: row[name] or "" for name in ("liquid", "pour", "by", "note")},
+            **{name: row[name] for name in ("t", "vessel", "kind")},
+            "change_g": None if row["change"] is None else 1e3 * row["change"],
+            "deviation_g": None if row["deviation"] is None else 1e3 * row["deviation"],
+        }
+        for row in rows
+    ]
+
+
+@router.post("/materials/liquids", status_code=201, operation_id="add_liquid", response_model=MaterialsOut)
+async def add_liquid(daemon: Daemon, orders: Orders, person: Operator, body: LiquidIn) -> Any:
+    """Register a liquid."""
+    with _answering():
+        orders.materials.add_liquid(body.id, body.code, body.properties)
+    return _changed(daemon, orders, person.name, "register liquid", body.id)
+
+
+@router.post("/materials/positions", status_code=201, operation_id="add_position", response_model=MaterialsOut)
+async def add_position(daemon: Daemon, orders: Orders, person: Operator, body: PositionIn) -> Any:
+    """Register a position of a rig."""
+    if body.rig not in daemon.workers:
+        raise HTTPException(404, f"there is no rig '{body.rig}'")
+    with _answering():
+        orders.materials.add_position(body.id, body.code, body.rig, body.note)
+    return _changed(daemon, orders, person.name, "register position", body.id)
+
+
+@router.post("/materials/vessels", status_code=201, operation_id="add_vessel", response_model=MaterialsOut)
+async def add_vessel(daemon: Daemon, orders: Orders, person: Operator, body: VesselIn) -> Any:
+    """Register an empty vessel."""
+    with _answering():
+        orders.materials.add_vessel(body.id, body.code, body.shape, body.position, person.name)
+    return _changed(daemon, orders, person.name, "register vessel", body.id)
+
+
+@router.post("/materials/vessels/{key}/weighed", operation_id="weigh_vessel", response_model=MaterialsOut)
+async def weigh_vessel(daemon: Daemon, orders: Orders, person: Operator, key: str, body: WeighingIn) -> Any:
+    """Correct the content of a vessel by a weighing, or enter a filling."""
+    with _answering():
+        mass, deviation = mass_of(body.mass, "mass"), mass_of(body.deviation, "deviation")
+        orders.materials.weigh(key, mass, deviation, body.liquid, person.name, body.note)
+    return _changed(daemon, orders, person.name, "weigh vessel", f"{key}: {body.mass}")
+
+
+@router.post("/materials/vessels/{key}/place", operation_id="place_vessel", response_model=MaterialsOut)
+async def place_vessel(daemon: Daemon, orders: Orders, person: Operator, key: str, body: PlaceIn) -> Any:
+    """Record that a vessel was moved to another position."""
+    with _answering():
+        orders.materials.place(key, body.position)
+    return _changed(daemon, orders, person.name, "place vessel", f"{key}: {body.position or 'nowhere'}")
+
+
+def _changed(daemon: Supervisor, orders: Ordering, by: str, what: str, detail: str) -> Any:
+    daemon.note(by, what, detail=detail)
+    return orders.materials.everything()

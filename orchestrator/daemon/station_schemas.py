@@ -1,0 +1,401 @@
+"""Request and response models of the station's API: ordered pours, batches, reservations and materials.
+
+Quantities in requests are texts with units, such as '30 g'; responses state the unit in the name. Times are in seconds
+since 1970. The models contain no logic.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from orchestrator.daemon.schemas import SubmissionIn
+
+CallerId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,79}$")]
+ResourceId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,59}$")]
+Key = Annotated[str, Field(min_length=1, max_length=80)]
+Quantity = Annotated[str, Field(max_length=40)]
+
+
+class _In(BaseModel):
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
+
+
+class _Out(BaseModel):
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+
+class PourIn(_In):
+    """One pour: an amount, or an action."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        use_attribute_docstrings=True,
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": "plan-17:step-4",
+                    "source": "beaker-1",
+                    "receiver": "vial-7",
+                    "amount": "30 g",
+                    "tolerance": "1 g",
+                },
+                {
+                    "id": "plan-17:step-5",
+                    "source": "beaker-1",
+                    "receiver": "vial-8",
+                    "action": {"angular_velocity": "60 deg/s", "x_offset": "90 mm"},
+                    "dry_run": True,
+                },
+            ]
+        },
+    )
+
+    id: CallerId
+    """Chosen by the caller. The same order with the same id is the same pour: it is never poured twice."""
+
+    source: Key
+    """Vessel to pour from: its id or bar code."""
+
+    receiver: Key
+    """Vessel to pour into: its id or bar code."""
+
+    liquid: str = Field(default="", max_length=80)
+    """Liquid that the source has to hold, by id or bar code; '' for any."""
+
+    amount: Quantity | None = None
+    """Wanted in the receiver, such as '30 g'."""
+
+    tolerance: Quantity = "1 g"
+    """Largest error of the amount. The pour ends before an excess of this size has a probability of 1 %."""
+
+    action: dict[Annotated[str, Field(max_length=40)], Quantity] = Field(default_factory=dict, max_length=10)
+    """Without an amount: the whole motion, at least `angular_velocity`. With an amount: `x_offset` and `height` only
+    where they differ from the default, a distance at which the vessels don't touch."""
+
+    rig: str = Field(default="", max_length=60)
+    """Rig; '' for the one on which the vessels stand."""
+
+    priority: int = Field(default=0, ge=-1000, le=1000)
+    hold: bool = False
+    """Wait in the queue until it is released."""
+
+    not_before: float | None = None
+    """Earliest start."""
+
+    dry_run: bool = False
+    """Check and predict the pour; nothing is queued and nothing moves."""
+
+    predict: bool = True
+    """Predict the pour before it is queued. An action is predicted by simulations, which takes seconds."""
+
+
+class PredictionOut(_Out):
+    """Prediction of a pour; intervals contain it with a probability of 90 %."""
+
+    amount_g: float | None = None
+    """Expected in the receiver."""
+
+    interval_g: tuple[float, float] | None = None
+    error_g: float | None = None
+    """Expected amount minus the wanted amount."""
+
+    error_interval_g: tuple[float, float] | None = None
+    spilled_g: float | None = None
+    duration_s: float | None = None
+    """Expected time until it is weighed, in the rig's own time."""
+
+    enough: float | None = None
+    """Probability that the source holds the amount."""
+
+    ends: dict[str, int] | None = None
+    """Number of predicted pours by their end."""
+
+    simulations: int | None = None
+    """Number of simulations of an action."""
+
+    simulations_lost: int | None = None
+
+
+class WeighedOut(_Out):
+    """Outcome of a pour; intervals state the uncertainty of the balance, with a probability of 90 %."""
+
+    state: str
+    received_g: float | None = None
+    """Weighed in the receiver."""
+
+    received_interval_g: tuple[float, float] | None = None
+    spilled_g: float | None = None
+    left_in_source_g: float | None = None
+    error_g: float | None = None
+    """Weighed amount minus the wanted amount."""
+
+    error_interval_g: tuple[float, float] | None = None
+    within_tolerance: bool | None = None
+    end: str = ""
+    """How the pour ended, or why it failed."""
+
+    duration_s: float | None = None
+    """From the first motion until it was weighed, in the rig's own time."""
+
+    seconds: float | None = None
+    """Duration in the journal, operator and balance included."""
+
+
+class LimitsOut(_Out):
+    """Limits of a pour from this source into this receiver."""
+
+    available_g: float
+    """In the source for certain, without amounts that are promised to other pours."""
+
+    room_ml: float
+    """Free volume of the receiver up to the brim."""
+
+
+class PourOut(_Out):
+    """An ordered pour."""
+
+    id: str
+    campaign: str
+    """Id of its campaign in the queue; '' for a dry run."""
+
+    state: Literal[
+        "dry run", "queued", "running", "waiting for operator", "paused", "weighed", "failed", "unknown", "cancelled"
+    ]
+    """'unknown': it has begun and has no outcome; an operator reports it. It is never repeated by software."""
+
+    reason: str
+    """Reason of the state."""
+
+    needs_enabling: bool
+    """It waits until an operator enables the motion of the hardware."""
+
+    source: str
+    receiver: str
+    amount_g: float | None
+    order: dict[str, Any]
+    """The request."""
+
+    limits: LimitsOut | None = None
+    """Only in a dry run."""
+
+    predicted: PredictionOut | None
+    result: WeighedOut | None
+    run: str | None
+    """Name of its run's folder."""
+
+    created: float | None
+    ended: float | None
+    seconds_left: float | None = None
+    """Expected time until it ends, while it runs."""
+
+
+class BatchItemIn(_In):
+    """A pour or a campaign."""
+
+    pour: PourIn | None = None
+    campaign: SubmissionIn | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> BatchItemIn:
+        if (self.pour is None) == (self.campaign is None):
+            raise ValueError("give either 'pour' or 'campaign'")
+        return self
+
+
+class BatchIn(_In):
+    """Pours and campaigns that are accepted or refused as a whole. The same id again is the same batch."""
+
+    id: CallerId
+    name: str = Field(default="", max_length=200)
+    items: list[BatchItemIn] = Field(min_length=1, max_length=500)
+    hold: bool = False
+    """Hold all items until the batch is released."""
+
+    not_before: float | None = None
+    """Earliest start of all items that state none."""
+
+
+class BatchItemOut(_Out):
+    """One item of a batch."""
+
+    campaign: str
+    """Id in the queue."""
+
+    pour: str
+    """Caller's id of a pour; '' for a campaign."""
+
+    state: str
+    reason: str
+    held: bool
+    not_before: float | None
+    priority: int
+    result: WeighedOut | None
+    """Result of a pour; that of a campaign is at `campaigns/ID`."""
+
+
+class BatchOut(_Out):
+    """A batch with the states and results of its items, in their order."""
+
+    id: str
+    name: str
+    by: str
+    created: float
+    states: dict[str, int]
+    """Number of items in each state."""
+
+    items: list[BatchItemOut]
+
+
+class QueueChangeIn(_In):
+    """Changes of a queued campaign or pour."""
+
+    hold: bool | None = None
+    not_before: float | None = None
+    """Earliest start; 0 removes it."""
+
+
+class ReservationIn(_In):
+    """Reserves a rig for campaigns and pours of its author. What runs already is not interrupted."""
+
+    rig: str = Field(max_length=60)
+    begins: float
+    ends: float
+    note: str = Field(default="", max_length=200)
+
+    @model_validator(mode="after")
+    def _order(self) -> ReservationIn:
+        if self.ends <= self.begins:
+            raise ValueError("'ends' should be later than 'begins'")
+        return self
+
+
+class ReservationOut(_Out):
+    """A reservation."""
+
+    id: int
+    rig: str
+    by: str
+    begins: float
+    ends: float
+    note: str
+
+
+class LiquidIn(_In):
+    """A liquid."""
+
+    id: ResourceId
+    code: str = Field(default="", max_length=80)
+    """Bar code."""
+
+    properties: dict[str, Any] = Field(default_factory=dict, max_length=10)
+    """As in a campaign's `liquid`, without its mass: {'name': 'ethanol'}, or density and viscosity."""
+
+
+class PositionIn(_In):
+    """A place at a rig where one vessel can stand."""
+
+    id: ResourceId
+    code: str = Field(default="", max_length=80)
+    rig: str = Field(max_length=60)
+    note: str = Field(default="", max_length=200)
+
+
+class VesselIn(_In):
+    """A vessel, registered as empty."""
+
+    id: ResourceId
+    code: str = Field(default="", max_length=80)
+    shape: dict[str, Any] = Field(max_length=10)
+    """As in a vessel file: {'profile': {'unit': 'mm', 'inner': [[0, 0], [30, 0], [30, 70]], 'wall': '4 mm'}}."""
+
+    position: str = Field(default="", max_length=60)
+
+
+class PlaceIn(_In):
+    """Another position of a vessel."""
+
+    position: str = Field(max_length=80)
+    """Id or code; '' for none."""
+
+
+class WeighingIn(_In):
+    """The content of a vessel, as weighed by an operator."""
+
+    mass: Quantity
+    deviation: Quantity = "0.1 g"
+    """Standard deviation of the mass."""
+
+    liquid: str = Field(default="", max_length=80)
+    """Id or code; '' keeps the present one."""
+
+    note: str = Field(default="", max_length=200)
+
+
+class ContentOut(_Out):
+    """Content of a vessel."""
+
+    mass_g: float | None
+    """Null if a pour with unknown outcome has changed it."""
+
+    deviation_g: float
+    liquid: str
+    since: float
+    pour: str
+    """Caller's id of the pour that changed it last; '' after a weighing."""
+
+    weighed: float
+
+
+class VesselOut(_Out):
+    """A vessel with its content."""
+
+    id: str
+    code: str
+    position: str
+    capacity_ml: float
+    content: ContentOut
+    promised_g: float
+    """Amounts that queued pours will take."""
+
+
+class LiquidOut(_Out):
+    """A liquid."""
+
+    id: str
+    code: str
+    properties: dict[str, Any]
+
+
+class PositionOut(_Out):
+    """A position."""
+
+    id: str
+    code: str
+    rig: str
+    note: str
+
+
+class MaterialsOut(_Out):
+    """All materials of the station."""
+
+    liquids: list[LiquidOut]
+    vessels: list[VesselOut]
+    positions: list[PositionOut]
+
+
+class AccountOut(_Out):
+    """One entry of a vessel's account."""
+
+    t: float
+    vessel: str
+    kind: Literal["weighed", "poured", "unknown"]
+    change_g: float | None
+    """Content after a weighing; change by a pour."""
+
+    deviation_g: float | None
+    liquid: str
+    pour: str
+    by: str
+    note: str

@@ -1,0 +1,185 @@
+"""The daemon as a MADSci node: the calls of madsci.client 0.8.1, replayed, and by the client where it is installed."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from orchestrator.daemon.access_tokens import Role
+from orchestrator.daemon.daemon_settings import MadsciSettings
+from orchestrator.daemon.madsci_node import create_node, new_ulid
+from orchestrator.daemon.ordering import Ordering
+from tests.support.station import order, rigs_in, set_up, until_pour
+from tests.support.toy_daemon import Served, held, run, serving
+
+ARGS = {
+    "source": "beaker",
+    "receiver": "vial-1",
+    "action": {"angular_velocity": "100 deg/s", "x_offset": "70 mm"},
+    "predict": False,
+}
+
+
+@contextlib.asynccontextmanager
+async def node(served: Served, address: str = "127.0.0.1") -> AsyncIterator[httpx.AsyncClient]:
+    app = create_node(served.daemon, Ordering(served.daemon), MadsciSettings(allow=["127.0.0.0/8"]))
+    transport = httpx.ASGITransport(app=app, client=(address, 1))
+    async with httpx.AsyncClient(transport=transport, base_url="http://node") as http:
+        yield http
+
+
+async def created(http: httpx.AsyncClient, name: str = "pour", **changes: Any) -> str:
+    answer = await http.post(f"/action/{name}", json={"args": ARGS | changes})
+    assert answer.status_code == 200, answer.text
+    return str(answer.json()["action_id"])
+
+
+def test_a_started_action_is_poured_once_however_often_its_start_is_repeated(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path, held, rigs=rigs_in(tmp_path)) as served:
+            await set_up(served)
+            async with node(served) as http:
+                info = (await http.get("/info")).json()
+                assert len(info["node_id"]) == len(new_ulid()) == 26
+                assert set(info["actions"]) == {"pour", "predict_pour", "run_campaign"}
+                key = await created(http)
+                assert (await http.get(f"/action/pour/{key}/status")).json() == "not_started"
+                for _ in range(3):
+                    assert (await http.post(f"/action/pour/{key}/start")).json()["status"] == "running"
+                await served.pouring()
+                assert (await http.get("/status")).json()["running_actions"] == [key]
+                served.laboratories[0].bench.go.set()
+                found = await until_pour(served, key, "weighed")
+                result = (await http.post(f"/action/pour/{key}/start")).json()
+                assert result["status"] == "succeeded"
+                assert result["json_result"]["result"]["received_g"] == found["result"]["received_g"]
+                assert len(served.laboratories[0].bench.poured) == 1
+                history = (await http.get("/action", params={"action_id": key})).json()
+                assert history[key][0]["status"] == "succeeded"
+                wrong = await created(http, source="nothing")
+                told = (await http.post(f"/action/pour/{wrong}/start")).json()
+                assert told["status"] == "failed"
+                assert "there is no vessel 'nothing'" in told["errors"][0]["message"]
+        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
+            assert (await http.get("/info")).json()["node_id"] == info["node_id"]
+            assert (await http.get(f"/action/{key}/result")).json()["status"] == "succeeded"
+
+    run(work())
+
+
+def test_admin_commands_stop_and_hold_the_node_and_only_a_person_clears_a_stop(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path, held, rigs=rigs_in(tmp_path)) as served:
+            await set_up(served)
+            async with node(served) as http:
+
+                async def admin(command: str) -> Any:
+                    return (await http.post(f"/admin/{command}")).json()
+
+                assert (await admin("AdminCommands.LOCK"))["success"]
+                key = await created(http)
+                told = (await http.post(f"/action/pour/{key}/start")).json()
+                assert told["status"] == "not_ready"
+                assert told["errors"][0]["message"] == "the node is locked"
+                assert (await admin("unlock"))["success"]
+                await http.post(f"/action/pour/{key}/start")
+                laboratory = await served.pouring()
+                waiting = await created(http, receiver="vial-2")
+                await http.post(f"/action/pour/{waiting}/start")
+                assert (await admin("safety_stop"))["success"]
+                assert laboratory.arm_stops == 1
+                await until_pour(served, key, "unknown")
+                assert (await http.get(f"/action/{key}/status")).json() == "unknown"
+                assert not (await http.get("/status")).json()["ready"]
+                assert "administrator" in (await admin("reset"))["errors"][0]["message"]
+                assert not (await admin("shutdown"))["success"]
+                assert (await admin("cancel"))["success"]
+                assert (await http.get(f"/action/{waiting}/status")).json() == "cancelled"
+                await served.post("/emergency-stop/clear", role=Role.ADMIN)
+                assert (await admin("reset"))["success"]
+                await admin("lock")
+        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
+            assert (await http.get("/status")).json()["locked"]
+
+    run(work())
+
+
+def test_an_address_that_is_not_listed_reaches_nothing(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served, "10.1.1.1") as http:
+            for path in ("/info", "/status"):
+                assert (await http.get(path)).status_code == 403
+            assert (await http.post("/admin/safety_stop")).status_code == 403
+            assert served.daemon.emergency is None
+
+    run(work())
+
+
+CLIENT = """
+import json, sys
+from madsci.client.node.rest_node_client import RestNodeClient
+from madsci.common.types.action_types import ActionRequest
+from madsci.common.types.node_types import AdminCommands
+client = RestNodeClient(url=sys.argv[1])
+args = json.loads(sys.argv[2])
+info = client.get_info()
+told = {"node": info.node_name, "ready": client.get_status().ready, "state": sorted(client.get_state())}
+def act(name, **changes):
+    request = ActionRequest(action_name=name, args={**args, **changes})
+    return client.send_action(request, await_result=True, timeout=300)
+told["predicted"] = act("predict_pour", amount="30 g").status.value
+told["poured"] = act("pour", amount="30 g").status.value
+told["refused"] = act("pour", amount="30 kg").status.value
+for command in (AdminCommands.LOCK, AdminCommands.UNLOCK, AdminCommands.PAUSE, AdminCommands.RESUME):
+    told[command.value] = client.send_admin_command(command).success
+told["safety_stop"] = client.send_admin_command(AdminCommands.SAFETY_STOP).success
+told["stopped"] = client.get_status().stopped
+told["history"] = len(client.get_action_history())
+print("TOLD " + json.dumps(told))
+"""
+
+
+@pytest.mark.slow
+def test_the_unmodified_client_of_madsci_pours(tmp_path: Path) -> None:
+    """Set $DECANT_MADSCI_PYTHON to an interpreter with madsci.client 0.8.1 in an environment of its own."""
+    python = os.environ.get("DECANT_MADSCI_PYTHON")
+    if not python:
+        pytest.skip("no environment with madsci.client ($DECANT_MADSCI_PYTHON)")
+    from tests.support.station_process import node_process
+
+    with node_process(tmp_path) as url:
+        arguments = {"source": "beaker", "receiver": "vial-1"}
+        done = subprocess.run(
+            [python, "-c", CLIENT, url, json.dumps(arguments)], capture_output=True, text=True, timeout=600, check=False
+        )
+    assert done.returncode == 0, done.stderr[-3000:]
+    told = json.loads(next(line for line in done.stdout.splitlines() if line.startswith("TOLD "))[5:])
+    assert told["predicted"] == told["poured"] == "succeeded"
+    assert told["refused"] == "failed"
+    assert told["safety_stop"]
+    assert told["stopped"]
+    assert told["history"] == 3
+
+
+def test_an_order_of_the_api_and_one_of_the_node_share_the_account(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served:
+            await set_up(served)
+            await served.post("/queue/pause")
+            await served.post("/pours", order("mine", amount="60 g"))
+            async with node(served) as http:
+                assert (await http.get("/status")).json()["paused"]
+                await served.post("/queue/resume")
+                key = await created(http, amount="60 g", receiver="vial-2")
+                told = (await http.post(f"/action/pour/{key}/start")).json()
+                assert told["status"] == "failed"
+
+    run(work())
