@@ -97,11 +97,12 @@ def rival(python: Path) -> Iterator[Ask]:
     child = subprocess.Popen([str(python), str(RIVALS_FILE), "BoTorch qLogNEI"], env=single_threaded(), **pipes)
     assert child.stdin is not None
     assert child.stdout is not None
+    answers = child.stdout
 
     def ask(seed: int, points: list[Floats], costs: list[float]) -> Floats:
         job = {"seed": seed, "points": [point.tolist() for point in points], "costs": costs}
         print(json.dumps(job), file=child.stdin, flush=True)
-        return np.array(json.loads(child.stdout.readline())["point"])
+        return np.array(json.loads(answers.readline())["point"])
 
     try:
         yield ask
@@ -147,7 +148,7 @@ def main() -> None:
     parser.add_argument("--rivals", type=Path, help="Python of an environment with BoTorch")
     parser.add_argument("--write", action="store_true", help="write the table to docs/data/results.json")
     asked = parser.parse_args()
-    kept = json.loads(CURVES.read_text()) if CURVES.exists() else {"level": LEVEL, "runs": {}, "seconds": {}}
+    kept: dict[str, Any] = json.loads(CURVES.read_text()) if CURVES.exists() else {"level": LEVEL, "runs": {}, "seconds": {}}
     for line in asked.kept.read_text().splitlines() if asked.kept else ():
         made = json.loads(line)
         if (made["arm"], made["level"]) == ("adaptive", LEVEL):
