@@ -80,7 +80,7 @@ def test_strategies_are_told_what_the_journal_holds(tmp_path: Path) -> None:
     """Lists stay lists in a replay, so a live run must not be told tuples."""
     laboratory = ToyLaboratory()
 
-    async def noted(scene: Any, action: Any, *, seed: int, progress: Any = None) -> Any:
+    async def noted(scene: Any, action: Any, *, seed: int, progress: Any = None, dose: Any = None) -> Any:
         measurement = await ToyBench().pour(scene, action, seed=seed)
         return replace(measurement, notes={"readings": (1.0, 2.0)})
 
@@ -334,7 +334,7 @@ def test_asked_twice_it_stops_at_once_and_the_pour_is_unknown(tmp_path: Path) ->
 def test_a_bench_that_calls_its_own_abortion_a_failure_does_not_make_it_known(tmp_path: Path) -> None:
     laboratory = ToyLaboratory()
 
-    async def sulk(scene: Any, action: Any, *, seed: int, progress: Any = None) -> Any:
+    async def sulk(scene: Any, action: Any, *, seed: int, progress: Any = None, dose: Any = None) -> Any:
         progress(None)
         try:
             await asyncio.sleep(60)
