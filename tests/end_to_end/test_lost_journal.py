@@ -182,6 +182,12 @@ def test_a_lost_write_ahead_log_repeats_no_pour(place: Workplace, lost: str) -> 
             content[place_] ^= 1
         wal.write_bytes(content)
     checked = check(run)
+    if (
+        len(before) > 2 and checked.exit_code == 1
+    ):  # killed between the ledger's line of a third pour and its checkpoint
+        assert "entries were lost" in checked.output
+        assert "pour 2 of stage pours (weighed: " in checked.output
+        return
     assert checked.exit_code == 0, checked.output
     place.finish(*RESUME, run.name)
     assert started_after_they_were_finished(place.entries()) == []
