@@ -148,7 +148,9 @@ def main() -> None:
     parser.add_argument("--rivals", type=Path, help="Python of an environment with BoTorch")
     parser.add_argument("--write", action="store_true", help="write the table to docs/data/results.json")
     asked = parser.parse_args()
-    kept: dict[str, Any] = json.loads(CURVES.read_text()) if CURVES.exists() else {"level": LEVEL, "runs": {}, "seconds": {}}
+    kept: dict[str, Any] = {"level": LEVEL, "runs": {}, "seconds": {}}
+    if CURVES.exists():
+        kept = json.loads(CURVES.read_text())
     for line in asked.kept.read_text().splitlines() if asked.kept else ():
         made = json.loads(line)
         if (made["arm"], made["level"]) == ("adaptive", LEVEL):

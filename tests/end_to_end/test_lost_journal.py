@@ -182,9 +182,7 @@ def test_a_lost_write_ahead_log_repeats_no_pour(place: Workplace, lost: str) -> 
             content[place_] ^= 1
         wal.write_bytes(content)
     checked = check(run)
-    if (
-        len(before) > 2 and checked.exit_code == 1
-    ):  # killed between ledger and checkpoint of the third
+    if len(before) > 2 and checked.exit_code == 1:  # killed between ledger and checkpoint of the third
         assert "entries were lost" in checked.output
         assert "pour 2 of stage pours (weighed: " in checked.output
         return
