@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import decant
+from tests.golden.world import FormulaLaboratory
 from tests.support.small_campaign import write_campaign
 from tests.support.station import VIAL
 from tests.support.station_process import node_process
@@ -45,11 +46,9 @@ def test_a_program_asks_for_pours_and_reads_them_as_a_table_with_units(tmp_path:
 def test_a_campaign_is_checked_without_running_and_started_with_progress(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from tests.support.toy_campaign import ToyLaboratory
-
     campaign = decant.load_campaign(write_campaign(tmp_path))
     assert decant.check(campaign).problems == ()
-    monkeypatch.setattr("actors.laboratory.open_laboratory", lambda spec, **more: ToyLaboratory())
+    monkeypatch.setattr("actors.laboratory.open_laboratory", lambda spec, **more: FormulaLaboratory())
 
     async def work() -> decant.Run:
         running = await decant.start(campaign)
